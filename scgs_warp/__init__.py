@@ -1,0 +1,43 @@
+"""scgs_warp: Sparse-Controlled Gaussian Splatting (SC-GS) on NVIDIA Warp, for the CPU and CUDA.
+
+Importing this package is cheap; torch and Warp are loaded when one of the names below is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from .environment import prepare_environment as _prepare_environment
+
+__version__ = "0.1.0"
+
+_prepare_environment()
+
+if TYPE_CHECKING:
+    from .rasterize import rasterization as rasterization
+    from .scene import Scene as Scene
+    from .train import fit as fit
+    from .types import Camera as Camera
+    from .types import Frame as Frame
+    from .types import Gaussians as Gaussians
+    from .types import Image as Image
+    from .types import Pose as Pose
+
+_EXPORTS = {
+    "Camera": "types",
+    "Frame": "types",
+    "Gaussians": "types",
+    "Image": "types",
+    "Pose": "types",
+    "Scene": "scene",
+    "fit": "train",
+    "rasterization": "rasterize",
+}
+__all__ = ["Camera", "Frame", "Gaussians", "Image", "Pose", "Scene", "__version__", "fit", "rasterization"]
+
+
+def __getattr__(name: str):
+    if name not in _EXPORTS:
+        raise AttributeError(f"module 'scgs_warp' has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_EXPORTS[name]}", __name__), name)
