@@ -1,0 +1,20 @@
+"""Constants that several stages share, each with its reason."""
+
+from __future__ import annotations
+
+import warp as wp
+
+TILE_SIZE = 16
+"""Side of a tile in pixels: one row of it is one 512-bit SIMD register, its 256 pixels are one CUDA block."""
+
+ALPHA_MIN = wp.constant(1.0 / 255.0)
+"""A splat is skipped at a pixel where its alpha is smaller: it could not change an 8-bit image."""
+
+ALPHA_MAX = wp.constant(0.999)
+"""Alpha is clamped here, so that the adjoint can divide by 1 - alpha; the clamped alpha passes no gradient."""
+
+TRANSMITTANCE_MIN = wp.constant(1.0e-4)
+"""A pixel ends for good before the splat that would leave no more than this: what follows is invisible."""
+
+SLOT_GEOMETRY = 8
+"""Leading columns of a gradient slot: 2D mean (2), conic (3), opacity (1), absolute 2D mean (2); channels follow."""
