@@ -1,0 +1,73 @@
+"""A data set: posed, timed frames of one split, and what they have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import overload
+
+import torch
+from torch import Tensor
+
+from ..types import Camera, Frame
+
+BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
+"""What RGBA images are composited on when they are read. With ``random`` the trainer composites, once per step."""
+
+
+class Dataset(Sequence[Frame]):
+    """Frames of one split, in the order of the file that lists them.
+
+    With ``background == "random"`` every image is premultiplied colour on black, and ``alpha`` is what is needed to
+    put it on any colour: ``image + (1 - alpha) * color``.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        *,
+        folder: Path,
+        split: str,
+        background: str = "black",
+        points: Tensor | None = None,
+    ) -> None:
+        self._frames = tuple(frames)
+        self.folder = folder
+        self.split = split
+        self.background = background
+        """``black``, ``white`` or ``random``."""
+        self.points = points
+        """[P, 3] initial points, world units, where the data has some."""
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Frame, ...]: ...
+    def __getitem__(self, index: int | slice) -> Frame | tuple[Frame, ...]:
+        return self._frames[index]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self._frames)
+
+    @property
+    def background_color(self) -> Tensor:
+        """[3] the colour that the images were composited on."""
+        return torch.tensor(BACKGROUND_COLORS[self.background])
+
+    @property
+    def cameras(self) -> list[Camera]:
+        return [frame.camera for frame in self._frames]
+
+    @property
+    def times(self) -> Tensor:
+        """[V] in [0, 1]."""
+        return torch.tensor([frame.time for frame in self._frames], dtype=torch.float32)
+
+    @property
+    def extent(self) -> float:
+        """Largest distance of a camera centre from the centres' mean, world units (official SC-GS: no 1.1 factor)."""
+        centres = torch.stack([camera.position.double().cpu() for camera in self.cameras])
+        return float((centres - centres.mean(0)).norm(dim=1).max())

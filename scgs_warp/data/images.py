@@ -1,0 +1,151 @@
+"""Image files to planar float tensors: decode, reduce, composite; in a small pool of threads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import environment
+from ..errors import UserError
+from .dataset import BACKGROUND_COLORS
+
+RESAMPLES = ("area", "bicubic")
+SMALLEST_SIDE = 8
+"""Pixels; a smaller image is smaller than SSIM's window and surely a mistake."""
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class Decoded(NamedTuple):
+    image: Tensor
+    """[H, W, 3] float32 on the background; stored planar."""
+    alpha: Tensor | None
+    """[H, W] float32, None for a file without alpha."""
+    source_size: tuple[int, int]
+    """(width, height) of the file, before the reduction."""
+
+
+def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[[int, int], None] | None = None):
+    """``work`` of every item, in order, in as many threads as the process may use; the first exception is raised.
+
+    Args:
+        progress: called with (done, total) after each item.
+    """
+    with ThreadPoolExecutor(environment.thread_count(), "decode") as pool:
+        results: list[R] = []
+        try:
+            for result in pool.map(work, items):
+                results.append(result)
+                if progress is not None:
+                    progress(len(results), len(items))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return results
+
+
+def check_options(downscale: float, resample: str, background: str) -> None:
+    """Raise UserError for an option that no reader takes."""
+    if not (isinstance(downscale, (int, float)) and math.isfinite(downscale) and downscale >= 1):
+        raise UserError(f"downscale is {downscale!r}; give a number >= 1 (2 halves width and height)")
+    if resample not in RESAMPLES:
+        raise UserError(f"resample is {resample!r}; give one of {', '.join(RESAMPLES)}")
+    if background not in BACKGROUND_COLORS:
+        raise UserError(f"background is {background!r}; give one of {', '.join(BACKGROUND_COLORS)}")
+
+
+def reduced_size(width: int, height: int, downscale: float, path: Path) -> tuple[int, int]:
+    """(width, height) after ``downscale``, rounded; UserError where nothing useful is left."""
+    size = (max(1, round(width / downscale)), max(1, round(height / downscale)))
+    if downscale != 1 and min(size) < SMALLEST_SIDE:
+        largest = max(1, min(width, height) // SMALLEST_SIDE)
+        raise UserError(
+            f"{path}: downscale {downscale:g} leaves {size[0]} x {size[1]} of {width} x {height} pixels; "
+            f"give a downscale of at most {largest}"
+        )
+    return size
+
+
+def read_image(path: Path, downscale: float, resample: str, background: str) -> Decoded:
+    """Decode one file, reduce it, and composite it on the background once.
+
+    ``area`` averages colour premultiplied by alpha over each target pixel, in float. ``bicubic`` repeats what the
+    official SC-GS does: composite, truncate to 8 bits, then Pillow's bicubic filter on colour and alpha apart.
+    With ``random`` the image is on black (= premultiplied).
+
+    Raises:
+        UserError: the file is missing or does not decode.
+    """
+    pixels = _decode(path)
+    height, width = pixels.shape[:2]
+    size = reduced_size(width, height, downscale, path)
+    color = np.asarray(BACKGROUND_COLORS[background], np.float32)
+    if resample == "bicubic" and size != (width, height):
+        rgb, alpha = _bicubic(pixels, size, color)
+    else:
+        rgb, alpha = _area(pixels, size, color)
+    planar = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
+    alpha_tensor = None if alpha is None else torch.from_numpy(np.ascontiguousarray(alpha))
+    return Decoded(planar.permute(1, 2, 0), alpha_tensor, (width, height))
+
+
+def _decode(path: Path) -> np.ndarray:
+    """[H, W, 3 or 4] RGB(A), uint8 or uint16."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such image, though a frame names it; restore the file or drop the frame") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    except cv2.error:
+        pixels = None
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        raise UserError(f"{path}: not an image that decodes to 8 or 16 bits; save it again as PNG or JPEG")
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    code = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}.get(channels)
+    if code is None:
+        raise UserError(f"{path}: has {channels} channels; save it as grey, RGB or RGBA")
+    return cv2.cvtColor(pixels, code)
+
+
+def _area(pixels: np.ndarray, size: tuple[int, int], color: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    floats = pixels.astype(np.float32) * np.float32(1.0 / np.iinfo(pixels.dtype).max)
+    if floats.shape[2] == 4:
+        floats[..., :3] *= floats[..., 3:]
+    if size != (floats.shape[1], floats.shape[0]):
+        floats = cv2.resize(floats, size, interpolation=cv2.INTER_AREA)
+    if floats.shape[2] == 3:
+        return floats, None
+    alpha = floats[..., 3].clip(0.0, 1.0)
+    rgb = floats[..., :3]
+    if color.any():
+        rgb = rgb + (1.0 - alpha[..., None]) * color
+    return rgb.clip(0.0, 1.0), alpha
+
+
+def _bicubic(pixels: np.ndarray, size: tuple[int, int], color: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    from PIL import Image
+
+    def reduce(array: np.ndarray) -> np.ndarray:
+        reduced = Image.fromarray(array).resize(size, Image.Resampling.BICUBIC)
+        return np.asarray(reduced, np.float32) / np.float32(255.0)
+
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    if pixels.shape[2] == 3:
+        return reduce(np.ascontiguousarray(pixels)), None
+    floats = pixels.astype(np.float64) / 255.0
+    composited = floats[..., :3] * floats[..., 3:] + color * (1.0 - floats[..., 3:])
+    rgb = reduce((composited * 255.0).astype(np.uint8))
+    return rgb, reduce(np.ascontiguousarray(pixels[..., 3]))
