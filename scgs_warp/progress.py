@@ -1,0 +1,190 @@
+"""A progress bar with rate and time left on a terminal; plain lines, few enough to read later, in a log file.
+
+``advance`` costs well under a microsecond unless it is time to draw, so that it may be called at every training step.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+REDRAW_SECONDS = 0.2
+"""A terminal is redrawn this often."""
+LINE_FRACTION = 0.05
+"""A log gets a line after this fraction of the work ..."""
+LINE_SHORTEST = 2.0
+"""... but no sooner than after these seconds ..."""
+LINE_LONGEST = 30.0
+"""... and after these in any case."""
+RATE_SECONDS = 15.0
+"""The rate is that of the last seconds: training steps become slower as Gaussians are added."""
+
+
+def clock(seconds: float) -> str:
+    """``1:02:03`` or ``2:03``."""
+    minutes, second = divmod(int(seconds + 0.5), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.2f}" if abs(value) >= 0.1 or value == 0 else f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+class Progress:
+    """What ``progress`` yields: counts steps, keeps the newest value of each field, draws now and then."""
+
+    def __init__(self, total: int, description: str, stream: TextIO, start: int = 0) -> None:
+        self.total = total
+        self.done = start
+        self.description = description
+        self.fields: dict[str, Any] = {}
+        self._stream = stream
+        self._began = time.perf_counter()
+        self._start = start
+        self._marks: deque[tuple[float, int]] = deque([(self._began, start)])
+        self._next = self._began
+
+    def advance(self, n: int = 1, **fields: Any) -> None:
+        """``n`` more steps are done; ``fields`` (numbers, text) replace those of the same name. None removes one."""
+        self.done += n
+        if fields:
+            self.fields.update(fields)
+        now = time.perf_counter()
+        if now >= self._next:
+            self._next = self._draw(now)
+
+    def print(self, text: str) -> None:
+        """A line that stays, above the bar."""
+        print(text, file=self._stream, flush=True)
+
+    def finish(self, completed: bool = True) -> None:
+        """Draw the last state; called by ``progress``."""
+
+    def _draw(self, now: float) -> float:
+        """Show the state; returns when to look again."""
+        raise NotImplementedError
+
+    def _mark(self, now: float) -> None:
+        self._marks.append((now, self.done))
+        while len(self._marks) > 2 and now - self._marks[1][0] > RATE_SECONDS:
+            self._marks.popleft()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._began
+
+    @property
+    def rate(self) -> float:
+        """Steps a second, of late; 0 while unknown."""
+        (then, before), (now, after) = self._marks[0], self._marks[-1]
+        return (after - before) / (now - then) if now > then else 0.0
+
+    def describe_rate(self) -> str:
+        """``12.3 it/s``, or ``4.5 s/it`` where one step takes longer than a second."""
+        rate = self.rate
+        if rate <= 0:
+            return "- it/s"
+        return f"{rate:.1f} it/s" if rate >= 1 else f"{1 / rate:.1f} s/it"
+
+    def describe_left(self) -> str:
+        """Time left as ``2:03``, ``-`` while unknown."""
+        return clock(max(self.total - self.done, 0) / self.rate) if self.rate > 0 else "-"
+
+    def describe_fields(self) -> str:
+        return "  ".join(f"{name} {_text(value)}" for name, value in self.fields.items() if value is not None)
+
+
+class _Lines(Progress):
+    """For log files: one plain line from time to time."""
+
+    def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
+        super().__init__(total, description, stream, start)
+        self._line_at, self._line_done = self._began, start
+
+    def _draw(self, now: float) -> float:
+        self._mark(now)
+        waited = now - self._line_at
+        if waited >= LINE_LONGEST or (
+            waited >= LINE_SHORTEST and self.done - self._line_done >= LINE_FRACTION * self.total
+        ):
+            self._line_at, self._line_done = now, self.done
+            self._line(f"{self.describe_rate()}  elapsed {clock(self.elapsed)}  left {self.describe_left()}")
+        return now + 0.5
+
+    def _line(self, timing: str) -> None:
+        share = 100 * self.done / self.total if self.total else 100
+        parts = [f"{self.description} {self.done}/{self.total} ({share:.0f} %)", timing, self.describe_fields()]
+        self.print("  ".join(part for part in parts if part))
+
+    def finish(self, completed: bool = True) -> None:
+        elapsed = self.elapsed
+        rate = (self.done - self._start) / elapsed if elapsed > 0 else 0.0
+        self._line(f"{rate:.1f} it/s  {'done' if completed else 'stopped'} after {clock(elapsed)}")
+
+
+class _Bar(Progress):
+    """For terminals, drawn by rich. Refreshed from ``advance``: no thread of its own that would compete for a core."""
+
+    def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
+        super().__init__(total, description, stream, start)
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn
+        from rich.progress import Progress as RichProgress
+
+        self._rich = RichProgress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=28),
+            TextColumn("{task.completed}/{task.total}"),
+            TextColumn("{task.fields[timing]}", style="cyan"),
+            TextColumn("{task.fields[text]}", style="dim"),
+            console=Console(file=stream),
+            auto_refresh=False,
+        )
+        self._task = self._rich.add_task(description, total=total, completed=start, timing="", text="")
+        self._rich.start()
+
+    def _draw(self, now: float) -> float:
+        self._mark(now)
+        timing = f"{self.describe_rate()}  {clock(self.elapsed)} < {self.describe_left()}"
+        # rich reads [words] in square brackets as markup
+        text = self.describe_fields().replace("[", "(").replace("]", ")")
+        self._rich.update(self._task, completed=self.done, timing=timing, text=text, refresh=True)
+        return now + REDRAW_SECONDS
+
+    def print(self, text: str) -> None:
+        self._rich.console.print(text, markup=False, highlight=False)
+
+    def finish(self, completed: bool = True) -> None:
+        self._draw(time.perf_counter())
+        self._rich.stop()
+
+
+@contextmanager
+def progress(total: int, description: str, *, start: int = 0, stream: TextIO | None = None) -> Iterator[Progress]:
+    """Show how far a loop of ``total`` steps has come.
+
+    Args:
+        total: steps.
+        description: what is being done, in a word or two.
+        start: steps done before (a resumed run); they do not count for the rate.
+        stream: where to show it; standard output by default. A bar on a terminal, plain lines elsewhere.
+
+    Yields:
+        An object whose ``advance(n=1, **fields)`` is to be called as the work proceeds.
+    """
+    shown_on: TextIO = stream or sys.stdout
+    shown = (_Bar if shown_on.isatty() else _Lines)(total, description, shown_on, start)
+    try:
+        yield shown
+    except BaseException:
+        shown.finish(completed=False)
+        raise
+    shown.finish()
