@@ -59,7 +59,7 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 def random_camera(
     seed: int, width: int, height: int, device: torch.device | str = "cpu", *, distance: float = 4.0
 ) -> Camera:
-    """A camera that looks at the origin from ``distance``; focal lengths differ and the principal point is off centre."""
+    """A camera that looks at the origin from ``distance``; focal lengths differ, the principal point is off centre."""
     generator = torch.Generator().manual_seed(seed)
     direction = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
     up = torch.randn(3, generator=generator, dtype=torch.float64)
