@@ -1,0 +1,146 @@
+"""SSIM and the photometric loss as one autograd op: L1 and SSIM share their passes over the images, and one adjoint."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from .. import warp_interop
+from ..kernels import ssim as kernels
+
+Form = Literal["auto", "pixel", "cpu"]
+
+
+def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form = "auto") -> Tensor:
+    """Structural similarity (Wang et al. 2004): 11 x 11 Gaussian, sigma 1.5, zero padding, data range 1.
+
+    Args:
+        image: [C, H, W] float32.
+        truth: [C, H, W] float32, a constant: no gradient reaches it.
+        mask: [H, W] bool, True where a pixel is valid; None: all are. Invalid pixels of ``image`` are replaced by
+            those of ``truth``, so that no window sees them, and the mean leaves them out.
+        form: ``pixel`` (plain kernels, any device), ``cpu`` (SIMD), or what suits the device.
+
+    Returns:
+        The mean over valid pixels and channels, a scalar; 1 where no pixel is valid. Differentiable in ``image``.
+
+    Raises:
+        ValueError: a shape, dtype or device does not fit; the message names the argument.
+    """
+    return photometric_loss(image, truth, mask, 0.0, form=form)[2]
+
+
+def photometric_loss(
+    image: Tensor, truth: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.2, *, form: Form = "auto"
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, equation 7), with arguments as in ``ssim``.
+
+    Returns:
+        loss, l1 and ssim, scalars, each differentiable in ``image``. L1 is the mean absolute difference over valid
+        pixels and channels. Where no pixel is valid they are 0, 0 and 1, and the gradient is zero. Values that are
+        not finite make the loss not finite.
+
+    Raises:
+        ValueError: a shape, dtype or device does not fit; the message names the argument.
+    """
+    if image.ndim != 3 or image.dtype != torch.float32:
+        raise ValueError(f"image must be [C, H, W] float32, got {list(image.shape)} {image.dtype}")
+    if truth.shape != image.shape or truth.dtype != image.dtype or truth.device != image.device:
+        raise ValueError(
+            f"truth must be {list(image.shape)} {image.dtype} on {image.device} like image, "
+            f"got {list(truth.shape)} {truth.dtype} on {truth.device}"
+        )
+    if mask is not None and (mask.shape != image.shape[1:] or mask.dtype != torch.bool or mask.device != image.device):
+        raise ValueError(
+            f"mask must be {list(image.shape[1:])} bool on {image.device}, "
+            f"got {list(mask.shape)} {mask.dtype} on {mask.device}"
+        )
+    if form == "cpu" and image.device.type != "cpu":
+        raise ValueError(f"form 'cpu' needs tensors on the CPU, image is on {image.device}")
+    if form not in ("auto", "pixel", "cpu"):
+        raise ValueError(f"form must be auto, pixel or cpu, got {form!r}")
+    simd = form == "cpu" or (form == "auto" and image.device.type == "cpu")
+    needs_gradient = torch.is_grad_enabled() and image.requires_grad
+    return _Photometric.apply(image, truth.detach(), mask, ssim_weight, simd, needs_gradient)
+
+
+def _forward_bands(image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor | None) -> Tensor:
+    channels, height, _ = image.shape
+    sums = image.new_empty(2, channels, height)
+    bands = channels * -(-height // kernels.BAND)
+    warp_interop.launch(kernels.photometric_bands, bands, image, truth, mask, sums, partials, grain=1)
+    return sums
+
+
+def _forward_pixels(image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor | None) -> Tensor:
+    channels, height, width = image.shape
+    blurred = image.new_empty(4, *image.shape)
+    values = image.new_empty(2, *image.shape)
+    partials = image.new_empty(3, *image.shape) if partials is None else partials
+    sums = image.new_empty(2, channels, height)
+    count, masked = image.numel(), int(mask is not None)
+    warp_interop.launch(kernels.blur_rows, count, image, truth, mask, masked, blurred)
+    warp_interop.launch(kernels.photometric, count, image, truth, mask, masked, blurred, values, partials)
+    warp_interop.launch(
+        kernels.sum_rows, 2 * channels * height, values.view(2 * channels * height, width), sums.view(-1), grain=16
+    )
+    return sums
+
+
+def _adjoint_pixels(
+    image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor, v_sums: Tensor, v_image: Tensor
+) -> None:
+    blurred, count = torch.empty_like(partials), image.numel()
+    warp_interop.launch(kernels.blur_rows_adjoint, count, partials, blurred)
+    masked = int(mask is not None)
+    warp_interop.launch(kernels.photometric_adjoint, count, image, truth, mask, masked, blurred, v_sums, v_image)
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        truth: Tensor,
+        mask: Tensor | None,
+        weight: float,
+        simd: bool,
+        needs_gradient: bool,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        image, truth = image.detach().contiguous(), truth.contiguous()
+        mask = None if mask is None else mask.contiguous()
+        partials = image.new_empty(3, *image.shape) if needs_gradient else None
+        if image.numel() == 0:
+            sums = image.new_zeros(2, 1, 1)
+        else:
+            sums = (_forward_bands if simd else _forward_pixels)(image, truth, mask, partials)
+        totals = sums.flatten(1).double().sum(1)  # a few thousand values: one thread, one order
+        pixels = image[0].numel() if mask is None and image.shape[0] else 0
+        valid = totals.new_tensor(float(pixels)) if mask is None else mask.sum().double()
+        count = valid * image.shape[0]
+        l1, similarity = totals / count.clamp(min=1.0)
+        similarity = torch.where(count > 0, similarity, torch.ones_like(similarity))
+        loss = (1.0 - weight) * l1 + weight * (1.0 - similarity)
+        ctx.save_for_backward(image, truth, mask, partials, count)
+        ctx.weight, ctx.simd = weight, simd
+        return loss.float(), l1.float(), similarity.float()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_loss: Tensor, v_l1: Tensor, v_ssim: Tensor) -> tuple[Tensor | None, ...]:
+        image, truth, mask, partials, count = ctx.saved_tensors
+        v_image = torch.empty_like(image)
+        if image.numel():
+            v_means = torch.stack([v_l1 + (1.0 - ctx.weight) * v_loss, v_ssim - ctx.weight * v_loss])
+            v_sums = (v_means.double() / count.clamp(min=1.0)).float()
+            if ctx.simd:
+                bands = image.shape[0] * -(-image.shape[1] // kernels.BAND)
+                warp_interop.launch(
+                    kernels.photometric_bands_adjoint, bands, image, truth, mask, partials, v_sums, v_image, grain=1
+                )
+            else:
+                _adjoint_pixels(image, truth, mask, partials, v_sums, v_image)
+        return v_image, None, None, None, None, None
