@@ -1,0 +1,112 @@
+"""As-rigid-as-possible: the rotation that best explains how a node's neighbourhood moved, and what it leaves over."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def local_rotations(
+    first: int,
+    # In:
+    rest_in: wp.array[wp.vec3],  # [M]
+    posed_in: wp.array[wp.vec3],  # [M]
+    neighbors_in: wp.array2d[wp.int32],  # [M, J], < 0: none
+    weights_in: wp.array2d[float],  # [M, J]
+    # Out:
+    rotations_out: wp.array[wp.mat33],  # [M]
+):
+    """R = argmin sum w |e' - R e|^2 = U diag(1, 1, det(U V^T)) V^T with U S V^T = sum w e' e^T.
+
+    In float64: a node has a few edges only, and nearly collinear ones are the rule in thin limbs.
+    """
+    i = first + wp.tid()
+    S = wp.mat33d(wp.float64(0.0))
+    for j in range(neighbors_in.shape[1]):
+        n = neighbors_in[i, j]
+        if n >= 0:
+            edge = wp.vec3d(rest_in[n]) - wp.vec3d(rest_in[i])
+            posed = wp.vec3d(posed_in[n]) - wp.vec3d(posed_in[i])
+            S += wp.float64(weights_in[i, j]) * wp.outer(posed, edge)
+    largest = wp.float64(0.0)
+    bad = int(0)
+    for a in range(3):
+        for b in range(3):
+            largest = wp.max(largest, wp.abs(S[a, b]))
+            if not wp.isfinite(S[a, b]):
+                bad = 1
+    R = wp.identity(n=3, dtype=wp.float64)
+    if bad == 0 and largest > wp.float64(1.0e-60):
+        U, _sigma, V = wp.svd3(S / largest)
+        # singular values come in descending order: a reflection is undone along the least of them
+        if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):
+            for a in range(3):
+                U[a, 2] = -U[a, 2]
+        R = U * wp.transpose(V)
+    rotations_out[i] = wp.mat33(R)
+
+
+@wp.func
+def residual(rest: wp.vec3, posed: wp.vec3, rest_n: wp.vec3, posed_n: wp.vec3, R: wp.mat33):
+    return (posed_n - posed) - R * (rest_n - rest)
+
+
+@wp.kernel
+def arap_energy(
+    first: int,
+    # In:
+    rest_in: wp.array[wp.vec3],  # [M]
+    posed_in: wp.array[wp.vec3],  # [M]
+    neighbors_in: wp.array2d[wp.int32],  # [M, J]
+    weights_in: wp.array2d[float],  # [M, J]
+    rotations_in: wp.array[wp.mat33],  # [M]
+    # Out:
+    energies_out: wp.array[float],  # [M]
+):
+    i = first + wp.tid()
+    energy = float(0.0)
+    for j in range(neighbors_in.shape[1]):
+        n = neighbors_in[i, j]
+        if n >= 0:
+            e = residual(rest_in[i], posed_in[i], rest_in[n], posed_in[n], rotations_in[i])
+            energy += weights_in[i, j] * wp.dot(e, e)
+    energies_out[i] = energy
+
+
+@wp.kernel
+def arap_energy_adjoint(
+    first: int,
+    # In:
+    rest_in: wp.array[wp.vec3],  # [M]
+    posed_in: wp.array[wp.vec3],  # [M]
+    neighbors_in: wp.array2d[wp.int32],  # [M, J]
+    weights_in: wp.array2d[float],  # [M, J]
+    rotations_in: wp.array[wp.mat33],  # [M], held constant
+    order_in: wp.array[wp.int32],  # edges i * J + j sorted by the node they lead to; those that lead nowhere come first
+    begin_in: wp.array[wp.int32],  # [M + 1]
+    v_energies_in: wp.array[float],  # [M]
+    # Out:
+    v_rest_out: wp.array[wp.vec3],  # [M]
+    v_posed_out: wp.array[wp.vec3],  # [M]
+):
+    """Gradients of one node: over the edges that leave it, then over those that lead to it."""
+    m = first + wp.tid()
+    J = neighbors_in.shape[1]
+    v_rest = wp.vec3(0.0)
+    v_posed = wp.vec3(0.0)
+    for j in range(J):
+        n = neighbors_in[m, j]
+        if n >= 0:
+            e = residual(rest_in[m], posed_in[m], rest_in[n], posed_in[n], rotations_in[m])
+            v = 2.0 * v_energies_in[m] * weights_in[m, j] * e
+            v_posed -= v
+            v_rest += wp.transpose(rotations_in[m]) * v
+    for at in range(begin_in[m], begin_in[m + 1]):
+        edge = order_in[at]
+        i = edge // J
+        e = residual(rest_in[i], posed_in[i], rest_in[m], posed_in[m], rotations_in[i])
+        v = 2.0 * v_energies_in[i] * weights_in[i, edge - i * J] * e
+        v_posed += v
+        v_rest -= wp.transpose(rotations_in[i]) * v
+    v_rest_out[m] = v_rest
+    v_posed_out[m] = v_posed

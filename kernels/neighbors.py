@@ -1,0 +1,330 @@
+"""The K nearest control points of every Gaussian, and the weights with which they pull it (SC-GS, Eq. 5).
+
+``nearest`` is exact and exists twice: one point a thread in plain Warp, and for the CPU sixteen points a thread as
+lanes of SIMD registers. Both keep a sorted list of the K best, visit the nodes in ascending order and insert on a
+strict ``<``: ties go to the lower index, and a distance that is NaN is never inserted.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+LANES = wp.constant(16)
+"""Points a grid index of ``nearest_lanes`` handles."""
+MAX_NEIGHBORS = 16
+MAX_LANE_DIMENSIONS = 64
+"""Above this many dimensions ``nearest_lanes`` has no room for its points; the plain kernel takes any."""
+
+_NEAREST_LANES = """
+#if !defined(__CUDA_ARCH__)
+    typedef float vf __attribute__((vector_size(64)));
+    typedef int vi __attribute__((vector_size(64)));
+    struct Two { enum { value = 2 }; }; struct Three { enum { value = 3 }; }; struct Four { enum { value = 4 }; };
+    struct Eight { enum { value = 8 }; }; struct Sixteen { enum { value = 16 }; };
+    const int N = points.shape[0], M = nodes.shape[0], D = points.shape[1];
+    const float* source = points.data;
+    const float* node_data = nodes.data;
+    const float infinity = __builtin_inff();
+    auto scan = [&](auto kc, auto dc) {
+        constexpr int S = decltype(kc)::value;    // size of the sorted list, >= K
+        constexpr int FIXED = decltype(dc)::value;  // 3 or, when 2, any D
+        vf x[FIXED == 3 ? 3 : 64];
+        const int dims = FIXED == 3 ? 3 : D;
+        for (int d = 0; d < dims; ++d)
+            for (int lane = 0; lane < 16; ++lane) {
+                int row = begin + lane < N ? begin + lane : N - 1;
+                x[d][lane] = source[(long long)row * D + d];
+            }
+        vf best[S]; vi index[S];
+        for (int j = 0; j < S; ++j) { best[j] = (vf){} + infinity; index[j] = (vi){} + (j < M ? j : 0); }
+        for (int m = 0; m < M; ++m) {
+            const float* node = node_data + (long long)m * dims;
+            vf e = x[0] - node[0];
+            vf d2 = e * e;
+            if (FIXED == 3) {
+                vf e1 = x[1] - node[1], e2 = x[2] - node[2];
+                d2 = d2 + e1 * e1 + e2 * e2;
+            } else {
+                for (int d = 1; d < dims; ++d) { e = x[d] - node[d]; d2 += e * e; }
+            }
+            vi closer = d2 < best[S - 1];
+            if (!__builtin_reduce_or(closer)) continue;
+            d2 = d2 < infinity ? d2 : (vf){} + infinity;  // NaN never enters the list
+            vi number = (vi){} + m;
+            #pragma clang loop unroll(full)
+            for (int j = S - 1; j > 0; --j) {
+                vi here = d2 < best[j], before = d2 < best[j - 1];
+                index[j] = before ? index[j - 1] : (here ? number : index[j]);
+                best[j] = before ? best[j - 1] : (here ? d2 : best[j]);
+            }
+            vi here = d2 < best[0];
+            index[0] = here ? number : index[0];
+            best[0] = here ? d2 : best[0];
+        }
+        const int rows = N - begin < 16 ? N - begin : 16;
+        for (int lane = 0; lane < rows; ++lane)
+            for (int j = 0; j < K; ++j) {
+                indices.data[(long long)(begin + lane) * K + j] = index[j][lane];
+                distances.data[(long long)(begin + lane) * K + j] = best[j][lane];
+            }
+    };
+    auto dispatch = [&](auto dc) {
+        if (K <= 3) scan(Three{}, dc);
+        else if (K == 4) scan(Four{}, dc);
+        else if (K <= 8) scan(Eight{}, dc);
+        else scan(Sixteen{}, dc);
+    };
+    if (D == 3) dispatch(Three{});
+    else dispatch(Two{});
+#endif
+"""
+
+
+@wp.func_native(_NEAREST_LANES)
+def _scan_lanes(
+    begin: int,
+    K: int,
+    points: wp.array2d[float],
+    nodes: wp.array2d[float],
+    indices: wp.array2d[wp.int32],
+    distances: wp.array2d[float],
+): ...
+
+
+@wp.kernel
+def nearest_lanes(
+    first: int,
+    # In:
+    points_in: wp.array2d[float],  # [N, D], D <= MAX_LANE_DIMENSIONS
+    nodes_in: wp.array2d[float],  # [M, D]
+    K: int,  # <= MAX_NEIGHBORS
+    # Out:
+    indices_out: wp.array2d[wp.int32],  # [N, K] nearest first
+    distances_out: wp.array2d[float],  # [N, K] squared
+):
+    """K nearest nodes of points ``16 i .. 16 i + 15``, on a CPU only."""
+    block = first + wp.tid()
+    _scan_lanes(block * LANES, K, points_in, nodes_in, indices_out, distances_out)
+
+
+@wp.kernel
+def nearest(
+    first: int,
+    # In:
+    points_in: wp.array2d[float],  # [N, D]
+    nodes_in: wp.array2d[float],  # [M, D]
+    K: int,
+    # Out:
+    indices_out: wp.array2d[wp.int32],  # [N, K] nearest first
+    distances_out: wp.array2d[float],  # [N, K] squared
+):
+    """K nearest nodes of point ``i``; the sorted list lives in the outputs' own row."""
+    i = first + wp.tid()
+    for j in range(K):
+        indices_out[i, j] = j
+        distances_out[i, j] = wp.inf
+    worst = float(wp.inf)
+    for m in range(nodes_in.shape[0]):
+        d2 = float(0.0)
+        for d in range(nodes_in.shape[1]):
+            e = points_in[i, d] - nodes_in[m, d]
+            d2 += e * e
+        if d2 < worst:
+            j = K - 1
+            while j > 0 and d2 < distances_out[i, wp.max(j - 1, 0)]:
+                distances_out[i, j] = distances_out[i, j - 1]
+                indices_out[i, j] = indices_out[i, j - 1]
+                j -= 1
+            distances_out[i, j] = d2
+            indices_out[i, j] = m
+            worst = distances_out[i, K - 1]
+
+
+@wp.func
+def squared_distance(points: wp.array2d[float], i: int, nodes: wp.array2d[float], m: int):
+    d2 = float(0.0)
+    for d in range(nodes.shape[1]):
+        e = points[i, d] - nodes[m, d]
+        d2 += e * e
+    return d2
+
+
+@wp.kernel
+def rbf_weights(
+    first: int,
+    # In:
+    points_in: wp.array2d[float],  # [N, D]
+    nodes_in: wp.array2d[float],  # [M, D]
+    radii_in: wp.array[float],  # [M]
+    strengths_in: wp.array[float],  # [M], touched only with has_strengths
+    has_strengths: int,
+    indices_in: wp.array2d[wp.int32],  # [N, K]
+    # Out:
+    weights_out: wp.array2d[float],  # [N, K]
+):
+    """A softmax over a Gaussian's neighbours of ``log s - d^2 / (2 r^2)``; all weight to the first if none is finite."""
+    i = first + wp.tid()
+    K = indices_in.shape[1]
+    top = float(-wp.inf)
+    for k in range(K):
+        m = indices_in[i, k]
+        r = radii_in[m]
+        e = -squared_distance(points_in, i, nodes_in, m) / (2.0 * r * r)
+        if has_strengths != 0:
+            e += wp.log(wp.max(strengths_in[m], MIN_STRENGTH))
+        weights_out[i, k] = e
+        if wp.isfinite(e):
+            top = wp.max(top, e)
+    total = float(0.0)
+    for k in range(K):
+        e = weights_out[i, k]
+        w = float(0.0)
+        if wp.isfinite(e):
+            w = wp.exp(e - top)
+        elif top == -wp.inf and k == 0:
+            w = 1.0
+        weights_out[i, k] = w
+        total += w
+    for k in range(K):
+        weights_out[i, k] = weights_out[i, k] / total
+
+
+MIN_STRENGTH = wp.constant(1.0e-30)
+
+
+@wp.kernel
+def rbf_weights_adjoint(
+    first: int,
+    # In:
+    points_in: wp.array2d[float],  # [N, D]
+    nodes_in: wp.array2d[float],  # [M, D]
+    radii_in: wp.array[float],  # [M]
+    indices_in: wp.array2d[wp.int32],  # [N, K]
+    weights_in: wp.array2d[float],  # [N, K]
+    v_weights_in: wp.array2d[float],  # [N, K]
+    # Out:
+    v_logits_out: wp.array2d[float],  # [N, K] gradient to log s - d^2 / (2 r^2)
+    v_points_out: wp.array2d[float],  # [N, D]
+):
+    """Gradients of one Gaussian's own values; the nodes' are summed from ``v_logits_out`` by ``rbf_reduce_*``."""
+    i = first + wp.tid()
+    K = indices_in.shape[1]
+    mean = float(0.0)
+    for k in range(K):
+        mean += weights_in[i, k] * v_weights_in[i, k]
+    for d in range(nodes_in.shape[1]):
+        v_points_out[i, d] = 0.0
+    for k in range(K):
+        v = weights_in[i, k] * (v_weights_in[i, k] - mean)
+        v_logits_out[i, k] = v
+        if v != 0.0:
+            m = indices_in[i, k]
+            r = radii_in[m]
+            v = v / (r * r)
+            for d in range(nodes_in.shape[1]):
+                v_points_out[i, d] = v_points_out[i, d] - v * (points_in[i, d] - nodes_in[m, d])
+
+
+@wp.func
+def _rbf_add(
+    i: int,
+    m: int,
+    row: int,
+    v: float,
+    points: wp.array2d[float],
+    nodes: wp.array2d[float],
+    sums: wp.array2d[float],
+):
+    """Add pair (i, m) to its node's sums: v, v d^2, v (x - p)."""
+    if v != 0.0:
+        d2 = float(0.0)
+        for d in range(nodes.shape[1]):
+            e = points[i, d] - nodes[m, d]
+            d2 += e * e
+            sums[row, 2 + d] = sums[row, 2 + d] + v * e
+        sums[row, 0] = sums[row, 0] + v
+        sums[row, 1] = sums[row, 1] + v * d2
+
+
+@wp.kernel
+def rbf_reduce_chunks(
+    first: int,
+    # In:
+    size: int,  # Gaussians a chunk
+    points_in: wp.array2d[float],  # [N, D]
+    nodes_in: wp.array2d[float],  # [M, D]
+    indices_in: wp.array2d[wp.int32],  # [N, K]
+    v_logits_in: wp.array2d[float],  # [N, K]
+    # Out:
+    sums_out: wp.array2d[float],  # [chunks * M, 2 + D] zero on entry
+):
+    """Node sums of the Gaussians of one chunk, on a CPU: a chunk's size does not depend on the threads."""
+    chunk = first + wp.tid()
+    M = nodes_in.shape[0]
+    for i in range(chunk * size, wp.min((chunk + 1) * size, points_in.shape[0])):
+        for k in range(indices_in.shape[1]):
+            m = indices_in[i, k]
+            _rbf_add(i, m, chunk * M + m, v_logits_in[i, k], points_in, nodes_in, sums_out)
+
+
+@wp.kernel
+def rbf_reduce_lists(
+    first: int,
+    # In:
+    order_in: wp.array[wp.int32],  # [N * K] pairs i * K + k sorted by node
+    begin_in: wp.array[wp.int32],  # [M + 1] a node's pairs lie at begin[m] .. begin[m + 1]
+    points_in: wp.array2d[float],  # [N, D]
+    nodes_in: wp.array2d[float],  # [M, D]
+    v_logits_in: wp.array2d[float],  # [N, K]
+    # Out:
+    sums_out: wp.array2d[float],  # [M, 2 + D] zero on entry
+):
+    """Node sums of one node, through its list of pairs: for CUDA, where chunks would leave the device idle."""
+    m = first + wp.tid()
+    K = v_logits_in.shape[1]
+    for at in range(begin_in[m], begin_in[m + 1]):
+        pair = order_in[at]
+        i = pair // K
+        _rbf_add(i, m, m, v_logits_in[i, pair - i * K], points_in, nodes_in, sums_out)
+
+
+@wp.kernel
+def rbf_finish(
+    first: int,
+    # In:
+    chunks: int,
+    radii_in: wp.array[float],  # [M]
+    strengths_in: wp.array[float],  # [M], touched only with has_strengths
+    has_strengths: int,
+    sums_in: wp.array2d[float],  # [chunks * M, 2 + D]
+    # Out:
+    v_nodes_out: wp.array2d[float],  # [M, D]
+    v_radii_out: wp.array[float],  # [M]
+    v_strengths_out: wp.array[float],  # [M], touched only with has_strengths
+):
+    """Gradients of one node from its sums."""
+    m = first + wp.tid()
+    M = radii_in.shape[0]
+    r = radii_in[m]
+    v = float(0.0)
+    v_d2 = float(0.0)
+    for c in range(chunks):
+        v += sums_in[c * M + m, 0]
+        v_d2 += sums_in[c * M + m, 1]
+    v_radius = float(0.0)
+    if v_d2 != 0.0:
+        v_radius = v_d2 / (r * r * r)
+    v_radii_out[m] = v_radius
+    for d in range(v_nodes_out.shape[1]):
+        v_x = float(0.0)
+        for c in range(chunks):
+            v_x += sums_in[c * M + m, 2 + d]
+        if v_x != 0.0:
+            v_x = v_x / (r * r)
+        v_nodes_out[m, d] = v_x
+    if has_strengths != 0:
+        s = strengths_in[m]
+        v_strength = float(0.0)
+        if s > MIN_STRENGTH:
+            v_strength = v / s
+        v_strengths_out[m] = v_strength

@@ -1,0 +1,71 @@
+"""Farthest-point sampling: a well-spread subset of a cloud, the same one on every run."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+CHOSEN = wp.constant(-1.0)
+NOT_FINITE = wp.constant(-0.5)
+"""Distances that mark a point: one already chosen, and one to be chosen only when nothing else is left."""
+
+
+@wp.kernel
+def start_distances(
+    first: int,
+    # In:
+    points_in: wp.array2d[float],  # [N, D]
+    # Out:
+    distances_out: wp.array[float],  # [N]
+):
+    i = first + wp.tid()
+    distance = float(wp.inf)
+    for d in range(points_in.shape[1]):
+        if not wp.isfinite(points_in[i, d]):
+            distance = NOT_FINITE
+    distances_out[i] = distance
+
+
+@wp.kernel
+def farthest_step(
+    first: int,
+    # In:
+    step: int,
+    size: int,  # points a chunk
+    points_in: wp.array2d[float],  # [N, D]
+    best_in: wp.array[float],  # [chunks] of the step before: greatest distance of each chunk
+    best_index_in: wp.array[wp.int32],  # [chunks] and its point
+    # Out:
+    distances_out: wp.array[float],  # [N] squared, to the points chosen so far; updated
+    best_out: wp.array[float],  # [chunks]
+    best_index_out: wp.array[wp.int32],  # [chunks]
+    chosen_out: wp.array[wp.int64],  # [count]
+):
+    """Choose the farthest point (every chunk for itself, from the same figures), then update one chunk's distances."""
+    chunk = first + wp.tid()
+    chosen = int(best_index_in[0])
+    farthest = float(best_in[0])
+    for c in range(1, best_in.shape[0]):
+        if best_in[c] > farthest:
+            farthest = best_in[c]
+            chosen = best_index_in[c]
+    if chunk == 0:
+        chosen_out[step] = wp.int64(chosen)
+    best = float(-wp.inf)
+    best_index = int(0)
+    for i in range(chunk * size, wp.min((chunk + 1) * size, points_in.shape[0])):
+        d2 = float(0.0)
+        for d in range(points_in.shape[1]):
+            e = points_in[i, d] - points_in[chosen, d]
+            d2 += e * e
+        distance = distances_out[i]
+        if i == chosen:
+            distance = CHOSEN
+            distances_out[i] = distance
+        elif d2 < distance:
+            distance = d2
+            distances_out[i] = distance
+        if distance > best:
+            best = distance
+            best_index = i
+    best_out[chunk] = best
+    best_index_out[chunk] = best_index

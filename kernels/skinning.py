@@ -1,0 +1,292 @@
+"""Linear blend skinning of Gaussians by their control points (SC-GS, Eq. 6 and 7).
+
+The adjoint runs in three launches: one thread a Gaussian for its own gradients, then the sums over each node's
+Gaussians (chunks of Gaussians on a CPU, lists of pairs on CUDA), then one thread a node. The rotation's gradient is
+summed as the matrix ``G = sum w v (x - p)^T``, which turns into the quaternion's only once a node.
+"""
+
+import warp as wp
+
+from .quaternion import (
+    quat_conjugate,
+    quat_matrix_adjoint,
+    quat_multiply,
+    quat_normalise,
+    quat_normalise_adjoint,
+    quat_rotate,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+SUMS = 16
+"""Columns of the node sums: G (9), w v (3), w s v_blend (4), then w v_log_scales (3) where there are any."""
+
+
+@wp.func
+def aligned(q: wp.vec4, reference: wp.vec4):
+    """q or -q, whichever lies on the side of the reference."""
+    if wp.dot(q, reference) < 0.0:
+        return -q
+    return q
+
+
+@wp.func
+def finite(x: wp.vec3):
+    return wp.isfinite(x[0]) and wp.isfinite(x[1]) and wp.isfinite(x[2])
+
+
+@wp.func
+def finite(q: wp.vec4):  # noqa: F811  (Warp overloads by type)
+    return wp.isfinite(q[0]) and wp.isfinite(q[1]) and wp.isfinite(q[2]) and wp.isfinite(q[3])
+
+
+@wp.kernel
+def skin(
+    first: int,
+    # In:
+    means_in: wp.array[wp.vec3],  # [N]
+    quats_in: wp.array[wp.vec4],  # [N] wxyz
+    nodes_in: wp.array[wp.vec3],  # [M]
+    translations_in: wp.array[wp.vec3],  # [M]
+    rotations_in: wp.array[wp.vec4],  # [M] wxyz
+    shape_rotations_in: wp.array[wp.vec4],  # [M] wxyz, the same array as rotations_in where there are none
+    log_scales_in: wp.array[wp.vec3],  # [M], touched only with has_log_scales
+    has_log_scales: int,
+    indices_in: wp.array2d[wp.int32],  # [N, K]
+    weights_in: wp.array2d[float],  # [N, K]
+    # Out:
+    means_out: wp.array[wp.vec3],  # [N]
+    quats_out: wp.array[wp.vec4],  # [N] unit
+    log_scales_out: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+):
+    i = first + wp.tid()
+    x = means_in[i]
+    mean = wp.vec3(0.0)
+    blend = wp.vec4(0.0)
+    log_scales = wp.vec3(0.0)
+    reference = wp.vec4(0.0)
+    for k in range(indices_in.shape[1]):
+        m = indices_in[i, k]
+        w = weights_in[i, k]
+        r = quat_normalise(rotations_in[m])
+        p = nodes_in[m]
+        mean += w * (quat_rotate(r, x - p) + p + translations_in[m])
+        shape = quat_normalise(shape_rotations_in[m])
+        if k == 0:
+            reference = shape
+        blend += w * aligned(shape, reference)
+        if has_log_scales != 0:
+            log_scales += w * log_scales_in[m]
+    means_out[i] = mean
+    quats_out[i] = quat_multiply(quat_normalise(blend), quat_normalise(quats_in[i]))
+    if has_log_scales != 0:
+        log_scales_out[i] = log_scales
+
+
+@wp.kernel
+def skin_adjoint(
+    first: int,
+    # In:
+    means_in: wp.array[wp.vec3],  # [N]
+    quats_in: wp.array[wp.vec4],  # [N]
+    nodes_in: wp.array[wp.vec3],  # [M]
+    translations_in: wp.array[wp.vec3],  # [M]
+    rotations_in: wp.array[wp.vec4],  # [M]
+    shape_rotations_in: wp.array[wp.vec4],  # [M]
+    log_scales_in: wp.array[wp.vec3],  # [M], touched only with has_log_scales
+    has_log_scales: int,
+    indices_in: wp.array2d[wp.int32],  # [N, K]
+    weights_in: wp.array2d[float],  # [N, K]
+    v_means_in: wp.array[wp.vec3],  # [N]
+    v_quats_in: wp.array[wp.vec4],  # [N]
+    v_log_scales_in: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+    # Out:
+    v_means_out: wp.array[wp.vec3],  # [N]
+    v_quats_out: wp.array[wp.vec4],  # [N]
+    v_weights_out: wp.array2d[float],  # [N, K]
+    v_blends_out: wp.array[wp.vec4],  # [N] gradient to the blended rotation before it is normalised
+):
+    """Gradients of one Gaussian's own values. One that is not finite passes none."""
+    i = first + wp.tid()
+    x = means_in[i]
+    v = v_means_in[i]
+    K = indices_in.shape[1]
+    if not (finite(x) and finite(quats_in[i])):
+        v_means_out[i] = wp.vec3(0.0)
+        v_quats_out[i] = wp.vec4(0.0)
+        v_blends_out[i] = wp.vec4(0.0)
+        for k in range(K):
+            v_weights_out[i, k] = 0.0
+        return
+    reference = quat_normalise(shape_rotations_in[indices_in[i, 0]])
+    blend = wp.vec4(0.0)
+    for k in range(K):
+        shape = quat_normalise(shape_rotations_in[indices_in[i, k]])
+        blend += weights_in[i, k] * aligned(shape, reference)
+    b = quat_normalise(blend)
+    q = quat_normalise(quats_in[i])
+    v_q = v_quats_in[i]
+    v_quats_out[i] = quat_normalise_adjoint(quats_in[i], quat_multiply(quat_conjugate(b), v_q))
+    v_blend = quat_normalise_adjoint(blend, quat_multiply(v_q, quat_conjugate(q)))
+    v_blends_out[i] = v_blend
+    v_mean = wp.vec3(0.0)
+    for k in range(K):
+        m = indices_in[i, k]
+        r = quat_normalise(rotations_in[m])
+        p = nodes_in[m]
+        shape = quat_normalise(shape_rotations_in[m])
+        v_w = wp.dot(v, quat_rotate(r, x - p) + p + translations_in[m]) + wp.dot(v_blend, aligned(shape, reference))
+        if has_log_scales != 0:
+            v_w += wp.dot(v_log_scales_in[i], log_scales_in[m])
+        v_weights_out[i, k] = v_w
+        v_mean += weights_in[i, k] * quat_rotate(quat_conjugate(r), v)
+    v_means_out[i] = v_mean
+
+
+@wp.func
+def _add(
+    i: int,
+    k: int,
+    row: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    nodes: wp.array[wp.vec3],
+    shapes: wp.array[wp.vec4],
+    indices: wp.array2d[wp.int32],
+    weights: wp.array2d[float],
+    v_means: wp.array[wp.vec3],
+    v_blends: wp.array[wp.vec4],
+    v_log_scales: wp.array[wp.vec3],
+    has_log_scales: int,
+    sums: wp.array2d[float],
+):
+    """Add pair (i, k) to its node's sums."""
+    x = means[i]
+    if not (finite(x) and finite(quats[i])):
+        return
+    m = indices[i, k]
+    w = weights[i, k]
+    v = w * v_means[i]
+    arm = x - nodes[m]
+    for a in range(3):
+        for c in range(3):
+            sums[row, 3 * a + c] = sums[row, 3 * a + c] + v[a] * arm[c]
+        sums[row, 9 + a] = sums[row, 9 + a] + v[a]
+    if wp.dot(quat_normalise(shapes[m]), quat_normalise(shapes[indices[i, 0]])) < 0.0:
+        w = -w
+    v_blend = v_blends[i]
+    for a in range(4):
+        sums[row, 12 + a] = sums[row, 12 + a] + w * v_blend[a]
+    if has_log_scales != 0:
+        v_scale = weights[i, k] * v_log_scales[i]
+        for a in range(3):
+            sums[row, 16 + a] = sums[row, 16 + a] + v_scale[a]
+
+
+@wp.kernel
+def skin_reduce_chunks(
+    first: int,
+    # In:
+    size: int,  # Gaussians a chunk
+    means_in: wp.array[wp.vec3],  # [N]
+    quats_in: wp.array[wp.vec4],  # [N]
+    nodes_in: wp.array[wp.vec3],  # [M]
+    shape_rotations_in: wp.array[wp.vec4],  # [M]
+    indices_in: wp.array2d[wp.int32],  # [N, K]
+    weights_in: wp.array2d[float],  # [N, K]
+    v_means_in: wp.array[wp.vec3],  # [N]
+    v_blends_in: wp.array[wp.vec4],  # [N]
+    v_log_scales_in: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+    has_log_scales: int,
+    # Out:
+    sums_out: wp.array2d[float],  # [chunks * M, SUMS (+ 3)] zero on entry
+):
+    """Node sums of the Gaussians of one chunk, on a CPU: a chunk's size does not depend on the threads."""
+    chunk = first + wp.tid()
+    M = nodes_in.shape[0]
+    for i in range(chunk * size, wp.min((chunk + 1) * size, means_in.shape[0])):
+        for k in range(indices_in.shape[1]):
+            row = chunk * M + indices_in[i, k]
+            _add(
+                i, k, row, means_in, quats_in, nodes_in, shape_rotations_in, indices_in, weights_in,
+                v_means_in, v_blends_in, v_log_scales_in, has_log_scales, sums_out,
+            )  # fmt: skip
+
+
+@wp.kernel
+def skin_reduce_lists(
+    first: int,
+    # In:
+    order_in: wp.array[wp.int32],  # [N * K] pairs i * K + k sorted by node
+    begin_in: wp.array[wp.int32],  # [M + 1]
+    means_in: wp.array[wp.vec3],  # [N]
+    quats_in: wp.array[wp.vec4],  # [N]
+    nodes_in: wp.array[wp.vec3],  # [M]
+    shape_rotations_in: wp.array[wp.vec4],  # [M]
+    indices_in: wp.array2d[wp.int32],  # [N, K]
+    weights_in: wp.array2d[float],  # [N, K]
+    v_means_in: wp.array[wp.vec3],  # [N]
+    v_blends_in: wp.array[wp.vec4],  # [N]
+    v_log_scales_in: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+    has_log_scales: int,
+    # Out:
+    sums_out: wp.array2d[float],  # [M, SUMS (+ 3)] zero on entry
+):
+    """Node sums of one node, through its list of pairs: for CUDA, where chunks would leave the device idle."""
+    m = first + wp.tid()
+    K = indices_in.shape[1]
+    for at in range(begin_in[m], begin_in[m + 1]):
+        pair = order_in[at]
+        i = pair // K
+        _add(
+            i, pair - i * K, m, means_in, quats_in, nodes_in, shape_rotations_in, indices_in, weights_in,
+            v_means_in, v_blends_in, v_log_scales_in, has_log_scales, sums_out,
+        )  # fmt: skip
+
+
+@wp.kernel
+def skin_finish(
+    first: int,
+    # In:
+    chunks: int,
+    rotations_in: wp.array[wp.vec4],  # [M]
+    shape_rotations_in: wp.array[wp.vec4],  # [M]
+    has_shape_rotations: int,
+    has_log_scales: int,
+    sums_in: wp.array2d[float],  # [chunks * M, SUMS (+ 3)]
+    # Out:
+    v_nodes_out: wp.array[wp.vec3],  # [M]
+    v_translations_out: wp.array[wp.vec3],  # [M]
+    v_rotations_out: wp.array[wp.vec4],  # [M]
+    v_shape_rotations_out: wp.array[wp.vec4],  # [M], touched only with has_shape_rotations
+    v_log_scales_out: wp.array[wp.vec3],  # [M], touched only with has_log_scales
+):
+    """Gradients of one node from its sums."""
+    m = first + wp.tid()
+    M = rotations_in.shape[0]
+    G = wp.mat33(0.0)
+    v = wp.vec3(0.0)
+    v_blend = wp.vec4(0.0)
+    v_log_scales = wp.vec3(0.0)
+    for chunk in range(chunks):
+        row = chunk * M + m
+        for a in range(3):
+            for c in range(3):
+                G[a, c] = G[a, c] + sums_in[row, 3 * a + c]
+            v[a] = v[a] + sums_in[row, 9 + a]
+        for a in range(4):
+            v_blend[a] = v_blend[a] + sums_in[row, 12 + a]
+        if has_log_scales != 0:
+            for a in range(3):
+                v_log_scales[a] = v_log_scales[a] + sums_in[row, 16 + a]
+    r = quat_normalise(rotations_in[m])
+    v_translations_out[m] = v
+    v_nodes_out[m] = v - quat_rotate(quat_conjugate(r), v)
+    v_r = quat_matrix_adjoint(r, G)
+    if has_shape_rotations != 0:
+        v_shape_rotations_out[m] = quat_normalise_adjoint(shape_rotations_in[m], v_blend)
+    else:
+        v_r += v_blend
+    v_rotations_out[m] = quat_normalise_adjoint(rotations_in[m], v_r)
+    if has_log_scales != 0:
+        v_log_scales_out[m] = v_log_scales

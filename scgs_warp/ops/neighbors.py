@@ -1,0 +1,158 @@
+"""Which control points move a Gaussian, and how much: exact nearest neighbours and RBF weights (SC-GS, Eq. 5)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels import neighbors as kernels
+from ..warp_interop import launch
+
+
+class NodeLists(NamedTuple):
+    """The (Gaussian, neighbour) pairs of every node, in ascending order: the order in which its gradients are summed."""
+
+    order: Tensor
+    """[N * K] int32, pairs ``i * K + k`` sorted by node."""
+    begin: Tensor
+    """[M + 1] int32, node m's pairs are ``order[begin[m]:begin[m + 1]]``."""
+
+
+def node_lists(indices: Tensor, count: int) -> NodeLists:
+    """Lists of the pairs of each of ``count`` nodes; ``indices`` [N, K] int32, entries in [0, count)."""
+    nodes, order = torch.sort(indices.reshape(-1), stable=True)
+    bounds = torch.arange(count + 1, device=indices.device, dtype=nodes.dtype)
+    return NodeLists(order.int(), torch.searchsorted(nodes, bounds, out_int32=True))
+
+
+def chunk_size(nodes: int) -> int:
+    """Gaussians whose node gradients are summed into one buffer on a CPU. A function of the node count alone."""
+    return max(2048, 4 * nodes)
+
+
+def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The exact ``k`` nearest nodes of every point, nearest first; ties go to the lower index. No gradient.
+
+    Args:
+        points: [N, D] float32.
+        nodes: [M, D] float32.
+        k: neighbours a point, 1 .. min(M, 16).
+
+    Returns:
+        Indices [N, k] int32, always in [0, M), and squared distances [N, k]. A row whose distances are NaN or infinite
+        gets distances of infinity.
+
+    Raises:
+        ValueError: shapes do not fit, or ``k`` is out of range.
+    """
+    if points.ndim != 2:
+        raise ValueError(f"points must be [N, D], got {tuple(points.shape)}")
+    if nodes.ndim != 2 or nodes.shape[1] != points.shape[1] or points.shape[1] == 0:
+        raise ValueError(f"nodes must be [M, {points.shape[1]}] (D > 0) as points, got {tuple(nodes.shape)}")
+    if not 1 <= k <= min(nodes.shape[0], kernels.MAX_NEIGHBORS):
+        raise ValueError(f"k must be in 1 .. min(M, {kernels.MAX_NEIGHBORS}), got {k} with M = {nodes.shape[0]} nodes")
+    points, nodes = points.detach().contiguous(), nodes.detach().contiguous()
+    indices = torch.empty(points.shape[0], k, dtype=torch.int32, device=points.device)
+    distances = torch.empty(points.shape[0], k, device=points.device)
+    arguments = points, nodes, k, indices, distances
+    if points.device.type == "cpu" and points.shape[1] <= kernels.MAX_LANE_DIMENSIONS:
+        launch(kernels.nearest_lanes, -(-points.shape[0] // kernels.LANES), *arguments, grain=16)
+    else:
+        launch(kernels.nearest, points.shape[0], *arguments)
+    return indices, distances
+
+
+def _node_sums(
+    indices: Tensor, points: Tensor, nodes: Tensor, v_logits: Tensor, lists: NodeLists | None
+) -> tuple[int, Tensor]:
+    """Number of partial sums and their buffer [parts * M, 2 + D]."""
+    count, width = nodes.shape[0], 2 + nodes.shape[1]
+    if lists is None and points.device.type == "cpu":
+        size = chunk_size(count)
+        chunks = -(-points.shape[0] // size)
+        sums = torch.zeros(chunks * count, width)
+        launch(kernels.rbf_reduce_chunks, chunks, size, points, nodes, indices, v_logits, sums, grain=1)
+        return chunks, sums
+    lists = lists or node_lists(indices, count)
+    sums = torch.zeros(count, width, device=points.device)
+    launch(kernels.rbf_reduce_lists, count, *lists, points, nodes, v_logits, sums, grain=8)
+    return 1, sums
+
+
+class _RbfWeights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, points, nodes, radii, strengths, indices, lists):
+        weights = torch.empty(indices.shape, device=points.device)
+        named = int(strengths is not None)
+        launch(kernels.rbf_weights, points.shape[0], points, nodes, radii, strengths, named, indices, weights)
+        ctx.save_for_backward(points, nodes, radii, strengths, indices, weights)
+        ctx.lists = lists
+        return weights
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients):  # type: ignore[override]
+        points, nodes, radii, strengths, indices, weights = ctx.saved_tensors
+        v_weights = gradients[0].contiguous()
+        v_logits, v_points = torch.empty_like(weights), torch.empty_like(points)
+        launch(
+            kernels.rbf_weights_adjoint,
+            points.shape[0],
+            *(points, nodes, radii, indices, weights, v_weights),
+            *(v_logits, v_points),
+        )
+        chunks, sums = _node_sums(indices, points, nodes, v_logits, ctx.lists)
+        v_nodes, v_radii = torch.empty_like(nodes), torch.empty_like(radii)
+        v_strengths = None if strengths is None else torch.empty_like(strengths)
+        named = int(strengths is not None)
+        outputs = v_nodes, v_radii, v_strengths
+        launch(kernels.rbf_finish, nodes.shape[0], chunks, radii, strengths, named, sums, *outputs, grain=128)
+        return v_points, v_nodes, v_radii, v_strengths, None, None
+
+
+def rbf_weights(
+    points: Tensor,
+    nodes: Tensor,
+    radii: Tensor,
+    indices: Tensor,
+    strengths: Tensor | None = None,
+    *,
+    lists: NodeLists | None = None,
+) -> Tensor:
+    """Weights of a Gaussian's control points: ``s_k exp(-d_k^2 / (2 r_k^2))``, normalised over its neighbours.
+
+    SC-GS, Eq. 5; the strengths are the official code's learned node weights. Computed as a softmax of exponents, so a
+    Gaussian far from every node keeps sensible weights. A row without one finite exponent gives all to its first
+    neighbour and passes no gradient.
+
+    Args:
+        points: [N, D] rest positions, hyper-coordinates appended where used.
+        nodes: [M, D].
+        radii: [M] > 0, in the units of the points.
+        indices: [N, K] int32 in [0, M), as ``nearest`` gives them.
+        strengths: [M] > 0, or None for 1.
+        lists: ``node_lists(indices, M)`` where there is one already; used on CUDA.
+
+    Returns:
+        [N, K], rows sum to 1. Gradients flow to points, nodes, radii and strengths.
+
+    Raises:
+        ValueError: shapes do not fit.
+    """
+    if points.ndim != 2:
+        raise ValueError(f"points must be [N, D], got {tuple(points.shape)}")
+    if nodes.ndim != 2 or nodes.shape[1] != points.shape[1]:
+        raise ValueError(f"nodes must be [M, {points.shape[1]}] as points, got {tuple(nodes.shape)}")
+    for name, value in (("radii", radii), ("strengths", strengths)):
+        if value is not None and tuple(value.shape) != (nodes.shape[0],):
+            raise ValueError(f"{name} must be [{nodes.shape[0]}], one a node, got {tuple(value.shape)}")
+    if indices.ndim != 2 or indices.shape[0] != points.shape[0] or indices.dtype != torch.int32 or not indices.shape[1]:
+        raise ValueError(
+            f"indices must be int32 [{points.shape[0]}, K] (K > 0), got {indices.dtype} {tuple(indices.shape)}"
+        )
+    strengths = None if strengths is None else strengths.contiguous()
+    return _RbfWeights.apply(  # type: ignore[return-value]
+        points.contiguous(), nodes.contiguous(), radii.contiguous(), strengths, indices.contiguous(), lists
+    )

@@ -1,0 +1,129 @@
+"""Gaussians follow their control points: linear blend skinning (SC-GS, Eq. 6 and 7)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..kernels import skinning as kernels
+from ..types import Pose
+from ..warp_interop import launch
+from .neighbors import NodeLists, chunk_size, node_lists
+
+
+class _Skin(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means, quats, nodes, translations, rotations, shapes, log_scales, indices, weights, lists):
+        scaled = int(log_scales is not None)
+        outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(means) if scaled else None
+        both = rotations if shapes is None else shapes
+        inputs = means, quats, nodes, translations, rotations, both, log_scales, scaled, indices, weights
+        launch(kernels.skin, means.shape[0], *inputs, *outputs)
+        ctx.save_for_backward(means, quats, nodes, translations, rotations, shapes, log_scales, indices, weights)
+        ctx.lists = lists
+        return outputs
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients):  # type: ignore[override]
+        means, quats, nodes, translations, rotations, shapes, log_scales, indices, weights = ctx.saved_tensors
+        scaled = int(log_scales is not None)
+        v_outputs = tuple(None if v is None else v.contiguous() for v in gradients)
+        both = rotations if shapes is None else shapes
+        v_means, v_quats = torch.empty_like(means), torch.empty_like(quats)
+        v_weights, v_blends = torch.empty_like(weights), torch.empty_like(quats)
+        inputs = means, quats, nodes, translations, rotations, both, log_scales, scaled, indices, weights
+        own = v_means, v_quats, v_weights, v_blends
+        launch(kernels.skin_adjoint, means.shape[0], *inputs, *v_outputs, *own)
+        pairs = means, quats, nodes, both, indices, weights, v_outputs[0], v_blends, v_outputs[2], scaled
+        chunks, sums = _node_sums(pairs, scaled, ctx.lists)
+        v_nodes, v_translations, v_rotations = (torch.empty_like(x) for x in (nodes, translations, rotations))
+        v_shapes = None if shapes is None else torch.empty_like(shapes)
+        v_log_scales = torch.empty_like(log_scales) if scaled else None
+        launch(
+            kernels.skin_finish,
+            nodes.shape[0],
+            *(chunks, rotations, both, int(shapes is not None), scaled, sums),
+            *(v_nodes, v_translations, v_rotations, v_shapes, v_log_scales),
+            grain=128,
+        )
+        of_pose = v_translations, v_rotations, v_shapes, v_log_scales
+        return v_means, v_quats, v_nodes, *of_pose, None, v_weights, None
+
+
+def _node_sums(pairs: tuple, scaled: int, lists: NodeLists | None) -> tuple[int, Tensor]:
+    """Number of partial sums and their buffer [parts * M, columns]."""
+    means, nodes, indices = pairs[0], pairs[2], pairs[4]
+    count, width = nodes.shape[0], kernels.SUMS + 3 * scaled
+    if lists is None and means.device.type == "cpu":
+        size = chunk_size(count)
+        chunks = -(-means.shape[0] // size)
+        sums = torch.zeros(chunks * count, width)
+        launch(kernels.skin_reduce_chunks, chunks, size, *pairs, sums, grain=1)
+        return chunks, sums
+    lists = lists or node_lists(indices, count)
+    sums = torch.zeros(count, width, device=means.device)
+    launch(kernels.skin_reduce_lists, count, *lists, *pairs, sums, grain=8)
+    return 1, sums
+
+
+def _validate(means: Tensor, quats: Tensor, nodes: Tensor, pose: Pose, indices: Tensor, weights: Tensor) -> None:
+    if means.ndim != 2 or means.shape[1] != 3:
+        raise ValueError(f"means must be [N, 3], got {tuple(means.shape)}")
+    if nodes.ndim != 2 or nodes.shape[1] != 3:
+        raise ValueError(f"nodes must be [M, 3], got {tuple(nodes.shape)}")
+    if indices.ndim != 2 or not indices.shape[1] or indices.dtype != torch.int32:
+        raise ValueError(f"indices must be int32 [N, K] with K > 0, got {indices.dtype} {tuple(indices.shape)}")
+    count, total, k = nodes.shape[0], means.shape[0], indices.shape[1]
+    expected = {
+        "quats": (quats, (total, 4)),
+        "indices": (indices, (total, k)),
+        "weights": (weights, (total, k)),
+        "pose.translations": (pose.translations, (count, 3)),
+        "pose.rotations": (pose.rotations, (count, 4)),
+        "pose.shape_rotations": (pose.shape_rotations, (count, 4)),
+        "pose.log_scales": (pose.log_scales, (count, 3)),
+    }
+    for name, (value, shape) in expected.items():
+        if value is not None and tuple(value.shape) != shape:
+            raise ValueError(f"{name} must be {list(shape)}, got {tuple(value.shape)}")
+
+
+def skin(
+    means: Tensor,
+    quats: Tensor,
+    nodes: Tensor,
+    pose: Pose,
+    indices: Tensor,
+    weights: Tensor,
+    *,
+    lists: NodeLists | None = None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Move Gaussians with their control points (SC-GS, Eq. 6 and 7).
+
+    ``mu_t = sum_k w_k (R_k (mu - p_k) + p_k + T_k)`` and ``q_t = unit(sum_k w_k s_k r_k) x unit(q)``, where s_k = +-1
+    brings r_k to the side of the first neighbour's. The gradient to mu includes the blended rotation.
+
+    Args:
+        means: [N, 3] at rest, world.
+        quats: [N, 4] wxyz at rest, need not be unit.
+        nodes: [M, 3] control points at rest, world.
+        pose: of the M control points. Its rotations need not be unit; ``shape_rotations``, where given, turn the
+            Gaussians' shape in place of ``rotations``.
+        indices: [N, K] int32 in [0, M), nearest first, as ``nearest`` gives them. Not checked against M.
+        weights: [N, K], rows sum to 1, as ``rbf_weights`` gives them.
+        lists: ``node_lists(indices, M)`` where there is one already; used on CUDA.
+
+    Returns:
+        Means [N, 3], quaternions [N, 4] (wxyz, unit), and the change of log scales [N, 3] (None if the pose has none).
+        Gradients flow to all tensors except the indices; a Gaussian whose mean or quaternion is not finite passes none.
+
+    Raises:
+        ValueError: shapes do not fit.
+    """
+    _validate(means, quats, nodes, pose, indices, weights)
+    floats = means, quats, nodes, pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales
+    values = (None if value is None else value.contiguous() for value in floats)
+    return _Skin.apply(*values, indices.contiguous(), weights.contiguous(), lists)  # type: ignore[return-value]
