@@ -146,7 +146,7 @@ def composite_pixels_adjoint(
     # Out:
     v_slots_out: wp.array2d[float],  # [P, S], S >= 8 + C; row: mean 2, conic 3, opacity 1, |mean| 2, channels C, rest
 ):
-    """One thread a tile (a pair's slot belongs to one tile): pixel by pixel, back to front from the last contributor."""
+    """One thread a tile (a slot belongs to one tile): pixel by pixel, back to front from the last contributor."""
     tile = first + wp.tid()
     span = ranges_in[tile]
     for p in range(span[0], span[1]):

@@ -1,0 +1,450 @@
+"""Alpha compositing on a CPU: one thread a tile, a row of 16 pixels in one SIMD register.
+
+The bodies are native snippets with Clang's vector types, which compile for every CPU (one AVX-512 register, two AVX2
+ones, four NEON ones). Semantics and arguments are those of ``compositing``; what differs is how the work is laid out:
+
+- Splats come packed (``pack_splats``): one gather of a cache line or two per pair, logarithm and divisions done once.
+- In base 2: ``alpha = 2^(power + log2 o)``, where ``power = -q / (2 ln 2)`` has its factor folded into the conic.
+- The rows of a tile that a splat reaches are found by one vector operation over all 16 rows; only those are visited.
+- A pixel that has ended is marked by the sign of its transmittance: its next transmittance is then never > 1e-4.
+- The adjoint contracts the channels with the incoming gradient first, so one running sum a pixel suffices. It keeps
+  the sums of a (tile, splat) pair in registers, a lane a column, and adds the lanes up at the end, 16 sums at a time.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from .types import ALPHA_MAX, TRANSMITTANCE_MIN
+
+wp.set_module_options({"enable_backward": False})
+
+PACKED_GEOMETRY = 8
+"""Leading columns of a packed splat: mean 2, scaled conic 3, log2 of the opacity, its inverse, -B / A."""
+
+CHANNEL_GROUP = 8
+"""Packed channels are padded with zeros to a multiple of this."""
+
+TILE_SIDE = 16
+"""The only tile size this form serves: a row is a register."""
+
+_LOG2_E = 1.4426950408889634
+
+
+@wp.kernel
+def pack_splats(
+    first: int,
+    # In:
+    means2d_in: wp.array[wp.vec2],  # [N]
+    conics_in: wp.array[wp.vec3],  # [N]
+    opacities_in: wp.array[float],  # [N]
+    channels_in: wp.array2d[float],  # [N, C]
+    # Out:
+    packed_out: wp.array2d[float],  # [N, 8 + C padded to a multiple of 8]
+):
+    i = first + wp.tid()
+    conic = conics_in[i]
+    opacity = opacities_in[i]
+    factor = float(-0.5 * _LOG2_E)
+    count = channels_in.shape[1]
+    for c in range(count):
+        if not wp.isfinite(channels_in[i, c]):
+            opacity = float(0.0)  # never added: see compositing.finite_opacities
+        packed_out[i, PACKED_GEOMETRY + c] = channels_in[i, c]
+    for c in range(PACKED_GEOMETRY + count, packed_out.shape[1]):
+        packed_out[i, c] = 0.0
+    packed_out[i, 0] = means2d_in[i][0]
+    packed_out[i, 1] = means2d_in[i][1]
+    packed_out[i, 2] = factor * conic[0]
+    packed_out[i, 3] = 2.0 * factor * conic[1]
+    packed_out[i, 4] = factor * conic[2]
+    packed_out[i, 5] = -1.0e30
+    packed_out[i, 6] = 0.0
+    packed_out[i, 7] = -conic[1] / conic[0]
+    if opacity > 0.0:
+        packed_out[i, 5] = wp.log2(opacity)
+        packed_out[i, 6] = 1.0 / opacity
+
+
+_PRELUDE = f"""
+#if !defined(__CUDA_ARCH__)
+    typedef float vf __attribute__((vector_size(64)));
+    typedef int vi __attribute__((vector_size(64)));
+    typedef unsigned vu __attribute__((vector_size(64)));
+    typedef bool vb __attribute__((ext_vector_type(16)));
+    const float ALPHA_MAX = {float(ALPHA_MAX)!r}f, TRANSMITTANCE_MIN = {float(TRANSMITTANCE_MIN)!r}f;
+    const float LOG2_ALPHA_MIN = -7.994353436858858f;
+    const vf LANE = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
+    const int GEOMETRY = {PACKED_GEOMETRY}, GROUP = {CHANNEL_GROUP};
+    const vf ZERO = {{}};
+
+    auto bits = [](vi mask) -> unsigned {{
+        return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask, vb));
+    }};
+    auto load = [](const float* from, int n) -> vf {{
+        vf v = {{}};
+        if (n == 16) __builtin_memcpy(&v, from, 64);
+        else for (int k = 0; k < n; ++k) v[k] = from[k];
+        return v;
+    }};
+    auto store = [](float* to, vf v, int n) {{
+        if (n == 16) __builtin_memcpy(to, &v, 64);
+        else for (int k = 0; k < n; ++k) to[k] = v[k];
+    }};
+    // 2^e for e in [-8, 0] (garbage below, masked by the caller): nearest integer by the magic number, then a
+    // polynomial on [-1/2, 1/2] of relative error 9e-8.
+    auto exp2v = [](vf e) -> vf {{
+        vf t = e + 12582912.0f;
+        vf f = e - (t - 12582912.0f);
+        vf r = f * 0.00132647f + 0.00967151f;
+        r = r * f + 0.05550734f;
+        r = r * f + 0.24022242f;
+        r = r * f + 0.69314698f;
+        r = r * f + 1.0f;
+        return (vf)((vu)r + ((vu)t << 23));
+    }};
+    // A splat as seen from the tile's first pixel.
+    struct Splat {{
+        float mx, my, a, b, c, log2_opacity, floor;
+        vf dx, adx2;
+    }};
+    const float x_begin = 16.0f * (tile % columns) + 0.5f, y_begin = 16.0f * (tile / columns) + 0.5f;
+    auto read = [&](const float* s) -> Splat {{
+        Splat g;
+        g.mx = s[0] - x_begin; g.my = s[1] - y_begin;
+        g.a = s[2]; g.b = s[3]; g.c = s[4]; g.log2_opacity = s[5];
+        g.floor = LOG2_ALPHA_MIN - s[5];
+        g.dx = LANE - g.mx;
+        g.adx2 = g.a * g.dx * g.dx;
+        return g;
+    }};
+    // One bit for each row in which the ellipse meets the tile: q at the row's point nearest to the ellipse's axis.
+    auto reached_rows = [&](const Splat& g, float slope) -> unsigned {{
+        vf dy = LANE - g.my, x = slope * dy;
+        vf low = ZERO - g.mx, high = ZERO + (15.0f - g.mx);
+        x = x < low ? low : x;
+        x = x > high ? high : x;
+        return bits((g.a * x + g.b * dy) * x + g.c * dy * dy >= g.floor - 1e-3f);
+    }};
+    auto power_of = [](const Splat& g, float dy) -> vf {{
+        return (g.b * dy) * g.dx + (g.adx2 + g.c * dy * dy);
+    }};
+    const int begin = ranges.data[tile].c[0], end = ranges.data[tile].c[1];
+    const int x0 = 16 * (tile % columns), y0 = 16 * (tile / columns);
+    const int wide = width - x0 < 16 ? width - x0 : 16, tall = height - y0 < 16 ? height - y0 : 16;
+    const long plane = (long)width * height, corner = (long)y0 * width + x0;
+    const int stride = packed.shape.dims[1];
+"""
+
+_FORWARD = (
+    _PRELUDE
+    + """
+    struct Four { enum { value = 4 }; };
+    struct Eight { enum { value = 8 }; };
+    struct Yes { enum { value = 1 }; };
+    struct No { enum { value = 0 }; };
+    const bool keep = last.shape.dims[0] > 0;
+
+    // One pass over the tile's splats for the channels from c0 on; only the first pass stores what has no channels.
+    auto pass = [&](auto group, auto keeping, int c0, int count) {
+        constexpr int C = decltype(group)::value;
+        constexpr bool KEEP = decltype(keeping)::value;
+        vf T[16], sum[16][C];
+        vi ends[16];
+        for (int r = 0; r < 16; ++r) {
+            T[r] = LANE < (float)wide ? ZERO + 1.0f : ZERO - 1.0f;
+            for (int c = 0; c < C; ++c) sum[r][c] = ZERO;
+            ends[r] = vi{};
+        }
+        unsigned alive = (1u << tall) - 1u;
+        for (int p = begin; p < end; ++p) {
+            if (((p - begin) & 15) == 15) {
+                unsigned still = 0;
+                for (int r = 0; r < tall; ++r) still |= bits(T[r] > 0.0f) ? 1u << r : 0u;
+                alive = still;
+                if (!alive) break;
+            }
+            const float* s = packed.data + (long)splats.data[p] * stride;
+            const Splat g = read(s);
+            unsigned rows = reached_rows(g, s[7]) & alive;
+            float channel[C];
+            for (int c = 0; c < C; ++c) channel[c] = s[GEOMETRY + c0 + c];
+            while (rows) {
+                const int r = __builtin_ctz(rows);
+                rows &= rows - 1u;
+                const vf power = power_of(g, r - g.my);
+                const vi skip = (power > 0.0f) | (power < g.floor);
+                vf alpha = exp2v(power + g.log2_opacity);
+                alpha = alpha > ALPHA_MAX ? ZERO + ALPHA_MAX : alpha;
+                alpha = skip ? ZERO : alpha;
+                const vf t = T[r];
+                const vf next = t - t * alpha;
+                const vi go = next > TRANSMITTANCE_MIN;
+                const vf w = go ? alpha * t : ZERO;
+                T[r] = go ? next : (vf)((vu)t | 0x80000000u);
+                for (int c = 0; c < C; ++c) sum[r][c] += w * channel[c];
+                if (KEEP) ends[r] = (w > 0.0f) ? vi{} + (p + 1) : ends[r];
+            }
+        }
+        for (int r = 0; r < tall; ++r) {
+            const vf t = (vf)((vu)T[r] & 0x7fffffffu);
+            const long at = corner + (long)r * width;
+            for (int c = 0; c < count; ++c)
+                store(image.data + (c0 + c) * plane + at, sum[r][c] + t * background.data[c0 + c], wide);
+            if (c0 == 0) store(alpha_image.data + at, 1.0f - t, wide);
+            if (KEEP) {
+                store(transmittance.data + at, t, wide);
+                store((float*)last.data + at, (vf)ends[r], wide);
+            }
+        }
+    };
+    const int channels = image.shape.dims[0];
+    for (int c0 = 0; c0 == 0 || c0 < channels; c0 += GROUP) {
+        const int count = channels - c0 < GROUP ? channels - c0 : GROUP;
+        const bool first_pass = keep && c0 == 0;
+        if (count <= 4) first_pass ? pass(Four(), Yes(), c0, count) : pass(Four(), No(), c0, count);
+        else first_pass ? pass(Eight(), Yes(), c0, count) : pass(Eight(), No(), c0, count);
+    }
+#endif
+"""
+)
+
+_ADJOINT = (
+    _PRELUDE
+    + """
+    struct Any { enum { value = 0 }; };
+    struct Four { enum { value = 4 }; };
+    struct Yes { enum { value = 1 }; };
+    struct No { enum { value = 0 }; };
+    const int channels = v_image.shape.dims[0];
+    const int row_size = v_slots.shape.dims[1];
+
+    // The sums of 16 vectors' lanes in one vector: halves are folded together pair by pair, four times.
+    auto fold8 = [](vf a, vf b) -> vf {
+        return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
+            + __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+    };
+    auto fold4 = [](vf a, vf b) -> vf {
+        return __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27)
+            + __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+    };
+    auto fold2 = [](vf a, vf b) -> vf {
+        return __builtin_shufflevector(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29)
+            + __builtin_shufflevector(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    };
+    auto fold1 = [](vf a, vf b) -> vf {
+        return __builtin_shufflevector(a, b, 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30)
+            + __builtin_shufflevector(a, b, 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31);
+    };
+    auto lane_sums = [&](const vf* v) -> vf {
+        vf part[4];  // the k-th holds 0 + k, 4 + k, ... so that the sums come out in order
+        for (int k = 0; k < 4; ++k) part[k] = fold4(fold8(v[4 * k], v[4 * k + 1]), fold8(v[4 * k + 2], v[4 * k + 3]));
+        return fold1(fold2(part[0], part[1]), fold2(part[2], part[3]));
+    };
+
+    auto pass = [&](auto group, auto absolute_sums) {
+        constexpr int C = decltype(group)::value;  // 0: any number of channels, read where they lie
+        constexpr bool ABSOLUTE = decltype(absolute_sums)::value;
+        constexpr int K = C > 0 ? C : 1;
+        vf T[16], behind[16], v[16][K], w[16];
+        vi ends[16];
+        vi row_ends = {};
+        int last_pair = begin;
+        for (int r = 0; r < 16; ++r) {
+            const int n = r < tall ? wide : 0;
+            const long at = corner + (long)r * width;
+            T[r] = load(transmittance.data + at, n);
+            ends[r] = (vi)load((const float*)last.data + at, n);
+            vf total = ZERO - load(v_alpha.data + at, n);
+            for (int c = 0; c < channels; ++c) total += load(v_image.data + c * plane + at, n) * background.data[c];
+            behind[r] = total * T[r];
+            for (int c = 0; c < C; ++c) v[r][c] = c < channels ? load(v_image.data + c * plane + at, n) : ZERO;
+            for (int k = 0; k < 16; ++k) row_ends[r] = ends[r][k] > row_ends[r] ? ends[r][k] : row_ends[r];
+            last_pair = row_ends[r] > last_pair ? row_ends[r] : last_pair;
+        }
+        for (int p = last_pair; p < end; ++p)
+            __builtin_memset(v_slots.data + (long)slots.data[p] * row_size, 0, row_size * sizeof(float));
+
+        for (int p = last_pair - 1; p >= begin; --p) {
+            const float* s = packed.data + (long)splats.data[p] * stride;
+            float* out = v_slots.data + (long)slots.data[p] * row_size;
+            const Splat g = read(s);
+            unsigned rows = reached_rows(g, s[7]) & bits(row_ends > p);
+            const unsigned visited = rows;
+            if (!rows) {
+                __builtin_memset(out, 0, row_size * sizeof(float));
+                continue;
+            }
+            const float to_conic = -1.3862943611198906f;  // undoes the factor folded into the packed conic
+            const float A = to_conic * g.a, B = 0.5f * to_conic * g.b, D = to_conic * g.c;
+            const vf adx = A * g.dx, bdx = B * g.dx;
+            vf g0 = ZERO, g1 = ZERO, g2 = ZERO, abs_x = ZERO, abs_y = ZERO, v_channel[K];
+            for (int c = 0; c < K; ++c) v_channel[c] = ZERO;
+            while (rows) {
+                const int r = __builtin_ctz(rows);
+                rows &= rows - 1u;
+                const float dy = r - g.my;
+                const vf power = power_of(g, dy);
+                const vi skip = (power > 0.0f) | (power < g.floor) | (ends[r] <= p);
+                const vf raw = exp2v(power + g.log2_opacity);
+                vf alpha = raw > ALPHA_MAX ? ZERO + ALPHA_MAX : raw;
+                alpha = skip ? ZERO : alpha;
+                const vf inverse = 1.0f / (1.0f - alpha);
+                const vf t = T[r] * inverse;
+                const vf weight = alpha * t;
+                vf own = ZERO;
+                if (C > 0) for (int c = 0; c < C; ++c) own += v[r][c] * s[GEOMETRY + c];
+                else for (int c = 0; c < channels; ++c)
+                    own += load(v_image.data + c * plane + corner + (long)r * width, wide) * s[GEOMETRY + c];
+                vf grad = alpha * (own * t - behind[r] * inverse);
+                grad = raw > ALPHA_MAX ? ZERO : grad;
+                behind[r] += own * weight;
+                T[r] = t;
+                const vf grad_dy = grad * dy;
+                g0 += grad;
+                g1 += grad_dy;
+                g2 += grad_dy * dy;
+                if (ABSOLUTE) {
+                    const vf gx = grad * (adx + B * dy), gy = grad * (bdx + D * dy);
+                    abs_x += gx < 0.0f ? -gx : gx;
+                    abs_y += gy < 0.0f ? -gy : gy;
+                }
+                if (C > 0) for (int c = 0; c < C; ++c) v_channel[c] += v[r][c] * weight;
+                else w[r] = weight;
+            }
+            const vf g0dx = g0 * g.dx;
+            vf sums[16] = {A * g0dx + B * g1, B * g0dx + D * g1, -0.5f * (g0dx * g.dx), -(g1 * g.dx), -0.5f * g2,
+                g0 * s[6], abs_x, abs_y};
+            for (int c = 0; c < C; ++c) sums[8 + c] = v_channel[c];
+            const vf total = lane_sums(sums);
+            if (C > 0) {
+                store(out, total, 16);
+                continue;
+            }
+            store(out, total, 8);
+            for (int c0 = 0; c0 < channels; c0 += 16) {
+                const int count = channels - c0 < 16 ? channels - c0 : 16;
+                vf channel_sums[16] = {};
+                for (int c = 0; c < count; ++c)
+                    for (unsigned left = visited; left; left &= left - 1u) {
+                        const long at = corner + (long)__builtin_ctz(left) * width;
+                        channel_sums[c] += load(v_image.data + (c0 + c) * plane + at, wide) * w[__builtin_ctz(left)];
+                    }
+                store(out + 8 + c0, lane_sums(channel_sums), count);
+            }
+        }
+    };
+    if (channels <= 4) absolute ? pass(Four(), Yes()) : pass(Four(), No());
+    else absolute ? pass(Any(), Yes()) : pass(Any(), No());
+#endif
+"""
+)
+
+
+@wp.func_native(_FORWARD)
+def composite_tile(
+    tile: int,
+    packed: wp.array2d[float],
+    background: wp.array[float],
+    ranges: wp.array[wp.vec2i],
+    splats: wp.array[int],
+    width: int,
+    height: int,
+    columns: int,
+    image: wp.array3d[float],
+    alpha_image: wp.array2d[float],
+    transmittance: wp.array2d[float],
+    last: wp.array2d[int],
+): ...
+
+
+@wp.func_native(_ADJOINT)
+def composite_tile_adjoint(
+    tile: int,
+    packed: wp.array2d[float],
+    background: wp.array[float],
+    ranges: wp.array[wp.vec2i],
+    splats: wp.array[int],
+    slots: wp.array[int],
+    transmittance: wp.array2d[float],
+    last: wp.array2d[int],
+    v_image: wp.array3d[float],
+    v_alpha: wp.array2d[float],
+    width: int,
+    height: int,
+    columns: int,
+    absolute: int,
+    v_slots: wp.array2d[float],
+): ...
+
+
+@wp.kernel
+def composite_tiles(
+    first: int,
+    # In:
+    packed_in: wp.array2d[float],  # [N, 8 + C padded]
+    background_in: wp.array[float],  # [C]
+    ranges_in: wp.array[wp.vec2i],  # [T]
+    splats_in: wp.array[int],  # [P]
+    width: int,
+    height: int,
+    columns: int,
+    # Out:
+    image_out: wp.array3d[float],  # [C, H, W]
+    alpha_out: wp.array2d[float],  # [H, W]
+    transmittance_out: wp.array2d[float],  # [H, W]; empty: not wanted
+    last_out: wp.array2d[int],  # [H, W]; empty too
+):
+    composite_tile(
+        first + wp.tid(),
+        packed_in,
+        background_in,
+        ranges_in,
+        splats_in,
+        width,
+        height,
+        columns,
+        image_out,
+        alpha_out,
+        transmittance_out,
+        last_out,
+    )
+
+
+@wp.kernel
+def composite_tiles_adjoint(
+    first: int,
+    # In:
+    packed_in: wp.array2d[float],  # [N, 8 + C padded]
+    background_in: wp.array[float],  # [C]
+    ranges_in: wp.array[wp.vec2i],  # [T]
+    splats_in: wp.array[int],  # [P]
+    slots_in: wp.array[int],  # [P]
+    transmittance_in: wp.array2d[float],  # [H, W]
+    last_in: wp.array2d[int],  # [H, W]
+    v_image_in: wp.array3d[float],  # [C, H, W]
+    v_alpha_in: wp.array2d[float],  # [H, W]
+    width: int,
+    height: int,
+    columns: int,
+    absolute: int,  # whether the absolute sums are wanted; else zero
+    # Out:
+    v_slots_out: wp.array2d[float],  # [P, S], S >= 16 and S >= 8 + C
+):
+    composite_tile_adjoint(
+        first + wp.tid(),
+        packed_in,
+        background_in,
+        ranges_in,
+        splats_in,
+        slots_in,
+        transmittance_in,
+        last_in,
+        v_image_in,
+        v_alpha_in,
+        width,
+        height,
+        columns,
+        absolute,
+        v_slots_out,
+    )

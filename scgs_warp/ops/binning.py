@@ -1,0 +1,95 @@
+"""Splats to tiles: which splats touch which tile, nearest first."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ..kernels import binning as kernels
+from ..kernels.types import TILE_SIZE
+from ..types import Splats, Tiles
+from ..warp_interop import launch, warp_view
+
+MAX_PAIRS = 2**31 - 1
+
+
+def bin_splats(splats: Splats, tile_size: int = TILE_SIZE) -> Tiles:
+    """List, for every tile of the image, the splats that reach one of its pixels, sorted by depth.
+
+    A splat reaches the pixels where its alpha is at least 1/255. Splats with a radius of 0, non-finite or not positive
+    definite values, or an opacity under 1/255 are left out. Equal depths are ordered by index. No gradient.
+
+    Args:
+        splats: N projected Gaussians, on any device.
+        tile_size: side of a tile in pixels.
+
+    Returns:
+        Tiles on the same device; ``ranges`` row major, ``slots`` such that splat ``i`` owns ``offsets[i]`` up to
+        ``offsets[i + 1]``, in the order rows first, then columns.
+
+    Raises:
+        ValueError: a field's shape does not fit, an image side or tile size is not positive, or there are more than
+            2^31 - 1 pairs of splat and tile.
+    """
+    _validate(splats, tile_size)
+    columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
+    count, device = len(splats.means2d), splats.means2d.device
+    geometry = [
+        getattr(splats, name).detach().contiguous() for name in ("means2d", "conics", "opacities", "depths", "radii")
+    ]
+    size = (splats.width, splats.height, columns, rows, tile_size)
+
+    counts = torch.empty(count, dtype=torch.int32, device=device)
+    keys = torch.empty(2 * count, device=device)
+    order = torch.empty(2 * count, dtype=torch.int32, device=device)
+    launch(kernels.count_tiles, count, *geometry, *size, counts, keys, order)
+    offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
+    torch.cumsum(counts, 0, out=offsets[1:])
+    pairs = int(offsets[-1])
+    if pairs > MAX_PAIRS:
+        raise ValueError(f"splats: {pairs} pairs of splat and tile, more than 2^31 - 1; reduce the image or the splats")
+
+    # Splats are sorted by depth once; their pairs, emitted in that order, then need a stable sort by tile alone.
+    _sort(keys, order, count, 0, 32)
+    ranked = torch.empty_like(counts)
+    launch(kernels.gather_counts, count, counts, order, ranked)
+    ends = torch.cumsum(ranked, 0)
+    tiles = torch.empty(2 * pairs, dtype=torch.int32, device=device)
+    slots = torch.empty(2 * pairs, dtype=torch.int32, device=device)
+    owners = torch.empty(pairs, dtype=torch.int32, device=device)
+    launch(kernels.emit_pairs, count, *geometry, order, offsets, ends, *size, tiles, slots, owners)
+    _sort(tiles, slots, pairs, 0, (columns * rows - 1).bit_length())
+    sorted_splats = torch.empty_like(owners)
+    launch(kernels.gather_owners, pairs, slots, owners, sorted_splats)
+    ranges = torch.empty(columns * rows, 2, dtype=torch.int32, device=device)
+    launch(kernels.tile_ranges, columns * rows, tiles, pairs, ranges)
+    return Tiles(ranges, sorted_splats, slots[:pairs], offsets, splats.width, splats.height, columns, rows, tile_size)
+
+
+def _sort(keys: Tensor, values: Tensor, count: int, begin_bit: int, end_bit: int) -> None:
+    """Stable radix sort of the first halves; the second halves are scratch."""
+    if count == 0:
+        return
+    if keys.is_cuda:
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(keys.device)), sync_enter=False):
+            wp.utils.radix_sort_pairs(warp_view(keys), warp_view(values), count, begin_bit, end_bit)
+    else:
+        wp.utils.radix_sort_pairs(warp_view(keys), warp_view(values), count, begin_bit, end_bit)
+
+
+def _validate(splats: Splats, tile_size: int) -> None:
+    if splats.width < 1 or splats.height < 1 or tile_size < 1:
+        raise ValueError(
+            f"width, height and tile_size must be positive, got {splats.width}, {splats.height}, {tile_size}"
+        )
+    count = len(splats.means2d)
+    for name, shape in (
+        ("means2d", (count, 2)),
+        ("conics", (count, 3)),
+        ("opacities", (count,)),
+        ("depths", (count,)),
+        ("radii", (count, 2)),
+    ):
+        if tuple(getattr(splats, name).shape) != shape:
+            raise ValueError(f"{name} must be {list(shape)}, got {list(getattr(splats, name).shape)}")
