@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from .errors import UserError
@@ -25,10 +26,10 @@ Picture = Tensor | np.ndarray
 
 
 def to_bytes(image: Picture) -> np.ndarray:
-    """[H, W, 3] or [H, W] floats, clamped to [0, 1], as uint8 on the CPU; not finite values become 0."""
-    array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
-    array = np.nan_to_num(array.astype(np.float32), nan=0.0, posinf=1.0, neginf=0.0)
-    return np.ascontiguousarray((array.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
+    """[H, W, 3] or [H, W] floats, clamped to [0, 1], as uint8 on the CPU; NaN becomes 0."""
+    tensor = image.detach() if isinstance(image, Tensor) else torch.from_numpy(np.ascontiguousarray(image))
+    scaled = tensor.float().nan_to_num(0.0, 1.0, 0.0).mul_(255.0).add_(0.5).clamp_(0.0, 255.0)
+    return scaled.to(torch.uint8).cpu().contiguous().numpy()
 
 
 def _floats(image: Picture) -> np.ndarray:
@@ -193,7 +194,7 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
     )
     figure = Figure(figsize=(12, 3.4), layout="constrained")
     for column, (title, series) in enumerate(panels):
-        axes = figure.add_subplot(1, len(panels), column + 1)
+        axes = figure.add_subplot(1, len(panels), column + 1, sharex=figure.axes[0] if column else None)
         axes.set_title(title)
         axes.set_xlabel("step")
         axes.grid(alpha=0.3)

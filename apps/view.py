@@ -1,0 +1,96 @@
+"""Render a film of a trained scene, off screen: a turntable, the motion, or both."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from scgs_warp.apps.cli import Device, prepare, run
+
+LARGEST = 8192
+
+
+@dataclass(frozen=True)
+class Options:
+    """Render a film of a trained scene, off screen."""
+
+    run: Path
+    """Folder of a run, as apps/train.py writes it."""
+    output: Path
+    """Where the film goes: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
+    mode: Literal["turntable", "time", "both"] = "both"
+    """turntable: the camera goes round, the scene stands still; time: the scene moves; both: both at once. Where the
+    training cameras saw the scene from one side only, the camera swings within what they saw."""
+    show: Literal["rgb", "depth", "alpha", "nodes", "trajectories"] = "rgb"
+    """Colours, depth (near is warm), coverage, control points, or the way that control points have come."""
+    frames: int = 120
+    """Length of the film."""
+    size: int = 512
+    """Longer side of the film in pixels; the proportions are those of the training images."""
+    fps: float = 30.0
+    """Frames a second."""
+    time: float = 0.5
+    """The instant that a turntable shows, from 0 to 1."""
+    device: Device = "auto"
+    """Where to render; auto takes a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all cores by default."""
+
+
+def check(options: Options) -> None:
+    """Refuse what cannot work before anything is loaded.
+
+    Raises:
+        UserError: naming the option and the remedy.
+    """
+    from scgs_warp import film
+    from scgs_warp.errors import UserError
+
+    if options.frames < 1:
+        raise UserError(f"--frames {options.frames}: a film needs at least 1")
+    if not 16 <= options.size <= LARGEST:
+        raise UserError(f"--size {options.size}: give 16 to {LARGEST} pixels")
+    if not 0 < options.fps <= 1000:
+        raise UserError(f"--fps {options.fps:g}: give more than 0 and at most 1000 frames a second")
+    if not 0 <= options.time <= 1:
+        raise UserError(f"--time {options.time:g}: give a time from 0 to 1")
+    film.check_path(options.output)
+
+
+def main(args: list[str] | None) -> None:
+    import tyro
+
+    options = tyro.cli(Options, args=args, prog="view.py")
+    check(options)
+    device = prepare(options.device, options.threads)
+
+    from scgs_warp import cameras, film
+    from scgs_warp.overlay import Painter
+    from scgs_warp.progress import progress
+    from scgs_warp.scene import Scene
+
+    scene = Scene.load(options.run, device=device)
+    if options.mode == "time":
+        path = [cameras.orbit_camera(scene.overview, scene.overview.azimuth, options.size)] * options.frames
+    else:
+        path = cameras.turntable(scene.overview, options.frames, options.size)
+    times = [frame / max(options.frames - 1, 1) for frame in range(options.frames)]
+    if options.mode == "turntable":
+        times = [options.time] * options.frames
+    views = [(camera.to(device), time) for camera, time in zip(path, times)]
+    painter = Painter(scene, options.show, views)
+    with film.film(options.output, options.fps) as writer, progress(options.frames, "view") as shown:
+        for camera, time in views:
+            writer.write(painter.paint(camera, time))
+            shown.advance()
+    print(f"{options.output}: {options.frames} frames of {path[0].width} x {path[0].height}")
+
+
+def cli(args: list[str] | None = None) -> int:
+    return run(main, args)
+
+
+if __name__ == "__main__":
+    sys.exit(cli())
