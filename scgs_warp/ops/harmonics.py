@@ -1,0 +1,79 @@
+"""Colour from spherical harmonics and the direction of view, with gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..kernels import harmonics as kernels
+from ..warp_interop import launch
+from .reduction import sum_rows
+
+MAX_DEGREE = 3
+
+
+class _SphericalHarmonics(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera: Tensor, degree: int) -> Tensor:
+        count, rest = sh_rest.shape[:2]
+        colors = torch.empty_like(sh_dc)
+        flat = sh_rest.view(count * rest, 3)
+        launch(kernels.spherical_harmonics, count, sh_dc, flat, rest, means, camera[None], degree, colors)
+        ctx.save_for_backward(sh_rest, means, camera, colors)
+        ctx.degree = degree
+        return colors
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_colors: Tensor):  # type: ignore[override]
+        sh_rest, means, camera, colors = ctx.saved_tensors
+        count, rest = sh_rest.shape[:2]
+        _, wants_rest, wants_means, wants_camera, _ = ctx.needs_input_grad
+        wants_means = (wants_means or wants_camera) and ctx.degree > 0
+        v_dc = torch.empty_like(colors)
+        v_rest = torch.empty_like(sh_rest) if wants_rest else None
+        v_means = torch.empty_like(means) if wants_means else None
+        flat = sh_rest.view(count * rest, 3)
+        v_flat = v_rest.view(count * rest, 3) if v_rest is not None else None
+        inputs = flat, rest, means, camera[None], ctx.degree, colors, v_colors.contiguous()
+        flags = int(wants_rest), int(wants_means)
+        launch(kernels.spherical_harmonics_adjoint, count, *inputs, *flags, v_dc, v_flat, v_means)
+        # Only mean minus camera enters, so the camera's gradient is minus the sum of the means'.
+        v_camera = -sum_rows(v_means) if wants_camera and v_means is not None else None
+        return v_dc, v_rest, v_means, v_camera, None
+
+
+def spherical_harmonics(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_position: Tensor, degree: int) -> Tensor:
+    """Colours of Gaussians seen from one point: harmonics + 0.5, clamped at 0 (3D-GS; signs as there).
+
+    Args:
+        sh_dc: [N, 3] float32, coefficients of degree 0.
+        sh_rest: [N, R, 3] float32, the higher ones, R >= (degree + 1)^2 - 1; those beyond get a zero gradient.
+        means: [N, 3] float32, world.
+        camera_position: [3] float32, world.
+        degree: 0 to 3.
+
+    Returns:
+        [N, 3] colours >= 0. Gradients reach all four tensors; a clamped channel passes none.
+
+    Raises:
+        ValueError: a shape is wrong, or the degree is not 0 to 3 or more than ``sh_rest`` has.
+    """
+    count = sh_dc.shape[0]
+    if sh_dc.ndim != 2 or sh_dc.shape[1] != 3:
+        raise ValueError(f"sh_dc must be [N, 3], got {tuple(sh_dc.shape)}")
+    if sh_rest.ndim != 3 or sh_rest.shape[0] != count or sh_rest.shape[2] != 3:
+        raise ValueError(f"sh_rest must be [{count}, R, 3], got {tuple(sh_rest.shape)}")
+    if tuple(means.shape) != (count, 3):
+        raise ValueError(f"means must be [{count}, 3], got {tuple(means.shape)}")
+    if tuple(camera_position.shape) != (3,):
+        raise ValueError(f"camera_position must be [3], got {tuple(camera_position.shape)}")
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"degree must be 0 to {MAX_DEGREE}, got {degree}")
+    if sh_rest.shape[1] < (degree + 1) ** 2 - 1:
+        needed = (degree + 1) ** 2 - 1
+        raise ValueError(f"degree {degree} needs {needed} coefficients in sh_rest, got {sh_rest.shape[1]}")
+    tensors = (x.contiguous() for x in (sh_dc, sh_rest, means, camera_position))
+    return _SphericalHarmonics.apply(*tensors, degree)

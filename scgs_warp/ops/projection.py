@@ -1,0 +1,139 @@
+"""Projection of 3D Gaussians to an image, with gradients."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels import projection as kernels
+from ..types import Splats
+from ..warp_interop import launch
+from .reduction import sum_rows
+
+
+class _Settings(NamedTuple):
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    antialiased: int
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means, quats, scales, opacities, viewmat, K, settings: _Settings):
+        count, device = means.shape[0], means.device
+        means2d = torch.empty(count, 2, device=device)
+        conics = torch.empty(count, 3, device=device)
+        depths = torch.empty(count, device=device)
+        seen = torch.empty(count, device=device)
+        radii = torch.empty(count, 2, device=device, dtype=torch.int32)
+        inputs = means, quats, scales, opacities, viewmat[None], K[None]
+        launch(kernels.project, count, *inputs, *settings, means2d, conics, depths, seen, radii)
+        ctx.save_for_backward(means, quats, scales, opacities, viewmat, K, radii)
+        ctx.settings = settings
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        return means2d, conics, depths, seen, radii
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_means2d, v_conics, v_depths, v_opacities, _):  # type: ignore[override]
+        means, quats, scales, opacities, viewmat, K, radii = ctx.saved_tensors
+        settings, count = ctx.settings, means.shape[0]
+        wants_view = ctx.needs_input_grad[4]
+        v_means2d = means.new_zeros(count, 2) if v_means2d is None else v_means2d.contiguous()
+        v_conics = means.new_zeros(count, 3) if v_conics is None else v_conics.contiguous()
+        v_opacities = means.new_zeros(count) if v_opacities is None else v_opacities.contiguous()
+        v_depths = None if v_depths is None else v_depths.contiguous()
+        v_inputs = tuple(torch.empty_like(x) for x in (means, quats, scales, opacities))
+        v_views = torch.empty(count, 4, 3, device=means.device) if wants_view else None
+        inputs = means, quats, scales, opacities, viewmat[None], K[None]
+        camera = settings.width, settings.height, settings.eps2d, settings.antialiased
+        incoming = v_means2d, v_conics, v_depths, v_opacities
+        launch(
+            kernels.project_adjoint,
+            count,
+            *(*inputs, *camera, radii, *incoming, int(wants_view)),
+            *(*v_inputs, v_views),
+        )
+        v_viewmat = None
+        if v_views is not None:
+            v_viewmat = torch.zeros_like(viewmat)
+            v_viewmat[:3] = sum_rows(v_views.view(count, 12)).view(4, 3).T
+        return *v_inputs, v_viewmat, None, None
+
+
+def _validate(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, K: Tensor) -> None:
+    if means.ndim != 2 or means.shape[1] != 3:
+        raise ValueError(f"means must be [N, 3], got {tuple(means.shape)}")
+    count = means.shape[0]
+    expected = {
+        "quats": (quats, (count, 4)),
+        "scales": (scales, (count, 3)),
+        "opacities": (opacities, (count,)),
+        "viewmat": (viewmat, (4, 4)),
+        "K": (K, (3, 3)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must be {list(shape)}, got {tuple(tensor.shape)}")
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    antialiased: bool = False,
+) -> Splats:
+    """Project Gaussians to a pinhole camera's image (EWA splatting, conventions of gsplat 1.5.3).
+
+    A splat ends where its alpha falls under 1/255: ``radii = ceil(sqrt(2 ln(255 opacity) covariance2d))`` per axis. All
+    its fields are 0, and it gets no gradient, where the Gaussian is culled: not between the planes, off the image, both
+    radii at most ``radius_clip``, opacity under 1/255, quaternion zero, or anything not finite.
+
+    Args:
+        means: [N, 3] float32, world.
+        quats: [N, 4] float32, wxyz, need not be unit.
+        scales: [N, 3] float32 > 0, standard deviations, world units.
+        opacities: [N] float32 in [0, 1].
+        viewmat: [4, 4] float32, world to camera (OpenCV).
+        K: [3, 3] float32, pixels; its skew is not used and it gets no gradient.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        near_plane: smallest camera z kept.
+        far_plane: largest camera z kept.
+        radius_clip: splats no larger than this are dropped, pixels.
+        eps2d: added to both variances of the 2D covariance, px^2.
+        antialiased: multiply the opacity by sqrt(det / det with eps2d) (Mip-Splatting, section 5.2), before the extent.
+
+    Returns:
+        Splats of this image. Gradients reach means, quats, scales, opacities and viewmat; the clamp of the Jacobian to
+        the frustum widened by 0.3 tan(fov / 2) passes none.
+
+    Raises:
+        ValueError: a shape or a size is wrong.
+    """
+    _validate(means, quats, scales, opacities, viewmat, K)
+    if width <= 0 or height <= 0:
+        raise ValueError(f"width and height must be positive, got {width} x {height}")
+    settings = _Settings(
+        int(width), int(height), float(near_plane), float(far_plane), float(radius_clip), float(eps2d), int(antialiased)
+    )
+    tensors = (x.contiguous() for x in (means, quats, scales, opacities, viewmat, K))
+    means2d, conics, depths, seen, radii = _Project.apply(*tensors, settings)
+    return Splats(means2d, conics, depths, seen, radii, settings.width, settings.height)
