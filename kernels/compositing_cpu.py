@@ -238,7 +238,7 @@ _ADJOINT = (
     };
     auto lane_sums = [&](const vf* v) -> vf {
         vf part[4];  // the k-th holds 0 + k, 4 + k, ... so that the sums come out in order
-        for (int k = 0; k < 4; ++k) part[k] = fold4(fold8(v[4 * k], v[4 * k + 1]), fold8(v[4 * k + 2], v[4 * k + 3]));
+        for (int k = 0; k < 4; ++k) part[k] = fold4(fold8(v[k], v[4 + k]), fold8(v[8 + k], v[12 + k]));
         return fold1(fold2(part[0], part[1]), fold2(part[2], part[3]));
     };
 
