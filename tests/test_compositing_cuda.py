@@ -1,0 +1,126 @@
+"""The block form of compositing against the pixel form, on CUDA where there is one, else on the CPU's block emulation.
+
+The emulation is a setting of the process that must be made before a kernel is compiled, so it runs in one of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+HERE = Path(__file__).resolve().parent
+
+# name: (width, height, splats, channels, seed, how opacities are drawn)
+CASES = {
+    "one tile": (16, 16, 12, 3, 0, "mixed"),
+    "odd size": (37, 21, 60, 4, 1, "mixed"),
+    "several batches and early stop": (16, 16, 700, 3, 2, "opaque"),
+    "faint, several batches": (16, 9, 600, 1, 3, "faint"),
+    "nine channels": (20, 18, 40, 9, 4, "mixed"),
+    "one splat": (8, 8, 1, 5, 5, "opaque"),
+    "no splat": (20, 20, 0, 3, 6, "mixed"),
+}
+
+
+def random_splats(width: int, height: int, count: int, channels: int, seed: int, opacity: str):
+    """Overlapping ellipses, some without area, one whose channel is not a number."""
+    generator = torch.Generator().manual_seed(seed)
+    means2d = torch.rand(count, 2, generator=generator) * torch.tensor([width, height]) * 1.2 - 1.5
+    factors = torch.randn(count, 2, 2, generator=generator) * min(width, height) * 0.2
+    covariances = factors @ factors.mT + 0.3 * torch.eye(2)
+    inverse = torch.linalg.inv(covariances) if count else covariances
+    conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], 1)
+    drawn = torch.rand(count, generator=generator)
+    opacities = {"mixed": drawn, "opaque": 0.9 + 0.1 * drawn, "faint": 0.03 * drawn}[opacity]
+    radii = (3.5 * covariances.diagonal(dim1=1, dim2=2).sqrt()).ceil().int()
+    depths = torch.rand(count, generator=generator) + 1.0
+    colors = torch.rand(count, channels, generator=generator)
+    if count > 10:
+        colors[count // 2, 0] = float("nan")
+        radii[count // 3] = 0
+    return means2d, conics, depths, opacities, radii, colors
+
+
+def run_form(case: str, form: str, device: str) -> list[torch.Tensor]:
+    """Image, alpha, all gradients and the absolute gradients."""
+    from scgs_warp.ops.binning import bin_splats
+    from scgs_warp.ops.compositing import composite
+    from scgs_warp.types import Splats, Stats
+
+    width, height, count, channels, seed, opacity = CASES[case]
+    tensors = [t.to(device) for t in random_splats(width, height, count, channels, seed, opacity)]
+    means2d, conics, depths, opacities, radii, colors = tensors
+    background = torch.linspace(0.1, 0.9, channels, device=device)
+    leaves = [t.requires_grad_() for t in (means2d, conics, opacities, colors, background)]
+    splats = Splats(means2d, conics, depths, opacities, radii, width, height)
+    absgrad = torch.empty(count, 2, device=device)
+    stats = Stats.zeros(count, device)
+    image, alpha = composite(splats, colors, bin_splats(splats), background, stats=stats, absgrad=absgrad, form=form)
+    generator = torch.Generator().manual_seed(seed + 1000)
+    v_image = torch.randn(image.shape, generator=generator).to(device)
+    v_alpha = torch.randn(alpha.shape, generator=generator).to(device)
+    gradients = torch.autograd.grad((image, alpha), leaves, (v_image, v_alpha))
+    results = [image, alpha, *gradients, absgrad, stats.grad_norm, stats.count]
+    return [t.detach().cpu() for t in results]
+
+
+def largest_differences(case: str, device: str) -> list[float]:
+    """Per result of ``run_form``, the largest difference between the forms, relative to the largest value."""
+    theirs, ours = run_form(case, "pixel", device), run_form(case, "cuda", device)
+    differences = []
+    for a, b in zip(theirs, ours):
+        assert a.shape == b.shape and torch.isfinite(b).all(), (case, a, b)
+        scale = a.abs().max().clamp(min=1e-6) if a.numel() else torch.tensor(1.0)
+        differences.append(float(((a - b).abs() / scale).max()) if a.numel() else 0.0)
+    return differences
+
+
+@pytest.fixture(scope="module")
+def differences() -> dict[str, list[float]]:
+    """All cases at once: one process, one compilation."""
+    if torch.cuda.is_available():
+        return {case: largest_differences(case, "cuda") for case in CASES}
+    result = subprocess.run(
+        [sys.executable, __file__],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": str(HERE)},
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_same_as_the_pixel_form(case, differences):
+    assert max(differences[case]) < 1e-5, differences[case]
+
+
+def test_the_cases_contain_what_they_are_for():
+    """Enough splats in a tile for several batches, and pixels that stop early in the opaque case."""
+    _, alpha, *_ = run_form("several batches and early stop", "pixel", "cpu")
+    assert (alpha > 0.99).float().mean() > 0.5
+    image, _, *gradients = run_form("faint, several batches", "pixel", "cpu")
+    assert image.shape == (1, 9, 16)
+    assert (gradients[0] != 0).any(1).sum() > 256
+
+
+def test_blocks_without_a_gpu_raise_instead_of_running_one_lane():
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(RuntimeError, match="enable_cpu_blocks"):
+        run_form("one tile", "cuda", "cpu")
+
+
+if __name__ == "__main__":
+    import warp
+
+    warp.config.enable_cpu_blocks = True
+    print(json.dumps({case: largest_differences(case, "cpu") for case in CASES}))
