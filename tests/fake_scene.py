@@ -44,7 +44,7 @@ class FakeScene:
         v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
         rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
         rgb, depth = np.zeros(rays.shape), np.full(u.shape, np.inf)
-        for centre, radius, color in ((self.centre(time), 0.35, (1.0, 0.5, 0.2)), (np.zeros(3), 0.4, (0.3, 0.6, 1.0))):
+        for centre, radius, color in ((self.centre(time), 0.35, (0.9, 0.5, 0.2)), (np.zeros(3), 0.4, (0.3, 0.6, 0.9))):
             middle = viewmat[:3, :3] @ centre + viewmat[:3, 3]
             a, b = (rays**2).sum(-1), rays @ middle
             inside = b**2 - a * (middle @ middle - radius**2)

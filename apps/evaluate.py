@@ -1,0 +1,121 @@
+"""Measure a trained scene on a split it has not seen; write renders beside ground truth."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from scgs_warp.apps.cli import Device, prepare, run
+
+if TYPE_CHECKING:
+    from scgs_warp.data import Dataset
+    from scgs_warp.scene import Scene
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure a trained scene on a split it has not seen; write renders beside ground truth to RUN/evaluation."""
+
+    run: Path
+    """Folder of a run, as apps/train.py writes it."""
+    split: Literal["train", "test", "val"] = "test"
+    """Which frames."""
+    data: Path | None = None
+    """The data set, if it is no longer where it was for training."""
+    lpips_weights: Path | None = None
+    """VGG16 and LPIPS weights; without them LPIPS is not measured."""
+    json: Path | None = None
+    """Where the metrics go; RUN/evaluation/SPLIT/metrics.json by default."""
+    device: Device = "auto"
+    """Where to render; auto takes a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all cores by default."""
+
+
+def load_data(scene: Scene, options: Options) -> Dataset:
+    """The split as the run saw its training images: same size, same background.
+
+    Raises:
+        UserError: the run does not say where its data lies, or it is not there, or it has no such split.
+    """
+    from scgs_warp import data
+    from scgs_warp.errors import UserError
+
+    settings: dict[str, Any] = scene.settings.get("data", {})
+    folder = options.data or settings.get("folder")
+    if not folder:
+        raise UserError(f"{options.run}/config.json: data.folder is missing; say where the data lies with --data DIR")
+    kept = {key: settings[key] for key in ("downscale", "resample", "background") if key in settings}
+    if options.data is None and not Path(folder).is_dir():
+        raise UserError(f"{folder}: the run's data are no longer there; say where they lie with --data DIR")
+    return data.load(folder, options.split, **kept)
+
+
+def training_seconds(folder: Path) -> float | None:
+    """What ``metrics.json`` of the run says; None if it does not."""
+    try:
+        value = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return float(value) if isinstance(value, (int, float)) else None
+
+
+def show(metrics: dict[str, Any]) -> None:
+    """The metrics as a table on the terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{metrics['split']}, {metrics['images']} images, step {metrics['step']}")
+    columns = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "epe": "EPE [%]", "jitter": "jitter [%]"}
+    columns.update(gaussians="Gaussians", control_points="control points")
+    present = [key for key in columns if metrics.get(key) is not None]
+    for key in present:
+        table.add_column(columns[key], justify="right")
+    digits = {"psnr": 2, "ssim": 4, "lpips": 4, "epe": 3, "jitter": 4}
+    cells = [f"{metrics[key]:.{digits[key]}f}" if key in digits else f"{metrics[key]:,}" for key in present]
+    table.add_row(*cells)
+    Console().print(table)
+
+
+def main(args: list[str] | None) -> None:
+    import tyro
+
+    options = tyro.cli(Options, args=args, prog="evaluate.py")
+    device = prepare(options.device, options.threads)
+
+    from scgs_warp.evaluate import metrics_of, write_metrics
+    from scgs_warp.progress import progress
+    from scgs_warp.scene import Scene
+
+    scene = Scene.load(options.run, device=device)
+    lpips = None
+    if options.lpips_weights is not None:
+        from scgs_warp.metrics import LPIPS
+
+        lpips = LPIPS(options.lpips_weights, device)
+    dataset = load_data(scene, options)
+    folder = options.run / "evaluation" / options.split
+    with progress(len(dataset), "evaluate") as shown:
+        metrics = metrics_of(
+            scene,
+            dataset,
+            seconds=training_seconds(options.run),
+            lpips=lpips,
+            render_dir=folder,
+            progress=lambda done, total: shown.advance(),
+        )
+    target = options.json or folder / "metrics.json"
+    write_metrics(metrics, target)
+    show(metrics)
+    print(f"renders and ground truth: {folder}; metrics: {target}")
+
+
+def cli(args: list[str] | None = None) -> int:
+    return run(main, args)
+
+
+if __name__ == "__main__":
+    sys.exit(cli())
