@@ -14,7 +14,7 @@ from .types import ALPHA_MIN
 wp.set_module_options({"enable_backward": False})
 
 FRUSTUM_MARGIN = wp.constant(0.3)
-"""The Jacobian is evaluated no farther outside the image than this times tan(fov / 2): it explodes at grazing angles."""
+"""The Jacobian, which explodes at grazing angles, is evaluated no farther outside the image than this tan(fov / 2)."""
 
 RADIUS_MAX = wp.constant(1.0e9)
 """Larger radii cover every image all the same; a larger float would overflow int32."""

@@ -1,0 +1,61 @@
+"""One image of the Gaussians at one instant: project, colour, bin, composite."""
+
+from __future__ import annotations
+
+from math import isqrt
+
+import torch
+from torch import Tensor
+
+from .ops.binning import bin_splats
+from .ops.compositing import composite
+from .ops.harmonics import MAX_DEGREE, spherical_harmonics
+from .ops.projection import project
+from .types import Camera, Gaussians, Image, Stats
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor | None = None,
+    *,
+    sh_degree: int | None = None,
+    stats: Stats | None = None,
+    antialiased: bool = False,
+) -> Image:
+    """Render Gaussians (3D Gaussian Splatting, Kerbl et al. 2023, section 4), colour and expected depth in one pass.
+
+    Args:
+        gaussians: N activated Gaussians in world units; N may be 0.
+        camera: where from; on the device of the Gaussians.
+        background: [3] colour behind everything. None: black.
+        sh_degree: degree of the harmonics used. None: all there is.
+        stats: if given, the backward pass adds to it what ``Stats`` says.
+        antialiased: Mip-Splatting's opacity compensation.
+
+    Returns:
+        Image: ``rgb`` [H, W, 3] (its planar permutation is contiguous), ``alpha`` [H, W], ``depth`` [H, W] in world
+        units along the camera's z. Gradients reach all of ``gaussians``, ``camera.viewmat`` and ``background``.
+
+    Raises:
+        ValueError: a shape, a size or the degree is wrong.
+    """
+    if background is not None and tuple(background.shape) != (3,):
+        raise ValueError(f"background must be [3], got {tuple(background.shape)}")
+    if sh_degree is None:
+        sh_degree = min(isqrt(gaussians.sh_rest.shape[1] + 1) - 1, MAX_DEGREE)
+    means = gaussians.means
+    shape = gaussians.quats, gaussians.scales, gaussians.opacities
+    size = camera.width, camera.height
+    splats = project(means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased)
+    colors = spherical_harmonics(gaussians.sh_dc, gaussians.sh_rest, means, camera.position, sh_degree)
+    channels = torch.cat([colors, splats.depths[:, None]], dim=1)
+    if background is not None:
+        background = torch.cat([background, background.new_zeros(1)])
+    image, alpha = composite(splats, channels, bin_splats(splats), background, stats=stats)
+    return Image(image[:3].permute(1, 2, 0), alpha, expected_depth(image[3], alpha))
+
+
+def expected_depth(accumulated: Tensor, alpha: Tensor) -> Tensor:
+    """Accumulated depth over alpha, and 0 where alpha is 0 (nothing was accumulated there); same shape as both."""
+    return accumulated / alpha.clamp_min(1e-10)
