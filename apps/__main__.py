@@ -12,8 +12,10 @@ def main() -> int:
     arguments = sys.argv[1:]
     if not arguments or arguments[0] not in APPS:
         wanted = not arguments or arguments[0] in ("-h", "--help")
-        print(f"usage: scgs-warp {{{','.join(APPS)}}} [options]; 'scgs-warp train --help' explains each option",
-              file=sys.stdout if wanted else sys.stderr)
+        print(
+            f"usage: scgs-warp {{{','.join(APPS)}}} [options]; 'scgs-warp train --help' explains each option",
+            file=sys.stdout if wanted else sys.stderr,
+        )
         return 0 if wanted else 2
     app = importlib.import_module(f"scgs_warp.apps.{arguments[0]}")
     return app.cli(arguments[1:])

@@ -22,7 +22,9 @@ def choose_device(device: Device) -> str:
 
     present = torch.cuda.is_available()
     if device == "cuda" and not present:
-        raise UserError("--device cuda: torch finds no CUDA GPU here; use --device cpu, or install a CUDA build of torch")
+        raise UserError(
+            "--device cuda: torch finds no CUDA GPU here; use --device cpu, or install a CUDA build of torch"
+        )
     return "cuda" if present and device != "cpu" else "cpu"
 
 

@@ -182,10 +182,9 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
     from matplotlib.figure import Figure
 
     lines = read_log(log_path)
-    stages = [str(line["stage"]) for line in lines if "stage" in line and "test_psnr" not in line]
-    for line in lines:  # an evaluation belongs to the main stage, the last one
-        if "stage" not in line and stages:
-            line["stage"] = stages[-1]
+    stage = ""
+    for line in lines:  # a line without a stage (an evaluation) belongs to that of the lines before it
+        stage = line["stage"] = str(line.get("stage", stage))
     positions, starts = _placed(lines)
     panels = (
         ("PSNR [dB]", (("psnr", "train", "-"), ("test_psnr", "test", "o-"))),

@@ -1,0 +1,36 @@
+"""Motion models, one class each, behind the protocol of ``base.Motion``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ..config import TrainConfig
+from .base import Motion
+from .control_points import ControlPoints, heads_of, make_network
+from .per_gaussian import PER_GAUSSIAN_HEADS, PerGaussian
+from .spheres import Spheres
+from .static import Static
+
+__all__ = ["ControlPoints", "Motion", "PerGaussian", "Spheres", "Static", "build_motion"]
+
+
+def build_motion(name: str, config: TrainConfig, state: Mapping[str, Tensor] | None = None) -> Motion:
+    """A motion model by name; control points have as many rows as ``state``, a checkpoint's tensors, holds.
+
+    Raises:
+        ValueError: no such model.
+    """
+    if name == "static":
+        return Static()
+    if name == "per-gaussian":
+        return PerGaussian(make_network(config.motion, PER_GAUSSIAN_HEADS, config.seed))
+    if name == "spheres":
+        return Spheres(make_network(config.motion, heads_of(config.motion), config.seed), 1.0)
+    if name == "control-points":
+        count = config.motion.nodes if state is None else state["positions"].shape[0]
+        network = make_network(config.motion, heads_of(config.motion), config.seed)
+        return ControlPoints(torch.zeros(count, 3), torch.ones(count), network, config.motion)
+    raise ValueError(f"no motion model is called {name!r}")

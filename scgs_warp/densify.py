@@ -1,0 +1,120 @@
+"""Grow, split, prune, reset: from statistics and thresholds to new rows (3D-GS section 5; seed S4)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from .config import DensifyConfig
+from .gaussians import GaussianParameters
+from .optim import regather, reset_moments
+from .quaternion import rotate
+from .types import Stats
+
+SPLIT_SHRINK = 1.6
+"""A split Gaussian's two halves are this much smaller (3D-GS)."""
+RESET_OPACITY = 0.01
+
+
+def threshold(config: DensifyConfig, width: int, height: int) -> float:
+    """Gradient threshold at this image size."""
+    return config.grad_threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent
+
+
+def mean_gradient(stats: Stats) -> Tensor:
+    """[N] mean norm of the screen-space gradient over the images that saw the Gaussian."""
+    return stats.grad_norm / stats.count.clamp(min=1.0)
+
+
+def densify(
+    gaussians: GaussianParameters,
+    optimizer: torch.optim.Adam,
+    stats: Stats,
+    config: DensifyConfig,
+    *,
+    grad_threshold: float,
+    extent: float,
+    prune_large: bool,
+    random: torch.Generator,
+) -> None:
+    """Clone small Gaussians and split large ones whose mean gradient exceeds the threshold, then prune.
+
+    Args:
+        gaussians, optimizer: changed in place; new rows start with zero moments.
+        stats: since the last call; the caller makes new ones.
+        extent: radius of the cameras, normalised units.
+        prune_large: also remove what is too large on screen or in space (after the first opacity reset).
+        random: where split halves land.
+    """
+    with torch.no_grad():
+        gradient = mean_gradient(stats)
+        chosen = _within_budget(gradient, gradient >= grad_threshold, config.max_gaussians - len(gaussians))
+        large = gaussians.scales().amax(1) > config.percent_dense * extent
+        split, clone = chosen & large, chosen & ~large
+        pieces = [torch.where(~split)[0], torch.where(clone)[0], torch.where(split)[0].repeat(2)]
+        index = torch.cat(pieces)
+        fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
+        fresh[len(pieces[0]) :] = True
+        regather(optimizer, gaussians, GaussianParameters.NAMES, index, fresh)
+        _spread_halves(gaussians, len(pieces[2]), random)
+        keep = _worth_keeping(gaussians, stats.max_radii[index], fresh, config, extent, prune_large)
+    prune(gaussians, optimizer, keep)
+
+
+def _within_budget(gradient: Tensor, chosen: Tensor, budget: int) -> Tensor:
+    """At most ``budget`` of the chosen ones, those with the largest gradient."""
+    if int(chosen.sum()) <= budget:
+        return chosen
+    best = torch.where(chosen, gradient, gradient.new_tensor(-1.0)).argsort(descending=True, stable=True)
+    allowed = torch.zeros_like(chosen)
+    allowed[best[: max(budget, 0)]] = True
+    return allowed & chosen
+
+
+def _spread_halves(gaussians: GaussianParameters, count: int, random: torch.Generator) -> None:
+    """The last ``count`` rows are halves of split Gaussians: sampled from their parents, and smaller."""
+    if count == 0:
+        return
+    tail = slice(len(gaussians) - count, None)
+    scales = gaussians.scales()[tail]
+    offsets = torch.randn(count, 3, generator=random).to(scales.device) * scales
+    gaussians.means.data[tail] += rotate(gaussians.quats[tail], offsets)
+    gaussians.log_scales.data[tail] -= math.log(SPLIT_SHRINK)
+
+
+def _worth_keeping(
+    gaussians: GaussianParameters,
+    max_radii: Tensor,
+    fresh: Tensor,
+    config: DensifyConfig,
+    extent: float,
+    prune_large: bool,
+) -> Tensor:
+    keep = gaussians.opacities() >= config.min_opacity
+    if prune_large:
+        keep &= (max_radii <= config.max_screen) | fresh
+        keep &= gaussians.scales().amax(1) <= config.max_scale * extent
+    for parameter in (gaussians.means, gaussians.log_scales, gaussians.quats):
+        keep &= torch.isfinite(parameter).all(dim=1)
+    return keep
+
+
+def prune(gaussians: GaussianParameters, optimizer: torch.optim.Adam, keep: Tensor) -> None:
+    """Keep the rows marked in ``keep`` [N]; if that would leave none, keep the most opaque one."""
+    if not bool(keep.any()):
+        keep = keep.clone()
+        keep[int(gaussians.opacity_logits.argmax())] = True
+    if bool(keep.all()):
+        return
+    index = torch.where(keep)[0]
+    fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
+    regather(optimizer, gaussians, GaussianParameters.NAMES, index, fresh)
+
+
+def reset_opacities(gaussians: GaussianParameters, optimizer: torch.optim.Adam) -> None:
+    """No opacity above 0.01 any more: what the images need comes back, floaters do not."""
+    with torch.no_grad():
+        gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    reset_moments(optimizer, "opacity_logits")

@@ -1,0 +1,55 @@
+"""Training views as the loop needs them: normalised cameras, planar truth on the device, and an order."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .config import TrainConfig
+from .data.dataset import Dataset
+from .data.normalise import Normalisation
+from .optim import generator
+from .types import Camera, Frame
+
+PROGRESSIVE_SHARE = 0.2
+
+
+class Frames:
+    """Random order without replacement, the same for the same seed; every epoch another."""
+
+    def __init__(self, data: Dataset, normalisation: Normalisation, config: TrainConfig, device: str) -> None:
+        self.frames = list(data)
+        self.config, self.device = config, device
+        self.cameras = [normalisation.apply_camera(frame.camera).to(device) for frame in self.frames]
+        self.background = data.background_color.to(device)
+        self.random_background = data.background == "random"
+        self.by_time = sorted(range(len(self.frames)), key=lambda i: self.frames[i].time)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def index_at(self, step: int, progressive: bool) -> int:
+        """The frame of this step. ``progressive``: only the first 20 % of the frames by time, 20 % more every
+        ``progressive_every`` steps (seed S4)."""
+        allowed = len(self.frames)
+        if progressive:
+            stages = 1 + step // self.config.pretrain.progressive_every
+            allowed = min(allowed, max(1, round(PROGRESSIVE_SHARE * stages * allowed)))
+        epoch, place = divmod(step, allowed)
+        chosen = int(torch.randperm(allowed, generator=generator(self.config.seed, 41, epoch, allowed))[place])
+        return self.by_time[chosen]
+
+    def view(
+        self, index: int, step: int, random_background: bool
+    ) -> tuple[Frame, Camera, Tensor, Tensor, Tensor | None]:
+        """Frame, normalised camera, truth [3, H, W] on the background of this step, that background [3], mask."""
+        frame = self.frames[index]
+        truth = frame.image.to(self.device).permute(2, 0, 1).contiguous()
+        background = self.background
+        if frame.alpha is not None and (random_background or self.random_background):
+            color = torch.rand(3, generator=generator(self.config.seed, 42, step)).to(self.device)
+            gap = 1.0 - frame.alpha.to(self.device)
+            truth = truth + gap * (color - background)[:, None, None]
+            background = color
+        mask = None if frame.mask is None else frame.mask.to(self.device)
+        return frame, self.cameras[index], truth, background, mask

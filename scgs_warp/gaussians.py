@@ -1,0 +1,95 @@
+"""The trained Gaussians: raw parameters, their activations, and how they start."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from .types import Gaussians
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh_dc."""
+
+
+class GaussianParameters(nn.Module):
+    """Raw parameters of N Gaussians in the normalised scene; :meth:`activate` gives what renders.
+
+    Attributes: ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``log_scales`` [N, 3], ``opacity_logits`` [N],
+    ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0).
+    """
+
+    NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper")
+
+    def __init__(
+        self,
+        means: Tensor,
+        log_scales: Tensor,
+        sh_dc: Tensor,
+        *,
+        opacity: float = 0.1,
+        sh_degree: int = 3,
+        hyper_dim: int = 0,
+    ) -> None:
+        super().__init__()
+        count, device = means.shape[0], means.device
+        quats = torch.zeros(count, 4, device=device)
+        quats[:, 0] = 1.0
+        self.means = nn.Parameter(means.clone())
+        self.quats = nn.Parameter(quats)
+        self.log_scales = nn.Parameter(log_scales.clone())
+        self.opacity_logits = nn.Parameter(torch.full((count,), opacity, device=device).logit())
+        self.sh_dc = nn.Parameter(sh_dc.clone())
+        self.sh_rest = nn.Parameter(torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device=device))
+        # Apart from the control points' initial +1e-2, as in the official code, so that the distance has a gradient.
+        self.hyper = nn.Parameter(torch.full((count, hyper_dim), -1e-2, device=device))
+
+    @staticmethod
+    def empty(count: int, sh_count: int, hyper_dim: int, device: torch.device | str) -> GaussianParameters:
+        """Room for ``count`` Gaussians, to be filled from a checkpoint."""
+        zeros = torch.zeros(count, 3, device=device)
+        made = GaussianParameters(zeros, zeros, zeros, sh_degree=0, hyper_dim=hyper_dim)
+        made.sh_rest = nn.Parameter(torch.zeros(count, sh_count, 3, device=device))
+        return made
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree there is room for."""
+        return round((self.sh_rest.shape[1] + 1) ** 0.5) - 1
+
+    def scales(self) -> Tensor:
+        """[N, 3] standard deviations."""
+        return self.log_scales.exp()
+
+    def opacities(self) -> Tensor:
+        """[N] in (0, 1)."""
+        return self.opacity_logits.sigmoid()
+
+    def activate(self) -> Gaussians:
+        """The Gaussians at rest: activation happens here and nowhere else."""
+        return Gaussians(self.means, self.quats, self.scales(), self.opacities(), self.sh_dc, self.sh_rest)
+
+
+def neighbor_distance(points: Tensor, count: int = 3) -> Tensor:
+    """[N] root mean squared distance to the ``count`` nearest other points; 1e-3 at least, 1e-2 for a lone point."""
+    total = points.shape[0]
+    if total <= 1:
+        return torch.full((total,), 1e-2, device=points.device)
+    count = min(count, total - 1)
+    array = points.detach().cpu().double().numpy()
+    distances, _ = cKDTree(array).query(array, k=count + 1)
+    mean = torch.from_numpy((distances[:, 1:] ** 2).mean(axis=1) ** 0.5)
+    return mean.float().clamp_(min=1e-3).to(points.device)
+
+
+def gaussians_from_points(
+    points: Tensor, colors: Tensor | None, *, sh_degree: int, hyper_dim: int, scale: float = 1.0
+) -> GaussianParameters:
+    """Round Gaussians at ``points`` [N, 3], as large as the distance to their neighbours times ``scale``; ``colors``
+    [N, 3] in [0, 1], grey where there are none."""
+    log_scales = (neighbor_distance(points) * scale).log()[:, None].repeat(1, 3)
+    sh_dc = torch.zeros_like(points) if colors is None else (colors - 0.5) / SH_C0
+    return GaussianParameters(points, log_scales, sh_dc, sh_degree=sh_degree, hyper_dim=hyper_dim)

@@ -1,0 +1,86 @@
+"""Adaptive control of control points: clone where the image still pulls, prune what moves nothing (paper section 4.3)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..gaussians import GaussianParameters
+from ..optim import regather
+from .control_points import NODE_NAMES, ControlPoints
+
+PRUNE_IMPACT = 1e-2
+"""A control point whose weights over all Gaussians sum to less than this moves nothing visible."""
+MOST_NEW = 0.1
+"""At most this share of new control points at a time: the largest gradients win."""
+
+
+class Influence(NamedTuple):
+    """Sums over the Gaussians of each control point, float64."""
+
+    impact: np.ndarray
+    """[M] sum of weights."""
+    gradient: np.ndarray
+    """[M] weighted mean of the Gaussians' screen gradients."""
+    centre: np.ndarray
+    """[M, 3] mean position of its Gaussians, weighted by weight and gradient: where a clone is needed."""
+
+
+def influence(motion: ControlPoints, gaussians: GaussianParameters, gradient: Tensor) -> Influence:
+    """``bincount`` adds in row order, so the result does not depend on threads."""
+    with torch.no_grad():
+        indices, weights = motion.binding(gaussians)
+    flat = indices.cpu().numpy().ravel()
+    weight = weights.detach().cpu().double().numpy().ravel()
+    pull = weight * np.repeat(gradient.cpu().double().numpy(), indices.shape[1])
+    means = np.repeat(gaussians.means.detach().cpu().double().numpy(), indices.shape[1], axis=0)
+    count = len(motion)
+    impact = np.bincount(flat, weight, count)
+    pulled = np.bincount(flat, pull, count)
+    centre = np.stack([np.bincount(flat, pull * means[:, axis], count) for axis in range(3)], axis=1)
+    return Influence(impact, pulled / np.maximum(impact, 1e-7), centre / np.maximum(pulled, 1e-30)[:, None])
+
+
+def adapt_control_points(
+    motion: ControlPoints,
+    optimizer: torch.optim.Adam,
+    gaussians: GaussianParameters,
+    gradient: Tensor,
+    *,
+    grad_threshold: float,
+) -> tuple[int, int]:
+    """Change the number of control points in place.
+
+    Args:
+        motion, optimizer: changed; clones inherit radius, weight and hyper-coordinates, with zero moments.
+        gaussians: whose neighbours and weights count.
+        gradient: [N] mean screen-space gradient of each Gaussian, normalised device coordinates.
+        grad_threshold: clone a control point whose weighted mean gradient exceeds this.
+
+    Returns:
+        how many were cloned, how many pruned.
+    """
+    found = influence(motion, gaussians, gradient)
+    keep = found.impact >= PRUNE_IMPACT
+    fewest = motion.config.neighbors + 1
+    if keep.sum() < fewest:
+        keep[np.argsort(-found.impact, kind="stable")[:fewest]] = True
+    wanted = keep & (found.gradient > grad_threshold) & np.isfinite(found.centre).all(axis=1)
+    most = max(1, int(MOST_NEW * len(motion)))
+    cloned = np.argsort(-np.where(wanted, found.gradient, -1.0), kind="stable")[: min(most, int(wanted.sum()))]
+    kept = np.nonzero(keep)[0]
+    if len(cloned) == 0 and len(kept) == len(motion):
+        return 0, 0
+    device = motion.positions.device
+    index = torch.from_numpy(np.concatenate([kept, cloned])).to(device)
+    fresh = torch.arange(len(index), device=device) >= len(kept)
+    names = tuple(name for name in NODE_NAMES if name != "strength_logits" or motion.config.node_weight)
+    pruned = len(motion) - len(kept)
+    regather(optimizer, motion, names, index, fresh)
+    centres = torch.from_numpy(found.centre[cloned]).to(motion.positions)
+    motion.positions.data[len(kept) :] = centres
+    motion.graph = None
+    return len(cloned), pruned

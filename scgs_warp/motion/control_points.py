@@ -1,0 +1,172 @@
+"""Sparse control points moved by a network: the model of SC-GS (paper section 4.1, Eq. 5-7)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..config import LossConfig, MotionConfig, TrainConfig
+from ..gaussians import GaussianParameters
+from ..ops.neighbors import nearest, rbf_weights
+from ..ops.skinning import skin
+from ..optim import generator, log_linear
+from ..types import Gaussians, Pose
+from .base import Motion, TrainingPose
+from .network import DeformationNetwork
+from .rigidity import Graph, arap_weight, build_graph, rigidity
+
+NODE_NAMES = ("positions", "log_radii", "hyper", "strength_logits")
+"""Parameters with one row per control point."""
+
+
+def heads_of(config: MotionConfig) -> dict[str, int]:
+    """What the network predicts for every control point."""
+    heads = {"rotations": 4, "translations": 3}
+    if config.shape_rotation:
+        heads["shape_rotations"] = 4
+    if config.scale_residual:
+        heads["log_scales"] = 3
+    return heads
+
+
+def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> DeformationNetwork:
+    return DeformationNetwork(
+        heads,
+        layers=config.layers,
+        width=config.width,
+        skip=config.skip,
+        position_frequencies=config.position_frequencies,
+        time_frequencies=config.time_frequencies,
+        bfloat16=config.bfloat16,
+        generator=generator(seed, 11),
+    )
+
+
+def unit_rotations(raw: Tensor) -> Tensor:
+    """Network output [..., 4] to unit quaternions near the identity."""
+    return F.normalize(raw + raw.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
+
+
+class ControlPoints(Motion):
+    """Positions [M, 3], radii [M], optional hyper-coordinates [M, H] and weights [M], and the network."""
+
+    name = "control-points"
+
+    def __init__(self, positions: Tensor, radii: Tensor, network: DeformationNetwork, config: MotionConfig) -> None:
+        super().__init__()
+        count, device = positions.shape[0], positions.device
+        self.config = config
+        self.positions = nn.Parameter(positions.clone())
+        self.log_radii = nn.Parameter(radii.log())
+        self.hyper = nn.Parameter(torch.full((count, config.hyper_dim), 1e-2, device=device))
+        self.strength_logits = nn.Parameter(torch.zeros(count if config.node_weight else 0, device=device))
+        self.network = network
+        self.graph: Graph | None = None
+        self._cached: tuple[Tensor, Tensor] | None = None
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+    def poses(self, times: Tensor) -> list[Pose]:
+        """One :class:`Pose` per time, from one call of the network. Its input is detached: the encoding's high octaves
+        would shake the control points."""
+        out = self.network(self.positions.detach(), times.to(self.positions.device))
+        rotations = unit_rotations(out["rotations"])
+        shape = unit_rotations(out["shape_rotations"]) if "shape_rotations" in out else None
+        log_scales = out.get("log_scales")
+        return [
+            Pose(
+                out["translations"][i].contiguous(),
+                rotations[i].contiguous(),
+                None if shape is None else shape[i].contiguous(),
+                None if log_scales is None else log_scales[i].contiguous(),
+            )
+            for i in range(times.shape[0])
+        ]
+
+    def binding(self, gaussians: GaussianParameters, frozen: bool = False) -> tuple[Tensor, Tensor]:
+        """K nearest control points of every Gaussian and their RBF weights (Eq. 5): indices [N, K], weights [N, K].
+
+        The search runs in space, with hyper-coordinates appended where the model has them.
+        """
+        positions, log_radii, strengths = self.positions, self.log_radii, None
+        points, nodes = gaussians.means, positions
+        if self.config.hyper_dim:
+            points = torch.cat([gaussians.means, gaussians.hyper], dim=1)
+            nodes = torch.cat([positions, self.hyper], dim=1)
+        if self.config.node_weight:
+            strengths = self.strength_logits.sigmoid()
+        radii = log_radii.exp()
+        if frozen:
+            nodes, radii = nodes.detach(), radii.detach()
+            strengths = None if strengths is None else strengths.detach()
+        with torch.no_grad():
+            indices, _ = nearest(points.detach().contiguous(), nodes.detach().contiguous(), self.config.neighbors)
+        return indices, rbf_weights(points, nodes, radii, indices, strengths)
+
+    def apply_pose(
+        self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor], frozen: bool = False
+    ) -> Gaussians:
+        """Linear blend skinning of all Gaussians (Eq. 6-7). Editing replaces ``pose``, nothing else."""
+        nodes = self.positions.detach() if frozen else self.positions
+        means, quats, log_scales = skin(gaussians.means, gaussians.quats, nodes, pose, *binding)
+        scales = gaussians.scales() if log_scales is None else (gaussians.log_scales + log_scales).exp()
+        return Gaussians(means, quats, scales, gaussians.opacities(), gaussians.sh_dc, gaussians.sh_rest)
+
+    def cache_binding(self, gaussians: GaussianParameters | None) -> None:
+        """For rendering: neighbours and weights do not depend on time. None forgets them."""
+        with torch.no_grad():
+            self._cached = None if gaussians is None else self.binding(gaussians)
+
+    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
+        binding = self._cached if self._cached is not None else self.binding(gaussians)
+        return self.apply_pose(gaussians, self.poses(torch.tensor([time]))[0], binding)
+
+    def train_at(
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
+    ) -> TrainingPose:
+        frozen = step < config.freeze
+        weight = 0.0 if frozen else arap_weight(step, config.loss)
+        times = [time]
+        if weight > 0.0:
+            self.refresh_graph(step, config.loss)
+            times += torch.rand(2, generator=generator(seed, 21, step)).tolist()
+        with torch.set_grad_enabled(not frozen):
+            poses = self.poses(torch.tensor(times))
+        posed = self.apply_pose(gaussians, poses[0], self.binding(gaussians, frozen), frozen)
+        if weight == 0.0 or self.graph is None:
+            return TrainingPose(posed, None)
+        first, second = (self.positions.detach() + pose.translations for pose in poses[1:])
+        return TrainingPose(posed, weight * rigidity(first, second, self.graph))
+
+    def refresh_graph(self, step: int, loss: LossConfig) -> None:
+        if self.graph is None or step % loss.arap_refresh < loss.arap_every:
+            self.graph = build_graph(self.trajectories, loss)
+
+    def trajectories(self, times: Tensor) -> Tensor:
+        """[T, M, 3] control points at ``times`` [T]."""
+        return torch.stack([self.positions.detach() + pose.translations for pose in self.poses(times)])
+
+    def control_points_at(self, time: float) -> Tensor:
+        with torch.no_grad():
+            return self.trajectories(torch.tensor([time]))[0]
+
+    def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
+        optim = config.optim
+        joint = max(0, step - config.freeze)
+        network = log_linear(optim.network, optim.network_end, joint, optim.network_until)
+        decay = network / optim.network
+        rates = {name: network for name, _ in self.named_parameters() if name.startswith("network.")}
+        positions = optim.node_positions * decay if config.motion.train_positions else 0.0
+        nodes = optim.nodes * decay
+        return {**rates, "positions": positions, "log_radii": nodes, "hyper": nodes, "strength_logits": nodes}
+
+    def extra_state(self) -> dict[str, Tensor]:
+        return (
+            {} if self.graph is None else {"graph.neighbors": self.graph.neighbors, "graph.weights": self.graph.weights}
+        )
+
+    def load_extra_state(self, tensors: dict[str, Tensor]) -> None:
+        if "graph.neighbors" in tensors:
+            self.graph = Graph.of(tensors["graph.neighbors"], tensors["graph.weights"])

@@ -1,0 +1,48 @@
+"""The paper's baseline: the same network, evaluated at every Gaussian instead of at control points."""
+
+from __future__ import annotations
+
+import torch
+
+from ..config import TrainConfig
+from ..gaussians import GaussianParameters
+from ..optim import log_linear
+from ..types import Gaussians
+from .base import Motion, TrainingPose
+from .network import DeformationNetwork
+
+
+class PerGaussian(Motion):
+    """Position, rotation and scale residuals predicted for each Gaussian from its rest position and the time."""
+
+    name = "per-gaussian"
+
+    def __init__(self, network: DeformationNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
+        out = self.network(gaussians.means.detach(), torch.tensor([time], device=gaussians.means.device))
+        return Gaussians(
+            gaussians.means + out["translations"][0],
+            gaussians.quats + out["rotations"][0],
+            (gaussians.log_scales + out["log_scales"][0]).exp(),
+            gaussians.opacities(),
+            gaussians.sh_dc,
+            gaussians.sh_rest,
+        )
+
+    def train_at(
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
+    ) -> TrainingPose:
+        if step < config.freeze:
+            return TrainingPose(gaussians.activate(), None)
+        return TrainingPose(self.gaussians_at(gaussians, time), None)
+
+    def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
+        joint = max(0, step - config.freeze)
+        rate = log_linear(config.optim.network, config.optim.network_end, joint, config.optim.network_until)
+        return {name: rate for name, _ in self.named_parameters()}
+
+
+PER_GAUSSIAN_HEADS = {"rotations": 4, "translations": 3, "log_scales": 3}

@@ -1,0 +1,50 @@
+"""As-rigid-as-possible regulariser on trajectories (paper Eq. 9-10; seed S4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..config import LossConfig
+from ..ops.arap import arap_energy, reverse_edges, trajectory_graph
+from ..ops.neighbors import NodeLists
+from ..optim import log_linear
+
+
+class Graph(NamedTuple):
+    """Who stays near whom over time."""
+
+    neighbors: Tensor
+    """[M, J] int32, -1 where there are fewer."""
+    weights: Tensor
+    """[M, J], rows sum to 1."""
+    reverse: NodeLists
+    """The edges that lead to each control point."""
+
+    @staticmethod
+    def of(neighbors: Tensor, weights: Tensor) -> Graph:
+        return Graph(neighbors, weights, reverse_edges(neighbors))
+
+
+def arap_weight(step: int, loss: LossConfig) -> float:
+    """Exponential decay over ``arap_until`` main steps, then 0; times ``arap_every`` on the steps that carry it."""
+    if loss.arap <= 0.0 or step >= loss.arap_until or step % loss.arap_every:
+        return 0.0
+    return log_linear(loss.arap, loss.arap_end, step, loss.arap_until) * loss.arap_every
+
+
+def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> Graph | None:
+    """Neighbours by trajectory: ``positions_at(times [T]) -> [T, M, 3]`` sampled at N_t times. None for fewer than two."""
+    with torch.no_grad():
+        trajectories = positions_at(torch.linspace(0.0, 1.0, loss.arap_times))
+        count = min(loss.arap_neighbors, trajectories.shape[1] - 1)
+        return Graph.of(*trajectory_graph(trajectories.contiguous(), count)) if count >= 1 else None
+
+
+def rigidity(first: Tensor, second: Tensor, graph: Graph) -> Tensor:
+    """Sum over control points of the energy between two instants [M, 3]; summed by a product with ones (fixed order)."""
+    energy = arap_energy(first, second, graph.neighbors, graph.weights, reverse=graph.reverse)
+    return energy @ torch.ones_like(energy)

@@ -1,0 +1,79 @@
+"""Stage 1: control points as same-sized spheres, each moved by the network at its own position (seed S4)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from ..config import LossConfig, TrainConfig
+from ..gaussians import GaussianParameters
+from ..optim import generator, log_linear
+from ..types import Gaussians
+from .base import Motion, TrainingPose
+from .network import DeformationNetwork
+from .rigidity import Graph, build_graph, rigidity
+
+
+class Spheres(Motion):
+    """The network and the one radius that all spheres share; their centres are the means of the Gaussians."""
+
+    name = "spheres"
+
+    def __init__(self, network: DeformationNetwork, radius: float) -> None:
+        super().__init__()
+        self.network = network
+        self.log_radius = nn.Parameter(torch.tensor([[radius]]).log())
+        self.graph: Graph | None = None
+
+    def translations(self, positions: Tensor, times: Tensor) -> Tensor:
+        """[T, n, 3] displacement of ``positions`` [n, 3] (detached: the octaves of the encoding would shake them)."""
+        return self.network(positions.detach(), times.to(positions.device))["translations"]
+
+    def _place(self, gaussians: GaussianParameters, means: Tensor) -> Gaussians:
+        # A product with ones instead of expand: its adjoint then sums in a fixed order.
+        ones = torch.ones(len(gaussians), 1, device=means.device)
+        scales = (ones @ self.log_radius.exp()).expand(-1, 3)
+        return Gaussians(
+            means, gaussians.quats.detach(), scales, gaussians.opacities(), gaussians.sh_dc, gaussians.sh_rest
+        )
+
+    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
+        moved = gaussians.means + self.translations(gaussians.means, torch.tensor([time]))[0]
+        return self._place(gaussians, moved)
+
+    def train_at(
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
+    ) -> TrainingPose:
+        if step < config.pretrain.warm_up:
+            return TrainingPose(self._place(gaussians, gaussians.means), None)
+        rigid = config.pretrain.arap_weight > 0 and step % config.loss.arap_every == 0
+        times = [time]
+        if rigid:
+            self.refresh_graph(gaussians, step, config.loss)
+            times += torch.rand(2, generator=generator(seed, 22, step)).tolist()
+        moves = self.translations(gaussians.means, torch.tensor(times))
+        posed = self._place(gaussians, gaussians.means + moves[0])
+        if not rigid or self.graph is None:
+            return TrainingPose(posed, None)
+        first, second = (gaussians.means.detach() + move for move in moves[1:])
+        weight = config.pretrain.arap_weight * config.loss.arap_every
+        return TrainingPose(posed, weight * rigidity(first, second, self.graph))
+
+    def refresh_graph(self, gaussians: GaussianParameters, step: int, loss: LossConfig) -> None:
+        if self.graph is None or step % loss.arap_refresh < loss.arap_every:
+            self.graph = build_graph(lambda times: gaussians.means + self.translations(gaussians.means, times), loss)
+
+    def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
+        moving = max(0, step - config.pretrain.warm_up)
+        rate = log_linear(config.optim.network, config.optim.network_end, moving, config.optim.network_until)
+        rates = {name: rate for name, _ in self.named_parameters() if name.startswith("network.")}
+        return {**rates, "log_radius": config.optim.scales}
+
+    def extra_state(self) -> dict[str, Tensor]:
+        return (
+            {} if self.graph is None else {"graph.neighbors": self.graph.neighbors, "graph.weights": self.graph.weights}
+        )
+
+    def load_extra_state(self, tensors: dict[str, Tensor]) -> None:
+        if "graph.neighbors" in tensors:
+            self.graph = Graph.of(tensors["graph.neighbors"], tensors["graph.weights"])

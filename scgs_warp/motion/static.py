@@ -1,0 +1,17 @@
+"""No motion: 3D-GS, the seed's reference for speed."""
+
+from __future__ import annotations
+
+from ..gaussians import GaussianParameters
+from ..types import Gaussians
+from .base import Motion
+
+
+class Static(Motion):
+    """Gaussians that stay where they are."""
+
+    name = "static"
+    moves = False
+
+    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
+        return gaussians.activate()

@@ -1,0 +1,153 @@
+"""A run directory: config.json, log.jsonl, previews/, and who may write to it."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from .checkpoint import FILE, write_atomically
+from .config import TrainConfig, to_dict
+from .data.dataset import Dataset
+from .errors import UserError
+from .metrics import psnr
+from .progress import Progress
+from .scene import Scene
+
+if TYPE_CHECKING:
+    from .train import StepResult
+    from .train_state import TrainState
+
+LOG_EVERY = 50
+PREVIEW_SECONDS = 15.0
+LOCK = ".lock"
+TEST_IMAGES = 4
+
+
+class RunFolder:
+    """Use as a context manager: holds a lock, so that two trainers cannot share one directory.
+
+    Raises:
+        UserError: not writable, in use, or there is a run already and ``resume`` was not asked for.
+    """
+
+    def __init__(self, path: str | Path, config: TrainConfig, settings: dict[str, Any] | None, *, resume: bool) -> None:
+        self.path = Path(path)
+        self.settings = settings if settings is not None else to_dict(config)
+        self.resume = resume
+        self.seconds = 0.0
+        self._began = time.perf_counter()
+        self._shown_at = 0.0
+        self._psnr: float | None = None
+        self._losses: list[tuple[float, float, float]] = []
+
+    def __enter__(self) -> RunFolder:
+        try:
+            (self.path / "previews").mkdir(parents=True, exist_ok=True)
+            self._lock()
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot be written ({error.strerror}); choose another --output") from error
+        if not self.resume and (self.path / FILE).exists():
+            self.__exit__(None, None, None)
+            raise UserError(f"{self.path}: holds a run already; continue it with --resume or choose another --output")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._lock_file)
+
+    def _lock(self) -> None:
+        self._lock_file = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            import fcntl
+        except ImportError:  # not on Windows: there a second trainer is the user's own care
+            return
+        try:
+            fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(self._lock_file)
+            raise UserError(
+                f"{self.path}: another trainer is running here; wait for it or choose another --output"
+            ) from error
+
+    def begin(self, step: int) -> None:
+        """Write the configuration; drop log lines after ``step``, which a resumed run will write again."""
+        text = json.dumps(self.settings, indent=2, sort_keys=True)
+        write_atomically(self.path / "config.json", text.encode())
+        log = self.path / "log.jsonl"
+        kept: list[str] = []
+        if self.resume and log.is_file():
+            for line in log.read_text(encoding="utf-8").splitlines():
+                try:
+                    entry = json.loads(line)
+                except ValueError:
+                    continue  # the line that a kill cut short
+                if entry.get("step", 0) <= step:
+                    kept.append(line)
+                    self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
+        write_atomically(log, "".join(line + "\n" for line in kept).encode())
+        self._began = time.perf_counter()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of training, those before a resume counted in."""
+        return self.seconds + time.perf_counter() - self._began
+
+    def log(self, entry: dict[str, Any]) -> None:
+        with open(self.path / "log.jsonl", "a", encoding="utf-8") as file:
+            file.write(json.dumps({**entry, "seconds": round(self.elapsed, 2)}) + "\n")
+
+    def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
+        """Progress, a log line every 50 steps, a preview every 15 seconds. ``state.step`` counts the step as done."""
+        due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
+        if due and result.failed is None:
+            now = float(psnr(result.render, result.truth))
+            self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
+            self.log(
+                {
+                    "step": state.step,
+                    "stage": state.stage,
+                    "loss": float(result.loss),
+                    "l1": float(result.l1),
+                    "ssim": float(result.ssim),
+                    "regulariser": result.regulariser,
+                    "psnr": round(self._psnr, 3),
+                    "gaussians": len(state.gaussians),
+                    "control_points": len(getattr(state.motion, "positions", ())),
+                }
+            )
+        if due or result.failed:
+            bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
+        else:
+            bar.advance(1)
+        if time.monotonic() - self._shown_at >= PREVIEW_SECONDS:
+            self._shown_at = time.monotonic()
+            self.show(result)
+
+    def show(self, result: StepResult) -> None:
+        """``previews/latest.png``: truth beside render."""
+        import cv2
+
+        pair = torch.cat([result.truth, result.render], dim=2).clamp(0.0, 1.0)
+        pixels = (pair.permute(1, 2, 0).cpu() * 255.0 + 0.5).to(torch.uint8).numpy()[:, :, ::-1]
+        done, content = cv2.imencode(".png", pixels)
+        if done:
+            write_atomically(self.path / "previews" / "latest.png", content.tobytes())
+
+    def look_at_test(self, scene: Scene, test: Dataset) -> None:
+        """PSNR of a few test images, for the curve."""
+        scene.motion.eval()
+        wanted = range(0, len(test), max(1, len(test) // TEST_IMAGES))
+        values = []
+        for i in wanted:
+            frame = test[i]
+            image = scene.render(frame.camera, frame.time)
+            values.append(float(psnr(image.rgb.cpu(), frame.image)))
+        scene.motion.train()
+        self.log({"step": scene.step, "test_psnr": sum(values) / len(values)})

@@ -1,0 +1,174 @@
+"""A trained scene: Gaussians, their motion, and how its units relate to the world's."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import checkpoint
+from .cameras import Overview
+from .config import TrainConfig, from_dict, to_dict
+from .data.dataset import BACKGROUND_COLORS
+from .data.normalise import Normalisation
+from .errors import UserError
+from .gaussians import GaussianParameters
+from .motion import build_motion
+from .motion.base import Motion
+from .render import render
+from .types import Camera, Gaussians, Image
+
+
+class Scene:
+    """What training returns and a run directory holds. All public methods speak world units.
+
+    Attributes: ``gaussians`` (:class:`GaussianParameters`, normalised units), ``motion``, ``normalisation``,
+    ``config``, ``overview`` (where cameras stood), ``step``, ``settings`` (``config.json`` as a dict).
+    """
+
+    def __init__(
+        self,
+        gaussians: GaussianParameters,
+        motion: Motion,
+        normalisation: Normalisation,
+        config: TrainConfig,
+        overview: Overview,
+        *,
+        step: int = 0,
+        settings: dict[str, Any] | None = None,
+    ) -> None:
+        self.gaussians, self.motion, self.normalisation = gaussians, motion, normalisation
+        self.config, self.overview, self.step = config, overview, step
+        self.settings = settings if settings is not None else to_dict(config)
+
+    @staticmethod
+    def load(run: str | Path, device: str = "cpu") -> Scene:
+        """Read a run directory.
+
+        Raises:
+            UserError: it is missing or damaged.
+        """
+        folder = Path(run)
+        if not folder.is_dir():
+            raise UserError(f"{folder}: no such run directory; apps/train.py --output makes one")
+        tensors, metadata = checkpoint.read(folder, ("gaussians.", "motion."))
+        scene = scene_from(tensors, metadata, device, str(folder / checkpoint.FILE))
+        settings_path = folder / "config.json"
+        if settings_path.is_file():
+            try:
+                scene.settings = json.loads(settings_path.read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                raise UserError(f"{settings_path}: cannot be read ({error}); restore it or train again") from error
+        if metadata["stage"] != "main":
+            raise UserError(f"{folder}: training stopped in stage 1; continue it with apps/train.py --resume")
+        scene.freeze_binding()
+        return scene
+
+    def freeze_binding(self) -> None:
+        """Find every Gaussian's control points once: they do not depend on time."""
+        cache = getattr(self.motion, "cache_binding", None)
+        if cache is not None:
+            cache(self.gaussians)
+
+    @property
+    def device(self) -> torch.device:
+        return self.gaussians.means.device
+
+    @property
+    def motion_name(self) -> str:
+        return self.motion.name
+
+    @property
+    def gaussian_count(self) -> int:
+        return len(self.gaussians)
+
+    @property
+    def control_point_count(self) -> int:
+        return self.control_points_at(0.0).shape[0]
+
+    @property
+    def background_color(self) -> tuple[float, float, float]:
+        """What the truth was composited on; black where it was random."""
+        return BACKGROUND_COLORS[self.config.data.background]
+
+    @torch.no_grad()
+    def gaussians_at(self, time: float) -> Gaussians:
+        """Activated Gaussians, posed at ``time`` in [0, 1], world units."""
+        posed = self.motion.gaussians_at(self.gaussians, float(time))
+        undo = self.normalisation
+        return Gaussians(
+            undo.undo(posed.means),
+            posed.quats,
+            undo.undo_scale(posed.scales),
+            posed.opacities,
+            posed.sh_dc,
+            posed.sh_rest,
+        )
+
+    @torch.no_grad()
+    def render(
+        self, camera: Camera, time: float, background: tuple[float, float, float] | Tensor | None = None
+    ) -> Image:
+        """The scene at ``time`` in [0, 1], seen by a world camera; depth in world units.
+
+        Args:
+            camera: any device.
+            time: clamped to [0, 1].
+            background: colour in [0, 1]; None: ``background_color``.
+        """
+        posed = self.motion.gaussians_at(self.gaussians, min(max(float(time), 0.0), 1.0))
+        color = torch.as_tensor(self.background_color if background is None else background, dtype=torch.float32)
+        view = self.normalisation.apply_camera(camera).to(self.device)
+        image = render(posed, view, color.to(self.device), antialiased=self.config.antialiased)
+        return Image(image.rgb, image.alpha, self.normalisation.undo_scale(image.depth))
+
+    @torch.no_grad()
+    def control_points_at(self, time: float) -> Tensor:
+        """[M, 3] control points at ``time``, world; [0, 3] for motion models without."""
+        return self.normalisation.undo(self.motion.control_points_at(float(time)))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that makes the scene, by name, for a checkpoint."""
+        found = {f"gaussians.{name}": getattr(self.gaussians, name) for name in GaussianParameters.NAMES}
+        found.update({f"motion.{name}": value for name, value in self.motion.state_dict().items()})
+        return found
+
+    def metadata(self) -> dict[str, Any]:
+        return {
+            "config": to_dict(self.config),
+            "normalisation": {"centre": self.normalisation.centre.tolist(), "scale": self.normalisation.scale},
+            "overview": self.overview.to_dict(),
+            "step": self.step,
+            "motion": self.motion.name,
+        }
+
+
+def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str, source: str) -> Scene:
+    """Inverse of :meth:`Scene.tensors` and :meth:`Scene.metadata`.
+
+    Raises:
+        UserError: tensors are missing or do not fit each other.
+    """
+    try:
+        config = from_dict(metadata["config"], source)
+        rows = checkpoint.strip(tensors, "gaussians.")
+        gaussians = GaussianParameters.empty(
+            len(rows["means"]), rows["sh_rest"].shape[1], rows["hyper"].shape[1], "cpu"
+        )
+        gaussians.load_state_dict(rows)
+        state = checkpoint.strip(tensors, "motion.")
+        motion = build_motion(metadata["motion"], config, state)
+        motion.load_state_dict(state)
+        unit = metadata["normalisation"]
+        normalisation = Normalisation(np.asarray(unit["centre"], dtype=np.float64), float(unit["scale"]))
+        overview = Overview.from_dict(metadata["overview"])
+        step = int(metadata["step"])
+    except (KeyError, RuntimeError, ValueError, TypeError) as error:
+        raise UserError(
+            f"{source}: not a complete checkpoint ({error}); train again or use the previous one"
+        ) from error
+    return Scene(gaussians.to(device), motion.to(device), normalisation, config, overview, step=step)

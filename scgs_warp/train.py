@@ -1,0 +1,270 @@
+"""Training: ``fit`` is the loop, ``training_step`` one step of it, in the order things happen."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .config import TrainConfig, check
+from .data.dataset import Dataset
+from .densify import densify, mean_gradient, reset_opacities, threshold
+from .errors import UserError
+from .frames import Frames
+from .motion.adapt import adapt_control_points
+from .motion.control_points import ControlPoints
+from .motion.spheres import Spheres
+from .ops.ssim import photometric_loss
+from .optim import generator, log_linear, set_rate
+from .pretrain import densify_spheres, thin_spheres
+from .progress import Progress, progress
+from .render import render
+from .run_folder import RunFolder
+from .scene import Scene
+from .train_state import TrainState
+
+MOST_FAILURES = 20
+"""Non-finite steps in a row after which training stops at the last good state."""
+LOG_EVERY = 50
+
+
+class StepResult(NamedTuple):
+    """What a step reports: detached scalars, and the picture for previews."""
+
+    loss: Tensor
+    l1: Tensor
+    ssim: Tensor
+    regulariser: float
+    render: Tensor
+    truth: Tensor
+    failed: str | None
+    """The name of the term that was not finite, if any; the step was dropped."""
+
+
+def training_step(state: TrainState, frames: Frames) -> StepResult:
+    """One frame: pose, render, compare, go back, step. Changes ``state``, except its ``step``."""
+    config, step = state.config, state.stage_step
+    pretraining = state.stage == "pretrain"
+    index = frames.index_at(step, config.pretrain.progressive and pretraining)
+    random_background = pretraining and config.pretrain.random_background
+    frame, camera, truth, background, mask = frames.view(index, state.step, random_background)
+    set_rates(state)
+
+    posed, regulariser = state.motion.train_at(state.gaussians, frame.time, step, config, config.seed)
+    collecting = pretraining or step < config.densify.until
+    image = render(
+        posed,
+        camera,
+        background,
+        sh_degree=min(state.gaussians.sh_degree, step // config.densify.sh_every),
+        stats=state.stats if collecting else None,
+        antialiased=config.antialiased,
+    )
+    picture = image.rgb.permute(2, 0, 1)
+    loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim)
+    total = loss if regulariser is None else loss + regulariser
+
+    failed = _not_finite(loss, regulariser)
+    if failed is None:
+        total.backward()
+        failed = _bad_gradient(state)
+    if failed is None:
+        state.gaussian_optimizer.step()
+        if state.motion_optimizer is not None and not frozen(state):
+            state.motion_optimizer.step()
+    state.gaussian_optimizer.zero_grad(set_to_none=True)
+    state.motion.zero_grad(set_to_none=True)
+    weighted = 0.0 if regulariser is None else float(regulariser.detach())
+    return StepResult(loss.detach(), l1.detach(), ssim.detach(), weighted, picture.detach(), truth, failed)
+
+
+def frozen(state: TrainState) -> bool:
+    """Main steps in which only the Gaussians learn (seed S4)."""
+    return state.stage == "main" and state.stage_step < state.config.freeze
+
+
+def set_rates(state: TrainState) -> None:
+    """Every learning rate is a function of the step."""
+    config, step = state.config, state.stage_step
+    means = log_linear(config.optim.means, config.optim.means_end, step, config.optim.means_until)
+    set_rate(state.gaussian_optimizer, "means", means)
+    if state.motion_optimizer is not None:
+        rates = state.motion.rates(step, config)
+        for group in state.motion_optimizer.param_groups:
+            group["lr"] = rates[group["name"]]
+
+
+def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
+    if not bool(torch.isfinite(loss)):
+        return "image loss"
+    if regulariser is not None and not bool(torch.isfinite(regulariser)):
+        return "regulariser"
+    return None
+
+
+def _bad_gradient(state: TrainState) -> str | None:
+    """Positions and the network see every term; the other gradients come through the same kernels."""
+    parameters = [("means", state.gaussians.means), *state.motion.named_parameters()]
+    for name, parameter in parameters:
+        if parameter.grad is not None and not bool(torch.isfinite(parameter.grad).all()):
+            return f"gradient of {name}"
+    return None
+
+
+def adapt(state: TrainState, size: tuple[int, int]) -> None:
+    """After the step: what the schedule wants of numbers of Gaussians and control points. ``stage_step`` is the step
+    just done."""
+    (_adapt_spheres if state.stage == "pretrain" else _adapt_gaussians)(state, size)
+
+
+def _adapt_spheres(state: TrainState, size: tuple[int, int]) -> None:
+    assert isinstance(state.motion, Spheres)
+    config, done = state.config, state.stage_step + 1
+    if done == config.pretrain.densify_until:
+        thin_spheres(state.gaussians, state.gaussian_optimizer, state.motion, config.motion.nodes)
+        state.reset_stats()
+    elif done < config.pretrain.densify_until and done % config.pretrain.densify_every == 0:
+        densify_spheres(state.gaussians, state.gaussian_optimizer, state.motion, state.stats, config, size, state.step)
+        state.reset_stats()
+
+
+def _adapt_gaussians(state: TrainState, size: tuple[int, int]) -> None:
+    config, done = state.config.densify, state.stage_step + 1
+    if done > config.until:
+        return
+    if done >= config.start and done % config.every == 0:
+        limit = threshold(config, *size)
+        if _nodes_due(state, done):
+            assert isinstance(state.motion, ControlPoints) and state.motion_optimizer is not None
+            node_limit = limit * config.node_grad_threshold / config.grad_threshold
+            gradient = mean_gradient(state.stats)
+            adapt_control_points(
+                state.motion, state.motion_optimizer, state.gaussians, gradient, grad_threshold=node_limit
+            )
+        densify(
+            state.gaussians,
+            state.gaussian_optimizer,
+            state.stats,
+            config,
+            grad_threshold=limit,
+            extent=state.extent,
+            prune_large=done > config.opacity_reset_every,
+            random=generator(state.config.seed, 51, state.step),
+        )
+        state.reset_stats()
+    if done % config.opacity_reset_every == 0 and done < config.until:
+        reset_opacities(state.gaussians, state.gaussian_optimizer)
+
+
+def _nodes_due(state: TrainState, done: int) -> bool:
+    """Control points change at the first densification after each of their own milestones."""
+    config = state.config.densify
+    if not isinstance(state.motion, ControlPoints) or done > config.nodes_until or done <= state.config.freeze:
+        return False
+    return done >= config.nodes_every and done % config.nodes_every < config.every
+
+
+@contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """Ctrl-C and SIGTERM ask for a stop instead of ending the process; a second one ends it."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+
+    def ask(number: int, frame: Any) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def fit(
+    config: TrainConfig,
+    data: Dataset,
+    *,
+    output: str | Path,
+    device: str = "cpu",
+    test: Dataset | None = None,
+    resume: bool = False,
+    settings: dict[str, Any] | None = None,
+) -> Scene:
+    """Train a scene; the run directory holds a resumable checkpoint at any time.
+
+    Args:
+        config: the complete configuration.
+        data: training frames.
+        output: run directory; made if needed.
+        device: where everything is computed.
+        test: held-out frames, looked at for the curve and the previews alone; nothing is selected by them.
+        resume: continue from the checkpoint in ``output``, to the same bits as an uninterrupted run.
+        settings: what to write to ``config.json``; default: the configuration.
+
+    Returns:
+        the scene after the last step.
+
+    Raises:
+        UserError: a bad configuration, a checkpoint that does not fit, repeated non-finite losses.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
+    """
+    check(config)
+    if len(data) == 0:
+        raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
+    with RunFolder(output, config, settings, resume=resume) as folder:
+        state = TrainState.resume(folder.path, config, device) if resume else TrainState.begin(config, data, device)
+        frames = Frames(data, state.normalisation, config, device)
+        folder.begin(state.step)
+        with progress(config.steps, "training", start=state.step) as bar, stop_signals() as stop:
+            _loop(state, frames, folder, test, bar, stop)
+        return state.scene()
+
+
+def _loop(
+    state: TrainState, frames: Frames, folder: RunFolder, test: Dataset | None, bar: Progress, stop: threading.Event
+) -> None:
+    config = state.config
+    saved_at = time.monotonic()
+    while state.step < config.steps:
+        if state.stage == "pretrain" and state.step >= config.pretrain_steps:
+            state.begin_main()
+        result = training_step(state, frames)
+        if result.failed is None:
+            state.failures = 0
+            adapt(state, (result.truth.shape[2], result.truth.shape[1]))
+        else:
+            _count_failure(state, result.failed, folder, bar)
+        state.step += 1
+        folder.record(state, result, bar)
+        if test is not None and (state.step % config.evaluate_every == 0 or state.step == config.steps):
+            folder.look_at_test(state.scene(), test)
+        now = time.monotonic()
+        if now - saved_at >= config.checkpoint_seconds or state.step == config.steps or stop.is_set():
+            state.save(folder.path)
+            saved_at = time.monotonic()
+        if stop.is_set() and state.step < config.steps:
+            bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
+            raise KeyboardInterrupt
+
+
+def _count_failure(state: TrainState, term: str, folder: RunFolder, bar: Progress) -> None:
+    state.failures += 1
+    bar.print(f"step {state.step}: {term} is not finite; the step was dropped")
+    folder.log({"step": state.step, "stage": state.stage, "dropped": term})
+    if state.failures >= MOST_FAILURES:
+        raise UserError(
+            f"{folder.path}: {term} was not finite {MOST_FAILURES} times in a row, up to step {state.step}; the "
+            "checkpoint holds the last good state; lower the learning rates or check the data, then --resume"
+        )

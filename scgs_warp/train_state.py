@@ -1,0 +1,163 @@
+"""Everything a training run is at one step, and how it is saved and resumed to the same bits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from . import checkpoint
+from .cameras import Overview, overview
+from .config import TrainConfig, to_dict
+from .data.dataset import Dataset
+from .data.normalise import Normalisation
+from .errors import UserError
+from .gaussians import GaussianParameters
+from .motion import build_motion
+from .motion.base import Motion
+from .motion.spheres import Spheres
+from .optim import adam, load_optimizer_tensors, optimizer_tensors
+from .pretrain import begin_gaussians, begin_spheres, control_points_of
+from .scene import Scene, scene_from
+from .types import Stats
+
+Stage = Literal["pretrain", "main"]
+
+
+class TrainState:
+    """Parameters, optimisers, statistics, step. ``step`` counts both stages; ``stage_step`` the present one."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        gaussians: GaussianParameters,
+        motion: Motion,
+        normalisation: Normalisation,
+        rig: Overview,
+        extent: float,
+        points: Tensor | None,
+        *,
+        stage: Stage,
+        step: int = 0,
+    ) -> None:
+        self.config, self.normalisation, self.overview = config, normalisation, rig
+        self.extent, self.points = extent, points
+        self.stage: Stage = stage
+        self.step = step
+        self.failures = 0
+        self.enter(gaussians, motion)
+
+    def enter(self, gaussians: GaussianParameters, motion: Motion) -> None:
+        """Take these models, with fresh optimisers and statistics."""
+        self.gaussians, self.motion = gaussians, motion
+        self.gaussian_optimizer = adam(dict(gaussians.named_parameters()), self.gaussian_rates())
+        self.motion_optimizer = motion.optimizer(self.config)
+        self.reset_stats()
+
+    @staticmethod
+    def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
+        normalisation = Normalisation.fit(data.cameras, data.points)
+        points = None if data.points is None else normalisation.apply(data.points).to(device)
+        rest = (normalisation, overview(data.cameras), data.extent * normalisation.scale, points)
+        if config.pretrain_steps > 0:
+            return TrainState(config, *begin_spheres(config, points, device), *rest, stage="pretrain")
+        gaussians = begin_gaussians(config, points, None, device)
+        return TrainState(config, gaussians, build_motion(config.motion.model, config).to(device), *rest, stage="main")
+
+    def begin_main(self) -> None:
+        """From stage 1 to stage 2: spheres become control points, new Gaussians are made."""
+        assert isinstance(self.motion, Spheres)
+        points = control_points_of(self.gaussians, self.motion, self.config)
+        gaussians = begin_gaussians(self.config, self.points, (self.gaussians, self.motion), str(self.device))
+        self.stage = "main"
+        self.enter(gaussians, points)
+
+    @property
+    def device(self) -> torch.device:
+        return self.gaussians.means.device
+
+    @property
+    def stage_step(self) -> int:
+        return self.step if self.stage == "pretrain" else self.step - self.config.pretrain_steps
+
+    def reset_stats(self) -> None:
+        absolute = self.config.densify.absolute_grad and self.stage == "main"
+        self.stats = Stats.zeros(len(self.gaussians), self.device, absolute)
+
+    def gaussian_rates(self) -> dict[str, float]:
+        """Learning rates of the Gaussians that do not follow a schedule, and where the others start."""
+        rates = self.config.optim
+        return {
+            "means": rates.means,
+            "quats": rates.quats,
+            "log_scales": rates.scales,
+            "opacity_logits": rates.opacity,
+            "sh_dc": rates.sh_dc,
+            "sh_rest": rates.sh_rest,
+            "hyper": rates.hyper,
+        }
+
+    def scene(self) -> Scene:
+        """The scene as it stands, for evaluation and pictures; shares the parameters."""
+        return Scene(self.gaussians, self.motion, self.normalisation, self.config, self.overview, step=self.step)
+
+    def save(self, folder: Path) -> None:
+        tensors = dict(self.scene().tensors())
+        tensors.update(optimizer_tensors(self.gaussian_optimizer, "adam.gaussians"))
+        if self.motion_optimizer is not None:
+            tensors.update(optimizer_tensors(self.motion_optimizer, "adam.motion"))
+        tensors.update({f"extra.{name}": value for name, value in self.motion.extra_state().items()})
+        for name in ("grad_norm", "count", "max_radii"):
+            tensors[f"stats.{name}"] = getattr(self.stats, name)
+        if self.points is not None:
+            tensors["points"] = self.points
+        metadata = {**self.scene().metadata(), "stage": self.stage, "extent": self.extent, "failures": self.failures}
+        checkpoint.write(folder, tensors, metadata)
+
+    @staticmethod
+    def resume(folder: Path, config: TrainConfig, device: str) -> TrainState:
+        """Continue from the checkpoint in ``folder``.
+
+        Raises:
+            UserError: there is none, it is damaged, or it was made with another configuration.
+        """
+        tensors, metadata = checkpoint.read(folder)
+        source = str(folder / checkpoint.FILE)
+        _same_configuration(metadata["config"], to_dict(config), source)
+        tensors = checkpoint.to_device(tensors, device)
+        scene = scene_from(tensors, metadata, device, source)
+        try:
+            state = TrainState(
+                config,
+                scene.gaussians,
+                scene.motion,
+                scene.normalisation,
+                scene.overview,
+                float(metadata["extent"]),
+                tensors.get("points"),
+                stage=metadata["stage"],
+                step=scene.step,
+            )
+            load_optimizer_tensors(state.gaussian_optimizer, "adam.gaussians", tensors)
+            if state.motion_optimizer is not None:
+                load_optimizer_tensors(state.motion_optimizer, "adam.motion", tensors)
+            state.motion.load_extra_state(checkpoint.strip(tensors, "extra."))
+            stats = checkpoint.strip(tensors, "stats.")
+            state.stats = Stats(stats["grad_norm"], stats["count"], stats["max_radii"], absolute=state.stats.absolute)
+            state.failures = int(metadata["failures"])
+        except (KeyError, ValueError, RuntimeError) as error:
+            raise UserError(f"{source}: cannot be resumed ({error}); train again without --resume") from error
+        return state
+
+
+def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
+    for name, value in wanted.items():
+        if isinstance(value, dict):
+            _same_configuration(saved.get(name, {}), value, source, f"{prefix}{name}.")
+        elif saved.get(name) != value:
+            raise UserError(
+                f"{source}: made with {prefix}{name} = {saved.get(name)!r}, now {value!r}; "
+                "give the same options to --resume, or another --output"
+            )
