@@ -201,11 +201,12 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
             points = _series(lines, key, positions)
             if points:
                 axes.plot(list(points), list(points.values()), style, label=label, markersize=3, linewidth=1.2)
-        if title == "loss" and axes.lines:
+        drawn = len(axes.lines)
+        if title == "loss" and drawn:
             axes.set_yscale("log")
         for _, start in starts[1:]:
             axes.axvline(start, color="0.6", linestyle=":", linewidth=1)
-        if axes.lines and len(series) > 1:
+        if drawn and len(series) > 1:
             axes.legend(frameon=False)
     FigureCanvasAgg(figure)
     try:

@@ -83,6 +83,17 @@ def test_stages_follow_each_other_and_resumed_steps_count_once() -> None:
     assert report._series(lines[:2] + lines[3:], "psnr", positions) == {0.0: 1.0, 10.0: 2.0, 15.0: 5.0}
 
 
+def test_an_evaluation_in_the_first_stage_does_not_shift_the_second(tmp_path: Path, monkeypatch) -> None:
+    lines = [{"step": 10, "stage": "pretrain"}, {"step": 10, "test_psnr": 20.0}, {"step": 20, "stage": "pretrain"},
+             {"step": 30, "stage": "main"}, {"step": 30, "test_psnr": 25.0}]  # fmt: skip
+    write_log(tmp_path / "log.jsonl", lines)
+    seen = {}
+    placed = report._placed
+    monkeypatch.setattr(report, "_placed", lambda lines: seen.setdefault("placed", placed(lines)))
+    report.curves(tmp_path / "log.jsonl", tmp_path / "curves.png")
+    assert list(seen["placed"][0].values()) == [10, 20, 30]
+
+
 @pytest.mark.parametrize("lines", [[], [{}], [{"step": 3}], [{"psnr": 3.0}], [{"step": None, "psnr": "x"}]])
 def test_curves_of_next_to_nothing(tmp_path: Path, lines: list) -> None:
     write_log(tmp_path / "log.jsonl", lines)
