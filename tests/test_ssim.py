@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from reference.ssim import photometric_loss as reference_loss
 from scgs_warp import environment
-from scgs_warp.kernels.ssim import BAND, BLOCK
+from scgs_warp.kernels.ssim_cpu import BAND, BLOCK
 from scgs_warp.ops.ssim import photometric_loss, ssim
 
 SHAPES = [(3, 37, 53), (1, 1, 1), (2, 5, 16), (3, 11, 17), (1, BAND + 1, 7), (3, BAND, 2 * BLOCK + 3), (4, 90, 31)]

@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from .. import warp_interop
 from ..kernels import ssim as kernels
+from ..kernels import ssim_cpu as cpu_kernels
 
 Form = Literal["auto", "pixel", "cpu"]
 
@@ -70,8 +71,8 @@ def photometric_loss(
 def _forward_bands(image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor | None) -> Tensor:
     channels, height, _ = image.shape
     sums = image.new_empty(2, channels, height)
-    bands = channels * -(-height // kernels.BAND)
-    warp_interop.launch(kernels.photometric_bands, bands, image, truth, mask, sums, partials, grain=1)
+    bands = channels * -(-height // cpu_kernels.BAND)
+    warp_interop.launch(cpu_kernels.photometric_bands, bands, image, truth, mask, sums, partials, grain=1)
     return sums
 
 
@@ -137,9 +138,9 @@ class _Photometric(torch.autograd.Function):
             v_means = torch.stack([v_l1 + (1.0 - ctx.weight) * v_loss, v_ssim - ctx.weight * v_loss])
             v_sums = (v_means.double() / count.clamp(min=1.0)).float()
             if ctx.simd:
-                bands = image.shape[0] * -(-image.shape[1] // kernels.BAND)
+                bands = image.shape[0] * -(-image.shape[1] // cpu_kernels.BAND)
                 warp_interop.launch(
-                    kernels.photometric_bands_adjoint, bands, image, truth, mask, partials, v_sums, v_image, grain=1
+                    cpu_kernels.photometric_bands_adjoint, bands, image, truth, mask, partials, v_sums, v_image, grain=1
                 )
             else:
                 _adjoint_pixels(image, truth, mask, partials, v_sums, v_image)
