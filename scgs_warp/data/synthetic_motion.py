@@ -1,0 +1,96 @@
+"""How the figure of the built-in scene moves: joint angles as smooth functions of time, and the skeleton they turn.
+
+From 0 to 1, one way: the right arm swings up from the hip into a wave (137 degrees at the shoulder) while the figure
+takes a step on the spot, looks from one side to the other, and its scarf and antenna follow.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+Vector = tuple[float, float, float]
+
+
+class Bone(NamedTuple):
+    """A joint: its place in the parent's frame (None: the world's)."""
+
+    parent: str | None
+    place: Vector
+
+
+BONES: dict[str, Bone] = {
+    "hips": Bone(None, (0.0, 0.0, -0.40)),
+    "torso": Bone("hips", (0.0, 0.0, 0.04)),
+    "neck": Bone("torso", (0.0, 0.0, 0.60)),
+    "head": Bone("neck", (0.0, 0.0, 0.03)),
+    "antenna": Bone("head", (0.0, 0.0, 0.56)),
+    "scarf": Bone("neck", (0.15, -0.20, -0.02)),
+    "scarf_tip": Bone("scarf", (0.0, 0.0, -0.24)),
+    "shoulder_left": Bone("torso", (0.365, 0.0, 0.45)),
+    "elbow_left": Bone("shoulder_left", (0.0, 0.0, -0.28)),
+    "shoulder_right": Bone("torso", (-0.365, 0.0, 0.45)),
+    "elbow_right": Bone("shoulder_right", (0.0, 0.0, -0.28)),
+    "hip_left": Bone("hips", (0.145, 0.0, -0.06)),
+    "knee_left": Bone("hip_left", (0.0, 0.0, -0.26)),
+    "hip_right": Bone("hips", (-0.145, 0.0, -0.06)),
+    "knee_right": Bone("hip_right", (0.0, 0.0, -0.26)),
+}
+
+
+def smoother_step(x: float) -> float:
+    """0 to 1 with zero first and second derivatives at both ends (Perlin's quintic)."""
+    x = min(max(x, 0.0), 1.0)
+    return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
+
+
+def rotation(x: float, y: float, z: float) -> np.ndarray:
+    """[3, 3] Rz Ry Rx of angles in degrees."""
+    result = np.eye(3)
+    for axis, degrees in ((2, z), (1, y), (0, x)):
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        turn = np.eye(3)
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
+        result = result @ turn
+    return result
+
+
+def joint_angles(time: float) -> dict[str, Vector]:
+    """Degrees about x, y, z of every joint that moves. Forward is -y: a negative x angle swings a limb forward."""
+    wave = math.sin(2.0 * math.pi * time)
+    late = smoother_step(1.25 * time - 0.1)
+    rise = smoother_step(time)
+    return {
+        "hips": (2.0 * math.sin(2.0 * math.pi * time + 0.5), 0.0, 7.0 * wave),
+        "torso": (-3.0, 4.0 * rise, -12.0 * wave),
+        "head": (4.0 - 8.0 * rise, 7.0 * wave, -32.0 + 60.0 * rise),
+        "antenna": (9.0 * math.sin(4.0 * math.pi * time), 14.0 * math.cos(3.0 * math.pi * time), 0.0),
+        "scarf": (-16.0 - 10.0 * wave, -8.0 + 14.0 * math.sin(2.0 * math.pi * time - 0.7), 0.0),
+        "scarf_tip": (-6.0 - 10.0 * math.sin(2.0 * math.pi * time - 0.9), 12.0 * math.cos(2.0 * math.pi * time), 0.0),
+        "shoulder_right": (-8.0 - 12.0 * rise, 16.0 + 137.0 * rise, 0.0),
+        "elbow_right": (-22.0 + 4.0 * wave, -4.0 + 30.0 * math.sin(3.0 * math.pi * late) * late, 0.0),
+        "shoulder_left": (26.0 * wave, -18.0 - 14.0 * rise, 0.0),
+        "elbow_left": (-28.0 - 34.0 * rise, 0.0, 0.0),
+        "hip_left": (-24.0 * wave, -3.0, 0.0),
+        "knee_left": (20.0 + 18.0 * math.sin(2.0 * math.pi * time + 0.4), 0.0, 0.0),
+        "hip_right": (24.0 * wave, 3.0, 0.0),
+        "knee_right": (20.0 - 18.0 * math.sin(2.0 * math.pi * time + 0.4), 0.0, 0.0),
+    }
+
+
+def bone_transforms(time: float) -> dict[str, np.ndarray]:
+    """[4, 4] bone to world of every bone at ``time`` in [0, 1]."""
+    angles = joint_angles(time)
+    transforms: dict[str, np.ndarray] = {}
+    for name, bone in BONES.items():  # parents come first
+        own = np.eye(4)
+        own[:3, :3] = rotation(*angles.get(name, (0.0, 0.0, 0.0)))
+        own[:3, 3] = bone.place
+        if bone.parent is None:
+            own[2, 3] += 0.035 * math.cos(4.0 * math.pi * time)
+            own[0, 3] += 0.03 * math.sin(2.0 * math.pi * time)
+        transforms[name] = own if bone.parent is None else transforms[bone.parent] @ own
+    return transforms
