@@ -162,7 +162,7 @@ def rbf_weights(
     # Out:
     weights_out: wp.array2d[float],  # [N, K]
 ):
-    """A softmax over a Gaussian's neighbours of ``log s - d^2 / (2 r^2)``; all weight to the first if none is finite."""
+    """Softmax over a Gaussian's neighbours of ``log s - d^2 / (2 r^2)``; all weight to the first if none is finite."""
     i = first + wp.tid()
     K = indices_in.shape[1]
     top = float(-wp.inf)

@@ -6,11 +6,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.nn.functional import normalize
+
 from reference import arap as twin
 from reference.neighbors import nearest
 from reference.skinning import matrix
-from torch.nn.functional import normalize
-
 from scgs_warp import environment
 from scgs_warp.ops.arap import arap_energy, local_rotations, reverse_edges, trajectory_graph
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import neighbors as twin
 
+from reference import neighbors as twin
 from scgs_warp import environment
 from scgs_warp.kernels import neighbors as kernels
 from scgs_warp.ops.neighbors import nearest, node_lists, rbf_weights

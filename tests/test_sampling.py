@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import sampling as twin
 
+from reference import sampling as twin
 from scgs_warp import environment
 from scgs_warp.ops import sampling
 from scgs_warp.ops.sampling import farthest_points
@@ -40,7 +42,7 @@ def test_each_choice_is_the_farthest(device):
     points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1))
     picked = points[farthest_points(points.to(device), 100).cpu()]
     gaps = [float(torch.cdist(picked[i : i + 1], picked[:i]).min()) for i in range(1, 100)]
-    assert all(later <= earlier + 1e-5 for earlier, later in zip(gaps, gaps[1:]))
+    assert all(later <= earlier + 1e-5 for earlier, later in itertools.pairwise(gaps))
 
 
 def test_points_that_are_not_finite_come_last(device):

@@ -6,13 +6,14 @@ import dataclasses
 
 import pytest
 import torch
-from reference import skinning as twin
-from reference.neighbors import nearest
 from torch.nn.functional import normalize
 
+from reference import neighbors as neighbors_twin
+from reference import skinning as twin
+from reference.neighbors import nearest
 from scgs_warp import environment
 from scgs_warp.ops.neighbors import node_lists
-from scgs_warp.ops.skinning import skin
+from scgs_warp.ops.skinning import skin, skin_rbf
 from scgs_warp.types import Pose
 
 FIELDS = ("translations", "rotations", "shape_rotations", "log_scales")
@@ -170,3 +171,93 @@ def test_shapes_that_do_not_fit():
         skin(means, quats, nodes, Pose(translations, rotations[:, :3]), indices, weights)
     with pytest.raises(ValueError, match="indices"):
         skin(means, quats, nodes, pose, indices.long(), weights)
+
+
+def fused_inputs(seed, n, m, k, *, shape=False, scales=False, strong=False, hyper=0):
+    """The tensors of ``skin_rbf`` by name, and indices."""
+    tensors, indices = inputs(seed, n, m, k, shape=shape, scales=scales)
+    generator = torch.Generator().manual_seed(1000 + seed)
+    names = "means", "quats", "nodes", None, *FIELDS
+    named = {name: t for name, t in zip(names, tensors, strict=True) if name and t is not None}
+    named["radii"] = 0.4 + torch.rand(m, generator=generator)
+    if strong:
+        named["strengths"] = 0.05 + torch.rand(m, generator=generator)
+    if hyper:
+        named["hyper_points"] = 0.3 * torch.randn(n, hyper, generator=generator)
+        named["hyper_nodes"] = 0.3 * torch.randn(m, hyper, generator=generator)
+    return named, indices
+
+
+def fused_twin(means, quats, nodes, radii, pose, indices, strengths=None, hyper_points=None, hyper_nodes=None):
+    points = means if hyper_points is None else torch.cat([means, hyper_points], 1)
+    centers = nodes if hyper_nodes is None else torch.cat([nodes, hyper_nodes], 1)
+    return twin.skin(
+        means, quats, nodes, pose, indices, neighbors_twin.rbf_weights(points, centers, radii, indices, strengths)
+    )
+
+
+def run_fused(function, named, indices, seed=7):
+    leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in named.items()}
+    pose = Pose(**{name: leaves[name] for name in FIELDS if name in leaves})
+    rest = {name: leaf for name, leaf in leaves.items() if name not in FIELDS}
+    outputs = [o for o in function(**rest, pose=pose, indices=indices) if o is not None]
+    generator = torch.Generator().manual_seed(seed)
+    torch.autograd.backward(outputs, [torch.randn(o.shape, generator=generator).to(o) for o in outputs])
+    return [o.detach() for o in outputs], {name: leaf.grad for name, leaf in leaves.items()}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"shape": True}, {"scales": True}, {"strong": True}, {"hyper": 2},
+     {"shape": True, "scales": True, "strong": True, "hyper": 8}, {"hyper": 9, "strong": True}],
+)  # fmt: skip
+@pytest.mark.parametrize(
+    ("n", "m", "k"), [(333, 40, 4), (5001, 20, 3), (1, 1, 1), (50, 6, 6), (60, 30, 1), (47, 40, 16)]
+)
+def test_weights_and_skinning_in_one_pass(device, n, m, k, options):
+    named, indices = fused_inputs(3, n, m, k, **options)
+    outputs, grads = run_fused(skin_rbf, {x: t.to(device) for x, t in named.items()}, indices.to(device))
+    expected, expected_grads = run_fused(fused_twin, {x: t.double() for x, t in named.items()}, indices)
+    for a, e in zip(outputs, expected, strict=True):
+        torch.testing.assert_close(a.cpu().double(), e, rtol=1e-5, atol=2e-5)
+    for name, e in expected_grads.items():
+        scale = float(e.abs().max())
+        torch.testing.assert_close(
+            grads[name].cpu().double(), e, rtol=3e-4, atol=3e-5 * scale + 1e-6, msg=lambda s, n=name: f"{n}: {s}"
+        )
+        assert k == 1 or scale > 1e-3, name
+
+
+def test_one_pass_of_nothing_and_of_shapes_that_do_not_fit(device):
+    named, indices = fused_inputs(0, 0, 5, 2, scales=True, strong=True, hyper=2)
+    outputs, grads = run_fused(skin_rbf, {x: t.to(device) for x, t in named.items()}, indices.to(device))
+    assert [tuple(o.shape) for o in outputs] == [(0, 3), (0, 4), (0, 3)]
+    assert all(not g.any() for g in grads.values())
+    for bad in ("radii", "strengths", "hyper_nodes"):
+        with pytest.raises(ValueError, match=bad):
+            run_fused(skin_rbf, {**named, bad: named[bad][1:]}, indices)
+
+
+def test_poison_in_one_pass(device):
+    named, indices = fused_inputs(4, 300, 20, 4, shape=True, scales=True, strong=True, hyper=2)
+    clean_outputs, _ = run_fused(skin_rbf, {x: t.to(device) for x, t in named.items()}, indices.to(device))
+    named["means"][7, 1], named["quats"][40], named["means"][41] = float("nan"), float("inf"), 1e30
+    named["radii"][3], named["quats"][50] = 1e-30, 0.0
+    outputs, grads = run_fused(skin_rbf, {x: t.to(device) for x, t in named.items()}, indices.to(device))
+    good = [i for i in range(300) if i not in (7, 40, 41, 50) and 3 not in indices[i].tolist()]
+    for a, b in zip(outputs, clean_outputs, strict=True):
+        assert torch.equal(a[good], b[good])
+    for name, grad in grads.items():
+        assert grad.isfinite().all(), name
+    assert not grads["means"][[7, 40]].any() and not grads["quats"][[7, 40, 50]].any()
+
+
+def test_one_pass_gives_the_same_bits_for_any_number_of_threads(all_threads):
+    named, indices = fused_inputs(8, 20_001, 512, 4, scales=True, strong=True)
+    results = []
+    for threads in (1, 2, 3):
+        environment.configure(threads=threads)
+        outputs, grads = run_fused(skin_rbf, named, indices)
+        results.append([*outputs, *grads.values()])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))

@@ -12,7 +12,7 @@ from ..warp_interop import launch
 
 
 class NodeLists(NamedTuple):
-    """The (Gaussian, neighbour) pairs of every node, in ascending order: the order in which its gradients are summed."""
+    """The (Gaussian, neighbour) pairs of every node, ascending: the order in which its gradients are summed."""
 
     order: Tensor
     """[N * K] int32, pairs ``i * K + k`` sorted by node."""

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from ..kernels import skinning as kernels
+from ..kernels import skinning_cpu, skinning_palette
 from ..types import Pose
 from ..warp_interop import launch
-from .neighbors import NodeLists, chunk_size, node_lists
+from .neighbors import NodeLists, chunk_size, node_lists, rbf_weights
 
 
 class _Skin(torch.autograd.Function):
@@ -69,7 +70,17 @@ def _node_sums(pairs: tuple, scaled: int, lists: NodeLists | None) -> tuple[int,
     return 1, sums
 
 
-def _validate(means: Tensor, quats: Tensor, nodes: Tensor, pose: Pose, indices: Tensor, weights: Tensor) -> None:
+def _pose_tensors(pose: Pose) -> tuple[Tensor | None, ...]:
+    return pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales
+
+
+def _check_shapes(expected: dict[str, tuple[Tensor | None, tuple[int, ...]]]) -> None:
+    for name, (value, shape) in expected.items():
+        if value is not None and tuple(value.shape) != shape:
+            raise ValueError(f"{name} must be {list(shape)}, got {tuple(value.shape)}")
+
+
+def _validate(means: Tensor, quats: Tensor, nodes: Tensor, pose: Pose, indices: Tensor, weights: Tensor | None) -> None:
     if means.ndim != 2 or means.shape[1] != 3:
         raise ValueError(f"means must be [N, 3], got {tuple(means.shape)}")
     if nodes.ndim != 2 or nodes.shape[1] != 3:
@@ -86,9 +97,7 @@ def _validate(means: Tensor, quats: Tensor, nodes: Tensor, pose: Pose, indices: 
         "pose.shape_rotations": (pose.shape_rotations, (count, 4)),
         "pose.log_scales": (pose.log_scales, (count, 3)),
     }
-    for name, (value, shape) in expected.items():
-        if value is not None and tuple(value.shape) != shape:
-            raise ValueError(f"{name} must be {list(shape)}, got {tuple(value.shape)}")
+    _check_shapes(expected)
 
 
 def skin(
@@ -124,6 +133,120 @@ def skin(
         ValueError: shapes do not fit.
     """
     _validate(means, quats, nodes, pose, indices, weights)
-    floats = means, quats, nodes, pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales
+    floats = means, quats, nodes, *_pose_tensors(pose)
     values = (None if value is None else value.contiguous() for value in floats)
     return _Skin.apply(*values, indices.contiguous(), weights.contiguous(), lists)  # type: ignore[return-value]
+
+
+class _SkinRbf(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose_and_indices):
+        translations, rotations, shapes, log_scales, indices = pose_and_indices
+        flags = tuple(int(value is not None) for value in (hyper, strengths, log_scales))
+        total, count = means.shape[0], nodes.shape[0]
+        both = rotations if shapes is None else shapes
+        motion, reach = (torch.empty(count, skinning_palette.ROW) for _ in range(2))
+        launch(
+            skinning_palette.palette,
+            count,
+            *(nodes, hyper_nodes, flags[0], radii, strengths, flags[1]),
+            *(translations, rotations, both, log_scales, flags[2], motion, reach),
+            grain=128,
+        )
+        weights = torch.empty(indices.shape)
+        outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(means) if flags[2] else None
+        launch(
+            skinning_cpu.skin_rbf_lanes,
+            -(-total // skinning_cpu.LANES),
+            *(means, quats, hyper, flags[0], motion, reach, flags[2], indices, weights, *outputs),
+            grain=32,
+        )
+        saved = means, quats, hyper, nodes, hyper_nodes, radii, strengths, translations, rotations, shapes, log_scales
+        ctx.save_for_backward(*saved, indices, weights, motion, reach)
+        ctx.flags = flags
+        return outputs
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients):  # type: ignore[override]
+        means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose, indices, weights, motion, reach = (
+            ctx.saved_tensors
+        )
+        translations, rotations, shapes, log_scales = pose
+        (has_hyper, has_strengths, has_log_scales), count = ctx.flags, nodes.shape[0]
+        v_outputs = (None if v is None else v.contiguous() for v in gradients)
+        size = chunk_size(count)
+        chunks = -(-means.shape[0] // size)
+        v_motion, v_reach = (torch.zeros(chunks, count, skinning_palette.ROW) for _ in range(2))
+        v_means, v_quats, v_hyper = _like(means, quats, hyper)
+        launch(
+            skinning_cpu.skin_rbf_lanes_adjoint,
+            chunks,
+            *(size, means, quats, hyper, has_hyper, motion, reach, has_log_scales, indices, weights, *v_outputs),
+            *(v_means, v_quats, v_hyper, v_motion.view(-1, 16), v_reach.view(-1, 16)),
+            grain=1,
+        )
+        of_nodes = _like(nodes, hyper_nodes, radii, strengths)
+        of_pose = _like(translations, rotations, shapes, log_scales)
+        both = rotations if shapes is None else shapes
+        launch(
+            skinning_palette.palette_adjoint,
+            count,
+            *(chunks, nodes, has_hyper, radii, strengths, has_strengths),
+            *(rotations, both, int(shapes is not None), has_log_scales, v_motion, v_reach, *of_nodes, *of_pose),
+            grain=64,
+        )
+        return v_means, v_quats, v_hyper, *of_nodes, *of_pose, None
+
+
+def _like(*values: Tensor | None) -> list[Tensor | None]:
+    return [None if value is None else torch.empty_like(value) for value in values]
+
+
+def skin_rbf(
+    means: Tensor,
+    quats: Tensor,
+    nodes: Tensor,
+    radii: Tensor,
+    pose: Pose,
+    indices: Tensor,
+    strengths: Tensor | None = None,
+    hyper_points: Tensor | None = None,
+    hyper_nodes: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """``skin`` with the weights of ``rbf_weights``, in one pass and one adjoint pass where the device is a CPU.
+
+    Args:
+        means, quats, nodes, pose, indices: as in ``skin``.
+        radii, strengths: as in ``rbf_weights``.
+        hyper_points: [N, H] further coordinates of the Gaussians, for the weights alone. None: none.
+        hyper_nodes: [M, H] of the control points; given exactly where ``hyper_points`` is.
+
+    Returns:
+        As ``skin``. Gradients flow to all tensors except the indices.
+
+    Raises:
+        ValueError: shapes do not fit.
+    """
+    if (hyper_points is None) != (hyper_nodes is None):
+        raise ValueError("hyper_points and hyper_nodes must be given together")
+    width = 0 if hyper_points is None else hyper_points.shape[-1]
+    _validate(means, quats, nodes, pose, indices, None)
+    total, count = means.shape[0], nodes.shape[0]
+    expected = {
+        "radii": (radii, (count,)),
+        "strengths": (strengths, (count,)),
+        "hyper_points": (hyper_points, (total, width)),
+        "hyper_nodes": (hyper_nodes, (count, width)),
+    }
+    _check_shapes(expected)
+    fits = indices.shape[1] <= skinning_cpu.MAX_NEIGHBORS and 3 + width <= skinning_palette.REACH_POINT
+    if means.device.type != "cpu" or not fits:
+        points = means if hyper_points is None else torch.cat([means, hyper_points], 1)
+        centers = nodes if hyper_nodes is None else torch.cat([nodes, hyper_nodes], 1)
+        lists = node_lists(indices, count) if means.device.type == "cuda" and torch.is_grad_enabled() else None
+        weights = rbf_weights(points, centers, radii, indices, strengths, lists=lists)
+        return skin(means, quats, nodes, pose, indices, weights, lists=lists)
+    floats = means, quats, hyper_points, nodes, hyper_nodes, radii, strengths, *_pose_tensors(pose)
+    values = (None if value is None else value.contiguous() for value in floats)
+    return _SkinRbf.apply(*values, indices.contiguous())  # type: ignore[return-value]
