@@ -68,6 +68,7 @@ def pack_splats(
 
 _PRELUDE = f"""
 #if !defined(__CUDA_ARCH__)
+    #pragma clang fp contract(on)
     typedef float vf __attribute__((vector_size(64)));
     typedef int vi __attribute__((vector_size(64)));
     typedef unsigned vu __attribute__((vector_size(64)));
