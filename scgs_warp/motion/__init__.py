@@ -10,11 +10,12 @@ from torch import Tensor
 from ..config import TrainConfig
 from .base import Motion
 from .control_points import ControlPoints, heads_of, make_network
+from .hexplane import HexPlane
 from .per_gaussian import PER_GAUSSIAN_HEADS, PerGaussian
 from .spheres import Spheres
 from .static import Static
 
-__all__ = ["ControlPoints", "Motion", "PerGaussian", "Spheres", "Static", "build_motion"]
+__all__ = ["ControlPoints", "HexPlane", "Motion", "PerGaussian", "Spheres", "Static", "build_motion"]
 
 
 def build_motion(name: str, config: TrainConfig, state: Mapping[str, Tensor] | None = None) -> Motion:
@@ -25,6 +26,8 @@ def build_motion(name: str, config: TrainConfig, state: Mapping[str, Tensor] | N
     """
     if name == "static":
         return Static()
+    if name == "hexplane":
+        return HexPlane(config.seed)
     if name == "per-gaussian":
         return PerGaussian(make_network(config.motion, PER_GAUSSIAN_HEADS, config.seed))
     if name == "spheres":

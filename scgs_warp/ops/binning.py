@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -41,41 +43,35 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE) -> Tiles:
     size = (splats.width, splats.height, columns, rows, tile_size)
 
     counts = torch.empty(count, dtype=torch.int32, device=device)
-    keys = torch.empty(2 * count, device=device)
-    order = torch.empty(2 * count, dtype=torch.int32, device=device)
-    launch(kernels.count_tiles, count, *geometry, *size, counts, keys, order)
+    launch(kernels.count_tiles, count, *geometry, *size, counts)
     offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
     torch.cumsum(counts, 0, out=offsets[1:])
     pairs = int(offsets[-1])
     if pairs > MAX_PAIRS:
         raise ValueError(f"splats: {pairs} pairs of splat and tile, more than 2^31 - 1; reduce the image or the splats")
 
-    # Splats are sorted by depth once; their pairs, emitted in that order, then need a stable sort by tile alone.
-    _sort(keys, order, count, 0, 32)
-    ranked = torch.empty_like(counts)
-    launch(kernels.gather_counts, count, counts, order, ranked)
-    ends = torch.cumsum(ranked, 0)
-    tiles = torch.empty(2 * pairs, dtype=torch.int32, device=device)
+    # The sort is stable and slots ascend with the splat's index: so equal depths are in the order of the index.
+    keys = torch.empty(2 * pairs, dtype=torch.int64, device=device)
     slots = torch.empty(2 * pairs, dtype=torch.int32, device=device)
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
-    launch(kernels.emit_pairs, count, *geometry, order, offsets, ends, *size, tiles, slots, owners)
-    _sort(tiles, slots, pairs, 0, (columns * rows - 1).bit_length())
+    launch(kernels.emit_pairs, count, *geometry, offsets, *size, keys, slots, owners)
+    _sort(keys, slots, pairs, 32 + (columns * rows - 1).bit_length())
     sorted_splats = torch.empty_like(owners)
     launch(kernels.gather_owners, pairs, slots, owners, sorted_splats)
     ranges = torch.empty(columns * rows, 2, dtype=torch.int32, device=device)
-    launch(kernels.tile_ranges, columns * rows, tiles, pairs, ranges)
+    launch(kernels.tile_ranges, columns * rows, keys, pairs, ranges)
     return Tiles(ranges, sorted_splats, slots[:pairs], offsets, splats.width, splats.height, columns, rows, tile_size)
 
 
-def _sort(keys: Tensor, values: Tensor, count: int, begin_bit: int, end_bit: int) -> None:
+def _sort(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
     """Stable radix sort of the first halves; the second halves are scratch."""
     if count == 0:
         return
+    stream = contextlib.nullcontext()
     if keys.is_cuda:
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(keys.device)), sync_enter=False):
-            wp.utils.radix_sort_pairs(warp_view(keys), warp_view(values), count, begin_bit, end_bit)
-    else:
-        wp.utils.radix_sort_pairs(warp_view(keys), warp_view(values), count, begin_bit, end_bit)
+        stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(keys.device)), sync_enter=False)
+    with stream:
+        wp.utils.radix_sort_pairs(warp_view(keys), warp_view(values), count, 0, bits)
 
 
 def _validate(splats: Splats, tile_size: int) -> None:

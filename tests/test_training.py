@@ -1,0 +1,196 @@
+"""The loop: it learns, it survives, and it gives the same bits."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import tiny_config, tiny_dataset
+
+from scgs_warp import environment
+from scgs_warp.config import with_steps
+from scgs_warp.errors import UserError
+from scgs_warp.evaluate import evaluate
+from scgs_warp.metrics import psnr
+from scgs_warp.scene import Scene
+from scgs_warp.train import fit
+
+MODELS = ["control-points", "per-gaussian", "hexplane", "static"]
+
+
+def checkpoint_bytes(folder: Path) -> bytes:
+    return (folder / "checkpoint.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_motion_model_learns(model, tmp_path, device):
+    data, test = tiny_dataset(), tiny_dataset(4, split="test")
+    config = tiny_config(200, motion={"model": model})
+    scene = fit(config, data, output=tmp_path / "run", device=device, test=test)
+    black = sum(float(psnr(torch.zeros_like(f.image), f.image)) for f in test) / len(test)
+    assert evaluate(scene, test)["psnr"] > black + 4.0
+    log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    assert log[-1]["loss" if "loss" in log[-1] else "test_psnr"] is not None
+    losses = [entry["loss"] for entry in log if "loss" in entry]
+    assert losses[-1] < losses[0]
+
+
+def test_checkpoint_round_trip(tmp_path, device):
+    data = tiny_dataset(6)
+    scene = fit(tiny_config(40), data, output=tmp_path / "run", device=device)
+    scene.freeze_binding()
+    loaded = Scene.load(tmp_path / "run", device=device)
+    for frame in data:
+        assert torch.equal(scene.render(frame.camera, frame.time).rgb, loaded.render(frame.camera, frame.time).rgb)
+    assert loaded.step == 40
+    posed = loaded.gaussians_at(0.3)
+    assert posed.means.shape == (loaded.gaussian_count, 3)
+    assert loaded.control_points_at(0.3).shape == (loaded.control_point_count, 3)
+
+
+def test_same_seed_same_bits_whatever_the_threads(tmp_path, all_threads):
+    data = tiny_dataset(6)
+    results = []
+    for name, threads in (("a", 2), ("b", 2), ("c", 1)):
+        environment.configure(threads)
+        fit(tiny_config(60), data, output=tmp_path / name)
+        results.append(checkpoint_bytes(tmp_path / name))
+    assert results[0] == results[1], "two runs with one seed differ"
+    assert results[0] == results[2], "one thread and two differ"
+    fit(tiny_config(60, seed=1), data, output=tmp_path / "d")
+    assert checkpoint_bytes(tmp_path / "d") != results[0]
+
+
+KILLED = """
+import sys, scgs_warp
+from scgs_warp import environment
+environment.configure()
+from tiny import tiny_config, tiny_dataset
+from scgs_warp.train import fit
+from scgs_warp import train_state
+import os, signal
+save = train_state.TrainState.save
+def save_and_die(self, folder):
+    save(self, folder)
+    if self.step >= {step}:
+        os.kill(os.getpid(), signal.SIGKILL)
+train_state.TrainState.save = save_and_die
+fit(tiny_config(60, checkpoint_seconds=0.0), tiny_dataset(6), output=sys.argv[1])
+"""
+
+
+@pytest.mark.parametrize("step", [5, 8, 33])
+def test_killed_and_resumed_gives_the_same_bits(step, tmp_path):
+    """Killed in stage 1, at its end, and in stage 2."""
+    data = tiny_dataset(6)
+    config = tiny_config(60, checkpoint_seconds=0.0)
+    fit(config, data, output=tmp_path / "whole")
+    here = Path(__file__).parent
+    environ = {**os.environ, "PYTHONPATH": str(here)}
+    script = KILLED.format(step=step)
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "cut")], env=environ, capture_output=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+    fit(config, data, output=tmp_path / "cut", resume=True)
+    assert checkpoint_bytes(tmp_path / "cut") == checkpoint_bytes(tmp_path / "whole")
+    steps = [json.loads(line).get("step") for line in (tmp_path / "cut/log.jsonl").read_text().splitlines()]
+    assert steps == sorted(steps), "log lines of the lost steps were kept"
+
+
+def test_interrupt_saves(tmp_path, monkeypatch):
+    from scgs_warp import train
+
+    data = tiny_dataset(6)
+    step = train.training_step
+
+    def interrupting(state, frames):
+        if state.step == 20:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return step(state, frames)
+
+    monkeypatch.setattr(train, "training_step", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        fit(tiny_config(60), data, output=tmp_path / "run")
+    monkeypatch.undo()
+    fit(tiny_config(60), data, output=tmp_path / "run", resume=True)
+    fit(tiny_config(60), data, output=tmp_path / "whole")
+    assert checkpoint_bytes(tmp_path / "run") == checkpoint_bytes(tmp_path / "whole")
+
+
+def test_a_bad_frame_is_dropped_and_named(tmp_path, capsys):
+    data = tiny_dataset(6)
+    data[2].image[5, 5, 0] = float("nan")
+    scene = fit(tiny_config(60), data, output=tmp_path / "run")
+    log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    dropped = [entry for entry in log if "dropped" in entry]
+    assert dropped and all(entry["dropped"] == "image loss" for entry in dropped)
+    assert len(dropped) == 10
+    assert all(bool(torch.isfinite(value).all()) for value in scene.tensors().values())
+
+
+def test_repeated_failure_stops_at_the_last_good_state(tmp_path):
+    data = tiny_dataset(3)
+    for frame in data:
+        frame.image[:] = float("inf")
+    with pytest.raises(UserError, match="not finite 20 times"):
+        fit(tiny_config(60), data, output=tmp_path / "run")
+
+
+def test_refusals(tmp_path):
+    data = tiny_dataset(3)
+    config = tiny_config(20)
+    with pytest.raises(UserError, match="no frames"):
+        fit(config, type(data)([], folder=Path("empty"), split="train"), output=tmp_path / "a")
+    fit(config, data, output=tmp_path / "run")
+    with pytest.raises(UserError, match="holds a run already"):
+        fit(config, data, output=tmp_path / "run")
+    with pytest.raises(UserError, match="made with steps"):
+        fit(with_steps(config, 40), data, output=tmp_path / "run", resume=True)
+    with pytest.raises(UserError, match="no checkpoint"):
+        fit(config, data, output=tmp_path / "new", resume=True)
+    path = tmp_path / "run/checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(UserError, match="damaged"):
+        Scene.load(tmp_path / "run")
+    with pytest.raises(UserError, match="no such run"):
+        Scene.load(tmp_path / "nowhere")
+
+
+def test_two_trainers_cannot_share_a_directory(tmp_path):
+    from scgs_warp.run_folder import RunFolder
+
+    config = tiny_config(20)
+    with (
+        RunFolder(tmp_path / "run", config, None, resume=False),
+        pytest.raises(UserError, match="another trainer"),
+        RunFolder(tmp_path / "run", config, None, resume=False),
+    ):
+        pass
+
+
+def test_max_gaussians_bounds_the_model(tmp_path):
+    config = tiny_config(150, densify={"max_gaussians": 320, "grad_threshold": 1e-9})
+    scene = fit(config, tiny_dataset(6), output=tmp_path / "run")
+    assert 100 < scene.gaussian_count <= 320
+
+
+def test_fit_runs_in_a_thread(tmp_path):
+    """Signals belong to the main thread; elsewhere training works without them."""
+    errors = []
+
+    def work():
+        try:
+            fit(tiny_config(12), tiny_dataset(3), output=tmp_path / "run")
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert not errors
