@@ -14,69 +14,83 @@ from .types import ALPHA_MIN
 
 wp.set_module_options({"enable_backward": False})
 
-DEPTH_CULLED = wp.constant(3.0e38)
-"""Sort key of splats that touch nothing; finite, so that a float sort never sees a NaN or an infinity."""
-
-Q_SLACK = wp.constant(1.0e-3)
+REACH_SLACK = wp.constant(1.0e-3)
 """Added to the ellipse: what float32 rounding may take from q, so that no pixel at the threshold loses its splat."""
 
 
 @wp.struct
 class Ellipse:
     mean: wp.vec2
-    conic: wp.vec3
+    reach: float  # q at the edge; negative: the splat is culled
     determinant: float
-    q: float  # squared size of the ellipse; negative: the splat is culled
+    scale: float  # 1 / A
+    shear: float  # -B / A
+    half_height: float
+    tip: float  # dy of the rightmost point; the leftmost lies at -tip
 
 
 @wp.func
 def splat_ellipse(mean: wp.vec2, conic: wp.vec3, opacity: float, depth: float, radius: wp.vec2i) -> Ellipse:
     e = Ellipse()
-    e.mean = mean
-    e.conic = conic
-    e.q = float(-1.0)
-    finite = wp.isfinite(mean) and wp.isfinite(conic) and wp.isfinite(opacity) and wp.isfinite(depth)
-    if finite and radius[0] > 0 and radius[1] > 0 and opacity >= ALPHA_MIN:
-        # In float64: of a needle's determinant float32 leaves nothing but rounding.
-        determinant = float(wp.float64(conic[0]) * wp.float64(conic[2]) - wp.float64(conic[1]) * wp.float64(conic[1]))
-        if determinant > 0.0 and conic[0] > 0.0 and conic[2] > 0.0:
-            e.determinant = determinant
-            e.q = wp.max(2.0 * wp.log(opacity / ALPHA_MIN), 0.0) + Q_SLACK
+    e.reach = float(-1.0)
+    if radius[0] <= 0 or radius[1] <= 0 or not opacity >= ALPHA_MIN:
+        return e
+    # A sum of finite products is finite unless one of them is not (or so large that the splat is beyond use).
+    if not wp.isfinite(mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + opacity + depth):
+        return e
+    # In float64: of a needle's determinant float32 leaves nothing but rounding.
+    determinant = float(wp.float64(conic[0]) * wp.float64(conic[2]) - wp.float64(conic[1]) * wp.float64(conic[1]))
+    if determinant > 0.0 and conic[0] > 0.0:
+        e.mean = mean
+        e.reach = wp.max(2.0 * wp.log(opacity / ALPHA_MIN), 0.0) + REACH_SLACK
+        e.determinant = determinant
+        e.scale = 1.0 / conic[0]
+        e.shear = -conic[1] * e.scale
+        e.half_height = wp.sqrt(e.reach * conic[0] / determinant)
+        e.tip = -conic[1] * wp.sqrt(e.reach / (conic[2] * determinant))
     return e
 
 
 @wp.func
 def touched(low: float, high: float, tile_size: int, tiles: int, extent: int) -> wp.vec2i:
     """Begin and end of the tiles, along one axis, whose pixel centres' span meets [low, high]."""
-    begin = int(0)
-    end = int(0)
-    if high >= 0.5 and low <= float(extent) - 0.5:
-        size = float(tile_size)
-        begin = int(wp.clamp(wp.ceil((low - size + 0.5) / size), 0.0, float(tiles)))
-        end = int(wp.clamp(wp.floor((high - 0.5) / size) + 1.0, 0.0, float(tiles)))
-    return wp.vec2i(begin, wp.max(begin, end))
+    if not (high >= 0.5 and low <= float(extent) - 0.5):
+        return wp.vec2i(0, 0)
+    size = float(tile_size)
+    begin = int(wp.ceil((wp.max(low, 0.0) - size + 0.5) / size))
+    end = int((wp.min(high, float(extent)) - 0.5) / size) + 1
+    return wp.vec2i(begin, wp.clamp(end, begin, tiles))
 
 
 @wp.func
 def touched_rows(e: Ellipse, tile_size: int, rows: int, height: int) -> wp.vec2i:
-    half = wp.sqrt(e.q * e.conic[0] / e.determinant)
-    return touched(e.mean[1] - half, e.mean[1] + half, tile_size, rows, height)
+    return touched(e.mean[1] - e.half_height, e.mean[1] + e.half_height, tile_size, rows, height)
 
 
 @wp.func
 def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: int, height: int) -> wp.vec2i:
-    a = e.conic[0]
-    b = e.conic[1]
-    half = wp.sqrt(e.q * a / e.determinant)
-    low = wp.max(float(row * tile_size) + 0.5 - e.mean[1], -half)
-    high = wp.min(float(wp.min((row + 1) * tile_size, height)) - 0.5 - e.mean[1], half)
-    # The ellipse's rightmost point lies at this dy, the leftmost at its negative; the slab may cut either off.
-    tip = -b / e.conic[2] * wp.sqrt(e.q * e.conic[2] / e.determinant)
-    right = wp.clamp(tip, low, high)
-    left = wp.clamp(-tip, low, high)
-    x_right = (wp.sqrt(wp.max(e.q * a - e.determinant * right * right, 0.0)) - b * right) / a
-    x_left = (-wp.sqrt(wp.max(e.q * a - e.determinant * left * left, 0.0)) - b * left) / a
+    # The slab of the row's pixel centres, cut to the ellipse; it may cut off either tip.
+    low = wp.max(float(row * tile_size) + 0.5 - e.mean[1], -e.half_height)
+    high = wp.min(float(wp.min((row + 1) * tile_size, height)) - 0.5 - e.mean[1], e.half_height)
+    right = wp.clamp(e.tip, low, high)
+    left = wp.clamp(-e.tip, low, high)
+    # q = reach, solved for dx: dx = shear dy +- sqrt(reach A - determinant dy^2) / A
+    steep = e.determinant * e.scale * e.scale
+    x_right = e.shear * right + wp.sqrt(wp.max(e.reach * e.scale - steep * right * right, 0.0))
+    x_left = e.shear * left - wp.sqrt(wp.max(e.reach * e.scale - steep * left * left, 0.0))
     return touched(e.mean[0] + x_left, e.mean[0] + x_right, tile_size, columns, width)
+
+
+@wp.func
+def sortable(depth: float) -> wp.int64:
+    """The bits of a float, turned so that they sort as unsigned integers in the float's order."""
+    bits = wp.cast(depth + 0.0, wp.uint32)  # + 0: minus zero becomes zero
+    sign = wp.uint32(0x80000000)
+    if (bits & sign) != wp.uint32(0):
+        bits = ~bits
+    else:
+        bits = bits | sign
+    return wp.int64(bits)
 
 
 @wp.kernel
@@ -95,36 +109,16 @@ def count_tiles(
     tile_size: int,
     # Out:
     counts_out: wp.array[int],  # [N] tiles touched; 0: culled
-    keys_out: wp.array[float],  # [2 N] depth in the first half, what to sort by; the other half is the sort's own
-    order_out: wp.array[int],  # [2 N] the splat's index in the first half
 ):
     i = first + wp.tid()
     e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
     count = int(0)
-    if e.q >= 0.0:
+    if e.reach >= 0.0:
         span = touched_rows(e, tile_size, rows, height)
         for row in range(span[0], span[1]):
             reach = touched_columns(e, row, tile_size, columns, width, height)
             count += reach[1] - reach[0]
     counts_out[i] = count
-    key = DEPTH_CULLED
-    if count > 0:
-        key = depths_in[i]
-    keys_out[i] = key
-    order_out[i] = i
-
-
-@wp.kernel
-def gather_counts(
-    first: int,
-    # In:
-    counts_in: wp.array[int],  # [N]
-    order_in: wp.array[int],  # [2 N] splats by depth in the first half
-    # Out:
-    counts_out: wp.array[int],  # [N] the same, nearest splat first
-):
-    rank = first + wp.tid()
-    counts_out[rank] = counts_in[order_in[rank]]
 
 
 @wp.kernel
@@ -136,35 +130,30 @@ def emit_pairs(
     opacities_in: wp.array[float],  # [N]
     depths_in: wp.array[float],  # [N]
     radii_in: wp.array[wp.vec2i],  # [N]
-    order_in: wp.array[int],  # [2 N] splats by depth in the first half
     offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
-    ends_in: wp.array[wp.int64],  # [N] by depth rank: end of the splat's pairs in the list to sort
     width: int,
     height: int,
     columns: int,
     rows: int,
     tile_size: int,
     # Out:
-    tiles_out: wp.array[int],  # [2 P] tile of each pair, nearest splat first, in the first half
-    slots_out: wp.array[int],  # [2 P] slot of each pair, in the first half
+    keys_out: wp.array[wp.int64],  # [2 P] tile << 32 | depth in the first half; the other half is the sort's own
+    slots_out: wp.array[int],  # [2 P] 0, 1, 2, ... in the first half
     owners_out: wp.array[int],  # [P] splat of each slot
 ):
-    rank = first + wp.tid()
-    i = order_in[rank]
+    i = first + wp.tid()
     slot = int(offsets_in[i])
-    count = int(offsets_in[i + 1]) - slot
-    if count == 0:
+    if int(offsets_in[i + 1]) == slot:
         return
-    position = int(ends_in[rank]) - count
     e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
+    depth = sortable(depths_in[i])
     span = touched_rows(e, tile_size, rows, height)
     for row in range(span[0], span[1]):
         reach = touched_columns(e, row, tile_size, columns, width, height)
         for column in range(reach[0], reach[1]):
-            tiles_out[position] = row * columns + column
-            slots_out[position] = slot
+            keys_out[slot] = (wp.int64(row * columns + column) << wp.int64(32)) | depth
+            slots_out[slot] = slot
             owners_out[slot] = i
-            position += 1
             slot += 1
 
 
@@ -182,11 +171,13 @@ def gather_owners(
 
 
 @wp.func
-def lower_bound(keys: wp.array[int], count: int, key: int) -> int:
+def first_of_tile(keys: wp.array[wp.int64], count: int, tile: int) -> int:
+    """Where the sorted pairs of a tile, or of a later one, begin."""
+    key = wp.int64(tile) << wp.int64(32)
     low = int(0)
     high = int(count)
     while low < high:
-        middle = (low + high) // 2
+        middle = low + (high - low) // 2
         if keys[middle] < key:
             low = middle + 1
         else:
@@ -198,10 +189,10 @@ def lower_bound(keys: wp.array[int], count: int, key: int) -> int:
 def tile_ranges(
     first: int,
     # In:
-    tiles_in: wp.array[int],  # [2 P] sorted in the first half
+    keys_in: wp.array[wp.int64],  # [2 P] sorted in the first half
     count: int,
     # Out:
     ranges_out: wp.array[wp.vec2i],  # [T]
 ):
     tile = first + wp.tid()
-    ranges_out[tile] = wp.vec2i(lower_bound(tiles_in, count, tile), lower_bound(tiles_in, count, tile + 1))
+    ranges_out[tile] = wp.vec2i(first_of_tile(keys_in, count, tile), first_of_tile(keys_in, count, tile + 1))
