@@ -16,6 +16,8 @@ from torch import Tensor
 from .data import Dataset
 from .errors import UserError
 from .film import write_png
+from .metrics import psnr, ssim
+from .motion_metrics import load_ground_truth, score_motion
 from .report import contact_sheet, to_bytes
 from .types import Frame
 
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
 
 SHEET_ROWS = 8
 """Images on a contact sheet, evenly spread over the split."""
-GROUND_TRUTH = "ground_truth.npz"
 
 Lpips = Callable[[Tensor, Tensor], Tensor | float]
 
@@ -36,18 +37,14 @@ def _mean(values: list[float]) -> float | None:
 
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, Any]:
     """The row of one image; ``image`` and ``truth`` are [H, W, 3] in [0, 1] on the scene's device."""
-    from .metrics import psnr
-    from .ops.ssim import ssim
-
     mask = None if frame.mask is None else frame.mask.to(image.device)
     row: dict[str, Any] = {"name": frame.name, "time": float(frame.time)}
-    planes, true_planes = image.permute(2, 0, 1).contiguous(), truth.permute(2, 0, 1).contiguous()
     row["psnr"] = float(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
-    row["ssim"] = float(ssim(planes, true_planes, mask))
+    row["ssim"] = float(ssim(image, truth, mask))
     if lpips is not None:
         if mask is not None:  # outside the mask nothing is known: no difference there
-            planes = torch.where(mask, planes, true_planes)
-        row["lpips"] = float(lpips(planes.permute(1, 2, 0), truth))
+            image = torch.where(mask[..., None], image, truth)
+        row["lpips"] = float(lpips(image, truth))
     return row
 
 
@@ -167,16 +164,11 @@ def metrics_of(
         **{key: data.get(key) for key in ("downscale", "resample", "background")},
         "seed": scene.settings.get("seed"),
     }
-    truth = Path(dataset.folder) / GROUND_TRUTH
-    if truth.is_file():
-        found.update(_motion(scene, truth))
+    truth = load_ground_truth(dataset.folder)
+    if truth is not None:
+        opacities = scene.gaussians_at(float(truth.times[0])).opacities
+        found.update(score_motion(truth, lambda time: scene.gaussians_at(time).means, opacities)._asdict())
     return {**found, "per_image": rows}
-
-
-def _motion(scene: Scene, truth: Path) -> dict[str, float]:
-    from .motion_metrics import motion_metrics
-
-    return motion_metrics(scene, truth)
 
 
 def _plain(value: Any) -> Any:

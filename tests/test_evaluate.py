@@ -101,6 +101,23 @@ def test_metrics_keep_the_contract(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.json"]
 
 
+def test_true_motion_is_scored_where_the_data_has_it(tmp_path: Path) -> None:
+    """A surface point on each ball; the truth circles once as fast as the scene, once exactly with it."""
+    scene = FakeScene()
+    for speed, expected in ((1.0, 0.0), (0.5, None)):
+        times = np.linspace(0, 1, 5)
+        moving = np.stack([scene.centre(speed * time) for time in times]) + np.array([0, 0, 0.3])
+        points = np.stack([moving, np.tile([0.0, 0.0, 0.3], (5, 1))], axis=1)
+        np.savez(tmp_path / "ground_truth.npz", points=points, times=times, visible=np.ones((2, 2), bool), height=2.0)
+        frames = Dataset(fake_dataset(scene, 1), folder=tmp_path, split="test")
+        found = metrics_of(scene, frames)
+        if expected == 0.0:
+            assert found["epe"] == pytest.approx(0.0, abs=1e-4) and found["jitter"] == pytest.approx(0.0, abs=1e-4)
+        else:
+            gaps = [np.linalg.norm(scene.centre(time) - scene.centre(speed * time)) for time in times]
+            assert found["epe"] == pytest.approx(50 * np.mean(gaps) / 2, rel=1e-4)  # one of two points, percent of 2
+
+
 def test_an_empty_split_has_no_metrics() -> None:
     found = evaluate(FakeScene(), Dataset([], folder=Path("x"), split="val"))
     assert (found["psnr"], found["ssim"], found["images"]) == (None, None, 0)
