@@ -72,7 +72,9 @@ _PRELUDE = f"""
     typedef float vf __attribute__((vector_size(64)));
     typedef int vi __attribute__((vector_size(64)));
     typedef unsigned vu __attribute__((vector_size(64)));
+    typedef short vs __attribute__((vector_size(64)));
     typedef bool vb __attribute__((ext_vector_type(16)));
+    typedef bool vb32 __attribute__((ext_vector_type(32)));
     const float ALPHA_MAX = {float(ALPHA_MAX)!r}f, TRANSMITTANCE_MIN = {float(TRANSMITTANCE_MIN)!r}f;
     const float LOG2_ALPHA_MIN = -7.994353436858858f;
     const vf LANE = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
@@ -104,31 +106,34 @@ _PRELUDE = f"""
         r = r * f + 1.0f;
         return (vf)((vu)r + ((vu)t << 23));
     }};
-    // A splat as seen from the tile's first pixel.
+    // A splat as seen from the tile's first pixel; the lanes of the last three are the tile's rows.
     struct Splat {{
-        float mx, my, a, b, c, log2_opacity, floor;
-        vf dx, adx2;
+        float mx, a, log2_opacity, floor;
+        vf dy, bdy, cdy2;
     }};
     const float x_begin = 16.0f * (tile % columns) + 0.5f, y_begin = 16.0f * (tile / columns) + 0.5f;
     auto read = [&](const float* s) -> Splat {{
         Splat g;
-        g.mx = s[0] - x_begin; g.my = s[1] - y_begin;
-        g.a = s[2]; g.b = s[3]; g.c = s[4]; g.log2_opacity = s[5];
+        g.mx = s[0] - x_begin;
+        g.a = s[2];
+        g.log2_opacity = s[5];
         g.floor = LOG2_ALPHA_MIN - s[5];
-        g.dx = LANE - g.mx;
-        g.adx2 = g.a * g.dx * g.dx;
+        g.dy = LANE - (s[1] - y_begin);
+        g.bdy = s[3] * g.dy;
+        g.cdy2 = s[4] * g.dy * g.dy;
         return g;
     }};
     // One bit for each row in which the ellipse meets the tile: q at the row's point nearest to the ellipse's axis.
     auto reached_rows = [&](const Splat& g, float slope) -> unsigned {{
-        vf dy = LANE - g.my, x = slope * dy;
+        vf x = slope * g.dy;
         vf low = ZERO - g.mx, high = ZERO + (15.0f - g.mx);
         x = x < low ? low : x;
         x = x > high ? high : x;
-        return bits((g.a * x + g.b * dy) * x + g.c * dy * dy >= g.floor - 1e-3f);
+        return bits((g.a * x + g.bdy) * x + g.cdy2 >= g.floor - 1e-3f);
     }};
-    auto power_of = [](const Splat& g, float dy) -> vf {{
-        return (g.b * dy) * g.dx + (g.adx2 + g.c * dy * dy);
+    // The exponent at a row's pixels; forward and adjoint must round alike, or they disagree on who contributed.
+    auto power_of = [](vf dx, float a, float bdy, float cdy2) -> vf {{
+        return (a * dx + bdy) * dx + cdy2;
     }};
     const int begin = ranges.data[tile].c[0], end = ranges.data[tile].c[1];
     const int x0 = 16 * (tile % columns), y0 = 16 * (tile / columns);
@@ -147,44 +152,57 @@ _FORWARD = (
     const bool keep = last.shape.dims[0] > 0;
 
     // One pass over the tile's splats for the channels from c0 on; only the first pass stores what has no channels.
+    // By chunks of 32 splats, row by row: a row's state stays in registers while it walks those that reach it.
     auto pass = [&](auto group, auto keeping, int c0, int count) {
         constexpr int C = decltype(group)::value;
         constexpr bool KEEP = decltype(keeping)::value;
         vf T[16], sum[16][C];
         vi ends[16];
+        Splat chunk[32];
+        float channel[32][C];
+        alignas(64) short reached[32];
         for (int r = 0; r < 16; ++r) {
             T[r] = LANE < (float)wide ? ZERO + 1.0f : ZERO - 1.0f;
             for (int c = 0; c < C; ++c) sum[r][c] = ZERO;
             ends[r] = vi{};
         }
         unsigned alive = (1u << tall) - 1u;
-        for (int p = begin; p < end; ++p) {
-            if (((p - begin) & 15) == 15) {
-                unsigned still = 0;
-                for (int r = 0; r < tall; ++r) still |= bits(T[r] > 0.0f) ? 1u << r : 0u;
-                alive = still;
-                if (!alive) break;
+        for (int p0 = begin; p0 < end && alive; p0 += 32) {
+            const int n = end - p0 < 32 ? end - p0 : 32;
+            for (int k = 0; k < n; ++k) {
+                const float* s = packed.data + (long)splats.data[p0 + k] * stride;
+                chunk[k] = read(s);
+                reached[k] = (short)reached_rows(chunk[k], s[7]);
+                for (int c = 0; c < C; ++c) channel[k][c] = s[GEOMETRY + c0 + c];
             }
-            const float* s = packed.data + (long)splats.data[p] * stride;
-            const Splat g = read(s);
-            unsigned rows = reached_rows(g, s[7]) & alive;
-            float channel[C];
-            for (int c = 0; c < C; ++c) channel[c] = s[GEOMETRY + c0 + c];
-            while (rows) {
+            for (int k = n; k < 32; ++k) reached[k] = 0;
+            for (unsigned rows = alive; rows; rows &= rows - 1u) {
                 const int r = __builtin_ctz(rows);
-                rows &= rows - 1u;
-                const vf power = power_of(g, r - g.my);
-                const vi skip = (power > 0.0f) | (power < g.floor);
-                vf alpha = exp2v(power + g.log2_opacity);
-                alpha = alpha > ALPHA_MAX ? ZERO + ALPHA_MAX : alpha;
-                alpha = skip ? ZERO : alpha;
-                const vf t = T[r];
-                const vf next = t - t * alpha;
-                const vi go = next > TRANSMITTANCE_MIN;
-                const vf w = go ? alpha * t : ZERO;
-                T[r] = go ? next : (vf)((vu)t | 0x80000000u);
-                for (int c = 0; c < C; ++c) sum[r][c] += w * channel[c];
-                if (KEEP) ends[r] = (w > 0.0f) ? vi{} + (p + 1) : ends[r];
+                vs in_row;
+                __builtin_memcpy(&in_row, reached, 64);
+                unsigned hits = __builtin_bit_cast(unsigned, __builtin_convertvector((in_row >> r) << 15, vb32));
+                vf t = T[r], own[C];
+                vi own_ends = ends[r];
+                for (int c = 0; c < C; ++c) own[c] = sum[r][c];
+                for (; hits; hits &= hits - 1u) {
+                    const int k = __builtin_ctz(hits);
+                    const Splat& g = chunk[k];
+                    const vf power = power_of(LANE - g.mx, g.a, ((const float*)&g.bdy)[r], ((const float*)&g.cdy2)[r]);
+                    const vi skip = (power > 0.0f) | (power < g.floor);
+                    vf alpha = exp2v(power + g.log2_opacity);
+                    alpha = alpha > ALPHA_MAX ? ZERO + ALPHA_MAX : alpha;
+                    alpha = skip ? ZERO : alpha;
+                    const vf next = t - t * alpha;
+                    const vi go = next > TRANSMITTANCE_MIN;
+                    const vf w = go ? alpha * t : ZERO;
+                    t = go ? next : (vf)((vu)t | 0x80000000u);
+                    for (int c = 0; c < C; ++c) own[c] += w * channel[k][c];
+                    if (KEEP) own_ends = (w > 0.0f) ? vi{} + (p0 + k + 1) : own_ends;
+                }
+                T[r] = t;
+                for (int c = 0; c < C; ++c) sum[r][c] = own[c];
+                if (KEEP) ends[r] = own_ends;
+                if (!bits(t > 0.0f)) alive &= ~(1u << r);
             }
         }
         for (int r = 0; r < tall; ++r) {
@@ -277,15 +295,19 @@ _ADJOINT = (
                 continue;
             }
             const float to_conic = -1.3862943611198906f;  // undoes the factor folded into the packed conic
-            const float A = to_conic * g.a, B = 0.5f * to_conic * g.b, D = to_conic * g.c;
-            const vf adx = A * g.dx, bdx = B * g.dx;
+            const float A = to_conic * s[2], B = 0.5f * to_conic * s[3], D = to_conic * s[4];
+            const vf dx = LANE - g.mx, adx = A * dx, bdx = B * dx;
+            float dys[16], bdy[16], cdy2[16];
+            __builtin_memcpy(dys, &g.dy, 64);
+            __builtin_memcpy(bdy, &g.bdy, 64);
+            __builtin_memcpy(cdy2, &g.cdy2, 64);
             vf g0 = ZERO, g1 = ZERO, g2 = ZERO, abs_x = ZERO, abs_y = ZERO, v_channel[K];
             for (int c = 0; c < K; ++c) v_channel[c] = ZERO;
             while (rows) {
                 const int r = __builtin_ctz(rows);
                 rows &= rows - 1u;
-                const float dy = r - g.my;
-                const vf power = power_of(g, dy);
+                const float dy = dys[r];
+                const vf power = power_of(dx, g.a, bdy[r], cdy2[r]);
                 const vi skip = (power > 0.0f) | (power < g.floor) | (ends[r] <= p);
                 const vf raw = exp2v(power + g.log2_opacity);
                 vf alpha = raw > ALPHA_MAX ? ZERO + ALPHA_MAX : raw;
@@ -313,8 +335,8 @@ _ADJOINT = (
                 if (C > 0) for (int c = 0; c < C; ++c) v_channel[c] += v[r][c] * weight;
                 else w[r] = weight;
             }
-            const vf g0dx = g0 * g.dx;
-            vf sums[16] = {A * g0dx + B * g1, B * g0dx + D * g1, -0.5f * (g0dx * g.dx), -(g1 * g.dx), -0.5f * g2,
+            const vf g0dx = g0 * dx;
+            vf sums[16] = {A * g0dx + B * g1, B * g0dx + D * g1, -0.5f * (g0dx * dx), -(g1 * dx), -0.5f * g2,
                 g0 * s[6], abs_x, abs_y};
             for (int c = 0; c < C; ++c) sums[8 + c] = v_channel[c];
             const vf total = lane_sums(sums);
