@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -91,8 +90,8 @@ def camera_position(viewmat: Tensor) -> Tensor:
     return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
 
-def rows_error(ours: Tensor, theirs: Tensor) -> Tensor:
-    """[N] relative L2 error of each row, with a floor of 1e-6 of the whole tensor's norm."""
+def rows_error(ours: Tensor, theirs: Tensor, floor: float = 1e-6) -> Tensor:
+    """[N] relative L2 error of each row; rows smaller than ``floor`` of the whole tensor's norm count as that large."""
     ours, theirs = ours.double().reshape(len(ours), -1), theirs.double().reshape(len(theirs), -1)
-    floor = max(1e-6 * theirs.norm().item(), math.ulp(0.0))
-    return (ours - theirs).norm(dim=1) / theirs.norm(dim=1).clamp_min(floor)
+    least = max(floor * theirs.norm().item(), 1e-30)
+    return (ours - theirs).norm(dim=1) / theirs.norm(dim=1).clamp_min(least)
