@@ -26,6 +26,7 @@ _NEAREST_LANES = """
     const float* node_data = nodes.data;
     const float infinity = __builtin_inff();
     auto scan = [&](auto kc, auto dc) {
+        #pragma clang fp contract(fast)
         constexpr int S = decltype(kc)::value;    // size of the sorted list, >= K
         constexpr int FIXED = decltype(dc)::value;  // 3 or, when 2, any D
         vf x[FIXED == 3 ? 3 : 64];
@@ -37,29 +38,70 @@ _NEAREST_LANES = """
             }
         vf best[S]; vi index[S];
         for (int j = 0; j < S; ++j) { best[j] = (vf){} + infinity; index[j] = (vi){} + (j < M ? j : 0); }
-        for (int m = 0; m < M; ++m) {
-            const float* node = node_data + (long long)m * dims;
-            vf e = x[0] - node[0];
-            vf d2 = e * e;
-            if (FIXED == 3) {
-                vf e1 = x[1] - node[1], e2 = x[2] - node[2];
-                d2 = d2 + e1 * e1 + e2 * e2;
-            } else {
-                for (int d = 1; d < dims; ++d) { e = x[d] - node[d]; d2 += e * e; }
+        for (int start = 0; start < M; start += 256) {
+            const int stop = start + 256 < M ? start + 256 : M;
+            // All distances of this batch, and the least of every sixteen nodes.
+            vf d2[256], least[16];
+            const int groups = (stop - start + 15) / 16;
+            for (int g = 0; g < groups; ++g) {
+                vf low = (vf){} + infinity;
+                const int end = start + 16 * g + 16 < stop ? start + 16 * g + 16 : stop;
+                const float* node = node_data + (start + 16ll * g) * dims;
+                vf* out = d2 + 16 * g;
+                auto distance = [&](int m) {
+                    vf e = x[0] - node[m * dims];
+                    vf s = e * e;
+                    if (FIXED == 3) {
+                        vf e1 = x[1] - node[3 * m + 1], e2 = x[2] - node[3 * m + 2];
+                        s = s + e1 * e1 + e2 * e2;
+                    } else {
+                        for (int d = 1; d < dims; ++d) { e = x[d] - node[m * dims + d]; s += e * e; }
+                    }
+                    out[m] = s;
+                    low = s < low ? s : low;
+                };
+                if (end - start - 16 * g == 16) {
+                    #pragma clang loop unroll_count(4)
+                    for (int m = 0; m < 16; ++m) distance(m);
+                } else
+                    for (int m = 0; m < end - start - 16 * g; ++m) distance(m);
+                least[g] = low;
             }
-            vi closer = d2 < best[S - 1];
-            if (!__builtin_reduce_or(closer)) continue;
-            d2 = d2 < infinity ? d2 : (vf){} + infinity;  // NaN never enters the list
-            vi number = (vi){} + m;
-            #pragma clang loop unroll(full)
-            for (int j = S - 1; j > 0; --j) {
-                vi here = d2 < best[j], before = d2 < best[j - 1];
-                index[j] = before ? index[j - 1] : (here ? number : index[j]);
-                best[j] = before ? best[j - 1] : (here ? d2 : best[j]);
+            // K groups hold a node within the K-th least of these: nothing beyond it can be among the K nearest.
+            vf bound[S];
+            for (int j = 0; j < S; ++j) bound[j] = best[j];
+            for (int g = 0; g < groups; ++g) {
+                vf low = least[g];
+                #pragma clang loop unroll(full)
+                for (int j = 0; j < S; ++j) {
+                    vi under = low < bound[j];
+                    vf kept = under ? low : bound[j];
+                    low = under ? bound[j] : low;
+                    bound[j] = kept;
+                }
             }
-            vi here = d2 < best[0];
-            index[0] = here ? number : index[0];
-            best[0] = here ? d2 : best[0];
+            const vf limit = bound[S - 1];
+            for (int g = 0; g < groups; ++g) {
+                if (!__builtin_reduce_or(least[g] <= limit)) continue;
+                const int end = start + 16 * g + 16 < stop ? start + 16 * g + 16 : stop;
+                unsigned found = 0;
+                for (int m = start + 16 * g; m < end; ++m)
+                    found |= (unsigned)(__builtin_reduce_or(d2[m - start] <= limit) != 0) << (m - start - 16 * g);
+                for (; found; found &= found - 1) {
+                    const int m = start + 16 * g + __builtin_ctz(found);
+                    const vf s = d2[m - start] < infinity ? d2[m - start] : (vf){} + infinity;  // no NaN in the list
+                    const vi number = (vi){} + m;
+                    #pragma clang loop unroll(full)
+                    for (int j = S - 1; j > 0; --j) {
+                        vi here = s < best[j], before = s < best[j - 1];
+                        index[j] = before ? index[j - 1] : (here ? number : index[j]);
+                        best[j] = before ? best[j - 1] : (here ? s : best[j]);
+                    }
+                    vi here = s < best[0];
+                    index[0] = here ? number : index[0];
+                    best[0] = here ? s : best[0];
+                }
+            }
         }
         const int rows = N - begin < 16 ? N - begin : 16;
         for (int lane = 0; lane < rows; ++lane)

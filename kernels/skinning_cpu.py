@@ -52,7 +52,7 @@ _PRELUDE = (
     auto inverse_norm = [](vf a, vf b, vf c, vf d) -> vf {  // 0 where the norm is 0 or not a number
         vf n = a * a + b * b + c * c + d * d, r;
         for (int l = 0; l < 16; ++l) r[l] = 1.0f / __builtin_sqrtf(n[l]);
-        return (n > 0.0f) & (n < __builtin_inff()) ? r : (vf){};
+        return ((n > 0.0f) & (n < __builtin_inff())) ? r : (vf){};
     };
     auto exponential = [](vf x) -> vf {  // of x <= 0; 0 below -87
         vf y = x < -87.0f ? (vf){} - 87.0f : x;
@@ -81,13 +81,30 @@ _PRELUDE = (
             for (int k = 0; k < K; ++k) picked[k][l] = indices.data[g * K + k];
         }
     };
-    // The motion row of neighbour k, its shape rotation brought to the side of the first neighbour's.
-    auto aligned_row = [&](int k, int l) -> vf {
-        const float* at = motion.data + 16ll * picked[k][l];
-        const float* front = motion.data + 16ll * picked[0][l];
-        float side = at[12] * front[12] + at[13] * front[13] + at[14] * front[14] + at[15] * front[15];
-        vf row = load(at);
-        return (side < 0.0f) & (number >= 12) ? -row : row;
+    // -1 where a neighbour's shape rotation must be turned to the side of the first one's, else 1.
+    const vi upper = number >= 12;
+    vf side[16];
+    auto align = [&]() {
+        side[0] = (vf){} + 1.0f;
+        for (int k = 1; k < K; ++k) {
+            vf products[16];
+            for (int l = 0; l < 16; ++l) {
+                vf p = load(motion.data + 16ll * picked[k][l]) * load(motion.data + 16ll * picked[0][l]);
+                products[l] = upper ? p : (vf){};
+            }
+            side[k] = row_sums(products) < 0.0f ? (vf){} - 1.0f : (vf){} + 1.0f;
+        }
+    };
+    auto blend = [&](const vf* weight) {
+        for (int l = 0; l < 16; ++l) {
+            vf row = (vf){};
+            for (int k = 0; k < K; ++k) {
+                vf w = upper ? (vf){} + weight[k][l] * side[k][l] : (vf){} + weight[k][l];
+                row += w * load(motion.data + 16ll * picked[k][l]);
+            }
+            motion_rows[l] = row;
+        }
+        transpose(motion_rows);
     };
 """
 )
@@ -95,6 +112,8 @@ _PRELUDE = (
 _FORWARD = (
     """
 #if !defined(__CUDA_ARCH__)
+{
+    #pragma clang fp contract(fast)
 """
     + _PRELUDE
     + """
@@ -124,18 +143,14 @@ _FORWARD = (
         weight[k] /= total;
         for (int l = 0; l < rows; ++l) weights.data[(long long)(begin + l) * K + k] = weight[k][l];
     }
-    for (int l = 0; l < 16; ++l) {
-        vf row = (vf){};
-        for (int k = 0; k < K; ++k) row += weight[k][l] * aligned_row(k, l);
-        motion_rows[l] = row;
-    }
     if (has_log_scales)
         for (int l = 0; l < rows; ++l) {
             vf row = (vf){};
             for (int k = 0; k < K; ++k) row += weight[k][l] * load(reach.data + 16ll * picked[k][l]);
             for (int c = 0; c < 3; ++c) log_scales.data[begin + l][c] = row[11 + c];
         }
-    transpose(motion_rows);
+    align();
+    blend(weight);
     const vf* B = motion_rows;
     vf moved[3], b[4], u[4];
     for (int c = 0; c < 3; ++c)
@@ -153,6 +168,7 @@ _FORWARD = (
         for (int c = 0; c < 3; ++c) means_t.data[begin + l][c] = moved[c][l];
         for (int c = 0; c < 4; ++c) quats_t.data[begin + l][c] = turned[c][l];
     }
+}
 #endif
 """
 )
@@ -160,6 +176,8 @@ _FORWARD = (
 _ADJOINT = (
     """
 #if !defined(__CUDA_ARCH__)
+{
+    #pragma clang fp contract(fast)
 """
     + _PRELUDE
     + """
@@ -187,12 +205,8 @@ _ADJOINT = (
         for (int k = 0; k < K; ++k) weight[k] = alive ? weight[k] : (vf){};
         for (int c = 0; c < 3; ++c) { x[c] = alive ? x[c] : (vf){}; v[c] = alive ? v[c] : (vf){}; }
         for (int c = 0; c < 4; ++c) { q[c] = alive ? q[c] : (vf){}; v_turned[c] = alive ? v_turned[c] : (vf){}; }
-        for (int l = 0; l < 16; ++l) {
-            vf row = (vf){};
-            for (int k = 0; k < K; ++k) row += weight[k][l] * aligned_row(k, l);
-            motion_rows[l] = row;
-        }
-        transpose(motion_rows);
+        align();
+        blend(weight);
         const vf* B = motion_rows;
         vf nb = inverse_norm(B[12], B[13], B[14], B[15]), nq = inverse_norm(q[0], q[1], q[2], q[3]);
         vf b[4], u[4];
@@ -230,9 +244,7 @@ _ADJOINT = (
             vf products[16];
             for (int l = 0; l < 16; ++l) {
                 const float* at = motion.data + 16ll * picked[k][l];
-                const float* front = motion.data + 16ll * picked[0][l];
-                float side = at[12] * front[12] + at[13] * front[13] + at[14] * front[14] + at[15] * front[15];
-                vf g = (side < 0.0f) & (number >= 12) ? -gradient[l] : gradient[l];
+                vf g = (upper ? (vf){} + side[k][l] : (vf){} + 1.0f) * gradient[l];
                 products[l] = g * load(at);
                 if (has_log_scales)
                     products[l] += scales ? v_scales[l] * load(reach.data + 16ll * picked[k][l]) : (vf){};
@@ -271,6 +283,7 @@ _ADJOINT = (
             for (int d = 0; d < H; ++d) v_hyper.data[g * H + d] = v_points[l][3 + d];
         }
     }
+}
 #endif
 """
 )
