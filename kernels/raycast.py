@@ -31,6 +31,12 @@ def fractal_noise(p: wp.vec3, seed: int):
 
 
 @wp.func
+def wobble(p: wp.vec3, seed: int):
+    """What keeps stripes from being ruled with a straight edge."""
+    return 0.15 * wp.noise(wp.rand_init(seed), p * 6.0)
+
+
+@wp.func
 def fraction(x: float):
     return x - wp.floor(x)
 
@@ -94,9 +100,8 @@ def face(p: wp.vec3, shell: wp.vec3, visor: wp.vec3, glow: wp.vec3):
 def albedo(p: wp.vec3, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, frequency: wp.vec3, part: int):
     """Colour of a surface point from its rest position in the part's frame."""
     color = a
-    wobble = 0.12 * fractal_noise(p * 5.0, part)
     if kind == STRIPES:
-        phase = fraction(p[2] * frequency[2] + wobble)
+        phase = fraction(p[2] * frequency[2] + wobble(p, part))
         if phase < 0.45:
             color = b
         elif phase > 0.62 and phase < 0.78:
@@ -132,7 +137,7 @@ def albedo(p: wp.vec3, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, frequency:
         elif phase > 0.68 and phase < 0.82:
             color = c
     elif kind == CHEST:
-        phase = fraction(p[2] * frequency[2] + wobble)
+        phase = fraction(p[2] * frequency[2] + wobble(p, part))
         if phase < 0.5:
             color = b
         if p[1] < 0.0:
@@ -144,7 +149,8 @@ def albedo(p: wp.vec3, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, frequency:
                     color = c
                 if in_heart(x, z + 0.1):
                     color = wp.vec3(0.87, 0.16, 0.24)
-    shade = 1.0 + 0.16 * fractal_noise(p * 9.0, part + 100) + 0.1 * fractal_noise(p * 27.0, part + 200)
+    state = wp.rand_init(part + 100)
+    shade = 1.0 + 0.18 * wp.noise(state, p * 9.0) + 0.14 * wp.noise(state, p * 24.0)
     return color * shade
 
 

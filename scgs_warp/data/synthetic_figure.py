@@ -131,7 +131,7 @@ PARTS: tuple[Part, ...] = (
          -0.12, 12),
     Part("torso", (0.20, 0.10, 0.24), 0.08, (0, 0.25, 0.28), int(patterns.CHECKS), (TEAL, MUSTARD, RED), (10, 10, 10),
          0.0, 8),
-    Part("torso", (0.14, 0.05, 0.07), 0.04, (0, 0.345, 0.17), int(patterns.DOTS), (BROWN, CREAM, RED), (8, 0, 13)),
+    Part("torso", (0.14, 0.05, 0.07), 0.04, (0, 0.345, 0.17), int(patterns.CHECKS), (BROWN, CREAM, RED), (18, 18, 18)),
     Part("hips", (0.255, 0.20, 0.13), 0.12, (0, 0, 0.0), int(patterns.CLOUDS), (NAVY, TEAL, MINT), (7, 0, 0), 0.0, 8),
     Part("hips", (0.285, 0.225, 0.04), 0.038, (0, 0, 0.075), int(patterns.SEGMENTS), (BROWN, MUSTARD, BROWN),
          (14, 0, 0), 0.0, 8),

@@ -61,7 +61,6 @@ def rotation(x: float, y: float, z: float) -> np.ndarray:
 def joint_angles(time: float) -> dict[str, Vector]:
     """Degrees about x, y, z of every joint that moves. Forward is -y: a negative x angle swings a limb forward."""
     wave = math.sin(2.0 * math.pi * time)
-    late = smoother_step(1.25 * time - 0.1)
     rise = smoother_step(time)
     return {
         "hips": (2.0 * math.sin(2.0 * math.pi * time + 0.5), 0.0, 7.0 * wave),
@@ -71,7 +70,7 @@ def joint_angles(time: float) -> dict[str, Vector]:
         "scarf": (-16.0 - 10.0 * wave, -8.0 + 14.0 * math.sin(2.0 * math.pi * time - 0.7), 0.0),
         "scarf_tip": (-6.0 - 10.0 * math.sin(2.0 * math.pi * time - 0.9), 12.0 * math.cos(2.0 * math.pi * time), 0.0),
         "shoulder_right": (-8.0 - 12.0 * rise, 16.0 + 137.0 * rise, 0.0),
-        "elbow_right": (-22.0 + 4.0 * wave, -4.0 + 30.0 * math.sin(3.0 * math.pi * late) * late, 0.0),
+        "elbow_right": (-22.0 + 4.0 * wave, -4.0 + 24.0 * math.sin(2.0 * math.pi * rise) * rise, 0.0),
         "shoulder_left": (26.0 * wave, -18.0 - 14.0 * rise, 0.0),
         "elbow_left": (-28.0 - 34.0 * rise, 0.0, 0.0),
         "hip_left": (-24.0 * wave, -3.0, 0.0),

@@ -18,7 +18,7 @@ from .synthetic_motion import bone_transforms
 LIGHT = (-0.42, -0.62, 0.66)
 """Direction to the key light: above, in front, on the figure's right."""
 LIGHT_SPREAD = 0.35
-SKY_RAYS, KEY_RAYS = 48, 20
+SKY_RAYS, KEY_RAYS = 40, 16
 OCCLUSION_REACH = 0.5
 TOLERANCE = 2e-3
 """World units by which a visible point may lie behind the first hit."""
