@@ -14,6 +14,9 @@ from .types import ALPHA_MIN
 
 wp.set_module_options({"enable_backward": False})
 
+DEPTH_CULLED = wp.constant(3.0e38)
+"""Sort key of splats that touch nothing; finite, so that a float sort never sees a NaN or an infinity."""
+
 REACH_SLACK = wp.constant(1.0e-3)
 """Added to the ellipse: what float32 rounding may take from q, so that no pixel at the threshold loses its splat."""
 
@@ -22,11 +25,11 @@ REACH_SLACK = wp.constant(1.0e-3)
 class Ellipse:
     mean: wp.vec2
     reach: float  # q at the edge; negative: the splat is culled
-    determinant: float
-    scale: float  # 1 / A
     shear: float  # -B / A
     half_height: float
     tip: float  # dy of the rightmost point; the leftmost lies at -tip
+    spread: float  # reach / A
+    steepness: float  # determinant / A^2
 
 
 @wp.func
@@ -43,9 +46,10 @@ def splat_ellipse(mean: wp.vec2, conic: wp.vec3, opacity: float, depth: float, r
     if determinant > 0.0 and conic[0] > 0.0:
         e.mean = mean
         e.reach = wp.max(2.0 * wp.log(opacity / ALPHA_MIN), 0.0) + REACH_SLACK
-        e.determinant = determinant
-        e.scale = 1.0 / conic[0]
-        e.shear = -conic[1] * e.scale
+        scale = 1.0 / conic[0]
+        e.shear = -conic[1] * scale
+        e.spread = e.reach * scale
+        e.steepness = determinant * scale * scale
         e.half_height = wp.sqrt(e.reach * conic[0] / determinant)
         e.tip = -conic[1] * wp.sqrt(e.reach / (conic[2] * determinant))
     return e
@@ -56,9 +60,11 @@ def touched(low: float, high: float, tile_size: int, tiles: int, extent: int) ->
     """Begin and end of the tiles, along one axis, whose pixel centres' span meets [low, high]."""
     if not (high >= 0.5 and low <= float(extent) - 0.5):
         return wp.vec2i(0, 0)
-    size = float(tile_size)
-    begin = int(wp.ceil((wp.max(low, 0.0) - size + 0.5) / size))
-    end = int((wp.min(high, float(extent)) - 0.5) / size) + 1
+    scale = 1.0 / float(tile_size)
+    begin = int((wp.max(low, 0.5) - 0.5) * scale)
+    if low > float((begin + 1) * tile_size) - 0.5:
+        begin += 1  # between this tile's last pixel centre and the next one's first
+    end = int((wp.min(high, float(extent)) - 0.5) * scale) + 1
     return wp.vec2i(begin, wp.clamp(end, begin, tiles))
 
 
@@ -74,10 +80,9 @@ def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: i
     high = wp.min(float(wp.min((row + 1) * tile_size, height)) - 0.5 - e.mean[1], e.half_height)
     right = wp.clamp(e.tip, low, high)
     left = wp.clamp(-e.tip, low, high)
-    # q = reach, solved for dx: dx = shear dy +- sqrt(reach A - determinant dy^2) / A
-    steep = e.determinant * e.scale * e.scale
-    x_right = e.shear * right + wp.sqrt(wp.max(e.reach * e.scale - steep * right * right, 0.0))
-    x_left = e.shear * left - wp.sqrt(wp.max(e.reach * e.scale - steep * left * left, 0.0))
+    # q = reach, solved for dx.
+    x_right = e.shear * right + wp.sqrt(wp.max(e.spread - e.steepness * right * right, 0.0))
+    x_left = e.shear * left - wp.sqrt(wp.max(e.spread - e.steepness * left * left, 0.0))
     return touched(e.mean[0] + x_left, e.mean[0] + x_right, tile_size, columns, width)
 
 
@@ -109,6 +114,8 @@ def count_tiles(
     tile_size: int,
     # Out:
     counts_out: wp.array[int],  # [N] tiles touched; 0: culled
+    depth_keys_out: wp.array[float],  # [2 N] what to sort the splats by, in the first half; empty: not wanted
+    order_out: wp.array[int],  # [2 N] 0, 1, 2, ... in the first half; empty too
 ):
     i = first + wp.tid()
     e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
@@ -119,6 +126,12 @@ def count_tiles(
             reach = touched_columns(e, row, tile_size, columns, width, height)
             count += reach[1] - reach[0]
     counts_out[i] = count
+    if order_out.shape[0] > 0:
+        key = float(DEPTH_CULLED)
+        if count > 0:
+            key = depths_in[i]
+        depth_keys_out[i] = key
+        order_out[i] = i
 
 
 @wp.kernel
@@ -137,9 +150,10 @@ def emit_pairs(
     rows: int,
     tile_size: int,
     # Out:
+    tiles_out: wp.array[int],  # [P] tile of each slot
+    owners_out: wp.array[int],  # [P] splat of each slot; empty: not wanted, nor the next two
     keys_out: wp.array[wp.int64],  # [2 P] tile << 32 | depth in the first half; the other half is the sort's own
     slots_out: wp.array[int],  # [2 P] 0, 1, 2, ... in the first half
-    owners_out: wp.array[int],  # [P] splat of each slot
 ):
     i = first + wp.tid()
     slot = int(offsets_in[i])
@@ -151,9 +165,12 @@ def emit_pairs(
     for row in range(span[0], span[1]):
         reach = touched_columns(e, row, tile_size, columns, width, height)
         for column in range(reach[0], reach[1]):
-            keys_out[slot] = (wp.int64(row * columns + column) << wp.int64(32)) | depth
-            slots_out[slot] = slot
-            owners_out[slot] = i
+            tile = row * columns + column
+            tiles_out[slot] = tile
+            if owners_out.shape[0] > 0:
+                owners_out[slot] = i
+                keys_out[slot] = (wp.int64(tile) << wp.int64(32)) | depth
+                slots_out[slot] = slot
             slot += 1
 
 
@@ -196,3 +213,38 @@ def tile_ranges(
 ):
     tile = first + wp.tid()
     ranges_out[tile] = wp.vec2i(first_of_tile(keys_in, count, tile), first_of_tile(keys_in, count, tile + 1))
+
+
+@wp.kernel
+def place_pairs(
+    first: int,
+    # In:
+    order_in: wp.array[int],  # [2 N] splats by depth in the first half
+    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
+    tiles_in: wp.array[int],  # [P] tile of each slot
+    # Out:
+    cursors_out: wp.array[int],  # [T] scratch
+    ranges_out: wp.array[wp.vec2i],  # [T]
+    splats_out: wp.array[int],  # [P] sorted by tile, then depth
+    slots_out: wp.array[int],  # [P]
+):
+    """Counting sort by tile of splats that are sorted by depth, for a CPU: one grid index does it all, because three
+    walks over the pairs are faster than a radix sort that could be shared."""
+    for tile in range(cursors_out.shape[0]):
+        cursors_out[tile] = 0
+    for slot in range(tiles_in.shape[0]):
+        cursors_out[tiles_in[slot]] = cursors_out[tiles_in[slot]] + 1
+    begin = int(0)
+    for tile in range(cursors_out.shape[0]):
+        end = begin + cursors_out[tile]
+        ranges_out[tile] = wp.vec2i(begin, end)
+        cursors_out[tile] = begin
+        begin = end
+    for rank in range(offsets_in.shape[0] - 1):
+        i = order_in[rank]
+        for slot in range(int(offsets_in[i]), int(offsets_in[i + 1])):
+            tile = tiles_in[slot]
+            p = cursors_out[tile]
+            cursors_out[tile] = p + 1
+            splats_out[p] = i
+            slots_out[p] = slot

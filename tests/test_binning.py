@@ -12,7 +12,7 @@ from splats import random_splats
 
 from reference.binning import needed_pairs, usable
 from scgs_warp import environment
-from scgs_warp.ops.binning import bin_splats
+from scgs_warp.ops.binning import _bin_by_counting, _bin_by_radix, bin_splats
 from scgs_warp.types import Splats, Tiles
 
 
@@ -117,6 +117,19 @@ def test_equal_depths_keep_index_order(device: str):
     tiles = check(replace(splats, depths=torch.ones_like(splats.depths)))
     for begin, end in tiles.ranges.tolist():
         assert tiles.splats[begin:end].tolist() == sorted(tiles.splats[begin:end].tolist())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_both_sorts_agree(device: str, seed: int):
+    """Counting on a CPU, radix sort on a GPU: the same lists, with equal and negative depths too."""
+    splats = random_splats(seed, 300, 90, 70)
+    depths = torch.round(4 * splats.depths) / 4 - 2.0
+    splats = replace(splats, depths=torch.where(depths == 0, -depths, depths))  # 0 and -0
+    geometry = [splats.means2d, splats.conics, splats.opacities, splats.depths, splats.radii]
+    size = (90, 70, 6, 5, 16)
+    by_radix = _bin_by_radix([t.to(device) for t in geometry], size)
+    for got, expected in zip(by_radix, _bin_by_counting(geometry, size)):
+        assert torch.equal(got.cpu(), expected)
 
 
 def test_threads_change_nothing(all_threads: None):

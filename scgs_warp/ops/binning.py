@@ -36,31 +36,59 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE) -> Tiles:
     """
     _validate(splats, tile_size)
     columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
-    count, device = len(splats.means2d), splats.means2d.device
+    device = splats.means2d.device
     geometry = [
         getattr(splats, name).detach().contiguous() for name in ("means2d", "conics", "opacities", "depths", "radii")
     ]
     size = (splats.width, splats.height, columns, rows, tile_size)
 
+    lists = _bin_by_counting if device.type == "cpu" else _bin_by_radix
+    ranges, sorted_splats, slots, offsets = lists(geometry, size)
+    return Tiles(ranges, sorted_splats, slots, offsets, splats.width, splats.height, columns, rows, tile_size)
+
+
+def _bin_by_counting(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Ranges, splats, slots, offsets, on a CPU: splats sorted by depth once, their pairs put in place tile by tile."""
+    count, tile_count = len(geometry[0]), size[2] * size[3]
+    counts, order = torch.empty(count, dtype=torch.int32), torch.empty(2 * count, dtype=torch.int32)
+    depth_keys = torch.empty(2 * count)
+    launch(kernels.count_tiles, count, *geometry, *size, counts, depth_keys, order)
+    offsets, pairs = _offsets(counts)
+    _sort(depth_keys, order, count, 32)
+    tiles, splats, slots = (torch.empty(pairs, dtype=torch.int32) for _ in range(3))
+    launch(kernels.emit_pairs, count, *geometry, offsets, *size, tiles, None, None, None)
+    cursors = torch.empty(tile_count, dtype=torch.int32)
+    ranges = torch.empty(tile_count, 2, dtype=torch.int32)
+    launch(kernels.place_pairs, 1, order, offsets, tiles, cursors, ranges, splats, slots)
+    return ranges, splats, slots, offsets
+
+
+def _bin_by_radix(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The same by one radix sort of all pairs, which a GPU can share among its threads."""
+    count, tile_count, device = len(geometry[0]), size[2] * size[3], geometry[0].device
     counts = torch.empty(count, dtype=torch.int32, device=device)
-    launch(kernels.count_tiles, count, *geometry, *size, counts)
-    offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
+    launch(kernels.count_tiles, count, *geometry, *size, counts, None, None)
+    offsets, pairs = _offsets(counts)
+    tiles, owners, splats = (torch.empty(pairs, dtype=torch.int32, device=device) for _ in range(3))
+    keys = torch.empty(2 * pairs, dtype=torch.int64, device=device)
+    slots = torch.empty(2 * pairs, dtype=torch.int32, device=device)
+    launch(kernels.emit_pairs, count, *geometry, offsets, *size, tiles, owners, keys, slots)
+    # The sort is stable and slots ascend with the splat's index: equal depths are in the order of the index.
+    _sort(keys, slots, pairs, 32 + (tile_count - 1).bit_length())
+    launch(kernels.gather_owners, pairs, slots, owners, splats)
+    ranges = torch.empty(tile_count, 2, dtype=torch.int32, device=device)
+    launch(kernels.tile_ranges, tile_count, keys, pairs, ranges)
+    return ranges, splats, slots[:pairs], offsets
+
+
+def _offsets(counts: Tensor) -> tuple[Tensor, int]:
+    """[N + 1] where each splat's slots begin, summed in 64 bits, and how many there are."""
+    offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, out=offsets[1:])
     pairs = int(offsets[-1])
     if pairs > MAX_PAIRS:
         raise ValueError(f"splats: {pairs} pairs of splat and tile, more than 2^31 - 1; reduce the image or the splats")
-
-    # The sort is stable and slots ascend with the splat's index: so equal depths are in the order of the index.
-    keys = torch.empty(2 * pairs, dtype=torch.int64, device=device)
-    slots = torch.empty(2 * pairs, dtype=torch.int32, device=device)
-    owners = torch.empty(pairs, dtype=torch.int32, device=device)
-    launch(kernels.emit_pairs, count, *geometry, offsets, *size, keys, slots, owners)
-    _sort(keys, slots, pairs, 32 + (columns * rows - 1).bit_length())
-    sorted_splats = torch.empty_like(owners)
-    launch(kernels.gather_owners, pairs, slots, owners, sorted_splats)
-    ranges = torch.empty(columns * rows, 2, dtype=torch.int32, device=device)
-    launch(kernels.tile_ranges, columns * rows, keys, pairs, ranges)
-    return Tiles(ranges, sorted_splats, slots[:pairs], offsets, splats.width, splats.height, columns, rows, tile_size)
+    return offsets, pairs
 
 
 def _sort(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
