@@ -130,18 +130,18 @@ PARTS: tuple[Part, ...] = (
     Part("torso", (0.30, 0.215, 0.33), 0.17, (0, 0, 0.26), int(patterns.CHEST), (CORAL, CREAM, NAVY), (0, 0, 7.5),
          -0.12, 12),
     Part("torso", (0.20, 0.10, 0.24), 0.08, (0, 0.25, 0.28), int(patterns.CHECKS), (TEAL, MUSTARD, RED), (10, 10, 10),
-         0.0, 8),
+         0.0, 6),
     Part("torso", (0.14, 0.05, 0.07), 0.04, (0, 0.345, 0.17), int(patterns.CHECKS), (BROWN, CREAM, RED), (18, 18, 18)),
-    Part("hips", (0.255, 0.20, 0.13), 0.12, (0, 0, 0.0), int(patterns.CLOUDS), (NAVY, TEAL, MINT), (7, 0, 0), 0.0, 8),
+    Part("hips", (0.255, 0.20, 0.13), 0.12, (0, 0, 0.0), int(patterns.CLOUDS), (NAVY, TEAL, MINT), (7, 0, 0), 0.0, 6),
     Part("hips", (0.285, 0.225, 0.04), 0.038, (0, 0, 0.075), int(patterns.SEGMENTS), (BROWN, MUSTARD, BROWN),
-         (14, 0, 0), 0.0, 8),
+         (14, 0, 0), 0.0, 6),
     Part("neck", (0.30, 0.30, 0.075), 0.0, (0, 0, 0.0), int(patterns.SEGMENTS), (RED, CREAM, RED), (14, 0, 0), 0.0, 12,
          0.165),
     Part("scarf", (0.085, 0.035, 0.15), 0.03, (0, 0, -0.12), int(patterns.STRIPES), (RED, CREAM, MUSTARD), (0, 0, 9)),
     Part("scarf_tip", (0.09, 0.035, 0.14), 0.03, (0, 0, -0.11), int(patterns.STRIPES), (RED, CREAM, MUSTARD),
          (0, 0, 9), -0.2),
     Part("head", (0.36, 0.30, 0.28), 0.19, (0, 0, 0.30), int(patterns.FACE), (MUSTARD, NAVY, GLOW), (0, 0, 0), 0.06,
-         14),
+         12),
     Part("head", (0.055, 0.12, 0.12), 0.05, (0.37, 0, 0.30), int(patterns.CHECKS), (TEAL, CREAM, RED), (14, 14, 14)),
     Part("head", (0.055, 0.12, 0.12), 0.05, (-0.37, 0, 0.30), int(patterns.CHECKS), (TEAL, CREAM, RED), (14, 14, 14)),
     Part("antenna", (0.028, 0.028, 0.14), 0.028, (0, 0, 0.10), int(patterns.STRIPES), (NAVY, CREAM, CORAL), (0, 0, 16),
@@ -199,8 +199,11 @@ def rounded_box(half: Vector, radius: float, divisions: int = 10, taper: float =
     cube, faces = _cube(divisions)
     extent = np.asarray(half, np.float64)
     core = np.maximum(extent - radius, 0.0)
-    # Grid lines are spent on the rounded edges and on the flat middle alike.
-    points = cube * extent
+    # A third of the grid lines goes to the flat middle, two thirds to the rounded edges, at even angles there.
+    share = np.arctan(np.abs(cube)) * (4.0 / np.pi)
+    edge = core + (extent - core) * np.tan(np.clip(1.5 * share - 0.5, 0.0, 1.0) * np.pi / 4)
+    beyond = np.where(share < 1.0 / 3.0, 3.0 * share * core, edge)
+    points = np.where(core > 0, np.sign(cube) * beyond, cube * extent)
     inner = np.clip(points, -core, core)
     away = points - inner
     vertices = inner + away / np.linalg.norm(away, axis=1, keepdims=True) * radius
