@@ -29,7 +29,9 @@ _PRELUDE = (
     typedef float vf __attribute__((vector_size(64)));
     typedef int vi __attribute__((vector_size(64)));
     typedef float vu __attribute__((vector_size(64), aligned(4)));
+    // Single lanes go through arrays of floats: a lane of a register picked by a variable would be spilled every time.
     auto load = [](const float* at) -> vf { return *(const vu*)at; };
+    auto put = [](float* at, vf value) { *(vu*)at = value; };
     auto transpose = [](vf* rows) {
 """
     + _steps("""
@@ -68,34 +70,38 @@ _PRELUDE = (
     const float infinity = __builtin_inff();
     const vi number = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
     vf x[3], q[4], points[16], motion_rows[16];
+    float xs[3][16], qs[4][16], point[16][16], side[16][16], weight[16][16];
     int picked[16][16];  // node of neighbour k of lane l
     int rows = 0;
     auto read = [&](int begin) {
         rows = N - begin < 16 ? N - begin : 16;
         for (int l = 0; l < 16; ++l) {
             long long g = l < rows ? begin + l : N - 1;
-            points[l] = (vf){};
-            for (int d = 0; d < 3; ++d) points[l][d] = x[d][l] = means.data[g][d];
-            for (int d = 0; d < H; ++d) points[l][3 + d] = hyper.data[g * H + d];
-            for (int c = 0; c < 4; ++c) q[c][l] = quats.data[g][c];
+            put(point[l], (vf){});
+            for (int d = 0; d < 3; ++d) point[l][d] = xs[d][l] = means.data[g][d];
+            for (int d = 0; d < H; ++d) point[l][3 + d] = hyper.data[g * H + d];
+            for (int c = 0; c < 4; ++c) qs[c][l] = quats.data[g][c];
+            #pragma clang loop vectorize(disable)
             for (int k = 0; k < K; ++k) picked[k][l] = indices.data[g * K + k];
         }
+        for (int d = 0; d < 3; ++d) x[d] = load(xs[d]);
+        for (int c = 0; c < 4; ++c) q[c] = load(qs[c]);
+        for (int l = 0; l < 16; ++l) points[l] = load(point[l]);
     };
     // -1 where a neighbour's shape rotation must be turned to the side of the first one's, else 1.
     const vi upper = number >= 12;
-    vf side[16];
     auto align = [&]() {
-        side[0] = (vf){} + 1.0f;
+        put(side[0], (vf){} + 1.0f);
         for (int k = 1; k < K; ++k) {
             vf products[16];
             for (int l = 0; l < 16; ++l) {
                 vf p = load(motion.data + 16ll * picked[k][l]) * load(motion.data + 16ll * picked[0][l]);
                 products[l] = upper ? p : (vf){};
             }
-            side[k] = row_sums(products) < 0.0f ? (vf){} - 1.0f : (vf){} + 1.0f;
+            put(side[k], row_sums(products) < 0.0f ? (vf){} - 1.0f : (vf){} + 1.0f);
         }
     };
-    auto blend = [&](const vf* weight) {
+    auto blend = [&]() {
         for (int l = 0; l < 16; ++l) {
             vf row = (vf){};
             for (int k = 0; k < K; ++k) {
@@ -119,28 +125,33 @@ _FORWARD = (
     + """
     read(begin);
     const vi inside = number < 3 + H;
-    vf weight[16], top = (vf){} - infinity, total = (vf){};
+    vf top = (vf){} - infinity, total = (vf){};
     for (int k = 0; k < K; ++k) {
-        vf squares[16], inverse, strength;
+        vf squares[16];
+        float inverse[16], strength[16];
         for (int l = 0; l < 16; ++l) {
             const float* at = reach.data + 16ll * picked[k][l];
             vf e = points[l] - load(at);
             squares[l] = inside ? e * e : (vf){};
             inverse[l] = at[14]; strength[l] = at[15];
         }
-        vf logit = row_sums(squares) * inverse + strength;
+        vf logit = row_sums(squares) * load(inverse) + load(strength);
         vi good = (logit > -infinity) & (logit < infinity);
-        weight[k] = good ? logit : (vf){} - infinity;
-        top = weight[k] > top ? weight[k] : top;
+        logit = good ? logit : (vf){} - infinity;
+        put(weight[k], logit);
+        top = logit > top ? logit : top;
     }
     const vi none = top == -infinity;
     for (int k = 0; k < K; ++k) {
-        vf w = weight[k] > -infinity ? exponential(weight[k] - (none ? (vf){} : top)) : (vf){};
+        vf logit = load(weight[k]);
+        vf w = logit > -infinity ? exponential(logit - (none ? (vf){} : top)) : (vf){};
         if (k == 0) w = none ? (vf){} + 1.0f : w;
-        weight[k] = w; total += w;
+        put(weight[k], w);
+        total += w;
     }
     for (int k = 0; k < K; ++k) {
-        weight[k] /= total;
+        put(weight[k], load(weight[k]) / total);
+        #pragma clang loop vectorize(disable)
         for (int l = 0; l < rows; ++l) weights.data[(long long)(begin + l) * K + k] = weight[k][l];
     }
     if (has_log_scales)
@@ -150,7 +161,7 @@ _FORWARD = (
             for (int c = 0; c < 3; ++c) log_scales.data[begin + l][c] = row[11 + c];
         }
     align();
-    blend(weight);
+    blend();
     const vf* B = motion_rows;
     vf moved[3], b[4], u[4];
     for (int c = 0; c < 3; ++c)
@@ -164,9 +175,11 @@ _FORWARD = (
     vf turned[4] = {
         b[0] * u[0] - b[1] * u[1] - b[2] * u[2] - b[3] * u[3], b[0] * u[1] + b[1] * u[0] + b[2] * u[3] - b[3] * u[2],
         b[0] * u[2] - b[1] * u[3] + b[2] * u[0] + b[3] * u[1], b[0] * u[3] + b[1] * u[2] - b[2] * u[1] + b[3] * u[0]};
+    for (int c = 0; c < 3; ++c) put(xs[c], moved[c]);
+    for (int c = 0; c < 4; ++c) put(qs[c], turned[c]);
     for (int l = 0; l < rows; ++l) {
-        for (int c = 0; c < 3; ++c) means_t.data[begin + l][c] = moved[c][l];
-        for (int c = 0; c < 4; ++c) quats_t.data[begin + l][c] = turned[c][l];
+        for (int c = 0; c < 3; ++c) means_t.data[begin + l][c] = xs[c][l];
+        for (int c = 0; c < 4; ++c) quats_t.data[begin + l][c] = qs[c][l];
     }
 }
 #endif
@@ -190,23 +203,33 @@ _ADJOINT = (
         read(begin);
         // Gaussians that are not finite, and lanes past the end, pass nothing: they become zeros with zero weights.
         vf probe = x[0] * 0.0f + x[1] * 0.0f + x[2] * 0.0f + q[0] * 0.0f + q[1] * 0.0f + q[2] * 0.0f + q[3] * 0.0f;
-        for (int l = 0; l < 16; ++l) for (int d = 0; d < H; ++d) probe[l] += points[l][3 + d] * 0.0f;
+        if (has_hyper) {
+            float bad[16];
+            for (int l = 0; l < 16; ++l) {
+                bad[l] = 0.0f;
+                for (int d = 0; d < H; ++d) bad[l] += point[l][3 + d] * 0.0f;
+            }
+            probe += load(bad);
+        }
         const vi alive = (probe == 0.0f) & (number < rows);
-        vf weight[16], v[3], v_turned[4], v_scales[16];
+        int live[16];
+        __builtin_memcpy(live, &alive, sizeof(alive));
+        vf v[3], v_turned[4], v_scales[16];
         for (int l = 0; l < 16; ++l) {
             long long g = l < rows ? begin + l : N - 1;
+            #pragma clang loop vectorize(disable)
             for (int k = 0; k < K; ++k) weight[k][l] = weights.data[g * K + k];
-            for (int c = 0; c < 3; ++c) v[c][l] = v_means_t.data[g][c];
-            for (int c = 0; c < 4; ++c) v_turned[c][l] = v_quats_t.data[g][c];
+            for (int c = 0; c < 3; ++c) xs[c][l] = v_means_t.data[g][c];
+            for (int c = 0; c < 4; ++c) qs[c][l] = v_quats_t.data[g][c];
             v_scales[l] = (vf){};
-            if (has_log_scales && alive[l]) for (int c = 0; c < 3; ++c) v_scales[l][11 + c] = v_log_scales_t.data[g][c];
-            if (!alive[l]) points[l] = (vf){};
+            if (has_log_scales && live[l]) for (int c = 0; c < 3; ++c) v_scales[l][11 + c] = v_log_scales_t.data[g][c];
+            if (!live[l]) points[l] = (vf){};
         }
-        for (int k = 0; k < K; ++k) weight[k] = alive ? weight[k] : (vf){};
-        for (int c = 0; c < 3; ++c) { x[c] = alive ? x[c] : (vf){}; v[c] = alive ? v[c] : (vf){}; }
-        for (int c = 0; c < 4; ++c) { q[c] = alive ? q[c] : (vf){}; v_turned[c] = alive ? v_turned[c] : (vf){}; }
+        for (int k = 0; k < K; ++k) put(weight[k], alive ? load(weight[k]) : (vf){});
+        for (int c = 0; c < 3; ++c) { x[c] = alive ? x[c] : (vf){}; v[c] = alive ? load(xs[c]) : (vf){}; }
+        for (int c = 0; c < 4; ++c) { q[c] = alive ? q[c] : (vf){}; v_turned[c] = alive ? load(qs[c]) : (vf){}; }
         align();
-        blend(weight);
+        blend();
         const vf* B = motion_rows;
         vf nb = inverse_norm(B[12], B[13], B[14], B[15]), nq = inverse_norm(q[0], q[1], q[2], q[3]);
         vf b[4], u[4];
@@ -252,17 +275,19 @@ _ADJOINT = (
                 *(vu*)sum = load(sum) + weight[k][l] * g;
             }
             v_weight[k] = row_sums(products);
-            mean += weight[k] * v_weight[k];
+            mean += load(weight[k]) * v_weight[k];
         }
         vf v_points[16];
         for (int l = 0; l < 16; ++l) v_points[l] = (vf){};
         for (int k = 0; k < K; ++k) {
-            vf v_logit = weight[k] * (v_weight[k] - mean), squares[16];
+            vf squares[16];
+            float v_logit[16], d2[16];
+            put(v_logit, load(weight[k]) * (v_weight[k] - mean));
             for (int l = 0; l < 16; ++l) {
                 vf e = points[l] - load(reach.data + 16ll * picked[k][l]);
                 squares[l] = inside ? e * e : (vf){};
             }
-            vf d2 = row_sums(squares);
+            put(d2, row_sums(squares));
             for (int l = 0; l < 16; ++l) {
                 const float* at = reach.data + 16ll * picked[k][l];
                 float* sum = reach_sum + 16ll * picked[k][l];
@@ -276,11 +301,14 @@ _ADJOINT = (
                 *(vu*)sum = load(sum) + add;
             }
         }
+        for (int c = 0; c < 3; ++c) put(xs[c], v_x[c]);
+        for (int c = 0; c < 4; ++c) put(qs[c], v_u[c]);
+        for (int l = 0; l < 16; ++l) put(point[l], v_points[l]);
         for (int l = 0; l < rows; ++l) {
             long long g = begin + l;
-            for (int c = 0; c < 3; ++c) v_means.data[g][c] = v_x[c][l] + v_points[l][c];
-            for (int c = 0; c < 4; ++c) v_quats.data[g][c] = v_u[c][l];
-            for (int d = 0; d < H; ++d) v_hyper.data[g * H + d] = v_points[l][3 + d];
+            for (int c = 0; c < 3; ++c) v_means.data[g][c] = xs[c][l] + point[l][c];
+            for (int c = 0; c < 4; ++c) v_quats.data[g][c] = qs[c][l];
+            for (int d = 0; d < H; ++d) v_hyper.data[g * H + d] = point[l][3 + d];
         }
     }
 }
