@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from .simd import LANE_SUMS, SIMD
 from .types import ALPHA_MAX, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
@@ -68,44 +69,11 @@ def pack_splats(
 
 _PRELUDE = f"""
 #if !defined(__CUDA_ARCH__)
-    #pragma clang fp contract(on)
-    typedef float vf __attribute__((vector_size(64)));
-    typedef int vi __attribute__((vector_size(64)));
-    typedef unsigned vu __attribute__((vector_size(64)));
-    typedef short vs __attribute__((vector_size(64)));
-    typedef bool vb __attribute__((ext_vector_type(16)));
-    typedef bool vb32 __attribute__((ext_vector_type(32)));
+{SIMD}
     const float ALPHA_MAX = {float(ALPHA_MAX)!r}f, TRANSMITTANCE_MIN = {float(TRANSMITTANCE_MIN)!r}f;
     const float LOG2_ALPHA_MIN = -7.994353436858858f;
-    const vf LANE = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
     const int GEOMETRY = {PACKED_GEOMETRY}, GROUP = {CHANNEL_GROUP};
-    const vf ZERO = {{}};
 
-    auto bits = [](vi mask) -> unsigned {{
-        return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask, vb));
-    }};
-    auto load = [](const float* from, int n) -> vf {{
-        vf v = {{}};
-        if (n == 16) __builtin_memcpy(&v, from, 64);
-        else for (int k = 0; k < n; ++k) v[k] = from[k];
-        return v;
-    }};
-    auto store = [](float* to, vf v, int n) {{
-        if (n == 16) __builtin_memcpy(to, &v, 64);
-        else for (int k = 0; k < n; ++k) to[k] = v[k];
-    }};
-    // 2^e for e in [-8, 0] (garbage below, masked by the caller): nearest integer by the magic number, then a
-    // polynomial on [-1/2, 1/2] of relative error 9e-8.
-    auto exp2v = [](vf e) -> vf {{
-        vf t = e + 12582912.0f;
-        vf f = e - (t - 12582912.0f);
-        vf r = f * 0.00132647f + 0.00967151f;
-        r = r * f + 0.05550734f;
-        r = r * f + 0.24022242f;
-        r = r * f + 0.69314698f;
-        r = r * f + 1.0f;
-        return (vf)((vu)r + ((vu)t << 23));
-    }};
     // A splat as seen from the tile's first pixel; the lanes of the last three are the tile's rows.
     struct Splat {{
         float mx, a, log2_opacity, floor;
@@ -230,6 +198,7 @@ _FORWARD = (
 
 _ADJOINT = (
     _PRELUDE
+    + LANE_SUMS
     + """
     struct Any { enum { value = 0 }; };
     struct Four { enum { value = 4 }; };
@@ -237,29 +206,6 @@ _ADJOINT = (
     struct No { enum { value = 0 }; };
     const int channels = v_image.shape.dims[0];
     const int row_size = v_slots.shape.dims[1];
-
-    // The sums of 16 vectors' lanes in one vector: halves are folded together pair by pair, four times.
-    auto fold8 = [](vf a, vf b) -> vf {
-        return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
-            + __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
-    };
-    auto fold4 = [](vf a, vf b) -> vf {
-        return __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27)
-            + __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
-    };
-    auto fold2 = [](vf a, vf b) -> vf {
-        return __builtin_shufflevector(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29)
-            + __builtin_shufflevector(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
-    };
-    auto fold1 = [](vf a, vf b) -> vf {
-        return __builtin_shufflevector(a, b, 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30)
-            + __builtin_shufflevector(a, b, 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31);
-    };
-    auto lane_sums = [&](const vf* v) -> vf {
-        vf part[4];  // the k-th holds 0 + k, 4 + k, ... so that the sums come out in order
-        for (int k = 0; k < 4; ++k) part[k] = fold4(fold8(v[k], v[4 + k]), fold8(v[8 + k], v[12 + k]));
-        return fold1(fold2(part[0], part[1]), fold2(part[2], part[3]));
-    };
 
     auto pass = [&](auto group, auto absolute_sums) {
         constexpr int C = decltype(group)::value;  // 0: any number of channels, read where they lie
@@ -364,41 +310,23 @@ _ADJOINT = (
 )
 
 
+# fmt: off
 @wp.func_native(_FORWARD)
 def composite_tile(
-    tile: int,
-    packed: wp.array2d[float],
-    background: wp.array[float],
-    ranges: wp.array[wp.vec2i],
-    splats: wp.array[int],
-    width: int,
-    height: int,
-    columns: int,
-    image: wp.array3d[float],
-    alpha_image: wp.array2d[float],
-    transmittance: wp.array2d[float],
-    last: wp.array2d[int],
+    tile: int, packed: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i],
+    splats: wp.array[int], width: int, height: int, columns: int,
+    image: wp.array3d[float], alpha_image: wp.array2d[float], transmittance: wp.array2d[float], last: wp.array2d[int],
 ): ...
 
 
 @wp.func_native(_ADJOINT)
 def composite_tile_adjoint(
-    tile: int,
-    packed: wp.array2d[float],
-    background: wp.array[float],
-    ranges: wp.array[wp.vec2i],
-    splats: wp.array[int],
-    slots: wp.array[int],
-    transmittance: wp.array2d[float],
-    last: wp.array2d[int],
-    v_image: wp.array3d[float],
-    v_alpha: wp.array2d[float],
-    width: int,
-    height: int,
-    columns: int,
-    absolute: int,
+    tile: int, packed: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i],
+    splats: wp.array[int], slots: wp.array[int], transmittance: wp.array2d[float], last: wp.array2d[int],
+    v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int, absolute: int,
     v_slots: wp.array2d[float],
 ): ...
+# fmt: on
 
 
 @wp.kernel

@@ -67,7 +67,7 @@ def composite(
     if background is None:
         background = channels.new_zeros(channels.shape[1])
     job = _Job(splats, tiles, stats, absgrad, _resolve_form(form, channels.device, tiles.tile_size))
-    tensors = (splats.means2d, splats.conics, splats.opacities, channels, background)
+    tensors: tuple[Tensor, ...] = (splats.means2d, splats.conics, splats.opacities, channels, background)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
         return _Composite.apply(*tensors, job)  # type: ignore[return-value]
     return _forward(job, tuple(t.detach().contiguous() for t in tensors), keep=False)[:2]
