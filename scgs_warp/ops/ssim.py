@@ -119,24 +119,28 @@ class _Photometric(torch.autograd.Function):
         else:
             sums = (_forward_bands if simd else _forward_pixels)(image, truth, mask, partials)
         totals = sums.flatten(1).double().sum(1)  # a few thousand values: one thread, one order
-        pixels = image[0].numel() if mask is None and image.shape[0] else 0
-        valid = totals.new_tensor(float(pixels)) if mask is None else mask.sum().double()
-        count = valid * image.shape[0]
-        l1, similarity = totals / count.clamp(min=1.0)
-        similarity = torch.where(count > 0, similarity, torch.ones_like(similarity))
+        # Pixels times channels that count: a number, or a tensor, as asking for its value would wait for the device.
+        count: float | Tensor = float(max(image.numel(), 1))
+        if mask is not None:
+            count = mask.sum().double() * image.shape[0]
+            totals = torch.stack([totals[0], torch.where(count > 0, totals[1], 1.0)])
+            count = count.clamp(min=1.0)
+        elif image.numel() == 0:
+            totals[1] = 1.0
+        l1, similarity = totals / count
         loss = (1.0 - weight) * l1 + weight * (1.0 - similarity)
-        ctx.save_for_backward(image, truth, mask, partials, count)
-        ctx.weight, ctx.simd = weight, simd
+        ctx.save_for_backward(image, truth, mask, partials)
+        ctx.weight, ctx.simd, ctx.count = weight, simd, count
         return loss.float(), l1.float(), similarity.float()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_loss: Tensor, v_l1: Tensor, v_ssim: Tensor) -> tuple[Tensor | None, ...]:
-        image, truth, mask, partials, count = ctx.saved_tensors
+        image, truth, mask, partials = ctx.saved_tensors
         v_image = torch.empty_like(image)
         if image.numel():
             v_means = torch.stack([v_l1 + (1.0 - ctx.weight) * v_loss, v_ssim - ctx.weight * v_loss])
-            v_sums = (v_means.double() / count.clamp(min=1.0)).float()
+            v_sums = (v_means / ctx.count).float()
             if ctx.simd:
                 bands = image.shape[0] * -(-image.shape[1] // cpu_kernels.BAND)
                 warp_interop.launch(
