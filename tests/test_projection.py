@@ -203,9 +203,9 @@ def test_ball_on_the_axis_and_off_it(z, scale, opacity, u, v):
     scale = scale / 200 * z
     f, size = 100.0, 200
     camera = Camera(torch.eye(4), torch.tensor([[f, 0, 100.0], [0, f, 100.0], [0, 0, 1]]), size, size)
-    ones = torch.ones(1)
+    ones, quat = torch.ones(1), torch.tensor([[0.3, -0.5, 0.7, 0.2]])
     splats = project(
-        torch.tensor([[u * z, v * z, z]]), torch.tensor([[0.3, -0.5, 0.7, 0.2]]), scale * torch.ones(1, 3), opacity * ones,
+        torch.tensor([[u * z, v * z, z]]), quat, scale * torch.ones(1, 3), opacity * ones,
         camera.viewmat, camera.K, size, size, eps2d=0.0,
     )  # fmt: skip
     s2 = (f * scale / z) ** 2
