@@ -78,9 +78,15 @@ class PretrainConfig:
     warm_up: int = milestone(500)
     """Steps before the network starts to move the spheres."""
     densify_every: int = 100
-    grad_threshold: float = 2e-4
+    clone_share: float = 0.2
+    """Share of the spheres that is cloned each time, those with the largest gradients, until the cap."""
+    start_ratio: float = 8.0
+    """Spheres per control point to start with; while they are at rest they cost little."""
     max_ratio: float = 4.0
-    """At most this many spheres per control point: each one queries the network."""
+    """At most this many spheres per control point once they move: each one queries the network."""
+    opacity_rate: float = 0.02
+    """Learning rates of the spheres; with the Gaussians' own they turn transparent before they find their colour."""
+    color_rate: float = 1e-2
     arap_weight: float = 1e-2
     random_background: bool = True
     """Where the data has alpha: another background every step, so that black cloth is not mistaken for nothing."""
@@ -170,8 +176,9 @@ class TrainConfig:
     """Main steps during which control points and network stay as stage 1 left them."""
     init_points: int = 100_000
     """Gaussians to start with where the data brings no points."""
-    init_from: Literal["random", "spheres"] = "random"
-    """random: uniformly in the cameras' common view; spheres: around the control points that stage 1 found."""
+    init_from: Literal["points", "spheres"] = "points"
+    """points: at the data's points, else at random where the images' alpha allows something to be; spheres: around the
+    control points that stage 1 found."""
     sh_degree: int = 3
     antialiased: bool = False
     seed: int = 0

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .config import TrainConfig
-from .densify import mean_gradient, threshold
+from .densify import mean_gradient
 from .gaussians import SH_C0, GaussianParameters, gaussians_from_points, neighbor_distance
 from .motion.control_points import ControlPoints, heads_of, make_network
 from .motion.spheres import Spheres
@@ -14,26 +14,20 @@ from .ops.sampling import farthest_points
 from .optim import generator, regather
 from .types import Stats
 
-SCENE_HALF_SIZE = 1.3
-"""Half the edge of the cube in which a scene without initial points starts (normalised units)."""
 TRAJECTORY_TIMES = 16
 """Instants whose positions make the space in which farthest-point sampling chooses control points."""
 DEAD_OPACITY = 0.01
 
 
-def random_points(count: int, seed: int, key: int) -> Tensor:
-    """[count, 3] uniform in the cube."""
-    return (torch.rand(count, 3, generator=generator(seed, key)) * 2.0 - 1.0) * SCENE_HALF_SIZE
-
-
-def begin_spheres(config: TrainConfig, points: Tensor | None, device: str) -> tuple[GaussianParameters, Spheres]:
-    """Spheres at a farthest-point sample of the data's points, else at random, and the network at rest."""
-    count = round(config.motion.nodes * config.pretrain.max_ratio)
-    if points is None or len(points) < config.motion.nodes:
-        chosen = random_points(count, config.seed, 31).to(device)
-    else:
-        chosen = points[farthest_points(points, min(count, len(points)))]
-    gaussians = gaussians_from_points(chosen, None, sh_degree=0, hyper_dim=0)
+def begin_spheres(
+    config: TrainConfig, points: Tensor, colors: Tensor, device: str
+) -> tuple[GaussianParameters, Spheres]:
+    """Spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and the
+    network at rest."""
+    count = round(config.motion.nodes * config.pretrain.start_ratio)
+    index = farthest_points(points, count) if len(points) > count else torch.arange(len(points), device=points.device)
+    chosen = points[index]
+    gaussians = gaussians_from_points(chosen, colors[index], sh_degree=0, hyper_dim=0)
     radius = float(neighbor_distance(chosen).median())
     network = make_network(config.motion, heads_of(config.motion), config.seed).to(device)
     return gaussians, Spheres(network, radius).to(device)
@@ -45,13 +39,12 @@ def densify_spheres(
     spheres: Spheres,
     stats: Stats,
     config: TrainConfig,
-    size: tuple[int, int],
     step: int,
 ) -> None:
-    """Remove transparent spheres, clone those that the image pulls at, keep between N_p and the cap.
+    """Remove transparent spheres, clone those that the image pulls at most, keep between N_p and the cap.
 
-    The clone lands within a radius of its parent. Too few left (a short first stage can fall to a dozen): the most
-    opaque ones are cloned in turn.
+    A threshold on the gradient does not carry over from Gaussians to large spheres, so the share is fixed. A clone lands
+    within a radius of its parent. Too few left (a short first stage can fall to a dozen): more are cloned.
     """
     with torch.no_grad():
         opacities = gaussians.opacities()
@@ -59,28 +52,21 @@ def densify_spheres(
         if not bool(alive.any()):
             alive[:] = True
         kept = torch.where(alive)[0]
-        gradient = mean_gradient(stats)[kept]
         limit = round(config.motion.nodes * config.pretrain.max_ratio)
-        order = gradient.argsort(descending=True, stable=True)
-        wanted = order[gradient[order] >= threshold_of(config, size)][: max(limit - len(kept), 0)]
-        clones = kept[wanted]
-        missing = config.motion.nodes - len(kept) - len(clones)
-        if missing > 0:
-            donors = kept[opacities[kept].argsort(descending=True, stable=True)]
-            clones = torch.cat([clones, donors[torch.arange(missing, device=donors.device) % len(donors)]])
+        if len(kept) > limit and step + 1 >= config.pretrain.warm_up:
+            kept = kept[opacities[kept].argsort(descending=True, stable=True)[:limit]].sort().values
+        gradient = mean_gradient(stats)[kept]
+        wanted = min(round(config.pretrain.clone_share * len(kept)), max(limit - len(kept), 0))
+        wanted = max(wanted, config.motion.nodes - len(kept))
+        parents = kept[gradient.argsort(descending=True, stable=True)]
+        clones = parents[torch.arange(wanted, device=kept.device) % len(parents)]
         index = torch.cat([kept, clones])
         fresh = torch.arange(len(index), device=index.device) >= len(kept)
         regather(optimizer, gaussians, GaussianParameters.NAMES, index, fresh)
-        if len(clones):
-            noise = torch.randn(len(clones), 3, generator=generator(config.seed, 32, step)).to(clones.device)
+        if wanted:
+            noise = torch.randn(wanted, 3, generator=generator(config.seed, 32, step)).to(clones.device)
             gaussians.means.data[len(kept) :] += noise * spheres.log_radius.exp()
         spheres.graph = None
-
-
-def threshold_of(config: TrainConfig, size: tuple[int, int]) -> float:
-    """The sphere threshold follows the resolution as the Gaussians' does."""
-    ratio = config.pretrain.grad_threshold / config.densify.grad_threshold
-    return ratio * threshold(config.densify, *size)
 
 
 def thin_spheres(gaussians: GaussianParameters, optimizer: torch.optim.Adam, spheres: Spheres, nodes: int) -> None:
@@ -107,15 +93,13 @@ def control_points_of(gaussians: GaussianParameters, spheres: Spheres, config: T
 
 
 def begin_gaussians(
-    config: TrainConfig, points: Tensor | None, spheres: tuple[GaussianParameters, Spheres] | None, device: str
+    config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None = None
 ) -> GaussianParameters:
-    """The Gaussians of stage 2: at the data's points, else around the spheres, else at random."""
+    """The Gaussians of stage 2: at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
     options = {"sh_degree": config.sh_degree, "hyper_dim": config.motion.hyper_dim}
     count = min(config.init_points, config.densify.max_gaussians)
-    if points is not None:
-        return gaussians_from_points(points[:count], None, **options)
-    if spheres is None or config.init_from == "random":
-        return gaussians_from_points(random_points(count, config.seed, 33).to(device), None, **options)
+    if spheres is None or config.init_from == "points":
+        return gaussians_from_points(points[:count], colors[:count], **options)
     parents, motion = spheres
     with torch.no_grad():
         opaque = torch.where(parents.opacities() >= 0.1)[0]

@@ -121,17 +121,20 @@ def _bad_gradient(state: TrainState) -> str | None:
 def adapt(state: TrainState, size: tuple[int, int]) -> None:
     """After the step: what the schedule wants of numbers of Gaussians and control points. ``stage_step`` is the step
     just done."""
-    (_adapt_spheres if state.stage == "pretrain" else _adapt_gaussians)(state, size)
+    if state.stage == "pretrain":
+        _adapt_spheres(state)
+    else:
+        _adapt_gaussians(state, size)
 
 
-def _adapt_spheres(state: TrainState, size: tuple[int, int]) -> None:
+def _adapt_spheres(state: TrainState) -> None:
     assert isinstance(state.motion, Spheres)
     config, done = state.config, state.stage_step + 1
     if done == config.pretrain.densify_until:
         thin_spheres(state.gaussians, state.gaussian_optimizer, state.motion, config.motion.nodes)
         state.reset_stats()
     elif done < config.pretrain.densify_until and done % config.pretrain.densify_every == 0:
-        densify_spheres(state.gaussians, state.gaussian_optimizer, state.motion, state.stats, config, size, state.step)
+        densify_spheres(state.gaussians, state.gaussian_optimizer, state.motion, state.stats, config, state.step)
         state.reset_stats()
 
 

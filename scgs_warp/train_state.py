@@ -15,10 +15,11 @@ from .data.dataset import Dataset
 from .data.normalise import Normalisation
 from .errors import UserError
 from .gaussians import GaussianParameters
+from .hull import likely_points
 from .motion import build_motion
 from .motion.base import Motion
 from .motion.spheres import Spheres
-from .optim import adam, load_optimizer_tensors, optimizer_tensors
+from .optim import adam, generator, load_optimizer_tensors, optimizer_tensors
 from .pretrain import begin_gaussians, begin_spheres, control_points_of
 from .scene import Scene, scene_from
 from .types import Stats
@@ -37,13 +38,14 @@ class TrainState:
         normalisation: Normalisation,
         rig: Overview,
         extent: float,
-        points: Tensor | None,
+        points: Tensor,
+        colors: Tensor,
         *,
         stage: Stage,
         step: int = 0,
     ) -> None:
         self.config, self.normalisation, self.overview = config, normalisation, rig
-        self.extent, self.points = extent, points
+        self.extent, self.points, self.colors = extent, points, colors
         self.stage: Stage = stage
         self.step = step
         self.failures = 0
@@ -59,18 +61,18 @@ class TrainState:
     @staticmethod
     def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
         normalisation = Normalisation.fit(data.cameras, data.points)
-        points = None if data.points is None else normalisation.apply(data.points).to(device)
-        rest = (normalisation, overview(data.cameras), data.extent * normalisation.scale, points)
+        points, colors = (tensor.to(device) for tensor in _initial_points(config, data, normalisation))
+        rest = (normalisation, overview(data.cameras), data.extent * normalisation.scale, points, colors)
         if config.pretrain_steps > 0:
-            return TrainState(config, *begin_spheres(config, points, device), *rest, stage="pretrain")
-        gaussians = begin_gaussians(config, points, None, device)
+            return TrainState(config, *begin_spheres(config, points, colors, device), *rest, stage="pretrain")
+        gaussians = begin_gaussians(config, points, colors)
         return TrainState(config, gaussians, build_motion(config.motion.model, config).to(device), *rest, stage="main")
 
     def begin_main(self) -> None:
         """From stage 1 to stage 2: spheres become control points, new Gaussians are made."""
         assert isinstance(self.motion, Spheres)
         points = control_points_of(self.gaussians, self.motion, self.config)
-        gaussians = begin_gaussians(self.config, self.points, (self.gaussians, self.motion), str(self.device))
+        gaussians = begin_gaussians(self.config, self.points, self.colors, (self.gaussians, self.motion))
         self.stage = "main"
         self.enter(gaussians, points)
 
@@ -88,13 +90,13 @@ class TrainState:
 
     def gaussian_rates(self) -> dict[str, float]:
         """Learning rates of the Gaussians that do not follow a schedule, and where the others start."""
-        rates = self.config.optim
+        rates, spheres = self.config.optim, self.stage == "pretrain"
         return {
             "means": rates.means,
             "quats": rates.quats,
             "log_scales": rates.scales,
-            "opacity_logits": rates.opacity,
-            "sh_dc": rates.sh_dc,
+            "opacity_logits": self.config.pretrain.opacity_rate if spheres else rates.opacity,
+            "sh_dc": self.config.pretrain.color_rate if spheres else rates.sh_dc,
             "sh_rest": rates.sh_rest,
             "hyper": rates.hyper,
         }
@@ -111,8 +113,8 @@ class TrainState:
         tensors.update({f"extra.{name}": value for name, value in self.motion.extra_state().items()})
         for name in ("grad_norm", "count", "max_radii"):
             tensors[f"stats.{name}"] = getattr(self.stats, name)
-        if self.points is not None:
-            tensors["points"] = self.points
+        if self.stage == "pretrain":  # stage 2 starts from them
+            tensors["points"], tensors["colors"] = self.points, self.colors
         metadata = {**self.scene().metadata(), "stage": self.stage, "extent": self.extent, "failures": self.failures}
         checkpoint.write(folder, tensors, metadata)
 
@@ -128,6 +130,7 @@ class TrainState:
         _same_configuration(metadata["config"], to_dict(config), source)
         tensors = checkpoint.to_device(tensors, device)
         scene = scene_from(tensors, metadata, device, source)
+        nothing = torch.zeros(0, 3, device=device)
         try:
             state = TrainState(
                 config,
@@ -136,7 +139,8 @@ class TrainState:
                 scene.normalisation,
                 scene.overview,
                 float(metadata["extent"]),
-                tensors.get("points"),
+                tensors.get("points", nothing),
+                tensors.get("colors", nothing),
                 stage=metadata["stage"],
                 step=scene.step,
             )
@@ -150,6 +154,17 @@ class TrainState:
         except (KeyError, ValueError, RuntimeError) as error:
             raise UserError(f"{source}: cannot be resumed ({error}); train again without --resume") from error
         return state
+
+
+def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
+    """Points [P, 3], normalised, and colours [P, 3]: the data's own points in a random order, else likely ones."""
+    count = max(config.init_points, round(config.motion.nodes * config.pretrain.start_ratio))
+    if data.points is None or len(data.points) == 0:
+        points, colors = likely_points(count, data, normalisation, config.seed, 31)
+    else:
+        order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
+        points, colors = normalisation.apply(data.points)[order].float().contiguous(), None
+    return points, torch.full_like(points, 0.5) if colors is None else colors
 
 
 def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:

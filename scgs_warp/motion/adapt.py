@@ -1,4 +1,4 @@
-"""Adaptive control of control points: clone where the image still pulls, prune what moves nothing (paper section 4.3)."""
+"""Adaptive control points: clone where the image still pulls, prune what moves nothing (paper section 4.3)."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from ..config import LossConfig, MotionConfig, TrainConfig
 from ..gaussians import GaussianParameters
 from ..ops.neighbors import nearest, rbf_weights
-from ..ops.skinning import skin
+from ..ops.skinning import skin, skin_rbf
 from ..optim import generator, log_linear
 from ..types import Gaussians, Pose
 from .base import Motion, TrainingPose
@@ -46,6 +46,12 @@ def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> Defo
 def unit_rotations(raw: Tensor) -> Tensor:
     """Network output [..., 4] to unit quaternions near the identity."""
     return F.normalize(raw + raw.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
+
+
+def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | None]) -> Gaussians:
+    means, quats, log_scales = moved
+    scales = gaussians.scales() if log_scales is None else (gaussians.log_scales + log_scales).exp()
+    return Gaussians(means, quats, scales, gaussians.opacities(), gaussians.sh_dc, gaussians.sh_rest)
 
 
 class ControlPoints(Motion):
@@ -85,34 +91,48 @@ class ControlPoints(Motion):
             for i in range(times.shape[0])
         ]
 
-    def binding(self, gaussians: GaussianParameters, frozen: bool = False) -> tuple[Tensor, Tensor]:
-        """K nearest control points of every Gaussian and their RBF weights (Eq. 5): indices [N, K], weights [N, K].
+    def neighbors(self, gaussians: GaussianParameters) -> Tensor:
+        """[N, K] int32 nearest control points of every Gaussian at rest, exact at every call: in space, with
+        hyper-coordinates appended where the model has them."""
+        points, nodes = gaussians.means.detach(), self.positions.detach()
+        if self.config.hyper_dim:
+            points = torch.cat([points, gaussians.hyper.detach()], dim=1)
+            nodes = torch.cat([nodes, self.hyper.detach()], dim=1)
+        return nearest(points.contiguous(), nodes.contiguous(), self.config.neighbors)[0]
 
-        The search runs in space, with hyper-coordinates appended where the model has them.
-        """
-        positions, log_radii, strengths = self.positions, self.log_radii, None
-        points, nodes = gaussians.means, positions
+    def binding(self, gaussians: GaussianParameters) -> tuple[Tensor, Tensor]:
+        """Neighbours and their RBF weights (Eq. 5): indices [N, K], weights [N, K]. They do not depend on time."""
+        indices = self.neighbors(gaussians)
+        points, nodes = gaussians.means, self.positions
         if self.config.hyper_dim:
             points = torch.cat([gaussians.means, gaussians.hyper], dim=1)
-            nodes = torch.cat([positions, self.hyper], dim=1)
-        if self.config.node_weight:
-            strengths = self.strength_logits.sigmoid()
-        radii = log_radii.exp()
-        if frozen:
-            nodes, radii = nodes.detach(), radii.detach()
-            strengths = None if strengths is None else strengths.detach()
-        with torch.no_grad():
-            indices, _ = nearest(points.detach().contiguous(), nodes.detach().contiguous(), self.config.neighbors)
-        return indices, rbf_weights(points, nodes, radii, indices, strengths)
+            nodes = torch.cat([self.positions, self.hyper], dim=1)
+        strengths = self.strength_logits.sigmoid() if self.config.node_weight else None
+        return indices, rbf_weights(points, nodes, self.log_radii.exp(), indices, strengths)
 
-    def apply_pose(
-        self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor], frozen: bool = False
-    ) -> Gaussians:
+    def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
         """Linear blend skinning of all Gaussians (Eq. 6-7). Editing replaces ``pose``, nothing else."""
-        nodes = self.positions.detach() if frozen else self.positions
-        means, quats, log_scales = skin(gaussians.means, gaussians.quats, nodes, pose, *binding)
-        scales = gaussians.scales() if log_scales is None else (gaussians.log_scales + log_scales).exp()
-        return Gaussians(means, quats, scales, gaussians.opacities(), gaussians.sh_dc, gaussians.sh_rest)
+        return _posed(gaussians, skin(gaussians.means, gaussians.quats, self.positions, pose, *binding))
+
+    def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
+        """As :meth:`apply_pose` with :meth:`binding`, in one pass; ``frozen`` control points get no gradient."""
+        hyper = self.config.hyper_dim > 0
+        rows = (
+            self.positions,
+            self.log_radii.exp(),
+            self.strength_logits.sigmoid() if self.config.node_weight else None,
+            self.hyper if hyper else None,
+        )
+        if frozen:
+            rows = tuple(None if row is None else row.detach() for row in rows)
+        nodes, radii, strengths, hyper_nodes = rows
+        assert nodes is not None and radii is not None
+        hyper_points = gaussians.hyper if hyper else None
+        indices = self.neighbors(gaussians)
+        moved = skin_rbf(
+            gaussians.means, gaussians.quats, nodes, radii, pose, indices, strengths, hyper_points, hyper_nodes
+        )
+        return _posed(gaussians, moved)
 
     def cache_binding(self, gaussians: GaussianParameters | None) -> None:
         """For rendering: neighbours and weights do not depend on time. None forgets them."""
@@ -134,7 +154,7 @@ class ControlPoints(Motion):
             times += torch.rand(2, generator=generator(seed, 21, step)).tolist()
         with torch.set_grad_enabled(not frozen):
             poses = self.poses(torch.tensor(times))
-        posed = self.apply_pose(gaussians, poses[0], self.binding(gaussians, frozen), frozen)
+        posed = self.bind_and_pose(gaussians, poses[0], frozen)
         if weight == 0.0 or self.graph is None:
             return TrainingPose(posed, None)
         first, second = (self.positions.detach() + pose.translations for pose in poses[1:])

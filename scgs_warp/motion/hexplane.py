@@ -35,7 +35,7 @@ class HexPlane(Motion):
         random = generator(seed, 12)
         self.planes = nn.ParameterList()
         for multiple in MULTIPLES:
-            for first, second in PAIRS:
+            for _, second in PAIRS:
                 rows = TEMPORAL if second == 3 else SPATIAL * multiple
                 shape = (1, CHANNELS, rows, SPATIAL * multiple)
                 # Space planes vary at first, time planes are 1: the scene starts at rest.
@@ -44,8 +44,10 @@ class HexPlane(Motion):
         self.trunk = nn.Linear(CHANNELS * len(MULTIPLES), WIDTH)
         widths = {"means": 3, "quats": 4, "log_scales": 3}
         self.heads = nn.ModuleDict(
-            {name: nn.Sequential(nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, width))
-             for name, width in widths.items()}
+            {
+                name: nn.Sequential(nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, width))
+                for name, width in widths.items()
+            }
         )
         for layer in self.modules():
             if isinstance(layer, nn.Linear):

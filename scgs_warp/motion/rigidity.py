@@ -37,7 +37,7 @@ def arap_weight(step: int, loss: LossConfig) -> float:
 
 
 def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> Graph | None:
-    """Neighbours by trajectory: ``positions_at(times [T]) -> [T, M, 3]`` sampled at N_t times. None for fewer than two."""
+    """Neighbours by trajectory; ``positions_at(times [T]) -> [T, M, 3]`` is sampled at N_t times. None for fewer than two."""
     with torch.no_grad():
         trajectories = positions_at(torch.linspace(0.0, 1.0, loss.arap_times))
         count = min(loss.arap_neighbors, trajectories.shape[1] - 1)
@@ -45,6 +45,6 @@ def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> G
 
 
 def rigidity(first: Tensor, second: Tensor, graph: Graph) -> Tensor:
-    """Sum over control points of the energy between two instants [M, 3]; summed by a product with ones (fixed order)."""
+    """Sum over control points of the energy between two instants [M, 3]; a product with ones sums in a fixed order."""
     energy = arap_energy(first, second, graph.neighbors, graph.weights, reverse=graph.reverse)
     return energy @ torch.ones_like(energy)

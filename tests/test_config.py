@@ -1,0 +1,92 @@
+"""Settings: presets are complete, milestones scale, mistakes are named."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from scgs_warp import config as C
+from scgs_warp.errors import UserError
+
+
+@pytest.mark.parametrize("name", C.PRESETS)
+def test_presets_are_complete_and_round_trip(name):
+    made = C.check(C.preset(name))
+    assert made.preset == name
+    assert C.from_dict(json.loads(json.dumps(C.to_dict(made)))) == made
+
+
+def test_paper_preset_is_the_supplements():
+    made = C.preset("paper")
+    assert (made.pretrain.steps, made.pretrain.densify_until, made.main_steps) == (10_000, 7_500, 70_000)
+    assert (made.freeze, made.motion.nodes, made.motion.neighbors) == (3_000, 512, 4)
+    assert (made.loss.arap, made.loss.arap_end, made.loss.arap_until) == (1e-4, 1e-7, 10_000)
+    assert (made.motion.layers, made.motion.position_frequencies, made.motion.time_frequencies) == (8, 10, 6)
+    assert made.pretrain.progressive_every == 1_000
+
+
+def test_steps_scale_every_milestone():
+    made = C.with_steps(C.preset("paper"), 8_000)
+    assert made.steps == 8_000
+    assert (made.pretrain.steps, made.pretrain.densify_until, made.freeze) == (1_000, 750, 300)
+    assert (made.densify.until, made.optim.means_until, made.loss.arap_until) == (5_000, 3_000, 1_000)
+    assert made.densify.every == 100 and made.loss.arap_refresh == 200, "intervals are no milestones"
+
+
+def test_only_control_points_have_a_first_stage():
+    made = C.with_field(C.preset("paper"), "motion.model", "static", "test")
+    assert made.pretrain_steps == 0 and made.main_steps == 80_000
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"preset": "fast"}, "preset is 'fast'"),
+        ({"step": 3}, "unknown field 'step'"),
+        ({"motion": {"node": 3}}, "unknown field 'motion.node'"),
+        ({"motion": 3}, "motion must be an object"),
+        ({"steps": "many"}, "steps is 'many'"),
+        ({"steps": True}, "steps is True"),
+        ({"motion": {"model": "fluid"}}, "motion.model is 'fluid'"),
+        ({"loss": {"ssim": None}}, "loss.ssim is None"),
+    ],
+)
+def test_mistakes_name_file_and_field(values, message):
+    with pytest.raises(UserError, match=r"my\.json") as caught:
+        C.from_dict(values, "my.json")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("motion.neighbors", 0),
+        ("motion.neighbors", 17),
+        ("motion.nodes", 4),
+        ("densify.max_gaussians", 1),
+        ("sh_degree", 4),
+        ("data.downscale", 0),
+        ("pretrain.steps", 80_000),
+    ],
+)
+def test_what_cannot_run_is_refused(name, value):
+    with pytest.raises(UserError):
+        C.check(C.with_field(C.preset("paper"), name, value, "test"))
+
+
+def test_unreadable_files(tmp_path):
+    with pytest.raises(UserError, match="cannot be read"):
+        C.read_config(tmp_path / "none.json")
+    path = tmp_path / "bad.json"
+    path.write_text("{")
+    with pytest.raises(UserError, match="not valid JSON"):
+        C.read_config(path)
+    path.write_text("[]")
+    with pytest.raises(UserError, match="must hold a JSON object"):
+        C.read_config(path)
+
+
+def test_too_few_steps():
+    with pytest.raises(UserError, match="--steps 3"):
+        C.with_steps(C.preset("cpu"), 3)
