@@ -319,44 +319,21 @@ _ADJOINT = (
 
 @wp.func_native(_FORWARD)
 def _skin_lanes(
-    begin: int,
-    means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
-    hyper: wp.array2d[float],
-    has_hyper: int,
-    motion: wp.array2d[float],
-    reach: wp.array2d[float],
-    has_log_scales: int,
-    indices: wp.array2d[wp.int32],
-    weights: wp.array2d[float],
-    means_t: wp.array[wp.vec3],
-    quats_t: wp.array[wp.vec4],
+    begin: int, means: wp.array[wp.vec3], quats: wp.array[wp.vec4], hyper: wp.array2d[float], has_hyper: int,
+    motion: wp.array2d[float], reach: wp.array2d[float], has_log_scales: int, indices: wp.array2d[wp.int32],
+    weights: wp.array2d[float], means_t: wp.array[wp.vec3], quats_t: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
-): ...
+): ...  # fmt: skip
 
 
 @wp.func_native(_ADJOINT)
 def _skin_lanes_adjoint(
-    chunk: int,
-    size: int,
-    means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
-    hyper: wp.array2d[float],
-    has_hyper: int,
-    motion: wp.array2d[float],
-    reach: wp.array2d[float],
-    has_log_scales: int,
-    indices: wp.array2d[wp.int32],
-    weights: wp.array2d[float],
-    v_means_t: wp.array[wp.vec3],
-    v_quats_t: wp.array[wp.vec4],
-    v_log_scales_t: wp.array[wp.vec3],
-    v_means: wp.array[wp.vec3],
-    v_quats: wp.array[wp.vec4],
-    v_hyper: wp.array2d[float],
-    v_motion: wp.array2d[float],
-    v_reach: wp.array2d[float],
-): ...
+    chunk: int, size: int, means: wp.array[wp.vec3], quats: wp.array[wp.vec4], hyper: wp.array2d[float],
+    has_hyper: int, motion: wp.array2d[float], reach: wp.array2d[float], has_log_scales: int,
+    indices: wp.array2d[wp.int32], weights: wp.array2d[float], v_means_t: wp.array[wp.vec3],
+    v_quats_t: wp.array[wp.vec4], v_log_scales_t: wp.array[wp.vec3], v_means: wp.array[wp.vec3],
+    v_quats: wp.array[wp.vec4], v_hyper: wp.array2d[float], v_motion: wp.array2d[float], v_reach: wp.array2d[float],
+): ...  # fmt: skip
 
 
 @wp.kernel
