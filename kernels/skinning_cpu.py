@@ -198,6 +198,7 @@ _ADJOINT = (
     const int M = motion.shape[0];
     float* motion_sum = v_motion.data + (long long)chunk * M * 16;
     float* reach_sum = v_reach.data + (long long)chunk * M * 16;
+    for (long long m = 0; m < M; ++m) { put(motion_sum + 16 * m, (vf){}); put(reach_sum + 16 * m, (vf){}); }
     const int end = (chunk + 1) * size < N ? (chunk + 1) * size : N;
     for (int begin = chunk * size; begin < end; begin += 16) {
         read(begin);
@@ -383,8 +384,8 @@ def skin_rbf_lanes_adjoint(
     v_means_out: wp.array[wp.vec3],  # [N]
     v_quats_out: wp.array[wp.vec4],  # [N]
     v_hyper_out: wp.array2d[float],  # [N, H], touched only with has_hyper
-    v_motion_out: wp.array2d[float],  # [chunks * M, 16] zero on entry
-    v_reach_out: wp.array2d[float],  # [chunks * M, 16] zero on entry: v e, w v_log_scales, v d^2, v of the exponents
+    v_motion_out: wp.array2d[float],  # [chunks * M, 16]
+    v_reach_out: wp.array2d[float],  # [chunks * M, 16]: v e, w v_log_scales, v d^2, v of the exponents
 ):
     """One chunk of Gaussians: their gradients, and their sums for every node."""
     chunk = first + wp.tid()

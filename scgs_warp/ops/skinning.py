@@ -177,7 +177,7 @@ class _SkinRbf(torch.autograd.Function):
         v_outputs = (None if v is None else v.contiguous() for v in gradients)
         size = chunk_size(count)
         chunks = -(-means.shape[0] // size)
-        v_motion, v_reach = (torch.zeros(chunks, count, skinning_palette.ROW) for _ in range(2))
+        v_motion, v_reach = (torch.empty(chunks, count, skinning_palette.ROW) for _ in range(2))
         v_means, v_quats, v_hyper = _like(means, quats, hyper)
         launch(
             skinning_cpu.skin_rbf_lanes_adjoint,
