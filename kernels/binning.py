@@ -26,6 +26,7 @@ class Ellipse:
     mean: wp.vec2
     reach: float  # q at the edge; negative: the splat is culled
     shear: float  # -B / A
+    half_width: float
     half_height: float
     tip: float  # dy of the rightmost point; the leftmost lies at -tip
     spread: float  # reach / A
@@ -50,6 +51,7 @@ def splat_ellipse(mean: wp.vec2, conic: wp.vec3, opacity: float, depth: float, r
         e.shear = -conic[1] * scale
         e.spread = e.reach * scale
         e.steepness = determinant * scale * scale
+        e.half_width = wp.sqrt(e.reach * conic[2] / determinant)
         e.half_height = wp.sqrt(e.reach * conic[0] / determinant)
         e.tip = -conic[1] * wp.sqrt(e.reach / (conic[2] * determinant))
     return e
@@ -86,6 +88,16 @@ def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: i
     return touched(e.mean[0] + x_left, e.mean[0] + x_right, tile_size, columns, width)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffsll(mask) - 1;
+#else
+    return __builtin_ctzll(mask);
+#endif
+""")
+def lowest_bit(mask: wp.uint64) -> int: ...
+
+
 @wp.func
 def sortable(depth: float) -> wp.int64:
     """The bits of a float, turned so that they sort as unsigned integers in the float's order."""
@@ -114,24 +126,57 @@ def count_tiles(
     tile_size: int,
     # Out:
     counts_out: wp.array[int],  # [N] tiles touched; 0: culled
+    corners_out: wp.array[int],  # [N] first tile of a window of 8 x 8
+    windows_out: wp.array[wp.int64],  # [N] the tiles touched there, a bit each; 0: they do not fit
     depth_keys_out: wp.array[float],  # [2 N] what to sort the splats by, in the first half; empty: not wanted
     order_out: wp.array[int],  # [2 N] 0, 1, 2, ... in the first half; empty too
 ):
     i = first + wp.tid()
     e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
     count = int(0)
+    corner = int(0)
+    window = wp.uint64(0)
     if e.reach >= 0.0:
         span = touched_rows(e, tile_size, rows, height)
+        left = touched(e.mean[0] - e.half_width, e.mean[0] + e.half_width, tile_size, columns, width)[0]
+        fits = span[1] - span[0] <= 8
+        corner = span[0] * columns + left
         for row in range(span[0], span[1]):
             reach = touched_columns(e, row, tile_size, columns, width, height)
-            count += reach[1] - reach[0]
+            length = reach[1] - reach[0]
+            count += length
+            if length > 0:
+                fits = fits and reach[0] >= left and reach[1] <= left + 8
+                if fits:
+                    bits = (wp.uint64(1) << wp.uint64(length)) - wp.uint64(1)
+                    window = window | (bits << wp.uint64((row - span[0]) * 8 + reach[0] - left))
+        if not fits:
+            window = wp.uint64(0)
     counts_out[i] = count
+    corners_out[i] = corner
+    windows_out[i] = wp.int64(window)
     if order_out.shape[0] > 0:
         key = float(DEPTH_CULLED)
         if count > 0:
             key = depths_in[i]
         depth_keys_out[i] = key
         order_out[i] = i
+
+
+@wp.kernel
+def scan_counts(
+    first: int,
+    # In:
+    counts_in: wp.array[int],  # [N]
+    # Out:
+    offsets_out: wp.array[wp.int64],  # [N + 1] sum of the counts before each
+):
+    """In one grid index, for a CPU, where torch would start its threads for it."""
+    total = wp.int64(0)
+    for i in range(counts_in.shape[0]):
+        offsets_out[i] = total
+        total += wp.int64(counts_in[i])
+    offsets_out[counts_in.shape[0]] = total
 
 
 @wp.kernel
@@ -144,6 +189,8 @@ def emit_pairs(
     depths_in: wp.array[float],  # [N]
     radii_in: wp.array[wp.vec2i],  # [N]
     offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
+    corners_in: wp.array[int],  # [N]
+    windows_in: wp.array[wp.int64],  # [N] what count_tiles found, where it fits; else it is found again
     width: int,
     height: int,
     columns: int,
@@ -151,27 +198,45 @@ def emit_pairs(
     tile_size: int,
     # Out:
     tiles_out: wp.array[int],  # [P] tile of each slot
-    owners_out: wp.array[int],  # [P] splat of each slot; empty: not wanted, nor the next two
-    keys_out: wp.array[wp.int64],  # [2 P] tile << 32 | depth in the first half; the other half is the sort's own
-    slots_out: wp.array[int],  # [2 P] 0, 1, 2, ... in the first half
 ):
     i = first + wp.tid()
     slot = int(offsets_in[i])
-    if int(offsets_in[i + 1]) == slot:
-        return
-    e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
+    end = int(offsets_in[i + 1])
+    window = wp.uint64(windows_in[i])
+    corner = corners_in[i]
+    while window != wp.uint64(0):
+        bit = lowest_bit(window)
+        window = window & (window - wp.uint64(1))
+        tiles_out[slot] = corner + (bit >> 3) * columns + (bit & 7)
+        slot += 1
+    if slot < end:
+        e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
+        span = touched_rows(e, tile_size, rows, height)
+        for row in range(span[0], span[1]):
+            reach = touched_columns(e, row, tile_size, columns, width, height)
+            for column in range(reach[0], reach[1]):
+                tiles_out[slot] = row * columns + column
+                slot += 1
+
+
+@wp.kernel
+def pair_keys(
+    first: int,
+    # In:
+    depths_in: wp.array[float],  # [N]
+    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
+    tiles_in: wp.array[int],  # [P] tile of each slot
+    # Out:
+    keys_out: wp.array[wp.int64],  # [2 P] tile << 32 | depth in the first half; the other half is the sort's own
+    slots_out: wp.array[int],  # [2 P] 0, 1, 2, ... in the first half
+    owners_out: wp.array[int],  # [P] splat of each slot
+):
+    i = first + wp.tid()
     depth = sortable(depths_in[i])
-    span = touched_rows(e, tile_size, rows, height)
-    for row in range(span[0], span[1]):
-        reach = touched_columns(e, row, tile_size, columns, width, height)
-        for column in range(reach[0], reach[1]):
-            tile = row * columns + column
-            tiles_out[slot] = tile
-            if owners_out.shape[0] > 0:
-                owners_out[slot] = i
-                keys_out[slot] = (wp.int64(tile) << wp.int64(32)) | depth
-                slots_out[slot] = slot
-            slot += 1
+    for slot in range(int(offsets_in[i]), int(offsets_in[i + 1])):
+        keys_out[slot] = (wp.int64(tiles_in[slot]) << wp.int64(32)) | depth
+        slots_out[slot] = slot
+        owners_out[slot] = i
 
 
 @wp.kernel

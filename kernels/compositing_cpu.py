@@ -243,10 +243,7 @@ _ADJOINT = (
             const float to_conic = -1.3862943611198906f;  // undoes the factor folded into the packed conic
             const float A = to_conic * s[2], B = 0.5f * to_conic * s[3], D = to_conic * s[4];
             const vf dx = LANE - g.mx, adx = A * dx, bdx = B * dx;
-            float dys[16], bdy[16], cdy2[16];
-            __builtin_memcpy(dys, &g.dy, 64);
-            __builtin_memcpy(bdy, &g.bdy, 64);
-            __builtin_memcpy(cdy2, &g.cdy2, 64);
+            const float *dys = (const float*)&g.dy, *bdy = (const float*)&g.bdy, *cdy2 = (const float*)&g.cdy2;
             vf g0 = ZERO, g1 = ZERO, g2 = ZERO, abs_x = ZERO, abs_y = ZERO, v_channel[K];
             for (int c = 0; c < K; ++c) v_channel[c] = ZERO;
             while (rows) {

@@ -50,13 +50,16 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE) -> Tiles:
 def _bin_by_counting(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Ranges, splats, slots, offsets, on a CPU: splats sorted by depth once, their pairs put in place tile by tile."""
     count, tile_count = len(geometry[0]), size[2] * size[3]
-    counts, order = torch.empty(count, dtype=torch.int32), torch.empty(2 * count, dtype=torch.int32)
-    depth_keys = torch.empty(2 * count)
-    launch(kernels.count_tiles, count, *geometry, *size, counts, depth_keys, order)
-    offsets, pairs = _offsets(counts)
+    counts, corners = (torch.empty(count, dtype=torch.int32) for _ in range(2))
+    windows = torch.empty(count, dtype=torch.int64)
+    depth_keys, order = torch.empty(2 * count), torch.empty(2 * count, dtype=torch.int32)
+    launch(kernels.count_tiles, count, *geometry, *size, counts, corners, windows, depth_keys, order)
+    offsets = torch.empty(count + 1, dtype=torch.int64)
+    launch(kernels.scan_counts, 1, counts, offsets)
+    pairs = _total(offsets)
     _sort(depth_keys, order, count, 32)
     tiles, splats, slots = (torch.empty(pairs, dtype=torch.int32) for _ in range(3))
-    launch(kernels.emit_pairs, count, *geometry, offsets, *size, tiles, None, None, None)
+    launch(kernels.emit_pairs, count, *geometry, offsets, corners, windows, *size, tiles)
     cursors = torch.empty(tile_count, dtype=torch.int32)
     ranges = torch.empty(tile_count, 2, dtype=torch.int32)
     launch(kernels.place_pairs, 1, order, offsets, tiles, cursors, ranges, splats, slots)
@@ -66,13 +69,17 @@ def _bin_by_counting(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Ten
 def _bin_by_radix(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The same by one radix sort of all pairs, which a GPU can share among its threads."""
     count, tile_count, device = len(geometry[0]), size[2] * size[3], geometry[0].device
-    counts = torch.empty(count, dtype=torch.int32, device=device)
-    launch(kernels.count_tiles, count, *geometry, *size, counts, None, None)
-    offsets, pairs = _offsets(counts)
+    counts, corners = (torch.empty(count, dtype=torch.int32, device=device) for _ in range(2))
+    windows = torch.empty(count, dtype=torch.int64, device=device)
+    launch(kernels.count_tiles, count, *geometry, *size, counts, corners, windows, None, None)
+    offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
+    torch.cumsum(counts, 0, out=offsets[1:])
+    pairs = _total(offsets)
     tiles, owners, splats = (torch.empty(pairs, dtype=torch.int32, device=device) for _ in range(3))
     keys = torch.empty(2 * pairs, dtype=torch.int64, device=device)
     slots = torch.empty(2 * pairs, dtype=torch.int32, device=device)
-    launch(kernels.emit_pairs, count, *geometry, offsets, *size, tiles, owners, keys, slots)
+    launch(kernels.emit_pairs, count, *geometry, offsets, corners, windows, *size, tiles)
+    launch(kernels.pair_keys, count, geometry[3], offsets, tiles, keys, slots, owners)
     # The sort is stable and slots ascend with the splat's index: equal depths are in the order of the index.
     _sort(keys, slots, pairs, 32 + (tile_count - 1).bit_length())
     launch(kernels.gather_owners, pairs, slots, owners, splats)
@@ -81,14 +88,12 @@ def _bin_by_radix(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor
     return ranges, splats, slots[:pairs], offsets
 
 
-def _offsets(counts: Tensor) -> tuple[Tensor, int]:
-    """[N + 1] where each splat's slots begin, summed in 64 bits, and how many there are."""
-    offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
-    torch.cumsum(counts, 0, out=offsets[1:])
+def _total(offsets: Tensor) -> int:
+    """Pairs in all, or a refusal of more than the lists can index."""
     pairs = int(offsets[-1])
     if pairs > MAX_PAIRS:
         raise ValueError(f"splats: {pairs} pairs of splat and tile, more than 2^31 - 1; reduce the image or the splats")
-    return offsets, pairs
+    return pairs
 
 
 def _sort(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
