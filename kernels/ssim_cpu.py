@@ -23,6 +23,7 @@ _SHARED = f"""
     #pragma clang fp contract(fast)  // Warp's default for the CPU is off: no fused multiply-add
     typedef float lanes __attribute__((vector_size(64), aligned(4), may_alias));
     typedef int truths __attribute__((vector_size(64), aligned(4), may_alias));
+    typedef unsigned char bytes __attribute__((vector_size(16), aligned(1), may_alias));
     const float w[6] = {{{", ".join(f"{tap:.9e}f" for tap in TAPS)}}};
     const int height = image.shape[1], width = image.shape[2];
     const int bands = (height + {BAND - 1}) / {BAND};
@@ -117,8 +118,11 @@ _LOAD_PAIR = """
                             valid[k] = -1;
                         }
                 if (valid_plane) {
-                    for (int k = 0; k < 16; ++k)
-                        if (column + k >= 0 && column + k < width && !valid_plane[at + k]) valid[k] = 0;
+                    if (COUNT == 16)
+                        valid = __builtin_convertvector(*(const bytes*)(valid_plane + at), truths) != truths{};
+                    else
+                        for (int k = 0; k < 16; ++k)
+                            if (column + k >= 0 && column + k < width && !valid_plane[at + k]) valid[k] = 0;
                     x = valid ? x : y;
                 }
 """

@@ -24,6 +24,7 @@ CASES = {
     "faint, several batches": (16, 9, 600, 1, 3, "faint"),
     "nine channels": (20, 18, 40, 9, 4, "mixed"),
     "one splat": (8, 8, 1, 5, 5, "opaque"),
+    "clamped alpha": (16, 16, 3, 3, 7, "full"),
     "no splat": (20, 20, 0, 3, 6, "mixed"),
 }
 
@@ -37,7 +38,10 @@ def random_splats(width: int, height: int, count: int, channels: int, seed: int,
     inverse = torch.linalg.inv(covariances) if count else covariances
     conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], 1)
     drawn = torch.rand(count, generator=generator)
-    opacities = {"mixed": drawn, "opaque": 0.9 + 0.1 * drawn, "faint": 0.03 * drawn}[opacity]
+    ranges = {"mixed": (0.0, 1.0), "opaque": (0.9, 0.1), "faint": (0.0, 0.03), "full": (1.0, 0.0)}
+    opacities = ranges[opacity][0] + ranges[opacity][1] * drawn
+    if opacity == "full":  # on pixel centres, where alpha reaches its bound
+        means2d = means2d.clamp(2.0, min(width, height) - 2.0).floor() + 0.5
     radii = (3.5 * covariances.diagonal(dim1=1, dim2=2).sqrt()).ceil().int()
     depths = torch.rand(count, generator=generator) + 1.0
     colors = torch.rand(count, channels, generator=generator)
