@@ -220,6 +220,39 @@ def sum_slots(
         absgrad_out[i] = absolute
 
 
+SLOT_WIDTH = 16
+"""Columns of a slot that is one cache line: up to 8 channels."""
+
+Slot = wp.types.vector(length=SLOT_WIDTH, dtype=wp.float32)
+
+
+@wp.kernel
+def sum_line_slots(
+    first: int,
+    # In:
+    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
+    v_slots_in: wp.array[Slot],  # [P, 16]
+    # Out:
+    v_means2d_out: wp.array[wp.vec2],  # [N]
+    v_conics_out: wp.array[wp.vec3],  # [N]
+    v_opacities_out: wp.array[float],  # [N]
+    v_channels_out: wp.array2d[float],  # [N, C], C <= 8
+    absgrad_out: wp.array[wp.vec2],  # [N]; empty: not wanted
+):
+    """``sum_slots`` of slots that are one vector: the same bits, in half the time on a CPU."""
+    i = first + wp.tid()
+    total = Slot()
+    for s in range(int(offsets_in[i]), int(offsets_in[i + 1])):
+        total += v_slots_in[s]
+    v_means2d_out[i] = wp.vec2(total[0], total[1])
+    v_conics_out[i] = wp.vec3(total[2], total[3], total[4])
+    v_opacities_out[i] = total[5]
+    if absgrad_out.shape[0] > 0:
+        absgrad_out[i] = wp.vec2(total[6], total[7])
+    for c in range(v_channels_out.shape[1]):
+        v_channels_out[i, c] = total[SLOT_GEOMETRY + c]
+
+
 @wp.kernel
 def add_stats(
     first: int,

@@ -96,9 +96,9 @@ class _Composite(torch.autograd.Function):
         if absolute and absgrad is None:
             absgrad = torch.empty_like(v_means2d)
         count = len(v_means2d)
-        launch(
-            kernels.sum_slots, count, job.tiles.offsets, v_slots, v_means2d, v_conics, v_opacities, v_channels, absgrad
-        )
+        outputs = (v_means2d, v_conics, v_opacities, v_channels, absgrad)
+        sum_slots = kernels.sum_line_slots if v_slots.shape[1] == kernels.SLOT_WIDTH else kernels.sum_slots
+        launch(sum_slots, count, job.tiles.offsets, v_slots, *outputs)
         if job.stats is not None:
             norm_of = absgrad if job.stats.absolute else v_means2d
             stats, size = job.stats, (job.tiles.width, job.tiles.height)
@@ -174,7 +174,9 @@ def _adjoint(
     means2d, conics, _, channels, background = tensors
     tiles = job.tiles
     # A slot of up to 8 channels is one cache line.
-    v_slots = torch.empty(len(tiles.splats), max(16, SLOT_GEOMETRY + channels.shape[1]), device=channels.device)
+    v_slots = torch.empty(
+        len(tiles.splats), max(kernels.SLOT_WIDTH, SLOT_GEOMETRY + channels.shape[1]), device=channels.device
+    )
     lists = (background, tiles.ranges, tiles.splats, tiles.slots, transmittance, last, v_image, v_alpha)
     size = (tiles.width, tiles.height, tiles.columns)
     count = len(tiles.ranges)
