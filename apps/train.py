@@ -20,7 +20,7 @@ class Options:
     """Reconstruct a moving scene from posed frames."""
 
     data: Path | None = None
-    """Folder of a data set in D-NeRF layout (transforms_train.json ...). Without it the built-in scene is made, once."""
+    """Folder of a data set in D-NeRF layout (transforms_train.json ...). Without it the built-in scene is made."""
     output: Path | None = None
     """Run directory; runs/NAME by default."""
     preset: PresetName | None = None

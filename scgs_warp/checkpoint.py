@@ -1,4 +1,4 @@
-"""Checkpoints: one safetensors file, written atomically, the previous one kept. No pickle, no path, date or host in it."""
+"""Checkpoints: one safetensors file, written atomically, the previous one kept. No pickle; no path, date or host."""
 
 from __future__ import annotations
 

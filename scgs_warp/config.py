@@ -203,7 +203,7 @@ class TrainConfig:
 
 
 def preset(name: PresetName) -> TrainConfig:
-    """A complete configuration: ``quick`` for the built-in scene, ``cpu`` for minutes on two cores, ``paper``: seed S4."""
+    """A complete configuration. ``quick``: the built-in scene; ``cpu``: minutes on two cores; ``paper``: seed S4."""
     if name == "paper":
         return TrainConfig()
     cpu = TrainConfig(

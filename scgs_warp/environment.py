@@ -11,8 +11,8 @@ def prepare_environment() -> None:
     """Set what must be known before torch is imported. Called when ``scgs_warp`` is imported; the user's values win.
 
     OpenMP threads sleep instead of spinning between torch calls: our own kernels use those cores meanwhile.
-    cuBLAS gets the fixed workspace that makes its sums reproducible; MKL is told to give the same bits for any number of
-    threads (without it the gradient of a narrow layer differs; it cost no measurable time).
+    cuBLAS gets the fixed workspace that makes its sums reproducible; MKL is told to give the same bits for any number
+    of threads (without it the gradient of a narrow layer differs; it cost no measurable time).
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("KMP_BLOCKTIME", "0")

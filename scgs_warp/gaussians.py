@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from .types import Gaussians
@@ -80,7 +80,7 @@ def neighbor_distance(points: Tensor, count: int = 3) -> Tensor:
         return torch.full((total,), 1e-2, device=points.device)
     count = min(count, total - 1)
     array = points.detach().cpu().double().numpy()
-    distances, _ = cKDTree(array).query(array, k=count + 1)
+    distances, _ = KDTree(array).query(array, k=count + 1)
     mean = torch.from_numpy((distances[:, 1:] ** 2).mean(axis=1) ** 0.5)
     return mean.float().clamp_(min=1e-3).to(points.device)
 

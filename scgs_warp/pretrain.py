@@ -43,8 +43,8 @@ def densify_spheres(
 ) -> None:
     """Remove transparent spheres, clone those that the image pulls at most, keep between N_p and the cap.
 
-    A threshold on the gradient does not carry over from Gaussians to large spheres, so the share is fixed. A clone lands
-    within a radius of its parent. Too few left (a short first stage can fall to a dozen): more are cloned.
+    A threshold on the gradient does not carry over from Gaussians to large spheres, so the share is fixed. A clone
+    lands within a radius of its parent. Too few left (a short first stage can fall to a dozen): more are cloned.
     """
     with torch.no_grad():
         opacities = gaussians.opacities()

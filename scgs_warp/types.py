@@ -1,6 +1,7 @@
 """The values that walk through the pipeline. Frozen; shapes stand beside the fields.
 
-``Frame -> motion -> Pose [M] -> skin -> Gaussians at t [N] -> project -> Splats [N] -> bin -> Tiles -> composite -> Image``
+``Frame -> motion -> Pose [M] -> skin -> Gaussians at t [N] -> project -> Splats [N] -> bin -> Tiles -> composite ->
+Image``
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Frame:
     camera: Camera
     time: float
     image: Tensor
-    """[H, W, 3] float32 in [0, 1], composited on the data set's background; ``image.permute(2, 0, 1)`` is contiguous."""
+    """[H, W, 3] float32 in [0, 1], on the data set's background; ``image.permute(2, 0, 1)`` is contiguous."""
     alpha: Tensor | None = None
     """[H, W] float32 coverage, where the data has it."""
     mask: Tensor | None = None

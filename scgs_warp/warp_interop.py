@@ -68,7 +68,7 @@ class _ArrayParameter(NamedTuple):
 class _Cpu(NamedTuple):
     """A kernel made ready for the CPU: its compiled entry and the ctypes structure of its arguments."""
 
-    command: wp.Launch  # keeps the module loaded
+    command: Any  # a wp.Launch; keeps the module loaded
     arguments: type[ctypes.Structure]
     bounds: type[ctypes.Structure]
 
@@ -138,7 +138,7 @@ def _pack(kernel: wp.Kernel, args: tuple) -> tuple[list, torch.device | None]:
 
 
 def _prepare_cpu(kernel: wp.Kernel, packed: list) -> _Cpu:
-    command = wp.launch(kernel, dim=1, inputs=[0, *packed], device="cpu", record_cmd=True)
+    command: Any = wp.launch(kernel, dim=1, inputs=[0, *packed], device="cpu", record_cmd=True)
     fields = [(argument.label, type(value)) for argument, value in zip(kernel.adj.args, command.params[1:])]
     arguments = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
     return _Cpu(command, arguments, type(command.params[0]))
@@ -146,7 +146,8 @@ def _prepare_cpu(kernel: wp.Kernel, packed: list) -> _Cpu:
 
 def _cpu_arguments(kernel: wp.Kernel, cpu: _Cpu, packed: list) -> ctypes.Structure:
     arguments = cpu.arguments()
-    for (label, ctype), value in zip(cpu.arguments._fields_[1:], packed):
+    fields: Any = cpu.arguments._fields_[1:]
+    for (label, ctype), value in zip(fields, packed):
         if value is None:
             continue  # a null array
         if type(value) is not ctype:

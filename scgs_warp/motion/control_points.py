@@ -114,8 +114,11 @@ class ControlPoints(Motion):
         """Linear blend skinning of all Gaussians (Eq. 6-7). Editing replaces ``pose``, nothing else."""
         return _posed(gaussians, skin(gaussians.means, gaussians.quats, self.positions, pose, *binding))
 
-    def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
-        """As :meth:`apply_pose` with :meth:`binding`, in one pass; ``frozen`` control points get no gradient."""
+    def bind_and_pose(
+        self, gaussians: GaussianParameters, pose: Pose, frozen: bool, indices: Tensor | None = None
+    ) -> Gaussians:
+        """As :meth:`apply_pose` with :meth:`binding`, in one pass; ``frozen`` control points get no gradient.
+        ``indices``: :meth:`neighbors`, where they are known already."""
         hyper = self.config.hyper_dim > 0
         rows = (
             self.positions,
@@ -128,9 +131,9 @@ class ControlPoints(Motion):
         nodes, radii, strengths, hyper_nodes = rows
         assert nodes is not None and radii is not None
         hyper_points = gaussians.hyper if hyper else None
-        indices = self.neighbors(gaussians)
+        found = self.neighbors(gaussians) if indices is None else indices
         moved = skin_rbf(
-            gaussians.means, gaussians.quats, nodes, radii, pose, indices, strengths, hyper_points, hyper_nodes
+            gaussians.means, gaussians.quats, nodes, radii, pose, found, strengths, hyper_points, hyper_nodes
         )
         return _posed(gaussians, moved)
 
@@ -140,8 +143,12 @@ class ControlPoints(Motion):
             self._cached = None if gaussians is None else self.binding(gaussians)
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
-        binding = self._cached if self._cached is not None else self.binding(gaussians)
-        return self.apply_pose(gaussians, self.poses(torch.tensor([time]))[0], binding)
+        pose = self.poses(torch.tensor([time]))[0]
+        if self._cached is None or gaussians.means.device.type == "cpu":
+            # On a CPU weights and skinning in one SIMD pass are faster than skinning with stored weights.
+            indices = None if self._cached is None else self._cached[0]
+            return self.bind_and_pose(gaussians, pose, frozen=False, indices=indices)
+        return self.apply_pose(gaussians, pose, self._cached)
 
     def train_at(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int

@@ -34,7 +34,7 @@ class DeformationNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
-        self.skip, self.bfloat16 = skip, bfloat16
+        self.skip, self.low_precision = skip, bfloat16
         inputs = 3 * (1 + 2 * position_frequencies) + 1 + 2 * time_frequencies
         self.layers = nn.ModuleList()
         for i in range(layers):
@@ -62,7 +62,7 @@ class DeformationNetwork(nn.Module):
         where = encode(positions, self.position_frequencies)[None].expand(instants, -1, -1)
         when = encode(times[:, None], self.time_frequencies)[:, None].expand(-1, count, -1)
         inputs = torch.cat([where, when], dim=-1).reshape(instants * count, -1)
-        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.bfloat16):
+        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.low_precision):
             hidden = inputs
             for i, layer in enumerate(self.layers):
                 if i == self.skip:
