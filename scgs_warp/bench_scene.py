@@ -1,0 +1,165 @@
+"""Scenes to measure: a seeded figure of any size under any motion model, its camera, and images to train on."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .cameras import Overview, orbit_camera
+from .config import MotionConfig, OptimConfig, TrainConfig
+from .data.dataset import Dataset
+from .data.normalise import Normalisation
+from .gaussians import SH_C0, GaussianParameters, neighbor_distance
+from .kernels import benchmark as kernels
+from .motion import ControlPoints, build_motion
+from .motion.base import Motion
+from .ops.binning import bin_splats
+from .ops.projection import project
+from .ops.sampling import farthest_points
+from .optim import generator
+from .scene import Scene
+from .train_state import TrainState
+from .types import Camera, Frame, Gaussians
+from .warp_interop import launch
+
+SEED = 20
+PARTS = (  # centre, half axes, share of the Gaussians
+    ((0.0, 0.0, 0.30), (0.36, 0.25, 0.50), 0.40),  # trunk
+    ((0.0, 0.0, 1.00), (0.19, 0.21, 0.23), 0.14),  # head
+    ((0.50, 0.0, 0.42), (0.27, 0.12, 0.13), 0.09),  # arms
+    ((-0.50, 0.0, 0.42), (0.27, 0.12, 0.13), 0.09),
+    ((0.19, 0.0, -0.66), (0.15, 0.16, 0.57), 0.14),  # legs
+    ((-0.19, 0.0, -0.66), (0.15, 0.16, 0.57), 0.14),
+)
+SHELL = 0.35
+"""Share of a part's half axes, from its surface inwards, in which the Gaussians lie: trained ones are not hollow."""
+SIZE = 2.2
+"""Median standard deviation of N Gaussians is SIZE / sqrt(N): what they cover together does not depend on N."""
+SIZE_SPREAD = 0.5
+"""Standard deviation of the logarithm of an axis' length."""
+OPACITY_POWER = 0.8
+"""Opacities are a uniform number to this power, between ``OPACITIES``."""
+OPACITIES = (0.02, 0.95)
+OVERVIEW = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0311, math.degrees(0.6911), 15.0, 60.0)
+"""The rig of D-NeRF: distance and field of view."""
+HEAD_WEIGHT = 2e-3
+"""Standard deviation of the last layer's weights: control points move by some hundredths of the figure's height."""
+FRAMES = 4
+RATES = 1e-6
+"""Learning rates are multiplied by this: Adam does all its work, and the scene stays the same from step to step."""
+
+
+def figure(count: int, seed: int = SEED) -> GaussianParameters:
+    """``count`` Gaussians in the shape of a standing figure, 2.5 units high; the same for the same arguments."""
+    random = generator(seed, 1)
+    centres, axes, shares = (torch.tensor(column) for column in zip(*PARTS))
+    part = torch.multinomial(shares, count, replacement=True, generator=random)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=1)
+    depth = 1.0 - SHELL * torch.rand(count, 1, generator=random)
+    means = centres[part] + axes[part] * direction * depth
+    log_scales = math.log(SIZE / math.sqrt(count)) + SIZE_SPREAD * torch.randn(count, 3, generator=random)
+    colors = (0.5 + 0.4 * torch.sin(5.0 * means + torch.tensor([0.0, 2.0, 4.0]))).clamp(0.0, 1.0)
+    made = GaussianParameters(means, log_scales, (colors - 0.5) / SH_C0)
+    low, high = OPACITIES
+    opacities = low + (high - low) * torch.rand(count, generator=random) ** OPACITY_POWER
+    with torch.no_grad():
+        made.quats.copy_(torch.randn(count, 4, generator=random))
+        made.opacity_logits.copy_(opacities.logit())
+        made.sh_rest.copy_(0.05 * torch.randn(made.sh_rest.shape, generator=random))
+    return made
+
+
+def _loosen(motion: Motion, seed: int) -> None:
+    """Networks start at rest; small random weights in their last layers make the figure move a little."""
+    random = generator(seed, 2)
+    heads = [motion.network.head] if hasattr(motion, "network") else []  # type: ignore[union-attr]
+    heads += [head[-1] for head in getattr(motion, "heads", {}).values()]
+    with torch.no_grad():
+        for head in heads:
+            head.weight.copy_(HEAD_WEIGHT * torch.randn(head.weight.shape, generator=random))
+
+
+def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int = SEED) -> Scene:
+    """A moving figure as a trained scene: ``count`` Gaussians, ``nodes`` control points (control-points only), networks
+    of the paper's size."""
+    gaussians = figure(count, seed)
+    config = TrainConfig(seed=seed, motion=MotionConfig(model=motion, nodes=nodes))  # type: ignore[arg-type]
+    model = build_motion(motion, config)
+    if isinstance(model, ControlPoints):
+        positions = gaussians.means.detach()[farthest_points(gaussians.means.detach(), nodes)]
+        with torch.no_grad():
+            model.positions.copy_(positions)
+            model.log_radii.fill_(math.log(float(neighbor_distance(positions).median())))
+    _loosen(model, seed)
+    scene = Scene(gaussians.to(device), model.to(device), Normalisation.identity(), config, OVERVIEW)
+    scene.freeze_binding()
+    return scene
+
+
+def scene_camera(scene: Scene, size: int, turn: float = 0.0) -> Camera:
+    """A world camera on the rig of the training cameras, ``turn`` degrees from where a film starts."""
+    return orbit_camera(scene.overview, scene.overview.azimuth + turn, size).to(scene.device)
+
+
+class Load(NamedTuple):
+    """How much there is to composite."""
+
+    pairs: int
+    """Pairs of splat and tile."""
+    contributors: float
+    """Mean over covered pixels of the splats blended there: alpha at least 1/255, before the pixel ends."""
+
+
+@torch.no_grad()
+def load_of(gaussians: Gaussians, camera: Camera) -> Load:
+    """Counted exactly, pixel by pixel; the camera in the units of the Gaussians."""
+    geometry = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    splats = project(*geometry, camera.viewmat, camera.K, camera.width, camera.height)
+    tiles = bin_splats(splats)
+    counts = torch.empty(camera.height * camera.width, dtype=torch.int32, device=splats.depths.device)
+    tensors = [splats.means2d, splats.conics, splats.opacities, tiles.ranges, tiles.splats]
+    lists = [tensor.contiguous() for tensor in tensors]
+    launch(kernels.count_contributors, len(counts), *lists, camera.width, tiles.columns, tiles.tile_size, counts)
+    covered = counts > 0
+    return Load(len(tiles.splats), float(counts[covered].double().mean()) if bool(covered.any()) else 0.0)
+
+
+def training_data(scene: Scene, size: int, seed: int = SEED) -> Dataset:
+    """Images of the scene itself from around, with noise: a loss whose gradient reaches everything."""
+    frames = []
+    for index in range(FRAMES):
+        time = index / max(FRAMES - 1, 1)
+        camera = scene_camera(scene, size, 30.0 * index)
+        image = scene.render(camera, time)
+        planar = image.rgb.permute(2, 0, 1).cpu()
+        noise = 0.05 * torch.randn(planar.shape, generator=generator(seed, 3, index))
+        planar = (planar + noise * (image.alpha.cpu() > 0)).clamp(0.0, 1.0)
+        frames.append(Frame(camera.to("cpu"), time, planar.permute(1, 2, 0), name=f"{index}"))
+    return Dataset(frames, folder=Path("synthetic"), split="train", background=_background(scene))
+
+
+def _background(scene: Scene) -> str:
+    """Random backgrounds need alpha; the scene is rendered on what it is evaluated on."""
+    return "black" if scene.config.data.background == "random" else scene.config.data.background
+
+
+def training_state(scene: Scene, arap: bool) -> TrainState:
+    """The scene in the joint phase of training, at full harmonics, statistics for densification on; rates near 0."""
+    base = TrainConfig(seed=scene.config.seed, data=scene.config.data, motion=scene.config.motion)
+    rates = OptimConfig()
+    slow = {
+        item.name: RATES * getattr(rates, item.name)
+        for item in dataclasses.fields(rates)
+        if not item.metadata.get("milestone")
+    }
+    loss = base.loss if arap else dataclasses.replace(base.loss, arap=0.0)
+    config = dataclasses.replace(base, optim=dataclasses.replace(rates, **slow), loss=loss)
+    step = config.pretrain_steps + max(config.freeze, 3 * config.densify.sh_every)
+    nothing: Tensor = torch.zeros(0, 3)
+    rest = (scene.normalisation, scene.overview, 1.0, nothing, nothing)
+    return TrainState(config, scene.gaussians, scene.motion, *rest, stage="main", step=step)
