@@ -38,11 +38,11 @@ PARTS = (  # centre, half axes, share of the Gaussians
 )
 SHELL = 0.35
 """Share of a part's half axes, from its surface inwards, in which the Gaussians lie: trained ones are not hollow."""
-SIZE = 2.2
+SIZE = 2.0
 """Median standard deviation of N Gaussians is SIZE / sqrt(N): what they cover together does not depend on N."""
 SIZE_SPREAD = 0.5
 """Standard deviation of the logarithm of an axis' length."""
-OPACITY_POWER = 0.8
+OPACITY_POWER = 0.45
 """Opacities are a uniform number to this power, between ``OPACITIES``."""
 OPACITIES = (0.02, 0.95)
 OVERVIEW = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0311, math.degrees(0.6911), 15.0, 60.0)

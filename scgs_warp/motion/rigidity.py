@@ -37,7 +37,7 @@ def arap_weight(step: int, loss: LossConfig) -> float:
 
 
 def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> Graph | None:
-    """Neighbours by trajectory; ``positions_at(times [T]) -> [T, M, 3]`` is asked for N_t times. None for less than two."""
+    """Neighbours by trajectory; ``positions_at(times [T]) -> [T, M, 3]`` is asked for N_t times; None if M < 2."""
     with torch.no_grad():
         trajectories = positions_at(torch.linspace(0.0, 1.0, loss.arap_times))
         count = min(loss.arap_neighbors, trajectories.shape[1] - 1)

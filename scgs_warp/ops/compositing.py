@@ -70,7 +70,8 @@ def composite(
     tensors: tuple[Tensor, ...] = (splats.means2d, splats.conics, splats.opacities, channels, background)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
         return _Composite.apply(*tensors, job)  # type: ignore[return-value]
-    return _forward(job, tuple(t.detach().contiguous() for t in tensors), keep=False)[:2]
+    image, alpha, *_ = _forward(job, tuple(t.detach().contiguous() for t in tensors), keep=False)
+    return image, alpha
 
 
 class _Composite(torch.autograd.Function):
@@ -121,7 +122,7 @@ def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
     return form
 
 
-def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Tensor, ...]:
+def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, ...]:
     """Image, alpha, and for the adjoint (None unless ``keep``): the form's view of the splats, final transmittance
     and last contributor."""
     means2d, conics, opacities, channels, background = tensors
