@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from .data.dataset import Dataset
 from .data.normalise import Normalisation
 from .gaussians import SH_C0, GaussianParameters, neighbor_distance
 from .kernels import benchmark as kernels
-from .motion import ControlPoints, build_motion
+from .motion import ControlPoints, HexPlane, PerGaussian, build_motion
 from .motion.base import Motion
 from .ops.binning import bin_splats
 from .ops.projection import project
@@ -49,6 +49,8 @@ OVERVIEW = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0311, math.degrees(0.691
 """The rig of D-NeRF: distance and field of view."""
 HEAD_WEIGHT = 2e-3
 """Standard deviation of the last layer's weights: control points move by some hundredths of the figure's height."""
+PLANE_HEAD_WEIGHT = 5e-2
+"""The same where the network is small and its features are."""
 FRAMES = 4
 RATES = 1e-6
 """Learning rates are multiplied by this: Adam does all its work, and the scene stays the same from step to step."""
@@ -75,13 +77,19 @@ def figure(count: int, seed: int = SEED) -> GaussianParameters:
 
 
 def _loosen(motion: Motion, seed: int) -> None:
-    """Networks start at rest; small random weights in their last layers make the figure move a little."""
+    """Models start at rest; small random weights in their last layers (and features that change with time) make the
+    figure move a little."""
     random = generator(seed, 2)
-    heads = [motion.network.head] if hasattr(motion, "network") else []  # type: ignore[union-attr]
-    heads += [head[-1] for head in getattr(motion, "heads", {}).values()]
+    heads: list[tuple[Any, float]] = []
+    if isinstance(motion, ControlPoints | PerGaussian):
+        heads = [(motion.network.head, HEAD_WEIGHT)]
+    elif isinstance(motion, HexPlane):
+        heads = [(head[-1], PLANE_HEAD_WEIGHT) for head in motion.heads.values()]  # type: ignore[index]
     with torch.no_grad():
-        for head in heads:
-            head.weight.copy_(HEAD_WEIGHT * torch.randn(head.weight.shape, generator=random))
+        for head, weight in heads:
+            head.weight.copy_(weight * torch.randn(head.weight.shape, generator=random))
+        for plane in motion.planes if isinstance(motion, HexPlane) else ():
+            plane.mul_(0.5 + torch.rand(plane.shape, generator=random))
 
 
 def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int = SEED) -> Scene:
@@ -116,10 +124,11 @@ class Load(NamedTuple):
 
 
 @torch.no_grad()
-def load_of(gaussians: Gaussians, camera: Camera) -> Load:
+def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> Load:
     """Counted exactly, pixel by pixel; the camera in the units of the Gaussians."""
     geometry = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
-    splats = project(*geometry, camera.viewmat, camera.K, camera.width, camera.height)
+    view = camera.viewmat, camera.K, camera.width, camera.height
+    splats = project(*geometry, *view, antialiased=antialiased)
     tiles = bin_splats(splats)
     counts = torch.empty(camera.height * camera.width, dtype=torch.int32, device=splats.depths.device)
     tensors = [splats.means2d, splats.conics, splats.opacities, tiles.ranges, tiles.splats]
@@ -150,7 +159,8 @@ def _background(scene: Scene) -> str:
 
 def training_state(scene: Scene, arap: bool) -> TrainState:
     """The scene in the joint phase of training, at full harmonics, statistics for densification on; rates near 0."""
-    base = TrainConfig(seed=scene.config.seed, data=scene.config.data, motion=scene.config.motion)
+    own = scene.config
+    base = TrainConfig(seed=own.seed, data=own.data, motion=own.motion, antialiased=own.antialiased)
     rates = OptimConfig()
     slow = {
         item.name: RATES * getattr(rates, item.name)
