@@ -213,7 +213,9 @@ def preset(name: PresetName) -> TrainConfig:
         init_points=10_000,
         init_from="spheres",
         evaluate_every=5_000,
-        pretrain=PretrainConfig(steps=3_000, densify_until=2_000, warm_up=300, max_ratio=2.0, progressive_every=300),
+        pretrain=PretrainConfig(
+            steps=3_000, densify_until=2_000, warm_up=300, max_ratio=2.0, arap_weight=1e-3, progressive_every=300
+        ),
         optim=OptimConfig(means_until=20_000, network_until=20_000),
         densify=DensifyConfig(
             start=400,

@@ -39,9 +39,9 @@ class Part(NamedTuple):
     """Above 0: a torus about z instead, with this radius; ``half[2]`` is the tube's."""
 
 
-def _limbs(side: str, sign: float) -> list[Part]:
-    """An arm and a leg; joints are spheres, so neighbours may turn without a gap."""
-    sleeve, trousers = (TEAL, CREAM, MUSTARD), (NAVY, STEEL, MINT)
+def _arm(side: str, sign: float) -> list[Part]:
+    """Joints are spheres, so neighbours may turn without a gap."""
+    sleeve = (TEAL, CREAM, MUSTARD)
     return [
         Part(
             f"shoulder_{side}",
@@ -92,6 +92,12 @@ def _limbs(side: str, sign: float) -> list[Part]:
             0.0,
             6,
         ),
+    ]
+
+
+def _leg(side: str) -> list[Part]:
+    trousers = (NAVY, STEEL, MINT)
+    return [
         Part(f"hip_{side}", (0.115, 0.115, 0.225), 0.115, (0, 0, -0.13), int(patterns.CHECKS), trousers, (9, 9, 9)),
         Part(
             f"knee_{side}",
@@ -147,8 +153,10 @@ PARTS: tuple[Part, ...] = (
     Part("antenna", (0.028, 0.028, 0.14), 0.028, (0, 0, 0.10), int(patterns.STRIPES), (NAVY, CREAM, CORAL), (0, 0, 16),
          0.0, 4),
     Part("antenna", (0.085, 0.085, 0.085), 0.085, (0, 0, 0.27), int(patterns.SEGMENTS), (RED, WHITE, NAVY), (8, 0, 0)),
-    *_limbs("left", 1.0),
-    *_limbs("right", -1.0),
+    *_arm("left", 1.0),
+    *_leg("left"),
+    *_arm("right", -1.0),
+    *_leg("right"),
 )  # fmt: skip
 
 
