@@ -61,13 +61,21 @@ def configuration(options: Options) -> tuple[Any, str | None]:
     from scgs_warp import config
     from scgs_warp.errors import UserError
 
-    values = config.read_config(options.config) if options.config else {}
+    recorded = options.output / "config.json" if options.resume and options.output else None
+    file = options.config or (recorded if recorded and recorded.is_file() else None)
+    values = config.read_config(file) if file else {}
     folder = values.get("data", {}).pop("folder", None) if isinstance(values.get("data"), dict) else None
     if options.preset:
+        if values.get("preset", options.preset) != options.preset:
+            raise UserError(f"{file}: is of preset {values['preset']}; leave out --preset {options.preset}")
         values["preset"] = options.preset
     values.setdefault("preset", "cpu" if options.data or folder else "quick")
-    made = config.from_dict(values, str(options.config or "options"))
-    if options.steps is not None:
+    # A complete file says where its milestones lie; a partial one that names the steps wants them scaled.
+    steps = values.pop("steps", None) if "pretrain" not in values else None
+    made = config.from_dict(values, str(file or "options"))
+    if steps is not None:
+        made = config.with_steps(made, config.whole_number(steps, f"{file}: steps"))
+    if options.steps is not None and options.steps != made.steps:
         made = config.with_steps(made, options.steps)
     flags = {
         "data.downscale": options.downscale,

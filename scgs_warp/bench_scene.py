@@ -172,4 +172,4 @@ def training_state(scene: Scene, arap: bool) -> TrainState:
     step = config.pretrain_steps + max(config.freeze, 3 * config.densify.sh_every)
     nothing: Tensor = torch.zeros(0, 3)
     rest = (scene.normalisation, scene.overview, 1.0, nothing, nothing)
-    return TrainState(config, scene.gaussians, scene.motion, *rest, stage="main", step=step)
+    return TrainState(config, scene.gaussians, scene.motion, *rest, stage="main", fingerprint="", step=step)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import types
 import typing
 from dataclasses import dataclass, field
@@ -127,7 +128,7 @@ class DensifyConfig:
     every: int = 100
     grad_threshold: float = 2e-4
     """Gradient of the loss to the 2D mean in normalised device coordinates, at 800 pixels."""
-    resolution_exponent: float = 0.0
+    resolution_exponent: float = 0.66
     """The threshold grows by (800 / image size) to this power: small images have larger gradients per Gaussian."""
     absolute_grad: bool = False
     """Judge by the sum of absolute per-pixel gradients."""
@@ -208,7 +209,7 @@ def preset(name: PresetName) -> TrainConfig:
         return TrainConfig()
     cpu = TrainConfig(
         preset="cpu",
-        steps=23_000,
+        steps=24_000,
         freeze=400,
         init_points=10_000,
         init_from="spheres",
@@ -216,11 +217,11 @@ def preset(name: PresetName) -> TrainConfig:
         pretrain=PretrainConfig(
             steps=3_000, densify_until=2_000, warm_up=300, max_ratio=2.0, arap_weight=1e-3, progressive_every=300
         ),
-        optim=OptimConfig(means_until=20_000, network_until=20_000),
+        motion=MotionConfig(nodes=256),
+        optim=OptimConfig(means_until=21_000, network_until=21_000),
         densify=DensifyConfig(
             start=400,
             until=12_000,
-            resolution_exponent=0.66,
             opacity_reset_every=3_000,
             sh_every=500,
             nodes_every=2_000,
@@ -230,8 +231,7 @@ def preset(name: PresetName) -> TrainConfig:
     )
     if name == "cpu":
         return cpu
-    quick = with_steps(cpu, 8_000)
-    return dataclasses.replace(quick, preset="quick", motion=dataclasses.replace(quick.motion, nodes=256))
+    return dataclasses.replace(with_steps(cpu, 8_000), preset="quick")
 
 
 def with_steps(config: TrainConfig, steps: int) -> TrainConfig:
@@ -307,11 +307,22 @@ def with_field(config: TrainConfig, name: str, value: Any, source: str) -> Train
     """One field replaced, by its dotted name (``motion.hyper_dim``); unknown names and wrong types raise UserError."""
     values: dict[str, Any] = {}
     inner = values
+    if name in ("steps", "preset"):
+        raise UserError(f"{source}: give --{name} instead: it changes more than one field")
     *outer, last = name.split(".")
     for part in outer:
         inner = inner.setdefault(part, {})
     inner[last] = value
     return from_dict(values, source, config)
+
+
+def whole_number(value: Any, label: str) -> int:
+    """The value, if it is an int.
+
+    Raises:
+        UserError: it is not.
+    """
+    return _checked(value, int, label)
 
 
 def parse_value(text: str) -> Any:
@@ -339,24 +350,52 @@ def read_config(path: Path) -> dict[str, Any]:
     return values
 
 
+AT_LEAST_ONE = (
+    "init_points evaluate_every data.downscale "
+    "motion.layers motion.width motion.time_frequencies motion.position_frequencies "
+    "pretrain.densify_every pretrain.progressive_every pretrain.start_ratio pretrain.max_ratio "
+    "optim.means_until optim.network_until "
+    "densify.every densify.opacity_reset_every densify.sh_every densify.nodes_every "
+    "loss.arap_every loss.arap_times loss.arap_refresh"
+).split()
+NOT_NEGATIVE = (
+    "seed freeze checkpoint_seconds pretrain.steps pretrain.warm_up pretrain.clone_share pretrain.arap_weight "
+    "densify.start densify.until densify.grad_threshold densify.min_opacity loss.ssim loss.arap loss.arap_end"
+).split()
+
+
 def check(config: TrainConfig) -> TrainConfig:
     """Refuse combinations that cannot run.
 
     Raises:
         UserError: naming the field and the remedy.
     """
+    motion = config.motion
+    for names, lowest in ((AT_LEAST_ONE, 1), (NOT_NEGATIVE, 0)):
+        for name in names:
+            value = _field(config, name)
+            if not lowest <= value < math.inf:  # NaN fails, too
+                raise UserError(f"{name} is {value}; it must be at least {lowest}")
     if config.main_steps < 1:
         raise UserError(
             f"steps {config.steps} leave nothing after {config.pretrain_steps} pre-training steps; raise --steps"
         )
-    if not 1 <= config.motion.neighbors <= 16:
-        raise UserError(f"motion.neighbors is {config.motion.neighbors}; choose 1 to 16")
-    if config.motion.nodes < config.motion.neighbors + 1:
-        raise UserError(f"--nodes {config.motion.nodes}: needs at least {config.motion.neighbors + 1}")
-    if config.densify.max_gaussians < 100:
-        raise UserError(f"--max-gaussians {config.densify.max_gaussians}: needs at least 100")
     if not 0 <= config.sh_degree <= 3:
         raise UserError(f"sh_degree is {config.sh_degree}; choose 0 to 3")
-    if config.data.downscale < 1:
-        raise UserError(f"--downscale {config.data.downscale}: must be at least 1")
+    if not 1 <= motion.neighbors <= 16:
+        raise UserError(f"motion.neighbors is {motion.neighbors}; choose 1 to 16")
+    if not 1 <= config.loss.arap_neighbors <= 15:
+        raise UserError(f"loss.arap_neighbors is {config.loss.arap_neighbors}; choose 1 to 15")
+    if not 1 <= motion.skip < motion.layers:
+        raise UserError(f"motion.skip is {motion.skip}; choose 1 to {motion.layers - 1}, below motion.layers")
+    if motion.nodes < motion.neighbors + 1:
+        raise UserError(f"--nodes {motion.nodes}: needs at least {motion.neighbors + 1}")
+    if config.densify.max_gaussians < 100:
+        raise UserError(f"--max-gaussians {config.densify.max_gaussians}: needs at least 100")
+    return config
+
+
+def _field(config: Any, name: str) -> Any:
+    for part in name.split("."):
+        config = getattr(config, part)
     return config

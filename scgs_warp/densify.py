@@ -25,7 +25,7 @@ def threshold(config: DensifyConfig, width: int, height: int) -> float:
 
 def mean_gradient(stats: Stats) -> Tensor:
     """[N] mean norm of the screen-space gradient over the images that saw the Gaussian."""
-    return stats.grad_norm / stats.count.clamp(min=1.0)
+    return torch.nan_to_num(stats.grad_norm / stats.count.clamp(min=1.0), nan=0.0, posinf=0.0)
 
 
 def densify(

@@ -6,6 +6,7 @@ import ctypes
 import os
 
 _threads: int | None = None
+_configured = False
 
 
 def prepare_environment() -> None:
@@ -33,6 +34,17 @@ def thread_count() -> int:
     return _threads or available_threads()
 
 
+def configured() -> bool:
+    """Whether :func:`configure` was called: threads of our own then flush denormals as the main thread does."""
+    return _configured
+
+
+def ensure_configured() -> None:
+    """:func:`configure` with its defaults, unless it was called before."""
+    if not _configured:
+        configure()
+
+
 def _keep_freed_memory() -> None:
     """Ask glibc to keep freed buffers instead of handing them back: every step allocates the same ones again, and
     faulting their pages in took a quarter of the compositing time."""
@@ -41,7 +53,8 @@ def _keep_freed_memory() -> None:
     except (OSError, AttributeError, TypeError):  # not glibc
         return
     trim_threshold, mmap_threshold = -1, -3
-    mallopt(mmap_threshold, 1 << 30)
+    if not mallopt(mmap_threshold, 1 << 30):  # older glibc: 32 MiB at most
+        mallopt(mmap_threshold, 32 << 20)
     mallopt(trim_threshold, 1 << 30)
 
 
@@ -51,10 +64,10 @@ def configure(threads: int | None = None, deterministic: bool = True) -> None:
     Call it before the first tensor operation: OpenMP's workers inherit the flush-to-zero mode from the thread that
     starts them. Denormals made one stretch of 250 training steps 20 times slower.
     """
-    global _threads
+    global _threads, _configured
     import torch
 
-    _threads = threads
+    _threads, _configured = threads, True
     _keep_freed_memory()
     torch.set_flush_denormal(True)
     torch.set_num_threads(thread_count())

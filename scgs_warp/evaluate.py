@@ -160,7 +160,7 @@ def metrics_of(
         "control_points": scene.control_point_count,
         "motion": scene.motion_name,
         "device": torch.device(getattr(scene, "device", "cpu")).type,
-        "data": str(data.get("folder") or dataset.folder),
+        "data": str(dataset.folder),
         **{key: data.get(key) for key in ("downscale", "resample", "background")},
         "seed": scene.settings.get("seed"),
     }

@@ -52,7 +52,7 @@ def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Cov
         hit = (inside & (frame.alpha[row, column] > 0.5)).float()
         covered += hit
         seen += inside.float()
-        colors += hit[:, None] * frame.image[row, column]
+        colors += hit[:, None] * torch.nan_to_num(frame.image[row, column])
     grey = 0.5 * (covered == 0).float()[:, None]
     return Coverage(covered / seen.clamp(min=1.0), colors / covered.clamp(min=1.0)[:, None] + grey)
 
@@ -62,10 +62,11 @@ def likely_points(
 ) -> tuple[Tensor, Tensor | None]:
     """Random points [count, 3] in the cube and their colours [count, 3], drawn where the images are covered; uniform,
     without colours, where no frame has alpha."""
-    candidates = random_points(max(CANDIDATES, 2 * count), seed, key)
+    candidates = random_points(max(CANDIDATES, count), seed, key)
     found = coverage(candidates, data, normalisation)
-    if found is None or int((found.share > 0).sum()) < count:
+    if found is None or not bool((found.share > 0).any()):
         return candidates[:count], None
     random = generator(seed, key, 1)
-    chosen = torch.multinomial(found.share**SHARPNESS, count, replacement=False, generator=random)
-    return candidates[chosen], found.colors[chosen]
+    chosen = torch.multinomial(found.share**SHARPNESS, count, replacement=True, generator=random)
+    spacing = 2.0 * HALF_SIZE / len(candidates) ** (1 / 3)  # the same candidate may be drawn twice
+    return candidates[chosen] + spacing * (torch.rand(count, 3, generator=random) - 0.5), found.colors[chosen]

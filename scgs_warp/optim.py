@@ -16,12 +16,14 @@ def log_linear(start: float, end: float, step: int, until: int) -> float:
     """From ``start`` at step 0 to ``end`` at step ``until``, straight in the logarithm, constant afterwards."""
     if step >= until:
         return end
+    if start <= 0.0 or end <= 0.0:  # no logarithm: straight
+        return start + (end - start) * step / until
     return math.exp(math.log(start) + (math.log(end) - math.log(start)) * step / until)
 
 
 def generator(seed: int, *keys: int, device: torch.device | str = "cpu") -> torch.Generator:
     """A random generator that depends on (seed, keys) alone: nothing has to be saved for a run to be resumed."""
-    state = np.random.SeedSequence([seed, *keys]).generate_state(1, np.uint64)[0]
+    state = np.random.SeedSequence([seed, len(keys), *keys]).generate_state(1, np.uint64)[0]
     return torch.Generator(device=device).manual_seed(int(state) & (2**63 - 1))
 
 

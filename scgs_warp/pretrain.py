@@ -8,6 +8,7 @@ from torch import Tensor
 from .config import TrainConfig
 from .densify import mean_gradient
 from .gaussians import SH_C0, GaussianParameters, gaussians_from_points, neighbor_distance
+from .motion import Motion, build_motion
 from .motion.control_points import ControlPoints, heads_of, make_network
 from .motion.spheres import Spheres
 from .ops.sampling import farthest_points
@@ -31,6 +32,16 @@ def begin_spheres(
     radius = float(neighbor_distance(chosen).median())
     network = make_network(config.motion, heads_of(config.motion), config.seed).to(device)
     return gaussians, Spheres(network, radius).to(device)
+
+
+def begin_motion(config: TrainConfig, points: Tensor) -> Motion:
+    """A motion model without a first stage; control points are then a sample of ``points`` [P, 3], at rest."""
+    if config.motion.model != "control-points":
+        return build_motion(config.motion.model, config)
+    positions = points[farthest_points(points, min(config.motion.nodes, len(points)))]
+    radii = torch.full((len(positions),), float(neighbor_distance(positions).median()), device=points.device)
+    network = make_network(config.motion, heads_of(config.motion), config.seed)
+    return ControlPoints(positions, radii, network, config.motion)
 
 
 def densify_spheres(

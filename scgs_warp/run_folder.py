@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from pathlib import Path
@@ -121,7 +122,8 @@ class RunFolder:
         due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
         if due and result.failed is None:
             now = float(psnr(result.render, result.truth))
-            self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
+            if math.isfinite(now):  # equal images, both empty, have none
+                self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
             self.log(
                 {
                     "step": state.step,
@@ -130,7 +132,7 @@ class RunFolder:
                     "l1": float(result.l1),
                     "ssim": float(result.ssim),
                     "regulariser": result.regulariser,
-                    "psnr": round(self._psnr, 3),
+                    "psnr": None if self._psnr is None else round(self._psnr, 3),
                     "gaussians": len(state.gaussians),
                     "control_points": len(getattr(state.motion, "positions", ())),
                 }
@@ -163,4 +165,6 @@ class RunFolder:
             image = scene.render(frame.camera, frame.time)
             values.append(float(psnr(image.rgb.cpu(), frame.image)))
         scene.motion.train()
-        self.log({"step": scene.step, "test_psnr": sum(values) / len(values)})
+        values = [value for value in values if math.isfinite(value)]
+        if values:
+            self.log({"step": scene.step, "test_psnr": sum(values) / len(values)})

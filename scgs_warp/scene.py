@@ -63,7 +63,10 @@ class Scene:
                 scene.settings = json.loads(settings_path.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
                 raise UserError(f"{settings_path}: cannot be read ({error}); restore it or train again") from error
-        if metadata["stage"] != "main":
+        if not isinstance(scene.settings, dict):
+            raise UserError(f"{settings_path}: must hold a JSON object; restore it or train again")
+        scene.motion.eval()
+        if metadata.get("stage") != "main":
             raise UserError(f"{folder}: training stopped in stage 1; continue it with apps/train.py --resume")
         scene.freeze_binding()
         return scene

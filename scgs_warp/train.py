@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from . import environment
 from .config import TrainConfig, check
 from .data.dataset import Dataset
 from .densify import densify, mean_gradient, reset_opacities, threshold
@@ -133,7 +134,9 @@ def _adapt_spheres(state: TrainState) -> None:
     if done == config.pretrain.densify_until:
         thin_spheres(state.gaussians, state.gaussian_optimizer, state.motion, config.motion.nodes)
         state.reset_stats()
-    elif done < config.pretrain.densify_until and done % config.pretrain.densify_every == 0:
+    elif done < config.pretrain.densify_until and (
+        done % config.pretrain.densify_every == 0 or done == config.pretrain.warm_up
+    ):
         densify_spheres(state.gaussians, state.gaussian_optimizer, state.motion, state.stats, config, state.step)
         state.reset_stats()
 
@@ -162,7 +165,8 @@ def _adapt_gaussians(state: TrainState, size: tuple[int, int]) -> None:
             random=generator(state.config.seed, 51, state.step),
         )
         state.reset_stats()
-    if done % config.opacity_reset_every == 0 and done < config.until:
+    # A reset needs time to heal before densification ends.
+    if done % config.opacity_reset_every == 0 and done + config.opacity_reset_every // 2 <= config.until:
         reset_opacities(state.gaussians, state.gaussian_optimizer)
 
 
@@ -224,14 +228,20 @@ def fit(
         KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
     """
     check(config)
+    environment.ensure_configured()
+    if data.background != config.data.background:
+        raise UserError(f"{data.folder}: loaded on {data.background}, but data.background is {config.data.background}")
     if len(data) == 0:
         raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
     with RunFolder(output, config, settings, resume=resume) as folder:
-        state = TrainState.resume(folder.path, config, device) if resume else TrainState.begin(config, data, device)
+        state = (
+            TrainState.resume(folder.path, config, data, device) if resume else TrainState.begin(config, data, device)
+        )
         frames = Frames(data, state.normalisation, config, device)
         folder.begin(state.step)
         with progress(config.steps, "training", start=state.step) as bar, stop_signals() as stop:
             _loop(state, frames, folder, test, bar, stop)
+        state.motion.eval()
         return state.scene()
 
 
@@ -246,9 +256,9 @@ def _loop(
         result = training_step(state, frames)
         if result.failed is None:
             state.failures = 0
-            adapt(state, (result.truth.shape[2], result.truth.shape[1]))
         else:
             _count_failure(state, result.failed, folder, bar)
+        adapt(state, (result.truth.shape[2], result.truth.shape[1]))
         state.step += 1
         folder.record(state, result, bar)
         if test is not None and (state.step % config.evaluate_every == 0 or state.step == config.steps):
@@ -257,7 +267,7 @@ def _loop(
         if now - saved_at >= config.checkpoint_seconds or state.step == config.steps or stop.is_set():
             state.save(folder.path)
             saved_at = time.monotonic()
-        if stop.is_set() and state.step < config.steps:
+        if stop.is_set():
             bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
             raise KeyboardInterrupt
 
@@ -267,6 +277,7 @@ def _count_failure(state: TrainState, term: str, folder: RunFolder, bar: Progres
     bar.print(f"step {state.step}: {term} is not finite; the step was dropped")
     folder.log({"step": state.step, "stage": state.stage, "dropped": term})
     if state.failures >= MOST_FAILURES:
+        state.save(folder.path)  # dropped steps left the parameters as they were
         raise UserError(
             f"{folder.path}: {term} was not finite {MOST_FAILURES} times in a row, up to step {state.step}; the "
             "checkpoint holds the last good state; lower the learning rates or check the data, then --resume"

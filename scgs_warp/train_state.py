@@ -12,15 +12,14 @@ from . import checkpoint
 from .cameras import Overview, overview
 from .config import TrainConfig, to_dict
 from .data.dataset import Dataset
-from .data.normalise import Normalisation
+from .data.normalise import COMMON_RADIUS, Normalisation
 from .errors import UserError
 from .gaussians import GaussianParameters
 from .hull import likely_points
-from .motion import build_motion
 from .motion.base import Motion
 from .motion.spheres import Spheres
 from .optim import adam, generator, load_optimizer_tensors, optimizer_tensors
-from .pretrain import begin_gaussians, begin_spheres, control_points_of
+from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, thin_spheres
 from .scene import Scene, scene_from
 from .types import Stats
 
@@ -42,12 +41,13 @@ class TrainState:
         colors: Tensor,
         *,
         stage: Stage,
+        fingerprint: str,
         step: int = 0,
     ) -> None:
         self.config, self.normalisation, self.overview = config, normalisation, rig
         self.extent, self.points, self.colors = extent, points, colors
         self.stage: Stage = stage
-        self.step = step
+        self.step, self.fingerprint = step, fingerprint
         self.failures = 0
         self.enter(gaussians, motion)
 
@@ -62,15 +62,20 @@ class TrainState:
     def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
         normalisation = Normalisation.fit(data.cameras, data.points)
         points, colors = (tensor.to(device) for tensor in _initial_points(config, data, normalisation))
-        rest = (normalisation, overview(data.cameras), data.extent * normalisation.scale, points, colors)
+        # A camera that stands still has no extent of its own; sizes are then judged by that of the content.
+        extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
+        rest = (normalisation, overview(data.cameras), extent, points, colors)
         if config.pretrain_steps > 0:
-            return TrainState(config, *begin_spheres(config, points, colors, device), *rest, stage="pretrain")
+            spheres = begin_spheres(config, points, colors, device)
+            return TrainState(config, *spheres, *rest, stage="pretrain", fingerprint=data.fingerprint)
         gaussians = begin_gaussians(config, points, colors)
-        return TrainState(config, gaussians, build_motion(config.motion.model, config).to(device), *rest, stage="main")
+        motion = begin_motion(config, points).to(device)
+        return TrainState(config, gaussians, motion, *rest, stage="main", fingerprint=data.fingerprint)
 
     def begin_main(self) -> None:
         """From stage 1 to stage 2: spheres become control points, new Gaussians are made."""
         assert isinstance(self.motion, Spheres)
+        thin_spheres(self.gaussians, self.gaussian_optimizer, self.motion, self.config.motion.nodes)
         points = control_points_of(self.gaussians, self.motion, self.config)
         gaussians = begin_gaussians(self.config, self.points, self.colors, (self.gaussians, self.motion))
         self.stage = "main"
@@ -115,11 +120,17 @@ class TrainState:
             tensors[f"stats.{name}"] = getattr(self.stats, name)
         if self.stage == "pretrain":  # stage 2 starts from them
             tensors["points"], tensors["colors"] = self.points, self.colors
-        metadata = {**self.scene().metadata(), "stage": self.stage, "extent": self.extent, "failures": self.failures}
+        metadata = {
+            **self.scene().metadata(),
+            "stage": self.stage,
+            "extent": self.extent,
+            "failures": self.failures,
+            "frames": self.fingerprint,
+        }
         checkpoint.write(folder, tensors, metadata)
 
     @staticmethod
-    def resume(folder: Path, config: TrainConfig, device: str) -> TrainState:
+    def resume(folder: Path, config: TrainConfig, data: Dataset, device: str) -> TrainState:
         """Continue from the checkpoint in ``folder``.
 
         Raises:
@@ -128,6 +139,8 @@ class TrainState:
         tensors, metadata = checkpoint.read(folder)
         source = str(folder / checkpoint.FILE)
         _same_configuration(metadata["config"], to_dict(config), source)
+        if metadata.get("frames") != data.fingerprint:
+            raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
         tensors = checkpoint.to_device(tensors, device)
         scene = scene_from(tensors, metadata, device, source)
         nothing = torch.zeros(0, 3, device=device)
@@ -142,6 +155,7 @@ class TrainState:
                 tensors.get("points", nothing),
                 tensors.get("colors", nothing),
                 stage=metadata["stage"],
+                fingerprint=data.fingerprint,
                 step=scene.step,
             )
             load_optimizer_tensors(state.gaussian_optimizer, "adam.gaussians", tensors)
@@ -167,11 +181,15 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     return points, torch.full_like(points, 0.5) if colors is None else colors
 
 
+FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds")
+"""Settings that change no bit of the result."""
+
+
 def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
     for name, value in wanted.items():
         if isinstance(value, dict):
             _same_configuration(saved.get(name, {}), value, source, f"{prefix}{name}.")
-        elif saved.get(name) != value:
+        elif saved.get(name) != value and name not in FREE_TO_CHANGE:
             raise UserError(
                 f"{source}: made with {prefix}{name} = {saved.get(name)!r}, now {value!r}; "
                 "give the same options to --resume, or another --output"

@@ -74,7 +74,7 @@ class _Cpu(NamedTuple):
 
 
 _pool: ThreadPoolExecutor | None = None
-_pool_size = 0
+_pool_state = (0, False)
 _parameters: dict[wp.Kernel, list[_ArrayParameter | None]] = {}
 _cpu_kernels: dict[wp.Kernel, _Cpu] = {}
 
@@ -208,11 +208,12 @@ def _launch_chunks(cpu: _Cpu, arguments: ctypes.Structure, count: int, threads: 
 
 
 def _workers(count: int) -> ThreadPoolExecutor:
-    global _pool, _pool_size
-    if _pool is None or _pool_size < count:
+    global _pool, _pool_state
+    flush = environment.configured()
+    if _pool is None or _pool_state[0] < count or _pool_state[1] != flush:
         # Denormals are flushed in every thread or in none: results must not depend on who computes them.
-        _pool = ThreadPoolExecutor(count, "warp", initializer=lambda: torch.set_flush_denormal(True))
-        _pool_size = count
+        _pool = ThreadPoolExecutor(count, "warp", initializer=lambda: torch.set_flush_denormal(flush))
+        _pool_state = (count, flush)
     return _pool
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -21,6 +22,7 @@ from scgs_warp.evaluate import evaluate
 from scgs_warp.metrics import psnr
 from scgs_warp.scene import Scene
 from scgs_warp.train import fit
+from scgs_warp.train_state import TrainState
 
 MODELS = ["control-points", "per-gaussian", "hexplane", "static"]
 
@@ -37,9 +39,9 @@ def test_every_motion_model_learns(model, tmp_path, device):
     black = sum(float(psnr(torch.zeros_like(f.image), f.image)) for f in test) / len(test)
     assert evaluate(scene, test)["psnr"] > black + 4.0
     log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
-    assert log[-1]["loss" if "loss" in log[-1] else "test_psnr"] is not None
-    losses = [entry["loss"] for entry in log if "loss" in entry]
-    assert losses[-1] < losses[0]
+    steps = [entry["step"] for entry in log if "loss" in entry]
+    assert steps == [50, 100, 150, 200]
+    assert any("test_psnr" in entry for entry in log)
 
 
 def test_checkpoint_round_trip(tmp_path, device):
@@ -160,6 +162,41 @@ def test_refusals(tmp_path):
         Scene.load(tmp_path / "run")
     with pytest.raises(UserError, match="no such run"):
         Scene.load(tmp_path / "nowhere")
+
+
+def test_resume_refuses_other_frames(tmp_path):
+    config = tiny_config(20)
+    fit(config, tiny_dataset(3), output=tmp_path / "run")
+    with pytest.raises(UserError, match="other frames"):
+        fit(config, tiny_dataset(4), output=tmp_path / "run", resume=True)
+
+
+def test_what_changes_no_bit_may_differ_on_resume(tmp_path):
+    fit(tiny_config(20), tiny_dataset(3), output=tmp_path / "run")
+    scene = fit(tiny_config(20, evaluate_every=7), tiny_dataset(3), output=tmp_path / "run", resume=True)
+    assert scene.step == 20
+
+
+def test_without_a_first_stage(tmp_path):
+    config = tiny_config(30, pretrain={"steps": 0})
+    scene = fit(config, tiny_dataset(4), output=tmp_path / "run")
+    places = scene.control_points_at(0.0)
+    assert float(places.std(0).min()) > 0.05, "control points must not coincide"
+
+
+def test_a_camera_that_stands_still():
+    """Its centres have no extent; Gaussians must not all count as too large."""
+    data = tiny_dataset(6)
+    frames = [dataclasses.replace(frame, camera=data[0].camera) for frame in data]
+    still = type(data)(frames, folder=Path("still"), split="train")
+    assert still.extent == 0.0
+    assert TrainState.begin(tiny_config(), still, "cpu").extent > 1.0
+
+
+def test_the_background_is_one(tmp_path):
+    data = type(tiny_dataset(1))(list(tiny_dataset(3)), folder=Path("white"), split="train", background="white")
+    with pytest.raises(UserError, match="loaded on white"):
+        fit(tiny_config(20), data, output=tmp_path / "run")
 
 
 def test_two_trainers_cannot_share_a_directory(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import overload
@@ -56,6 +57,12 @@ class Dataset(Sequence[Frame]):
     def background_color(self) -> Tensor:
         """[3] the colour that the images were composited on."""
         return torch.tensor(BACKGROUND_COLORS[self.background])
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the frames' names, times, sizes and background, without any path: a run resumes on the same frames."""
+        listed = [(frame.name, frame.time, *frame.image.shape) for frame in self._frames]
+        return hashlib.sha256(repr((self.background, listed)).encode()).hexdigest()[:16]
 
     @property
     def cameras(self) -> list[Camera]:

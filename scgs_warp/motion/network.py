@@ -62,7 +62,7 @@ class DeformationNetwork(nn.Module):
         where = encode(positions, self.position_frequencies)[None].expand(instants, -1, -1)
         when = encode(times[:, None], self.time_frequencies)[:, None].expand(-1, count, -1)
         inputs = torch.cat([where, when], dim=-1).reshape(instants * count, -1)
-        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.low_precision):
+        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.low_precision and self.training):
             hidden = inputs
             for i, layer in enumerate(self.layers):
                 if i == self.skip:
