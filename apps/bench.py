@@ -71,6 +71,8 @@ def check(options: Options) -> None:
     for name in ("gaussians", "nodes", "motion", "table_s2"):
         if options.run is not None and getattr(options, name, None) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: the run in --run has its own; leave one of the two out")
+    if getattr(options, "table_s2", False) and options.motion is not None:
+        raise UserError("--motion: --table-s2 measures all four models; leave one of the two out")
     least = MotionConfig().neighbors + 1
     nodes = 512 if options.nodes is None else options.nodes
     gaussians = 49_000 if options.gaussians is None else options.gaussians

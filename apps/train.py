@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import tyro
+
 from scgs_warp.apps.cli import Device, prepare, run
 from scgs_warp.config import MotionName, PresetName
 
@@ -46,8 +48,8 @@ class Options:
     """Never have more Gaussians than this: bounds memory."""
     seed: int | None = None
     """The same seed gives the same bits on the same machine."""
-    set: tuple[str, ...] = ()
-    """Any other field of the configuration, as NAME=VALUE: motion.hyper_dim=8."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Any other field of the configuration, as NAME=VALUE; again for each: --set motion.hyper_dim=8 --set freeze=0."""
     resume: bool = False
     """Continue the run in --output."""
     device: Device = "auto"
@@ -56,13 +58,13 @@ class Options:
     """CPU threads; all cores by default."""
 
 
-def configuration(options: Options) -> tuple[Any, str | None]:
-    """The complete configuration, and the data folder that a --config names."""
+def configuration(options: Options, recorded: Path) -> tuple[Any, str | None]:
+    """The complete configuration, and the data folder that a --config names; ``recorded``: config.json of the run that
+    --resume continues."""
     from scgs_warp import config
     from scgs_warp.errors import UserError
 
-    recorded = options.output / "config.json" if options.resume and options.output else None
-    file = options.config or (recorded if recorded and recorded.is_file() else None)
+    file = options.config or (recorded if options.resume and recorded.is_file() else None)
     values = config.read_config(file) if file else {}
     folder = values.get("data", {}).pop("folder", None) if isinstance(values.get("data"), dict) else None
     if options.preset:
@@ -98,6 +100,12 @@ def configuration(options: Options) -> tuple[Any, str | None]:
     return config.check(made), folder
 
 
+def default_output(options: Options) -> Path:
+    """runs/NAME-PRESET, NAME being that of the data folder."""
+    name = (options.data or BUILTIN).resolve().name
+    return RUNS / f"{name}-{options.preset or ('cpu' if options.data else 'quick')}"
+
+
 def find_data(options: Options, folder: str | None, device: str) -> Path:
     """The data set to train on; the built-in scene is made on first use."""
     if options.data or folder:
@@ -106,24 +114,24 @@ def find_data(options: Options, folder: str | None, device: str) -> Path:
     from scgs_warp.progress import progress
 
     with progress(120, "making the built-in scene") as bar:
-        make_synthetic(BUILTIN, progress=lambda done, total: bar.advance())
+        make_synthetic(BUILTIN, device=device, progress=lambda done, total: bar.advance())
     return BUILTIN
 
 
 def main(args: list[str] | None) -> None:
-    import tyro
-
     options = tyro.cli(Options, args=args, prog="train.py")
     device = prepare(options.device, options.threads)
-    config, named = configuration(options)
+    output = options.output or default_output(options)
+    config, named = configuration(options, output / "config.json")
 
     from scgs_warp.config import to_dict
     from scgs_warp.data import load
     from scgs_warp.finish import finish, summary
+    from scgs_warp.run_folder import refuse_existing
     from scgs_warp.train import fit
 
+    refuse_existing(output, options.resume)
     folder = find_data(options, named, device)
-    output = options.output or RUNS / f"{folder.resolve().name}-{config.preset}"
     look = dataclasses.asdict(config.data)
     train, test = load(folder, "train", **look), load(folder, "test", **look)
     settings = to_dict(config)

@@ -52,7 +52,7 @@ def count_contributors(
         i = splats_in[p]
         q = squared_distance(conics_in[i], centre - means2d_in[i])
         alpha = wp.min(ALPHA_MAX, opacities_in[i] * wp.exp(-0.5 * q))
-        if q < 0.0 or alpha < ALPHA_MIN:
+        if not (q >= 0.0 and alpha >= ALPHA_MIN):
             continue
         transmittance *= 1.0 - alpha
         if transmittance <= TRANSMITTANCE_MIN:

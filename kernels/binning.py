@@ -12,7 +12,8 @@ import warp as wp
 
 from .types import ALPHA_MIN
 
-wp.set_module_options({"enable_backward": False})
+# Counting and emitting must find the same tiles: no fusing of multiply and add, which may differ between two kernels.
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 DEPTH_CULLED = wp.constant(3.0e38)
 """Sort key of splats that touch nothing; finite, so that a float sort never sees a NaN or an infinity."""
@@ -102,7 +103,7 @@ def lowest_bit(mask: wp.uint64) -> int: ...
 def sortable(depth: float) -> wp.int64:
     """The bits of a float, turned so that they sort as unsigned integers in the float's order."""
     bits = wp.cast(depth + 0.0, wp.uint32)  # + 0: minus zero becomes zero
-    sign = wp.uint32(0x80000000)
+    sign = wp.uint32(1) << wp.uint32(31)
     if (bits & sign) != wp.uint32(0):
         bits = ~bits
     else:
@@ -215,8 +216,12 @@ def emit_pairs(
         for row in range(span[0], span[1]):
             reach = touched_columns(e, row, tile_size, columns, width, height)
             for column in range(reach[0], reach[1]):
-                tiles_out[slot] = row * columns + column
+                if slot < end:
+                    tiles_out[slot] = row * columns + column
                 slot += 1
+        while slot < end:  # never, as long as both passes find the same tiles; but no slot may stay unwritten
+            tiles_out[slot] = corner
+            slot += 1
 
 
 @wp.kernel

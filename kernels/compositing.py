@@ -78,7 +78,7 @@ def composite_pixels(
         i = splats_in[p]
         q = squared_distance(conics_in[i], centre - means2d_in[i])
         alpha = wp.min(ALPHA_MAX, opacities_in[i] * wp.exp(-0.5 * q))
-        if q < 0.0 or alpha < ALPHA_MIN:
+        if not (q >= 0.0 and alpha >= ALPHA_MIN):
             continue
         remaining = transmittance * (1.0 - alpha)
         if remaining <= TRANSMITTANCE_MIN:
@@ -169,7 +169,7 @@ def composite_pixels_adjoint(
                 q = squared_distance(conics_in[i], centre - means2d_in[i])
                 alpha = wp.min(ALPHA_MAX, opacities_in[i] * wp.exp(-0.5 * q))
                 p -= 1
-                if q < 0.0 or alpha < ALPHA_MIN:
+                if not (q >= 0.0 and alpha >= ALPHA_MIN):
                     continue
                 transmittance /= 1.0 - alpha
                 own = float(0.0)

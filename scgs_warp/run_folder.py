@@ -43,6 +43,16 @@ def read_seconds(folder: Path) -> float | None:
     return newest
 
 
+def refuse_existing(path: Path, resume: bool) -> None:
+    """Nothing is ever overwritten.
+
+    Raises:
+        UserError: there is a run in ``path`` and ``resume`` was not asked for.
+    """
+    if not resume and (path / FILE).exists():
+        raise UserError(f"{path}: holds a run already; continue it with --resume or choose another --output")
+
+
 class RunFolder:
     """Use as a context manager: holds a lock, so that two trainers cannot share one directory.
 
@@ -66,9 +76,11 @@ class RunFolder:
             self._lock()
         except OSError as error:
             raise UserError(f"{self.path}: cannot be written ({error.strerror}); choose another --output") from error
-        if not self.resume and (self.path / FILE).exists():
+        try:
+            refuse_existing(self.path, self.resume)
+        except UserError:
             self.__exit__(None, None, None)
-            raise UserError(f"{self.path}: holds a run already; continue it with --resume or choose another --output")
+            raise
         return self
 
     def __exit__(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
@@ -111,12 +112,15 @@ def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
 
 
 def _bad_gradient(state: TrainState) -> str | None:
-    """Positions and the first of the motion's parameters see every term; what reaches the others came through them."""
-    parameters = [("means", state.gaussians.means), *list(state.motion.named_parameters())[:1]]
-    for name, parameter in parameters:
-        if parameter.grad is not None and not bool(torch.isfinite(parameter.grad).all()):
-            return f"gradient of {name}"
-    return None
+    parameters = [*state.gaussians.named_parameters(), *state.motion.named_parameters()]
+    named = [(name, parameter.grad) for name, parameter in parameters if parameter.grad is not None]
+    # One look at all of them; which one it was matters only when something is wrong.
+    if math.isfinite(float(torch.nn.utils.get_total_norm([gradient for _, gradient in named]))):
+        return None
+    bad = [name for name, gradient in named if not bool(torch.isfinite(gradient).all())]
+    if not bad:
+        return None  # finite, but too large to be squared
+    return f"gradient of {bad[0]}"
 
 
 def adapt(state: TrainState, size: tuple[int, int]) -> None:
@@ -277,7 +281,7 @@ def _count_failure(state: TrainState, term: str, folder: RunFolder, bar: Progres
     bar.print(f"step {state.step}: {term} is not finite; the step was dropped")
     folder.log({"step": state.step, "stage": state.stage, "dropped": term})
     if state.failures >= MOST_FAILURES:
-        state.save(folder.path)  # dropped steps left the parameters as they were
+        state.save(folder.path)  # no dropped step has touched the parameters
         raise UserError(
             f"{folder.path}: {term} was not finite {MOST_FAILURES} times in a row, up to step {state.step}; the "
             "checkpoint holds the last good state; lower the learning rates or check the data, then --resume"

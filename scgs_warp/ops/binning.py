@@ -56,7 +56,7 @@ def _bin_by_counting(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Ten
     launch(kernels.count_tiles, count, *geometry, *size, counts, corners, windows, depth_keys, order)
     offsets = torch.empty(count + 1, dtype=torch.int64)
     launch(kernels.scan_counts, 1, counts, offsets)
-    pairs = _total(offsets)
+    pairs = _total(offsets, MAX_PAIRS)
     _sort(depth_keys, order, count, 32)
     tiles, splats, slots = (torch.empty(pairs, dtype=torch.int32) for _ in range(3))
     launch(kernels.emit_pairs, count, *geometry, offsets, corners, windows, *size, tiles)
@@ -74,7 +74,7 @@ def _bin_by_radix(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor
     launch(kernels.count_tiles, count, *geometry, *size, counts, corners, windows, None, None)
     offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
     torch.cumsum(counts, 0, out=offsets[1:])
-    pairs = _total(offsets)
+    pairs = _total(offsets, MAX_PAIRS // 2)  # the sort's lists are twice as long
     tiles, owners, splats = (torch.empty(pairs, dtype=torch.int32, device=device) for _ in range(3))
     keys = torch.empty(2 * pairs, dtype=torch.int64, device=device)
     slots = torch.empty(2 * pairs, dtype=torch.int32, device=device)
@@ -88,11 +88,11 @@ def _bin_by_radix(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor
     return ranges, splats, slots[:pairs], offsets
 
 
-def _total(offsets: Tensor) -> int:
+def _total(offsets: Tensor, most: int) -> int:
     """Pairs in all, or a refusal of more than the lists can index."""
     pairs = int(offsets[-1])
-    if pairs > MAX_PAIRS:
-        raise ValueError(f"splats: {pairs} pairs of splat and tile, more than 2^31 - 1; reduce the image or the splats")
+    if pairs > most:
+        raise ValueError(f"splats: {pairs} pairs of splat and tile, more than {most}; reduce the image or the splats")
     return pairs
 
 
