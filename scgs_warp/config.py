@@ -183,6 +183,8 @@ class TrainConfig:
     sh_degree: int = 3
     antialiased: bool = False
     seed: int = 0
+    half_size: int = milestone(0)
+    """Steps of both stages in which the images are looked at in half their size: coarse first, and twice as fast."""
     evaluate_every: int = milestone(5_000)
     """Steps between two looks at the test split (a few images, for the curve only: nothing is selected by it)."""
     checkpoint_seconds: float = 60.0
@@ -251,7 +253,7 @@ def _scale(config: Any, ratio: float) -> Any:
     for item in dataclasses.fields(config):
         value = getattr(config, item.name)
         if item.metadata.get("milestone"):
-            changes[item.name] = max(1, round(value * ratio))
+            changes[item.name] = max(min(value, 1), round(value * ratio))
         elif dataclasses.is_dataclass(value):
             changes[item.name] = _scale(value, ratio)
     return dataclasses.replace(config, **changes)
@@ -359,7 +361,8 @@ AT_LEAST_ONE = (
     "loss.arap_every loss.arap_times loss.arap_refresh"
 ).split()
 NOT_NEGATIVE = (
-    "seed freeze checkpoint_seconds pretrain.steps pretrain.warm_up pretrain.clone_share pretrain.arap_weight "
+    "seed freeze half_size checkpoint_seconds "
+    "pretrain.steps pretrain.warm_up pretrain.clone_share pretrain.arap_weight "
     "densify.start densify.until densify.grad_threshold densify.min_opacity loss.ssim loss.arap loss.arap_end"
 ).split()
 

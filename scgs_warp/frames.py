@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from .config import TrainConfig
@@ -14,6 +17,22 @@ from .types import Camera, Frame
 PROGRESSIVE_SHARE = 0.2
 
 
+SMALLEST = 64
+"""Images with a shorter side than this are not halved."""
+
+
+def _half(frame: Frame, camera: Camera) -> tuple[Frame, Camera]:
+    def pool(image: Tensor) -> Tensor:
+        return F.avg_pool2d(image[None], 2)[0]
+
+    image = pool(frame.image.permute(2, 0, 1))
+    alpha = None if frame.alpha is None else pool(frame.alpha[None])[0]
+    mask = None if frame.mask is None else pool(frame.mask[None].float())[0] == 1.0
+    intrinsics = camera.K * camera.K.new_tensor([0.5, 0.5, 1.0])[:, None]
+    small = Camera(camera.viewmat, intrinsics, image.shape[2], image.shape[1])
+    return dataclasses.replace(frame, image=image.permute(1, 2, 0), alpha=alpha, mask=mask), small
+
+
 class Frames:
     """Random order without replacement, the same for the same seed; every epoch another."""
 
@@ -23,6 +42,7 @@ class Frames:
         self.cameras = [normalisation.apply_camera(frame.camera).to(device) for frame in self.frames]
         self.background = data.background_color.to(device)
         self.random_background = data.background == "random"
+        self._halved: dict[int, tuple[Frame, Camera]] = {}
         self.by_time = sorted(range(len(self.frames)), key=lambda i: self.frames[i].time)
 
     def __len__(self) -> int:
@@ -39,11 +59,19 @@ class Frames:
         chosen = int(torch.randperm(allowed, generator=generator(self.config.seed, 41, epoch, allowed))[place])
         return self.by_time[chosen]
 
+    def halved(self, index: int) -> tuple[Frame, Camera]:
+        """Frame and normalised camera at half the size, each pixel the mean of four; made once."""
+        if index not in self._halved:
+            self._halved[index] = _half(self.frames[index], self.cameras[index])
+        return self._halved[index]
+
     def view(
         self, index: int, step: int, random_background: bool
     ) -> tuple[Frame, Camera, Tensor, Tensor, Tensor | None]:
         """Frame, normalised camera, truth [3, H, W] on the background of this step, that background [3], mask."""
-        frame = self.frames[index]
+        frame, camera = self.frames[index], self.cameras[index]
+        if step < self.config.half_size and min(camera.width, camera.height) >= SMALLEST:
+            frame, camera = self.halved(index)
         truth = frame.image.to(self.device).permute(2, 0, 1).contiguous()
         background = self.background
         if frame.alpha is not None and (random_background or self.random_background):
@@ -52,4 +80,4 @@ class Frames:
             truth = truth + gap * (color - background)[:, None, None]
             background = color
         mask = None if frame.mask is None else frame.mask.to(self.device)
-        return frame, self.cameras[index], truth, background, mask
+        return frame, camera, truth, background, mask
