@@ -96,6 +96,10 @@ def face(p: wp.vec3, shell: wp.vec3, visor: wp.vec3, glow: wp.vec3):
     return color
 
 
+SOFTNESS = wp.constant(0.3)
+"""Share of the ground colour in a pattern's other colours: enough contrast to see motion by, learnable in minutes."""
+
+
 @wp.func
 def albedo(p: wp.vec3, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, frequency: wp.vec3, part: int):
     """Colour of a surface point from its rest position in the part's frame."""
@@ -149,8 +153,10 @@ def albedo(p: wp.vec3, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, frequency:
                     color = c
                 if in_heart(x, z + 0.1):
                     color = wp.vec3(0.87, 0.16, 0.24)
+    if kind != FACE and kind != CHEST:
+        color = mix(color, a, SOFTNESS)
     state = wp.rand_init(part + 100)
-    shade = 1.0 + 0.18 * wp.noise(state, p * 9.0) + 0.14 * wp.noise(state, p * 24.0)
+    shade = 1.0 + 0.18 * wp.noise(state, p * 9.0) + 0.06 * wp.noise(state, p * 18.0)
     return color * shade
 
 

@@ -233,7 +233,7 @@ def preset(name: PresetName) -> TrainConfig:
     )
     if name == "cpu":
         return cpu
-    return dataclasses.replace(with_steps(cpu, 8_000), preset="quick")
+    return dataclasses.replace(with_steps(cpu, 7_000), preset="quick")
 
 
 def with_steps(config: TrainConfig, steps: int) -> TrainConfig:

@@ -24,7 +24,7 @@ from ..types import Camera
 from .synthetic_figure import Figure, build_figure
 from .synthetic_raycast import Raycaster
 
-VERSION = 3
+VERSION = 4
 """Raised whenever the scene's pictures or its ground truth change; folders of another version are made anew."""
 MARKER = "synthetic.json"
 RADIUS = 4.0311
