@@ -233,7 +233,18 @@ def preset(name: PresetName) -> TrainConfig:
     )
     if name == "cpu":
         return cpu
-    return dataclasses.replace(with_steps(cpu, 7_000), preset="quick")
+    # The built-in figure swings an arm through 137 degrees: spheres follow it only frame by frame.
+    stage1 = dataclasses.replace(
+        cpu.pretrain,
+        steps=1_800,
+        densify_until=1_500,
+        warm_up=100,
+        progressive=True,
+        progressive_every=330,
+        start_ratio=16.0,
+    )
+    quick = with_steps(cpu, 7_000)
+    return dataclasses.replace(quick, preset="quick", half_size=1_800, pretrain=stage1)
 
 
 def with_steps(config: TrainConfig, steps: int) -> TrainConfig:

@@ -21,6 +21,12 @@ SMALLEST = 64
 """Images with a shorter side than this are not halved."""
 
 
+def first_frames(data: Dataset) -> list[Frame]:
+    """The first fifth of the frames by time, with which progressive pre-training begins."""
+    ordered = sorted(data, key=lambda frame: frame.time)
+    return ordered[: max(1, round(PROGRESSIVE_SHARE * len(ordered)))]
+
+
 def _half(frame: Frame, camera: Camera) -> tuple[Frame, Camera]:
     def pool(image: Tensor) -> Tensor:
         return F.avg_pool2d(image[None], 2)[0]
@@ -49,15 +55,19 @@ class Frames:
         return len(self.frames)
 
     def index_at(self, step: int, progressive: bool) -> int:
-        """The frame of this step. ``progressive``: only the first 20 % of the frames by time, 20 % more every
-        ``progressive_every`` steps (seed S4)."""
-        allowed = len(self.frames)
+        """The frame of this step. ``progressive``: at first only the first 20 % of the frames by time, 20 % more every
+        ``progressive_every`` steps (seed S4), one by one rather than all at once; every other step then looks at the
+        newest 20 %, so that a limb is followed before its places of yesterday make it transparent."""
+        first, allowed = 0, len(self.frames)
         if progressive:
-            stages = 1 + step // self.config.pretrain.progressive_every
-            allowed = min(allowed, max(1, round(PROGRESSIVE_SHARE * stages * allowed)))
-        epoch, place = divmod(step, allowed)
-        chosen = int(torch.randperm(allowed, generator=generator(self.config.seed, 41, epoch, allowed))[place])
-        return self.by_time[chosen]
+            grown = PROGRESSIVE_SHARE * (1.0 + step / self.config.pretrain.progressive_every)
+            allowed = min(allowed, max(1, round(grown * allowed)))
+            if step % 2 and allowed < len(self.frames):
+                first = max(0, allowed - max(1, round(PROGRESSIVE_SHARE * len(self.frames))))
+        count = allowed - first
+        epoch, place = divmod(step, count)
+        order = torch.randperm(count, generator=generator(self.config.seed, 41, epoch, count))
+        return self.by_time[first + int(order[place])]
 
     def halved(self, index: int) -> tuple[Frame, Camera]:
         """Frame and normalised camera at half the size, each pixel the mean of four; made once."""

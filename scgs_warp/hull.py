@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from .data.dataset import Dataset
 from .data.normalise import Normalisation
 from .optim import generator
+from .types import Frame
 
 HALF_SIZE = 1.3
 """Half the edge of the cube in which a scene without initial points starts (normalised units)."""
@@ -34,7 +35,7 @@ class Coverage(NamedTuple):
     """[P, 3] mean colour in those views; grey where there is none."""
 
 
-def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Coverage | None:
+def coverage(points: Tensor, data: Sequence[Frame], normalisation: Normalisation) -> Coverage | None:
     """Look every point up in up to 100 frames; None where no frame has alpha. ``points`` [P, 3] normalised."""
     frames = [frame for frame in data if frame.alpha is not None]
     if not frames:
@@ -58,7 +59,7 @@ def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Cov
 
 
 def likely_points(
-    count: int, data: Dataset, normalisation: Normalisation, seed: int, key: int
+    count: int, data: Sequence[Frame], normalisation: Normalisation, seed: int, key: int
 ) -> tuple[Tensor, Tensor | None]:
     """Random points [count, 3] in the cube and their colours [count, 3], drawn where the images are covered; uniform,
     without colours, where no frame has alpha."""

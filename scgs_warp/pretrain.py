@@ -17,6 +17,8 @@ from .types import Stats
 
 TRAJECTORY_TIMES = 16
 """Instants whose positions make the space in which farthest-point sampling chooses control points."""
+START_RADIUS = 0.5
+"""Of the spheres of progressive pre-training, as a share of their spacing."""
 DEAD_OPACITY = 0.01
 
 
@@ -24,12 +26,20 @@ def begin_spheres(
     config: TrainConfig, points: Tensor, colors: Tensor, device: str
 ) -> tuple[GaussianParameters, Spheres]:
     """Spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and the
-    network at rest."""
-    count = round(config.motion.nodes * config.pretrain.start_ratio)
-    index = farthest_points(points, count) if len(points) > count else torch.arange(len(points), device=points.device)
+    network at rest.
+
+    The sample is spread evenly, since with all frames at once a limb may be anywhere. Progressive pre-training knows the
+    first pose: there the spheres stay as dense as the points, and start smaller than their spacing, because one that
+    sticks out of a thin limb turns transparent before it has shrunk.
+    """
+    count = min(round(config.motion.nodes * config.pretrain.start_ratio), len(points))
+    index = torch.arange(count, device=points.device)
+    if not config.pretrain.progressive and count < len(points):
+        index = farthest_points(points, count)
     chosen = points[index]
     gaussians = gaussians_from_points(chosen, colors[index], sh_degree=0, hyper_dim=0)
-    radius = float(neighbor_distance(chosen).median())
+    share = START_RADIUS if config.pretrain.progressive else 1.0
+    radius = share * float(neighbor_distance(chosen).median())
     network = make_network(config.motion, heads_of(config.motion), config.seed).to(device)
     return gaussians, Spheres(network, radius).to(device)
 

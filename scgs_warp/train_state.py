@@ -14,6 +14,7 @@ from .config import TrainConfig, to_dict
 from .data.dataset import Dataset
 from .data.normalise import COMMON_RADIUS, Normalisation
 from .errors import UserError
+from .frames import first_frames
 from .gaussians import GaussianParameters
 from .hull import likely_points
 from .motion.base import Motion
@@ -174,7 +175,9 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     """Points [P, 3], normalised, and colours [P, 3]: the data's own points in a random order, else likely ones."""
     count = max(config.init_points, round(config.motion.nodes * config.pretrain.start_ratio))
     if data.points is None or len(data.points) == 0:
-        points, colors = likely_points(count, data, normalisation, config.seed, 31)
+        # Progressive pre-training starts from the pose of the first frames; what others cover is not there yet.
+        frames = first_frames(data) if config.pretrain.progressive and config.pretrain_steps else list(data)
+        points, colors = likely_points(count, frames, normalisation, config.seed, 31)
     else:
         order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
         points, colors = normalisation.apply(data.points)[order].float().contiguous(), None
