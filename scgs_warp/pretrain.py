@@ -28,9 +28,9 @@ def begin_spheres(
     """Spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and the
     network at rest.
 
-    The sample is spread evenly, since with all frames at once a limb may be anywhere. Progressive pre-training knows the
-    first pose: there the spheres stay as dense as the points, and start smaller than their spacing, because one that
-    sticks out of a thin limb turns transparent before it has shrunk.
+    The sample is spread evenly, since with all frames at once a limb may be anywhere. Progressive pre-training knows
+    the first pose: there the spheres stay as dense as the points, and start smaller than their spacing, because one
+    that sticks out of a thin limb turns transparent before it has shrunk.
     """
     count = min(round(config.motion.nodes * config.pretrain.start_ratio), len(points))
     index = torch.arange(count, device=points.device)
