@@ -61,7 +61,7 @@ class Options:
 def configuration(options: Options, recorded: Path) -> tuple[Any, str | None]:
     """The complete configuration, and the data folder that a --config names; ``recorded``: config.json of the run that
     --resume continues."""
-    from scgs_warp import config
+    from scgs_warp import config, limits
     from scgs_warp.errors import UserError
 
     file = options.config or (recorded if options.resume and recorded.is_file() else None)
@@ -97,7 +97,7 @@ def configuration(options: Options, recorded: Path) -> tuple[Any, str | None]:
         if not sign:
             raise UserError(f"--set {text}: write NAME=VALUE, for example motion.hyper_dim=8")
         made = config.with_field(made, name.strip(), config.parse_value(value.strip()), f"--set {text}")
-    return config.check(made), folder
+    return limits.check(made), folder
 
 
 def default_output(options: Options) -> Path:

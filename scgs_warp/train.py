@@ -15,11 +15,12 @@ import torch
 from torch import Tensor
 
 from . import environment
-from .config import TrainConfig, check
+from .config import TrainConfig
 from .data.dataset import Dataset
 from .densify import densify, mean_gradient, reset_opacities, threshold
 from .errors import UserError
 from .frames import Frames
+from .limits import check
 from .motion.adapt import adapt_control_points
 from .motion.control_points import ControlPoints
 from .motion.spheres import Spheres

@@ -8,11 +8,12 @@ import pytest
 
 from scgs_warp import config as C
 from scgs_warp.errors import UserError
+from scgs_warp.limits import check
 
 
 @pytest.mark.parametrize("name", C.PRESETS)
 def test_presets_are_complete_and_round_trip(name):
-    made = C.check(C.preset(name))
+    made = check(C.preset(name))
     assert made.preset == name
     assert C.from_dict(json.loads(json.dumps(C.to_dict(made)))) == made
 
@@ -72,7 +73,7 @@ def test_mistakes_name_file_and_field(values, message):
 )
 def test_what_cannot_run_is_refused(name, value):
     with pytest.raises(UserError):
-        C.check(C.with_field(C.preset("paper"), name, value, "test"))
+        check(C.with_field(C.preset("paper"), name, value, "test"))
 
 
 def test_unreadable_files(tmp_path):
