@@ -273,6 +273,10 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds")
+"""Settings that change no bit of the result: not part of a checkpoint, and free when a run is resumed."""
+
+
 def from_dict(values: dict[str, Any], source: str = "config", base: Any = None, prefix: str = "") -> TrainConfig:
     """Read a (possibly partial) configuration over ``base`` (default: the preset it names, else ``paper``).
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from . import checkpoint
 from .cameras import Overview, overview
-from .config import TrainConfig, to_dict
+from .config import FREE_TO_CHANGE, TrainConfig, to_dict
 from .data.dataset import Dataset
 from .data.normalise import COMMON_RADIUS, Normalisation
 from .errors import UserError
@@ -182,10 +182,6 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
         order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
         points, colors = normalisation.apply(data.points)[order].float().contiguous(), None
     return points, torch.full_like(points, 0.5) if colors is None else colors
-
-
-FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds")
-"""Settings that change no bit of the result."""
 
 
 def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:

@@ -173,8 +173,11 @@ def test_resume_refuses_other_frames(tmp_path):
 
 def test_what_changes_no_bit_may_differ_on_resume(tmp_path):
     fit(tiny_config(20), tiny_dataset(3), output=tmp_path / "run")
-    scene = fit(tiny_config(20, evaluate_every=7), tiny_dataset(3), output=tmp_path / "run", resume=True)
-    assert scene.step == 20
+    before = checkpoint_bytes(tmp_path / "run")
+    other = tiny_config(20, evaluate_every=7, checkpoint_seconds=0.0)
+    assert fit(other, tiny_dataset(3), output=tmp_path / "run", resume=True).step == 20
+    fit(other, tiny_dataset(3), output=tmp_path / "again")
+    assert checkpoint_bytes(tmp_path / "again") == before
 
 
 def test_without_a_first_stage(tmp_path):
