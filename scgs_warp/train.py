@@ -35,7 +35,6 @@ from .train_state import TrainState
 
 MOST_FAILURES = 20
 """Non-finite steps in a row after which training stops at the last good state."""
-LOG_EVERY = 50
 
 
 class StepResult(NamedTuple):

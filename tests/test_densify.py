@@ -9,7 +9,7 @@ from tiny import tiny_config
 from scgs_warp.config import DensifyConfig
 from scgs_warp.densify import densify, prune, reset_opacities, threshold
 from scgs_warp.gaussians import GaussianParameters, gaussians_from_points, neighbor_distance
-from scgs_warp.motion.adapt import PRUNE_IMPACT, adapt_control_points
+from scgs_warp.motion.adapt import adapt_control_points
 from scgs_warp.motion.control_points import ControlPoints, heads_of, make_network
 from scgs_warp.optim import adam, generator, load_optimizer_tensors, optimizer_tensors
 from scgs_warp.pretrain import begin_spheres, control_points_of, densify_spheres, thin_spheres
@@ -154,4 +154,3 @@ def test_control_points_clone_where_the_image_pulls_and_idle_ones_go(device):
     assert (cloned, pruned) == (1, 1)
     assert len(motion) == 7 and motion.log_radii.shape == (7,) and motion.hyper.shape[0] == 7
     assert torch.allclose(motion.positions[6], gaussians.means[2], atol=1e-3)
-    assert PRUNE_IMPACT > 0
