@@ -12,7 +12,8 @@ from splats import random_splats
 
 from reference.binning import needed_pairs, usable
 from scgs_warp import environment
-from scgs_warp.ops.binning import _bin_by_counting, _bin_by_radix, bin_splats
+from scgs_warp.ops.binning import _bin_by_counting, bin_splats
+from scgs_warp.ops.binning_cuda import bin_by_radix
 from scgs_warp.types import Splats, Tiles
 
 
@@ -127,7 +128,7 @@ def test_both_sorts_agree(device: str, seed: int):
     splats = replace(splats, depths=torch.where(depths == 0, -depths, depths))  # 0 and -0
     geometry = [splats.means2d, splats.conics, splats.opacities, splats.depths, splats.radii]
     size = (90, 70, 6, 5, 16)
-    by_radix = _bin_by_radix([t.to(device) for t in geometry], size)
+    by_radix = bin_by_radix([t.to(device) for t in geometry], size)
     for got, expected in zip(by_radix, _bin_by_counting(geometry, size)):
         assert torch.equal(got.cpu(), expected)
 
