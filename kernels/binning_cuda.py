@@ -1,42 +1,149 @@
-"""Sorting the pairs of tile and splat by one radix sort, which a GPU can share among its threads."""
+"""The pairs of tile and splat by two radix sorts, which a GPU can share among its threads.
+
+Splats are sorted by depth first, N keys of 32 bits; their pairs, listed in that order, then only by tile, P keys of a
+dozen bits. The sort is stable, so both together are a sort by tile, then depth, then index, with a third of the
+traffic of sorting P keys of both.
+
+Nothing here depends on a count that the host would have to know: lists have room for P pairs, the rest of the room is
+filled with a tile beyond the last, and where there is too little room the pairs that do not fit are left out. Whoever
+set the room compares it with the true total, afterwards.
+"""
 
 from __future__ import annotations
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from .binning import DEPTH_CULLED, splat_ellipse, touched_columns, touched_rows
 
-
-@wp.func
-def sortable(depth: float) -> wp.int64:
-    """The bits of a float, turned so that they sort as unsigned integers in the float's order."""
-    bits = wp.cast(depth + 0.0, wp.uint32)  # + 0: minus zero becomes zero
-    sign = wp.uint32(1) << wp.uint32(31)
-    if (bits & sign) != wp.uint32(0):
-        bits = ~bits
-    else:
-        bits = bits | sign
-    return wp.int64(bits)
+# Counting and emitting must find the same tiles: no fusing of multiply and add, which may differ between two kernels.
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel
-def pair_keys(
+def count_pairs(
     first: int,
     # In:
+    means2d_in: wp.array[wp.vec2],  # [N]
+    conics_in: wp.array[wp.vec3],  # [N]
+    opacities_in: wp.array[float],  # [N]
     depths_in: wp.array[float],  # [N]
-    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
-    tiles_in: wp.array[int],  # [P] tile of each slot
+    radii_in: wp.array[wp.vec2i],  # [N]
+    width: int,
+    height: int,
+    columns: int,
+    rows: int,
+    tile_size: int,
     # Out:
-    keys_out: wp.array[wp.int64],  # [2 P] tile << 32 | depth in the first half; the other half is the sort's own
-    slots_out: wp.array[int],  # [2 P] 0, 1, 2, ... in the first half
-    owners_out: wp.array[int],  # [P] splat of each slot
+    counts_out: wp.array[int],  # [N] tiles touched; 0: culled
+    depth_keys_out: wp.array[float],  # [2 N] what to sort the splats by, in the first half
+    order_out: wp.array[int],  # [2 N] 0, 1, 2, ... in the first half
 ):
     i = first + wp.tid()
-    depth = sortable(depths_in[i])
-    for slot in range(int(offsets_in[i]), int(offsets_in[i + 1])):
-        keys_out[slot] = (wp.int64(tiles_in[slot]) << wp.int64(32)) | depth
-        slots_out[slot] = slot
-        owners_out[slot] = i
+    e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
+    count = int(0)
+    if e.reach >= 0.0:
+        span = touched_rows(e, tile_size, rows, height)
+        for row in range(span[0], span[1]):
+            reach = touched_columns(e, row, tile_size, columns, width, height)
+            count += reach[1] - reach[0]
+    key = float(DEPTH_CULLED)
+    if count > 0:
+        key = depths_in[i] + 0.0  # minus zero becomes zero
+    counts_out[i] = count
+    depth_keys_out[i] = key
+    order_out[i] = i
+
+
+@wp.kernel
+def counts_by_depth(
+    first: int,
+    # In:
+    order_in: wp.array[int],  # [2 N] splats by depth in the first half
+    counts_in: wp.array[int],  # [N]
+    # Out:
+    ranked_out: wp.array[int],  # [N] the count of the splat of each rank
+):
+    rank = first + wp.tid()
+    ranked_out[rank] = counts_in[order_in[rank]]
+
+
+@wp.kernel
+def emit_by_depth(
+    first: int,
+    # In:
+    means2d_in: wp.array[wp.vec2],  # [N]
+    conics_in: wp.array[wp.vec3],  # [N]
+    opacities_in: wp.array[float],  # [N]
+    depths_in: wp.array[float],  # [N]
+    radii_in: wp.array[wp.vec2i],  # [N]
+    order_in: wp.array[int],  # [2 N] splats by depth in the first half
+    places_in: wp.array[wp.int64],  # [N + 1] where the pairs of each rank go, at most P
+    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots, at most P; empty: slots are not wanted
+    width: int,
+    height: int,
+    columns: int,
+    rows: int,
+    tile_size: int,
+    # Out:
+    tiles_out: wp.array[int],  # [2 P] tile of each pair in the first half; the other half is the sort's own
+    values_out: wp.array[int],  # [2 P] slot of each pair, or its splat where slots are not wanted
+    owners_out: wp.array[int],  # [P] splat of each slot; empty too
+):
+    rank = first + wp.tid()
+    at = int(places_in[rank])
+    end = int(places_in[rank + 1])
+    if at == end:
+        return
+    i = order_in[rank]
+    slot = int(0)
+    most = int(0)
+    with_slots = offsets_in.shape[0] > 0
+    if with_slots:
+        slot = int(offsets_in[i])
+        most = owners_out.shape[0] - 1
+    e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
+    span = touched_rows(e, tile_size, rows, height)
+    for row in range(span[0], span[1]):
+        reach = touched_columns(e, row, tile_size, columns, width, height)
+        for column in range(reach[0], reach[1]):
+            if at < end:
+                tiles_out[at] = row * columns + column
+                value = i
+                if with_slots:
+                    value = wp.min(slot, most)  # only where there is too little room do two pairs share a slot
+                    owners_out[value] = i
+                values_out[at] = value
+            at += 1
+            slot += 1
+    while at < end:  # never, as long as both passes find the same tiles; but no place may stay unwritten
+        tiles_out[at] = 0
+        values_out[at] = i
+        if with_slots:
+            values_out[at] = wp.min(slot, most)
+            owners_out[wp.min(slot, most)] = i
+        at += 1
+        slot += 1
+
+
+@wp.kernel
+def fill_rest(
+    first: int,
+    # In:
+    places_in: wp.array[wp.int64],  # [N + 1]
+    beyond: int,  # a tile after the last
+    # Out:
+    tiles_out: wp.array[int],  # [2 P]
+    values_out: wp.array[int],  # [2 P]
+    owners_out: wp.array[int],  # [P] or empty
+):
+    """Give the room that no pair took a key that sorts last."""
+    p = first + wp.tid()
+    if wp.int64(p) >= places_in[places_in.shape[0] - 1]:
+        tiles_out[p] = beyond
+        values_out[p] = 0
+        if owners_out.shape[0] > 0:
+            values_out[p] = p
+            owners_out[p] = 0
 
 
 @wp.kernel
@@ -53,14 +160,13 @@ def gather_owners(
 
 
 @wp.func
-def first_of_tile(keys: wp.array[wp.int64], count: int, tile: int) -> int:
+def first_of_tile(tiles: wp.array[int], count: int, tile: int) -> int:
     """Where the sorted pairs of a tile, or of a later one, begin."""
-    key = wp.int64(tile) << wp.int64(32)
     low = int(0)
     high = int(count)
     while low < high:
         middle = low + (high - low) // 2
-        if keys[middle] < key:
+        if tiles[middle] < tile:
             low = middle + 1
         else:
             high = middle
@@ -71,10 +177,10 @@ def first_of_tile(keys: wp.array[wp.int64], count: int, tile: int) -> int:
 def tile_ranges(
     first: int,
     # In:
-    keys_in: wp.array[wp.int64],  # [2 P] sorted in the first half
+    tiles_in: wp.array[int],  # [2 P] sorted in the first half
     count: int,
     # Out:
     ranges_out: wp.array[wp.vec2i],  # [T]
 ):
     tile = first + wp.tid()
-    ranges_out[tile] = wp.vec2i(first_of_tile(keys_in, count, tile), first_of_tile(keys_in, count, tile + 1))
+    ranges_out[tile] = wp.vec2i(first_of_tile(tiles_in, count, tile), first_of_tile(tiles_in, count, tile + 1))

@@ -18,6 +18,7 @@ import torch
 import warp as wp
 
 from . import environment
+from .cuda_graph import on_torch_stream
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 
@@ -218,7 +219,7 @@ def _workers(count: int) -> ThreadPoolExecutor:
 
 
 def _torch_stream(device: torch.device) -> contextlib.AbstractContextManager:
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+    return on_torch_stream(device)
 
 
 def launch_blocks(kernel: wp.Kernel, blocks: int, *args, block_dim: int) -> None:

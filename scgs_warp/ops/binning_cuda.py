@@ -1,4 +1,9 @@
-"""Splats to tiles on CUDA: one radix sort of all pairs."""
+"""Splats to tiles on CUDA: a radix sort of the splats by depth, then one of all pairs by tile.
+
+Two ways in. ``bin_by_radix`` asks the device for the number of pairs, once, in the middle. ``bin_within`` never asks:
+it has room for so many pairs and says afterwards, on the device, how many there were. Both run on a CPU as well, where
+they are tested.
+"""
 
 from __future__ import annotations
 
@@ -8,33 +13,107 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..kernels import binning as kernels
-from ..kernels import binning_cuda as cuda_kernels
+from ..cuda_graph import on_torch_stream
+from ..kernels import binning_cuda as kernels
+from ..kernels.types import TILE_SIZE
+from ..types import Splats, Tiles
 from ..warp_interop import launch, warp_view
 
 MAX_PAIRS = 2**31 - 1
+MAX_ROOM = MAX_PAIRS // 2
+"""Pairs that a radix sort can hold: its lists are twice as long."""
+
+
+def bin_within(
+    splats: Splats, capacity: int, *, slots: bool = True, tile_size: int = TILE_SIZE
+) -> tuple[Tiles, Tensor]:
+    """``bin_splats`` without waiting for the device: every buffer's size follows from the arguments' shapes.
+
+    Args:
+        splats: N projected Gaussians, on any device; shapes are not checked.
+        capacity: pairs of splat and tile that there is room for, at least 1.
+        slots: whether ``Tiles.slots`` is wanted; compositing needs it for gradients only. Else it is empty.
+        tile_size: side of a tile in pixels.
+
+    Returns:
+        Tiles whose lists have ``capacity`` entries, and the number of pairs there really were, int64 [1] on the
+        device. Where it is more than ``capacity``, pairs are missing from the lists (nothing is out of bounds) and what
+        was drawn with them must be thrown away.
+
+    Raises:
+        ValueError: the capacity is less than 1 or more than ``MAX_ROOM``.
+    """
+    if not 1 <= capacity <= MAX_ROOM:
+        raise ValueError(f"capacity must be in 1 .. {MAX_ROOM}, got {capacity}")
+    columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
+    size = (splats.width, splats.height, columns, rows, tile_size)
+    geometry = geometry_of(splats)
+    counts, order = _count(geometry, size)
+    offsets = _running_sums(counts)
+    total = offsets[-1:].clone()
+    lists = _list(geometry, size, counts, order, offsets.clamp_(max=capacity), capacity, slots)
+    return Tiles(*lists, offsets, splats.width, splats.height, columns, rows, tile_size), total
 
 
 def bin_by_radix(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The same by one radix sort of all pairs, which a GPU can share among its threads."""
-    count, tile_count, device = len(geometry[0]), size[2] * size[3], geometry[0].device
-    counts, corners = (torch.empty(count, dtype=torch.int32, device=device) for _ in range(2))
-    windows = torch.empty(count, dtype=torch.int64, device=device)
-    launch(kernels.count_tiles, count, *geometry, *size, counts, corners, windows, None, None)
-    offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
-    torch.cumsum(counts, 0, out=offsets[1:])
-    pairs = pair_total(offsets, MAX_PAIRS // 2)  # the sort's lists are twice as long
-    tiles, owners, splats = (torch.empty(pairs, dtype=torch.int32, device=device) for _ in range(3))
-    keys = torch.empty(2 * pairs, dtype=torch.int64, device=device)
-    slots = torch.empty(2 * pairs, dtype=torch.int32, device=device)
-    launch(kernels.emit_pairs, count, *geometry, offsets, corners, windows, *size, tiles)
-    launch(cuda_kernels.pair_keys, count, geometry[3], offsets, tiles, keys, slots, owners)
-    # The sort is stable and slots ascend with the splat's index: equal depths are in the order of the index.
-    radix_sort(keys, slots, pairs, 32 + (tile_count - 1).bit_length())
-    launch(cuda_kernels.gather_owners, pairs, slots, owners, splats)
+    """Ranges, splats, slots, offsets for ``bin_splats``: exactly as many pairs as there are, which takes one wait."""
+    counts, order = _count(geometry, size)
+    offsets = _running_sums(counts)
+    pairs = pair_total(offsets, MAX_ROOM)
+    return *_list(geometry, size, counts, order, offsets, pairs, True), offsets
+
+
+def geometry_of(splats: Splats) -> list[Tensor]:
+    """The tensors that decide which tiles a splat touches, in the kernels' order."""
+    names = ("means2d", "conics", "opacities", "depths", "radii")
+    return [getattr(splats, name).detach().contiguous() for name in names]
+
+
+def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """[N] tiles that each splat touches; [2 N] in whose first half the splats are in order of depth."""
+    count, device = len(geometry[0]), geometry[0].device
+    counts = torch.empty(count, dtype=torch.int32, device=device)
+    depth_keys = torch.empty(2 * count, device=device)
+    order = torch.empty(2 * count, dtype=torch.int32, device=device)
+    launch(kernels.count_pairs, count, *geometry, *size, counts, depth_keys, order)
+    radix_sort(depth_keys, order, count, 32)
+    return counts, order
+
+
+def _running_sums(counts: Tensor) -> Tensor:
+    """[N + 1] int64 sum of the counts before each."""
+    offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
+    torch.cumsum(counts, 0, dtype=torch.int64, out=offsets[1:])
+    return offsets
+
+
+def _list(
+    geometry: list[Tensor],
+    size: tuple[int, ...],
+    counts: Tensor,
+    order: Tensor,
+    offsets: Tensor,
+    room: int,
+    with_slots: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Ranges [T, 2], splats [room], slots [room] (or [0])."""
+    count, tile_count, device = len(counts), size[2] * size[3], counts.device
+    ranked = torch.empty_like(counts)
+    launch(kernels.counts_by_depth, count, order, counts, ranked)
+    places = _running_sums(ranked).clamp_(max=room)
+    tiles, values = (torch.empty(2 * room, dtype=torch.int32, device=device) for _ in range(2))
+    owners = torch.empty(room, dtype=torch.int32, device=device) if with_slots else None
+    lists = (order, places, offsets if with_slots else None)
+    launch(kernels.fill_rest, room, places, tile_count, tiles, values, owners)
+    launch(kernels.emit_by_depth, count, *geometry, *lists, *size, tiles, values, owners)
+    radix_sort(tiles, values, room, tile_count.bit_length())
     ranges = torch.empty(tile_count, 2, dtype=torch.int32, device=device)
-    launch(cuda_kernels.tile_ranges, tile_count, keys, pairs, ranges)
-    return ranges, splats, slots[:pairs], offsets
+    launch(kernels.tile_ranges, tile_count, tiles, room, ranges)
+    if owners is None:
+        return ranges, values[:room], values[:0]
+    splats = torch.empty(room, dtype=torch.int32, device=device)
+    launch(kernels.gather_owners, room, values, owners, splats)
+    return ranges, splats, values[:room]
 
 
 def pair_total(offsets: Tensor, most: int) -> int:
@@ -49,8 +128,5 @@ def radix_sort(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
     """Stable radix sort of the first halves; the second halves are scratch."""
     if count == 0:
         return
-    stream = contextlib.nullcontext()
-    if keys.is_cuda:
-        stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(keys.device)), sync_enter=False)
-    with stream:
+    with on_torch_stream(keys.device) if keys.is_cuda else contextlib.nullcontext():
         wp.utils.radix_sort_pairs(warp_view(keys), warp_view(values), count, 0, bits)

@@ -69,6 +69,8 @@ def composite(
     job = _Job(splats, tiles, stats, absgrad, _resolve_form(form, channels.device, tiles.tile_size))
     tensors: tuple[Tensor, ...] = (splats.means2d, splats.conics, splats.opacities, channels, background)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+        if len(tiles.slots) != len(tiles.splats):
+            raise ValueError("tiles.slots is empty: these tiles were made for an image without gradients")
         return _Composite.apply(*tensors, job)  # type: ignore[return-value]
     image, alpha, *_ = _forward(job, tuple(t.detach().contiguous() for t in tensors), keep=False)
     return image, alpha
