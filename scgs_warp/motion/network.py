@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
+
+from ..ops.network import Layers, evaluate, network, supported
 
 
 def encode(values: Tensor, frequencies: int) -> Tensor:
@@ -47,6 +51,11 @@ class DeformationNetwork(nn.Module):
         self.head = nn.Linear(width, sum(heads.values()))
         nn.init.normal_(self.head.weight, std=1e-5, generator=generator)
         nn.init.zeros_(self.head.bias)
+        self._packed: tuple[tuple[tuple[int, int], ...], Layers] | None = None
+
+    def train(self, mode: bool = True) -> DeformationNetwork:
+        self._packed = None  # the optimiser writes where torch does not count
+        return super().train(mode)
 
     def forward(self, positions: Tensor, times: Tensor) -> dict[str, Tensor]:
         """Every position at every time.
@@ -58,15 +67,38 @@ class DeformationNetwork(nn.Module):
         Returns:
             one tensor [T, M, width] per head.
         """
-        count, instants = positions.shape[0], times.shape[0]
-        where = encode(positions, self.position_frequencies)[None].expand(instants, -1, -1)
-        when = encode(times[:, None], self.time_frequencies)[:, None].expand(-1, count, -1)
-        inputs = torch.cat([where, when], dim=-1).reshape(instants * count, -1)
+        where = encode(positions, self.position_frequencies)
+        when = encode(times[:, None], self.time_frequencies)
+        out = self._fused(where, when)
+        if out is None:
+            out = self._layered(where, when)
+        out = out.reshape(times.shape[0], positions.shape[0], -1)
+        return dict(zip(self.heads, out.split(list(self.heads.values()), dim=-1)))
+
+    def _layered(self, where: Tensor, when: Tensor) -> Tensor:
+        """Layer by layer in torch: on CUDA, in bfloat16, and where the positions want a gradient."""
+        count, instants = where.shape[0], when.shape[0]
+        both = [where[None].expand(instants, -1, -1), when[:, None].expand(-1, count, -1)]
+        inputs = torch.cat(both, dim=-1).reshape(instants * count, -1)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.low_precision and self.training):
             hidden = inputs
             for i, layer in enumerate(self.layers):
                 if i == self.skip:
                     hidden = torch.cat([inputs, hidden], dim=-1)
                 hidden = layer(hidden).relu()
-        out = self.head(hidden.float()).reshape(instants, count, -1)
-        return dict(zip(self.heads, out.split(list(self.heads.values()), dim=-1)))
+        return self.head(hidden.float())
+
+    def _fused(self, where: Tensor, when: Tensor) -> Tensor | None:
+        """All layers in one kernel, where there is one for them."""
+        layers = [cast(nn.Linear, layer) for layer in (*self.layers, self.head)]
+        weights: list[Tensor] = [layer.weight for layer in layers]
+        biases: list[Tensor] = [layer.bias for layer in layers]
+        if (self.low_precision and self.training) or where.requires_grad or not supported(weights, biases):
+            return None
+        if self.training or torch.is_grad_enabled():
+            return network(where, when, weights, biases)
+        # Packed weights are kept for the next frame; in training they would be old after one step.
+        key = tuple((p.data_ptr(), p._version) for p in (*weights, *biases))
+        if self._packed is None or self._packed[0] != key:
+            self._packed = key, Layers(weights, biases, where.shape[1] + when.shape[1])
+        return evaluate(self._packed[1], where, when)

@@ -1,0 +1,159 @@
+"""The deformation network on a CPU: a multilayer perceptron as three kernels instead of forty torch operations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..kernels import network_cpu as kernels
+from ..warp_interop import launch
+
+ROWS = 8
+"""Matrices have a multiple of this many rows."""
+
+LARGEST = 8192
+"""Rows evaluated at once where no gradient is wanted: what they pass from layer to layer stays in the cache."""
+
+
+class Layers:
+    """Weights of all layers in the form that the kernels read, made anew when a parameter has changed.
+
+    Args:
+        weights: [out, in] of every layer, float32, contiguous, on the CPU; the first reads the inputs alone.
+        biases: [out] of every layer.
+        inputs: columns of the inputs. A layer whose weights are that much wider than its predecessor's output reads
+            them again, before that output (a skip connection).
+    """
+
+    def __init__(self, weights: list[Tensor], biases: list[Tensor], inputs: int) -> None:
+        self.weights, self.biases = [w.detach() for w in weights], [b.detach() for b in biases]
+        self.inputs = inputs
+        self.panels = max(-(-w.shape[0] // kernels.PANEL) for w in weights)
+        self.outputs = weights[-1].shape[0]
+        self.gradient_begin: list[int] = []
+        rows, at, behind, before = [], 0, 0, 0
+        for layer, weight in enumerate(self.weights):
+            out, columns = weight.shape
+            own = columns - before
+            panels = -(-out // kernels.PANEL)
+            adjoint = at + panels * kernels.PANEL * columns
+            own_row = [weight.data_ptr(), self.biases[layer].data_ptr(), own, before, out, at]
+            rows.append([*own_row, adjoint if before else -1, 0])
+            at = adjoint + before * out
+            self.gradient_begin.append(behind)
+            behind += out * columns + out
+            before = out
+        self.gradient_size = behind
+        self.table = torch.tensor(rows, dtype=torch.int64)
+        self.packed = torch.empty(at)
+        launch(kernels.pack_weights, len(rows) * self.panels, self.panels, self.table, self.packed, grain=1)
+
+    def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Inputs and hidden values in panels, and the outputs [T M, out]."""
+        count = where.shape[0] * when.shape[0]
+        rows = -(-count // ROWS) * ROWS
+        inputs = torch.empty(-(-self.inputs // kernels.PANEL), rows, kernels.PANEL)
+        launch(kernels.pack_inputs, rows, where, when, inputs)
+        hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * kernels.PANEL)
+        out = torch.empty(count, self.outputs)
+        blocks, size = -(-rows // kernels.BLOCK), kernels.BLOCK
+        launch(kernels.network_values, blocks, size, int(keep), self.table, self.packed, inputs, hidden, out, grain=1)
+        return inputs, hidden, out
+
+    def gradients(self, inputs: Tensor, hidden: Tensor, v_out: Tensor) -> list[Tensor]:
+        """Of every layer's weights, then of every layer's bias."""
+        rows, count, layers = hidden.shape[1], v_out.shape[0], len(self.weights)
+        v_hidden = torch.empty_like(hidden)
+        blocks, size = -(-rows // kernels.BLOCK), kernels.BLOCK
+        launch(kernels.network_adjoint, blocks, size, self.table, self.packed, hidden, v_out, v_hidden, grain=1)
+        flat = torch.empty(self.gradient_size)
+        table = self.table.clone()
+        table[:, 7] = torch.tensor(self.gradient_begin) * flat.element_size() + flat.data_ptr()
+        parts = 2
+        shared = self.panels, parts, count, table, inputs, hidden, v_hidden
+        launch(kernels.network_weights_adjoint, layers * self.panels * parts, *shared, grain=1)
+        weights, biases = [], []
+        for begin, weight in zip(self.gradient_begin, self.weights):
+            end = begin + weight.numel()
+            weights.append(flat[begin:end].view_as(weight))
+            biases.append(flat[end : end + weight.shape[0]])
+        return weights + biases
+
+
+class _Network(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, where, when, *parameters):
+        half = len(parameters) // 2
+        layers = Layers(list(parameters[:half]), list(parameters[half:]), where.shape[1] + when.shape[1])
+        inputs, hidden, out = layers.values(where, when, keep=True)
+        ctx.layers = layers
+        ctx.save_for_backward(inputs, hidden)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients):  # type: ignore[override]
+        return None, None, *ctx.layers.gradients(*ctx.saved_tensors, gradients[0].contiguous())
+
+
+def supported(weights: list[Tensor], biases: list[Tensor]) -> bool:
+    """Whether :func:`network` takes them: float32 on a CPU, hidden widths multiples of 32."""
+    return all(
+        p.device.type == "cpu" and p.dtype == torch.float32 and p.is_contiguous() for p in (*weights, *biases)
+    ) and all(w.shape[0] % kernels.PANEL == 0 for w in weights[:-1])
+
+
+def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
+    """Hidden layers with ReLU and a last one without, for every position at every time.
+
+    Args:
+        where: [M, A] inputs that depend on the position. No gradient.
+        when: [T, B] inputs that depend on the time. No gradient.
+        weights: [out, in] of every layer; ``in`` is A + B for the first, and for the others the width of the layer
+            before, or that and A + B more: then the inputs are read again, in front (a skip connection).
+        biases: [out] of every layer.
+
+    Returns:
+        [T M, out of the last layer], rows ``t M + m``. Gradients go to weights and biases; their sums are taken in a
+        fixed order.
+
+    Raises:
+        ValueError: shapes do not fit, or the parameters are not :func:`supported`.
+    """
+    _validate(where, when, weights, biases)
+    where, when = where.detach().contiguous(), when.detach().contiguous()
+    if torch.is_grad_enabled() and any(p.requires_grad for p in (*weights, *biases)):
+        return _Network.apply(where, when, *weights, *biases)  # type: ignore[return-value]
+    return evaluate(Layers(weights, biases, where.shape[1] + when.shape[1]), where, when)
+
+
+def evaluate(layers: Layers, where: Tensor, when: Tensor) -> Tensor:
+    """:func:`network` without gradients, of weights that are packed already."""
+    if where.shape[0] * when.shape[0] <= LARGEST:
+        return layers.values(where, when, keep=False)[2]
+    parts = [
+        layers.values(rows, when[t : t + 1], keep=False)[2]
+        for t in range(when.shape[0])
+        for rows in where.split(LARGEST)
+    ]
+    return torch.cat(parts)
+
+
+def _validate(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Tensor]) -> None:
+    if where.ndim != 2 or when.ndim != 2:
+        raise ValueError(f"where and when must be matrices, got {tuple(where.shape)} and {tuple(when.shape)}")
+    if len(weights) < 2 or len(weights) != len(biases):
+        raise ValueError(f"weights and biases must be two or more layers, got {len(weights)} and {len(biases)}")
+    if not supported(weights, biases):
+        raise ValueError("weights and biases must be contiguous float32 on the CPU, hidden widths multiples of 32")
+    inputs, before = where.shape[1] + when.shape[1], 0
+    for layer, (weight, bias) in enumerate(zip(weights, biases)):
+        fits = (before, inputs + before) if layer else (inputs,)
+        if weight.ndim != 2 or weight.shape[1] not in fits or tuple(bias.shape) != (weight.shape[0],):
+            raise ValueError(
+                f"weights[{layer}] and biases[{layer}] must be [out, {' or '.join(map(str, fits))}] and [out], "
+                f"got {tuple(weight.shape)} and {tuple(bias.shape)}"
+            )
+        before = weight.shape[0]
