@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .config import DensifyConfig
 from .gaussians import GaussianParameters
-from .optim import regather, reset_moments
+from .optim import Adam
 from .quaternion import rotate
 from .types import Stats
 
@@ -30,7 +30,7 @@ def mean_gradient(stats: Stats) -> Tensor:
 
 def densify(
     gaussians: GaussianParameters,
-    optimizer: torch.optim.Adam,
+    optimizer: Adam,
     stats: Stats,
     config: DensifyConfig,
     *,
@@ -57,7 +57,7 @@ def densify(
         index = torch.cat(pieces)
         fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
         fresh[len(pieces[0]) :] = True
-        regather(optimizer, gaussians, GaussianParameters.NAMES, index, fresh)
+        optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
         _spread_halves(gaussians, len(pieces[2]), random)
         keep = _worth_keeping(gaussians, stats.max_radii[index], fresh, config, extent, prune_large)
     prune(gaussians, optimizer, keep)
@@ -101,7 +101,7 @@ def _worth_keeping(
     return keep
 
 
-def prune(gaussians: GaussianParameters, optimizer: torch.optim.Adam, keep: Tensor) -> None:
+def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> None:
     """Keep the rows marked in ``keep`` [N]; if that would leave none, keep the most opaque one."""
     if not bool(keep.any()):
         keep = keep.clone()
@@ -110,11 +110,11 @@ def prune(gaussians: GaussianParameters, optimizer: torch.optim.Adam, keep: Tens
         return
     index = torch.where(keep)[0]
     fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
-    regather(optimizer, gaussians, GaussianParameters.NAMES, index, fresh)
+    optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
 
 
-def reset_opacities(gaussians: GaussianParameters, optimizer: torch.optim.Adam) -> None:
+def reset_opacities(gaussians: GaussianParameters, optimizer: Adam) -> None:
     """No opacity above 0.01 any more: what the images need comes back, floaters do not."""
     with torch.no_grad():
         gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
-    reset_moments(optimizer, "opacity_logits")
+    optimizer.reset_moments("opacity_logits")

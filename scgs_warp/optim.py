@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .ops.adam import Update, adam_step
+
+ADAM_BETAS = (0.9, 0.999)
 ADAM_EPS = 1e-15
 
 
@@ -27,74 +31,107 @@ def generator(seed: int, *keys: int, device: torch.device | str = "cpu") -> torc
     return torch.Generator(device=device).manual_seed(int(state) & (2**63 - 1))
 
 
-def adam(parameters: Mapping[str, nn.Parameter], rates: Mapping[str, float]) -> torch.optim.Adam:
-    """One group per parameter, named, so that its rate can be scheduled and its rows found. Fused: one pass a row."""
-    groups = [{"params": [parameter], "lr": rates[name], "name": name} for name, parameter in parameters.items()]
-    return torch.optim.Adam(groups, lr=0.0, eps=ADAM_EPS, fused=True)
+@dataclass
+class Group:
+    """One parameter and what Adam keeps beside it."""
+
+    parameter: nn.Parameter
+    rate: float
+    steps: int = 0
+    exp_avg: Tensor | None = None
+    """First moment; like the second, None before the first step with a gradient."""
+    exp_avg_sq: Tensor | None = None
 
 
-def set_rate(optimizer: torch.optim.Adam, name: str, rate: float) -> None:
-    """Set the learning rate of the groups called ``name``."""
-    for group in optimizer.param_groups:
-        if group["name"] == name:
-            group["lr"] = rate
+class Adam:
+    """Adam with bias correction, as ``torch.optim.Adam`` has it, on named parameters: all of them in one launch.
 
-
-def regather(
-    optimizer: torch.optim.Adam, owner: nn.Module, names: tuple[str, ...], index: Tensor, fresh: Tensor
-) -> None:
-    """New rows from old ones: row i of every named parameter becomes old row ``index[i]``.
-
-    Args:
-        optimizer: whose moments follow; rows marked ``fresh`` start with zero moments.
-        owner: module that holds the parameters as attributes.
-        names: parameters whose first dimension is to be re-gathered.
-        index: [N'] int64 source rows; repeated to clone, left out to prune.
-        fresh: [N'] bool.
+    Attributes: ``groups``, name to :class:`Group`. Rates are read at every step. A parameter without a gradient is
+    left alone; one whose gradient is zero still has its moments decay.
     """
-    for group in optimizer.param_groups:
-        name = group["name"]
-        if name not in names:
-            continue
-        old = group["params"][0]
-        new = nn.Parameter(old.detach()[index])
-        state = optimizer.state.pop(old, None)
-        if state:
-            keep = (~fresh).view(-1, *([1] * (old.ndim - 1))).to(old.dtype)
+
+    def __init__(self, parameters: Mapping[str, nn.Parameter], rates: Mapping[str, float]) -> None:
+        self.groups = {name: Group(parameter, rates[name]) for name, parameter in parameters.items()}
+        for parameter in parameters.values():
+            parameter.data = parameter.data.contiguous()
+
+    def gradients(self) -> list[tuple[str, Tensor]]:
+        """The gradients there are, with the names of their parameters."""
+        found = ((name, group.parameter.grad) for name, group in self.groups.items())
+        return [(name, gradient) for name, gradient in found if gradient is not None]
+
+    def step(self) -> None:
+        """Change every parameter that has a gradient."""
+        updates = []
+        for group in self.groups.values():
+            gradient = group.parameter.grad
+            if gradient is None:
+                continue
+            if group.exp_avg is None or group.exp_avg_sq is None:
+                group.exp_avg, group.exp_avg_sq = (torch.zeros_like(group.parameter) for _ in range(2))
+            group.steps += 1
+            moments = group.exp_avg, group.exp_avg_sq
+            updates.append(Update(group.parameter, gradient.contiguous(), *moments, group.rate, group.steps))
+        adam_step(updates, betas=ADAM_BETAS, eps=ADAM_EPS)
+
+    def zero_grad(self) -> None:
+        """Drop all gradients."""
+        for group in self.groups.values():
+            group.parameter.grad = None
+
+    def regather(self, owner: nn.Module, names: tuple[str, ...], index: Tensor, fresh: Tensor) -> None:
+        """New rows from old ones: row i of every named parameter becomes old row ``index[i]``.
+
+        Args:
+            owner: module that holds the parameters as attributes.
+            names: parameters whose first dimension is to be re-gathered.
+            index: [N'] int64 source rows; repeated to clone, left out to prune.
+            fresh: [N'] bool, rows that start with zero moments.
+        """
+        for name in names:
+            group = self.groups.get(name)
+            if group is None:
+                continue
+            old = group.parameter.detach()
+            group.parameter = nn.Parameter(old[index])
+            setattr(owner, name, group.parameter)
+            if group.exp_avg is not None and group.exp_avg_sq is not None:
+                keep = (~fresh).view(-1, *([1] * (old.ndim - 1))).to(old.dtype)
+                group.exp_avg, group.exp_avg_sq = group.exp_avg[index] * keep, group.exp_avg_sq[index] * keep
+
+    def reset_moments(self, name: str) -> None:
+        """Forget the moments of one parameter after its values were overwritten; its steps go on counting."""
+        for moment in (self.groups[name].exp_avg, self.groups[name].exp_avg_sq):
+            if moment is not None:
+                moment.zero_()
+
+    def tensors(self, prefix: str) -> dict[str, Tensor]:
+        """Moments and step counts as ``prefix.name.exp_avg``, ``.exp_avg_sq`` and ``.step`` (a float32 scalar), for a
+        checkpoint; nothing for a parameter that never had a gradient."""
+        found = {}
+        for name, group in self.groups.items():
+            if group.exp_avg is not None and group.exp_avg_sq is not None:
+                found[f"{prefix}.{name}.step"] = torch.tensor(float(group.steps))
+                found[f"{prefix}.{name}.exp_avg"] = group.exp_avg
+                found[f"{prefix}.{name}.exp_avg_sq"] = group.exp_avg_sq
+        return found
+
+    def load_tensors(self, prefix: str, tensors: Mapping[str, Tensor]) -> None:
+        """Inverse of :meth:`tensors`; a parameter that had no state yet stays without.
+
+        Raises:
+            KeyError: a parameter has part of its state.
+            ValueError: a moment does not have the shape of its parameter.
+        """
+        for name, group in self.groups.items():
+            start = f"{prefix}.{name}."
+            if f"{start}step" not in tensors:
+                continue
+            moments = []
             for key in ("exp_avg", "exp_avg_sq"):
-                state[key] = state[key][index] * keep
-            optimizer.state[new] = state
-        group["params"][0] = new
-        setattr(owner, name, new)
-
-
-def reset_moments(optimizer: torch.optim.Adam, name: str) -> None:
-    """Forget the moments of one parameter after its values were overwritten."""
-    for group in optimizer.param_groups:
-        if group["name"] == name:
-            state = optimizer.state.get(group["params"][0])
-            if state:
-                state["exp_avg"].zero_()
-                state["exp_avg_sq"].zero_()
-
-
-def optimizer_tensors(optimizer: torch.optim.Adam, prefix: str) -> dict[str, Tensor]:
-    """The moments and step counts as named tensors, for a checkpoint."""
-    tensors = {}
-    for group in optimizer.param_groups:
-        for key, value in optimizer.state.get(group["params"][0], {}).items():
-            tensors[f"{prefix}.{group['name']}.{key}"] = torch.as_tensor(value).detach()
-    return tensors
-
-
-def load_optimizer_tensors(optimizer: torch.optim.Adam, prefix: str, tensors: Mapping[str, Tensor]) -> None:
-    """Inverse of :func:`optimizer_tensors`; a parameter that had no state yet stays without."""
-    for group in optimizer.param_groups:
-        parameter = group["params"][0]
-        start = f"{prefix}.{group['name']}."
-        state = {
-            key: tensors[start + key].clone() for key in ("step", "exp_avg", "exp_avg_sq") if start + key in tensors
-        }
-        if state:
-            # Fused Adam keeps its step count beside the parameter.
-            optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in state.items()}
+                moment = tensors[start + key].to(group.parameter.device).clone(memory_format=torch.contiguous_format)
+                if moment.shape != group.parameter.shape:
+                    raise ValueError(f"{start}{key} must be {list(group.parameter.shape)}, got {list(moment.shape)}")
+                moments.append(moment)
+            group.exp_avg, group.exp_avg_sq = moments
+            group.steps = int(tensors[f"{start}step"])

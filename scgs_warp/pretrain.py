@@ -12,7 +12,7 @@ from .motion import Motion, build_motion
 from .motion.control_points import ControlPoints, heads_of, make_network
 from .motion.spheres import Spheres
 from .ops.sampling import farthest_points
-from .optim import generator, regather
+from .optim import Adam, generator
 from .types import Stats
 
 TRAJECTORY_TIMES = 16
@@ -56,7 +56,7 @@ def begin_motion(config: TrainConfig, points: Tensor) -> Motion:
 
 def densify_spheres(
     gaussians: GaussianParameters,
-    optimizer: torch.optim.Adam,
+    optimizer: Adam,
     spheres: Spheres,
     stats: Stats,
     config: TrainConfig,
@@ -83,14 +83,14 @@ def densify_spheres(
         clones = parents[torch.arange(wanted, device=kept.device) % len(parents)]
         index = torch.cat([kept, clones])
         fresh = torch.arange(len(index), device=index.device) >= len(kept)
-        regather(optimizer, gaussians, GaussianParameters.NAMES, index, fresh)
+        optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
         if wanted:
             noise = torch.randn(wanted, 3, generator=generator(config.seed, 32, step)).to(clones.device)
             gaussians.means.data[len(kept) :] += noise * spheres.log_radius.exp()
         spheres.graph = None
 
 
-def thin_spheres(gaussians: GaussianParameters, optimizer: torch.optim.Adam, spheres: Spheres, nodes: int) -> None:
+def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Spheres, nodes: int) -> None:
     """Farthest-point sampling to N_p in trajectory space, so that parts that move apart are both represented."""
     if len(gaussians) <= nodes:
         return
@@ -99,7 +99,7 @@ def thin_spheres(gaussians: GaussianParameters, optimizer: torch.optim.Adam, sph
         tracks = gaussians.means + spheres.translations(gaussians.means, times)
         flat = tracks.permute(1, 0, 2).reshape(len(gaussians), -1).contiguous()
         index = farthest_points(flat, nodes).to(flat.device)
-    regather(optimizer, gaussians, GaussianParameters.NAMES, index, torch.zeros_like(index, dtype=torch.bool))
+    optimizer.regather(gaussians, GaussianParameters.NAMES, index, torch.zeros_like(index, dtype=torch.bool))
     spheres.graph = None
 
 

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from . import environment
@@ -24,8 +23,9 @@ from .limits import check
 from .motion.adapt import adapt_control_points
 from .motion.control_points import ControlPoints
 from .motion.spheres import Spheres
+from .ops.adam import first_not_finite
 from .ops.ssim import photometric_loss
-from .optim import generator, log_linear, set_rate
+from .optim import generator, log_linear
 from .pretrain import densify_spheres, thin_spheres
 from .progress import Progress, progress
 from .render import render
@@ -81,8 +81,9 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
         state.gaussian_optimizer.step()
         if state.motion_optimizer is not None and not frozen(state):
             state.motion_optimizer.step()
-    state.gaussian_optimizer.zero_grad(set_to_none=True)
-    state.motion.zero_grad(set_to_none=True)
+    state.gaussian_optimizer.zero_grad()
+    if state.motion_optimizer is not None:
+        state.motion_optimizer.zero_grad()
     weighted = 0.0 if regulariser is None else float(regulariser.detach())
     return StepResult(loss.detach(), l1.detach(), ssim.detach(), weighted, picture.detach(), truth, failed)
 
@@ -96,31 +97,27 @@ def set_rates(state: TrainState) -> None:
     """Every learning rate is a function of the step."""
     config, step = state.config, state.stage_step
     means = log_linear(config.optim.means, config.optim.means_end, step, config.optim.means_until)
-    set_rate(state.gaussian_optimizer, "means", means)
+    state.gaussian_optimizer.groups["means"].rate = means
     if state.motion_optimizer is not None:
         rates = state.motion.rates(step, config)
-        for group in state.motion_optimizer.param_groups:
-            group["lr"] = rates[group["name"]]
+        for name, group in state.motion_optimizer.groups.items():
+            group.rate = rates[name]
 
 
 def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
-    if not bool(torch.isfinite(loss)):
+    if not math.isfinite(float(loss.detach())):
         return "image loss"
-    if regulariser is not None and not bool(torch.isfinite(regulariser)):
+    if regulariser is not None and not math.isfinite(float(regulariser.detach())):
         return "regulariser"
     return None
 
 
 def _bad_gradient(state: TrainState) -> str | None:
-    parameters = [*state.gaussians.named_parameters(), *state.motion.named_parameters()]
-    named = [(name, parameter.grad) for name, parameter in parameters if parameter.grad is not None]
-    # One look at all of them; which one it was matters only when something is wrong.
-    if math.isfinite(float(torch.nn.utils.get_total_norm([gradient for _, gradient in named]))):
-        return None
-    bad = [name for name, gradient in named if not bool(torch.isfinite(gradient).all())]
-    if not bad:
-        return None  # finite, but too large to be squared
-    return f"gradient of {bad[0]}"
+    named = state.gaussian_optimizer.gradients()
+    if state.motion_optimizer is not None:
+        named += state.motion_optimizer.gradients()
+    bad = first_not_finite([gradient for _, gradient in named])
+    return None if bad is None else f"gradient of {named[bad][0]}"
 
 
 def adapt(state: TrainState, size: tuple[int, int]) -> None:

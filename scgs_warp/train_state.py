@@ -19,7 +19,7 @@ from .gaussians import GaussianParameters
 from .hull import likely_points
 from .motion.base import Motion
 from .motion.spheres import Spheres
-from .optim import adam, generator, load_optimizer_tensors, optimizer_tensors
+from .optim import Adam, generator
 from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, thin_spheres
 from .scene import Scene, scene_from
 from .types import Stats
@@ -55,7 +55,7 @@ class TrainState:
     def enter(self, gaussians: GaussianParameters, motion: Motion) -> None:
         """Take these models, with fresh optimisers and statistics."""
         self.gaussians, self.motion = gaussians, motion
-        self.gaussian_optimizer = adam(dict(gaussians.named_parameters()), self.gaussian_rates())
+        self.gaussian_optimizer = Adam(dict(gaussians.named_parameters()), self.gaussian_rates())
         self.motion_optimizer = motion.optimizer(self.config)
         self.reset_stats()
 
@@ -113,9 +113,9 @@ class TrainState:
 
     def save(self, folder: Path) -> None:
         tensors = dict(self.scene().tensors())
-        tensors.update(optimizer_tensors(self.gaussian_optimizer, "adam.gaussians"))
+        tensors.update(self.gaussian_optimizer.tensors("adam.gaussians"))
         if self.motion_optimizer is not None:
-            tensors.update(optimizer_tensors(self.motion_optimizer, "adam.motion"))
+            tensors.update(self.motion_optimizer.tensors("adam.motion"))
         tensors.update({f"extra.{name}": value for name, value in self.motion.extra_state().items()})
         for name in ("grad_norm", "count", "max_radii"):
             tensors[f"stats.{name}"] = getattr(self.stats, name)
@@ -159,9 +159,9 @@ class TrainState:
                 fingerprint=data.fingerprint,
                 step=scene.step,
             )
-            load_optimizer_tensors(state.gaussian_optimizer, "adam.gaussians", tensors)
+            state.gaussian_optimizer.load_tensors("adam.gaussians", tensors)
             if state.motion_optimizer is not None:
-                load_optimizer_tensors(state.motion_optimizer, "adam.motion", tensors)
+                state.motion_optimizer.load_tensors("adam.motion", tensors)
             state.motion.load_extra_state(checkpoint.strip(tensors, "extra."))
             stats = checkpoint.strip(tensors, "stats.")
             state.stats = Stats(stats["grad_norm"], stats["count"], stats["max_radii"], absolute=state.stats.absolute)

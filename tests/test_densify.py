@@ -11,7 +11,7 @@ from scgs_warp.densify import densify, prune, reset_opacities, threshold
 from scgs_warp.gaussians import GaussianParameters, gaussians_from_points, neighbor_distance
 from scgs_warp.motion.adapt import adapt_control_points
 from scgs_warp.motion.control_points import ControlPoints, heads_of, make_network
-from scgs_warp.optim import adam, generator, load_optimizer_tensors, optimizer_tensors
+from scgs_warp.optim import Adam, generator
 from scgs_warp.pretrain import begin_spheres, control_points_of, densify_spheres, thin_spheres
 from scgs_warp.types import Stats
 
@@ -23,7 +23,7 @@ def make(count: int, device: str, seed: int = 0):
     gaussians = gaussians_from_points(points, None, sh_degree=1, hyper_dim=2)
     with torch.no_grad():
         gaussians.opacity_logits.fill_(2.0)
-    optimizer = adam(dict(gaussians.named_parameters()), RATES)
+    optimizer = Adam(dict(gaussians.named_parameters()), RATES)
     for parameter in gaussians.parameters():
         parameter.grad = torch.arange(parameter.numel(), device=device).reshape(parameter.shape).float() + 1.0
     optimizer.step()
@@ -31,10 +31,7 @@ def make(count: int, device: str, seed: int = 0):
 
 
 def moments(optimizer, name: str):
-    for group in optimizer.param_groups:
-        if group["name"] == name:
-            return group["params"][0], optimizer.state[group["params"][0]]["exp_avg"]
-    raise KeyError(name)
+    return optimizer.groups[name].parameter, optimizer.groups[name].exp_avg
 
 
 def run_densify(gaussians, optimizer, gradient, config, **options):
@@ -106,10 +103,11 @@ def test_threshold_follows_the_resolution():
 
 def test_optimizer_round_trip(device):
     gaussians, optimizer = make(3, device)
-    saved = {name: value.clone() for name, value in optimizer_tensors(optimizer, "a").items()}
-    fresh = adam(dict(gaussians.named_parameters()), RATES)
-    load_optimizer_tensors(fresh, "a", saved)
-    again = optimizer_tensors(fresh, "a")
+    saved = {name: value.clone() for name, value in optimizer.tensors("a").items()}
+    fresh = Adam(dict(gaussians.named_parameters()), RATES)
+    fresh.load_tensors("a", saved)
+    again = fresh.tensors("a")
+    assert len(saved) == 3 * len(GaussianParameters.NAMES)
     assert again.keys() == saved.keys() and all(torch.equal(again[k], saved[k]) for k in saved)
 
 
@@ -124,7 +122,7 @@ def test_stage_one_never_falls_below_its_count(opaque, device):
     config = tiny_config()
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(1)).to(device)
     gaussians, spheres = begin_spheres(config, points, points, device)
-    optimizer = adam(dict(gaussians.named_parameters()), RATES)
+    optimizer = Adam(dict(gaussians.named_parameters()), RATES)
     with torch.no_grad():
         gaussians.opacity_logits.fill_(-9.0)
         gaussians.opacity_logits[:opaque] = 1.0

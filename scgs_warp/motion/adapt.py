@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..gaussians import GaussianParameters
-from ..optim import regather
+from ..optim import Adam
 from .control_points import NODE_NAMES, ControlPoints
 
 PRUNE_IMPACT = 1e-2
@@ -46,7 +46,7 @@ def influence(motion: ControlPoints, gaussians: GaussianParameters, gradient: Te
 
 def adapt_control_points(
     motion: ControlPoints,
-    optimizer: torch.optim.Adam,
+    optimizer: Adam,
     gaussians: GaussianParameters,
     gradient: Tensor,
     *,
@@ -79,7 +79,7 @@ def adapt_control_points(
     fresh = torch.arange(len(index), device=device) >= len(kept)
     names = tuple(name for name in NODE_NAMES if name != "strength_logits" or motion.config.node_weight)
     pruned = len(motion) - len(kept)
-    regather(optimizer, motion, names, index, fresh)
+    optimizer.regather(motion, names, index, fresh)
     centres = torch.from_numpy(found.centre[cloned]).to(motion.positions)
     motion.positions.data[len(kept) :] = centres
     motion.graph = None

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ..config import TrainConfig
 from ..gaussians import GaussianParameters
-from ..optim import adam
+from ..optim import Adam
 from ..types import Gaussians
 
 
@@ -48,10 +48,10 @@ class Motion(nn.Module):
         """Learning rate of every named parameter at this main step."""
         return {}
 
-    def optimizer(self, config: TrainConfig) -> torch.optim.Adam | None:
+    def optimizer(self, config: TrainConfig) -> Adam | None:
         """Adam over all parameters, one named group each; None for a model without parameters."""
         parameters = dict(self.named_parameters())
-        return adam(parameters, self.rates(0, config)) if parameters else None
+        return Adam(parameters, self.rates(0, config)) if parameters else None
 
     def extra_state(self) -> dict[str, Tensor]:
         """Tensors beside the parameters that a resumed run needs."""

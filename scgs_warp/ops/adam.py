@@ -1,0 +1,121 @@
+"""One step of Adam over many tensors at once, and the first of many that is not finite. No gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels import adam as kernels
+from ..warp_interop import launch
+
+Form = Literal["auto", "plain", "cpu"]
+
+
+class Update(NamedTuple):
+    """One tensor's share of a step; all tensors have one shape, float32, contiguous."""
+
+    value: Tensor
+    """Changed in place."""
+    gradient: Tensor
+    exp_avg: Tensor
+    """First moment, changed in place."""
+    exp_avg_sq: Tensor
+    """Second moment, changed in place."""
+    rate: float
+    steps: int
+    """Steps taken, this one included: 1 or more."""
+
+
+def adam_step(
+    updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15, form: Form = "auto"
+) -> None:
+    """Adam (Kingma and Ba 2015, algorithm 1) with bias correction as in ``torch.optim.Adam``, in one launch.
+
+    Args:
+        updates: tensors on one device; those without elements, and no updates at all, are fine.
+        betas: decay of the first and second moment.
+        eps: added to the root of the second moment after its bias correction.
+        form: ``plain`` (any device), ``cpu`` (SIMD), or what suits the device.
+
+    Raises:
+        ValueError: a tensor is no contiguous float32 of its value's shape, on one device; or the form does not fit.
+    """
+    if not updates:
+        return
+    device = updates[0].value.device
+    simd = _simd(form, device)
+    addresses, factors = [], []
+    for update in updates:
+        _validate(update, device)
+        addresses.append([tensor.data_ptr() for tensor in update[:4]])
+        corrections = (1.0 - beta**update.steps for beta in betas)
+        factors.append([update.rate / next(corrections), 1.0 / math.sqrt(next(corrections))])
+    sizes, chunks = _layout(tuple(update.value.numel() for update in updates), device)
+    tables = torch.tensor(addresses).to(device), torch.tensor(factors, dtype=torch.float32).to(device), sizes, chunks
+    numbers = 1.0 - betas[0], betas[1], 1.0 - betas[1], eps
+    if simd:
+        launch(kernels.adam_chunks, len(chunks), *tables, *numbers, grain=4)
+    else:
+        launch(kernels.adam, len(chunks) * kernels.CHUNK, *tables, *numbers)
+
+
+def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
+    """Index of the first tensor with an infinity or a NaN, or None. Exact: nothing is summed that could overflow.
+
+    Args:
+        tensors: float32, on one device.
+    """
+    if not tensors:
+        return None
+    if tensors[0].device.type != "cpu":
+        if math.isfinite(float(torch.nn.utils.get_total_norm(tensors, math.inf))):
+            return None
+        return next(i for i, tensor in enumerate(tensors) if not bool(torch.isfinite(tensor).all()))
+    tensors = [tensor.detach().contiguous() for tensor in tensors]
+    for tensor in tensors:
+        if tensor.dtype != torch.float32:
+            raise ValueError(f"tensors must be float32, got {tensor.dtype}")
+    sizes, chunks = _layout(tuple(tensor.numel() for tensor in tensors), tensors[0].device)
+    bad = torch.empty(len(chunks), dtype=torch.int32)
+    launch(
+        kernels.find_bad_chunks,
+        len(chunks),
+        torch.tensor([tensor.data_ptr() for tensor in tensors]),
+        *(sizes, chunks, bad),
+        grain=4,
+    )
+    found = bad.numpy().nonzero()[0]
+    return int(chunks[found[0], 0]) if len(found) else None
+
+
+def _simd(form: str, device: torch.device) -> bool:
+    if form not in ("auto", "plain", "cpu"):
+        raise ValueError(f"form must be auto, plain or cpu, got {form!r}")
+    if form == "cpu" and device.type != "cpu":
+        raise ValueError(f"form cpu needs tensors on the CPU, got {device}")
+    return form == "cpu" or (form == "auto" and device.type == "cpu")
+
+
+def _validate(update: Update, device: torch.device) -> None:
+    shape = update.value.shape
+    for name, tensor in zip(Update._fields, update[:4]):
+        if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device != device:
+            raise ValueError(
+                f"{name} must be {list(shape)} float32 on {device}, "
+                f"got {list(tensor.shape)} {tensor.dtype} on {tensor.device}"
+            )
+        if not tensor.is_contiguous():
+            raise ValueError(f"{name} must be contiguous, got strides {tensor.stride()}")
+
+
+@lru_cache(maxsize=16)
+def _layout(sizes: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Sizes [T] and chunks [C, 2] (tensor, first element) of tensors with ``sizes`` elements."""
+    chunks = [(i, begin) for i, size in enumerate(sizes) for begin in range(0, size, kernels.CHUNK)]
+    table = torch.tensor(chunks, dtype=torch.int64).view(-1, 2)
+    return torch.tensor(sizes, dtype=torch.int64).to(device), table.to(device)
