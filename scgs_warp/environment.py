@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
+from pathlib import Path
 
 _threads: int | None = None
 _configured = False
@@ -23,10 +25,22 @@ def prepare_environment() -> None:
 
 
 def available_threads() -> int:
-    """Cores this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Cores this process may use: those it may run on, and no more than a container's share of processor time."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, math.ceil(min(cores, _quota())))
+
+
+def _quota(folder: str = "/sys/fs/cgroup") -> float:
+    """Processors' worth of time that the control group grants (Linux); infinite where nothing is said."""
+    for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):  # version 2, version 1
+        try:
+            words = " ".join(Path(folder, name).read_text() for name in names).split()
+            quota, period = float(words[0]), float(words[1])
+        except (OSError, ValueError, IndexError):  # not Linux, no limit ("max"), or another layout
+            continue
+        if quota > 0.0 and period > 0.0:
+            return quota / period
+    return math.inf
 
 
 def thread_count() -> int:
