@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 import os
 from pathlib import Path
@@ -30,6 +31,7 @@ def available_threads() -> int:
     return max(1, math.ceil(min(cores, _quota())))
 
 
+@functools.cache
 def _quota(folder: str = "/sys/fs/cgroup") -> float:
     """Processors' worth of time that the control group grants (Linux); infinite where nothing is said."""
     for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):  # version 2, version 1
