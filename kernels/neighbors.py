@@ -1,152 +1,15 @@
 """The K nearest control points of every Gaussian, and the weights with which they pull it (SC-GS, Eq. 5).
 
-``nearest`` is exact and exists twice: one point a thread in plain Warp, and for the CPU sixteen points a thread as
-lanes of SIMD registers. Both keep a sorted list of the K best, visit the nodes in ascending order and insert on a
-strict ``<``: ties go to the lower index, and a distance that is NaN is never inserted.
+``nearest`` is exact: one point a thread, a sorted list of the K best, the nodes in ascending order, inserted on a
+strict ``<``. Ties go to the lower index, and a distance that is NaN is never inserted. ``neighbors_cpu.py`` does the
+same with SIMD.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-LANES = wp.constant(16)
-"""Points a grid index of ``nearest_lanes`` handles."""
 MAX_NEIGHBORS = 16
-MAX_LANE_DIMENSIONS = 64
-"""Above this many dimensions ``nearest_lanes`` has no room for its points; the plain kernel takes any."""
-
-_NEAREST_LANES = """
-#if !defined(__CUDA_ARCH__)
-    typedef float vf __attribute__((vector_size(64)));
-    typedef int vi __attribute__((vector_size(64)));
-    struct Two { enum { value = 2 }; }; struct Three { enum { value = 3 }; }; struct Four { enum { value = 4 }; };
-    struct Eight { enum { value = 8 }; }; struct Sixteen { enum { value = 16 }; };
-    const int N = points.shape[0], M = nodes.shape[0], D = points.shape[1];
-    const float* source = points.data;
-    const float* node_data = nodes.data;
-    const float infinity = __builtin_inff();
-    auto scan = [&](auto kc, auto dc) {
-        #pragma clang fp contract(fast)
-        constexpr int S = decltype(kc)::value;    // size of the sorted list, >= K
-        constexpr int FIXED = decltype(dc)::value;  // 3 or, when 2, any D
-        vf x[FIXED == 3 ? 3 : 64];
-        const int dims = FIXED == 3 ? 3 : D;
-        for (int d = 0; d < dims; ++d)
-            for (int lane = 0; lane < 16; ++lane) {
-                int row = begin + lane < N ? begin + lane : N - 1;
-                x[d][lane] = source[(long long)row * D + d];
-            }
-        vf best[S]; vi index[S];
-        for (int j = 0; j < S; ++j) { best[j] = (vf){} + infinity; index[j] = (vi){} + (j < M ? j : 0); }
-        for (int start = 0; start < M; start += 256) {
-            const int stop = start + 256 < M ? start + 256 : M;
-            // All distances of this batch, and the least of every sixteen nodes.
-            vf d2[256], least[16];
-            const int groups = (stop - start + 15) / 16;
-            for (int g = 0; g < groups; ++g) {
-                vf low = (vf){} + infinity;
-                const int end = start + 16 * g + 16 < stop ? start + 16 * g + 16 : stop;
-                const float* node = node_data + (start + 16ll * g) * dims;
-                vf* out = d2 + 16 * g;
-                auto distance = [&](int m) {
-                    vf e = x[0] - node[m * dims];
-                    vf s = e * e;
-                    if (FIXED == 3) {
-                        vf e1 = x[1] - node[3 * m + 1], e2 = x[2] - node[3 * m + 2];
-                        s = s + e1 * e1 + e2 * e2;
-                    } else {
-                        for (int d = 1; d < dims; ++d) { e = x[d] - node[m * dims + d]; s += e * e; }
-                    }
-                    out[m] = s;
-                    low = s < low ? s : low;
-                };
-                if (end - start - 16 * g == 16) {
-                    #pragma clang loop unroll_count(4)
-                    for (int m = 0; m < 16; ++m) distance(m);
-                } else
-                    for (int m = 0; m < end - start - 16 * g; ++m) distance(m);
-                least[g] = low;
-            }
-            // K groups hold a node within the K-th least of these: nothing beyond it can be among the K nearest.
-            vf bound[S];
-            for (int j = 0; j < S; ++j) bound[j] = best[j];
-            for (int g = 0; g < groups; ++g) {
-                vf low = least[g];
-                #pragma clang loop unroll(full)
-                for (int j = 0; j < S; ++j) {
-                    vi under = low < bound[j];
-                    vf kept = under ? low : bound[j];
-                    low = under ? bound[j] : low;
-                    bound[j] = kept;
-                }
-            }
-            const vf limit = bound[S - 1];
-            for (int g = 0; g < groups; ++g) {
-                if (!__builtin_reduce_or(least[g] <= limit)) continue;
-                const int end = start + 16 * g + 16 < stop ? start + 16 * g + 16 : stop;
-                unsigned found = 0;
-                for (int m = start + 16 * g; m < end; ++m)
-                    found |= (unsigned)(__builtin_reduce_or(d2[m - start] <= limit) != 0) << (m - start - 16 * g);
-                for (; found; found &= found - 1) {
-                    const int m = start + 16 * g + __builtin_ctz(found);
-                    const vf s = d2[m - start] < infinity ? d2[m - start] : (vf){} + infinity;  // no NaN in the list
-                    const vi number = (vi){} + m;
-                    #pragma clang loop unroll(full)
-                    for (int j = S - 1; j > 0; --j) {
-                        vi here = s < best[j], before = s < best[j - 1];
-                        index[j] = before ? index[j - 1] : (here ? number : index[j]);
-                        best[j] = before ? best[j - 1] : (here ? s : best[j]);
-                    }
-                    vi here = s < best[0];
-                    index[0] = here ? number : index[0];
-                    best[0] = here ? s : best[0];
-                }
-            }
-        }
-        const int rows = N - begin < 16 ? N - begin : 16;
-        for (int lane = 0; lane < rows; ++lane)
-            for (int j = 0; j < K; ++j) {
-                indices.data[(long long)(begin + lane) * K + j] = index[j][lane];
-                distances.data[(long long)(begin + lane) * K + j] = best[j][lane];
-            }
-    };
-    auto dispatch = [&](auto dc) {
-        if (K <= 3) scan(Three{}, dc);
-        else if (K == 4) scan(Four{}, dc);
-        else if (K <= 8) scan(Eight{}, dc);
-        else scan(Sixteen{}, dc);
-    };
-    if (D == 3) dispatch(Three{});
-    else dispatch(Two{});
-#endif
-"""
-
-
-@wp.func_native(_NEAREST_LANES)
-def _scan_lanes(
-    begin: int,
-    K: int,
-    points: wp.array2d[float],
-    nodes: wp.array2d[float],
-    indices: wp.array2d[wp.int32],
-    distances: wp.array2d[float],
-): ...
-
-
-@wp.kernel
-def nearest_lanes(
-    first: int,
-    # In:
-    points_in: wp.array2d[float],  # [N, D], D <= MAX_LANE_DIMENSIONS
-    nodes_in: wp.array2d[float],  # [M, D]
-    K: int,  # <= MAX_NEIGHBORS
-    # Out:
-    indices_out: wp.array2d[wp.int32],  # [N, K] nearest first
-    distances_out: wp.array2d[float],  # [N, K] squared
-):
-    """K nearest nodes of points ``16 i .. 16 i + 15``, on a CPU only."""
-    block = first + wp.tid()
-    _scan_lanes(block * LANES, K, points_in, nodes_in, indices_out, distances_out)
 
 
 @wp.kernel

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reference import neighbors as twin
 from scgs_warp import environment
 from scgs_warp.kernels import neighbors as kernels
-from scgs_warp.ops.neighbors import nearest, node_lists, rbf_weights
+from scgs_warp.ops.neighbors import NeighborSearch, nearest, node_lists, rbf_weights
 from scgs_warp.warp_interop import launch
 
 
@@ -93,6 +93,106 @@ def test_sizes_that_cannot_be(device):
     assert indices.shape == (0, 2) and distances.shape == (0, 2)
 
 
+def full_searches(search: NeighborSearch) -> int:
+    """Blocks that the lists did not suffice for, since they were made."""
+    return search._searched
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("n", "m", "d", "k"), [(3001, 300, 3, 4), (2000, 200, 5, 7), (1000, 100, 11, 3), (500, 3, 2, 3), (40, 20, 3, 16)]
+)
+def test_search_with_a_memory_is_exact_while_all_moves(device, seed, n, m, d, k):
+    points, nodes = cloud(seed, n, m, d, device)
+    generator = torch.Generator().manual_seed(50 + seed)
+    search = NeighborSearch()
+    for step in range(30):
+        assert torch.equal(search(points, nodes, k), nearest(points, nodes, k)[0]), step
+        size = 0.3 if step in (10, 20) else 2e-3 * step
+        points = points + size * torch.randn(n, d, generator=generator).to(device)
+        nodes = nodes + size * torch.randn(m, d, generator=generator).to(device)
+
+
+def test_the_memory_is_used_and_renewed():
+    points, nodes = cloud(7, 20_000, 300, 3)
+    search = NeighborSearch()
+    search(points, nodes, 4)
+    lists = search._lists
+    assert lists is not None and int((lists.counts >= 0).sum()) > 0.9 * len(lists.counts)
+    assert float(lists.counts.float().mean()) < 100
+    search(points + 1e-3, nodes + 1e-3, 4)
+    assert search._lists is lists and full_searches(search) < 0.01 * len(lists.counts)
+    moved = nodes.flip(0)
+    for _ in range(2):
+        assert torch.equal(search(points, moved, 4), nearest(points, moved, 4)[0])
+    assert full_searches(search) > len(lists.counts) and search._lists is lists
+    search(points, moved, 4)
+    assert search._lists is not lists and full_searches(search) == 0
+    lists = search._lists
+    for other in ((points[1:], nodes, 4), (points, nodes[1:], 4), (points, nodes, 3), (points[:, :2], nodes[:, :2], 3)):
+        assert torch.equal(search(*other), nearest(*other)[0])
+        assert search._lists is not lists
+        lists = search._lists
+
+
+def test_one_far_jump_is_noticed():
+    """One node that comes from afar into the midst of all, and one point that goes elsewhere."""
+    points, nodes = cloud(8, 4000, 200, 3)
+    nodes[17] = 50.0
+    search = NeighborSearch()
+    search(points, nodes, 4)
+    nodes[17] = 0.0
+    points[9], points[10] = points[2000], 30.0
+    found = search(points, nodes, 4)
+    assert torch.equal(found, nearest(points, nodes, 4)[0])
+    assert (found == 17).any() and full_searches(search) > 1
+
+
+def test_memory_and_poison():
+    points, nodes = cloud(9, 600, 60, 3)
+    nan, inf = float("nan"), float("inf")
+    search = NeighborSearch()
+    cases: list[tuple[dict[int, float], dict[int, float]]] = [
+        ({}, {}), ({3: nan, 17: inf}, {}), ({3: nan, 18: 3e30}, {5: nan, 6: inf}), ({}, {5: 1e25}),
+        ({4: 1e19}, {7: 2e19}), ({}, {}),
+    ]  # fmt: skip
+    for poisoned_points, poisoned_nodes in cases:
+        own, others = points.clone(), nodes.clone()
+        for tensor, values in ((own, poisoned_points), (others, poisoned_nodes)):
+            for row, value in values.items():
+                tensor[row, 1] = value
+        for search_again in (search, NeighborSearch()):
+            for _ in range(3):
+                assert torch.equal(search_again(own, others, 4), nearest(own, others, 4)[0])
+    everything = torch.full_like(points, nan)
+    for _ in range(2):
+        assert torch.equal(search(everything, nodes, 4), nearest(everything, nodes, 4)[0])
+    assert search(points[:0], nodes, 4).shape == (0, 4)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 120),
+    st.integers(1, 40),
+    st.integers(1, 4),
+    st.sampled_from([0.0, 0.1, 0.5, 1.0]),
+)
+def test_memory_keeps_ties(seed, n, m, d, moving):
+    """Points and nodes on a grid, many of them twice; some jump to another cell of it."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def grid(count):
+        return torch.randint(-3, 4, (count, d), generator=generator).float()
+
+    points, nodes, k = grid(n), grid(m), min(m, 5)
+    search = NeighborSearch()
+    for _ in range(4):
+        assert torch.equal(search(points, nodes, k), twin.nearest(points, nodes, k)[0].int())
+        points = torch.where(torch.rand(n, 1, generator=generator) < moving, grid(n), points)
+        nodes = torch.where(torch.rand(m, 1, generator=generator) < 0.2 * moving, grid(m), nodes)
+
+
 def weights_inputs(seed, n, m, d, k, device):
     generator = torch.Generator().manual_seed(seed)
     points, nodes = cloud(seed, n, m, d, device)
@@ -143,7 +243,9 @@ def test_same_bits_for_any_number_of_threads(all_threads):
     for threads in (1, 2, 3):
         environment.configure(threads=threads)
         weights, grads = gradients(rbf_weights, tensors, indices, v)
-        results.append([*nearest(tensors[0], tensors[1], 4), weights, *grads])
+        search = NeighborSearch()
+        searched = [search(tensors[0] + 1e-3 * step, tensors[1], 4) for step in range(3)]
+        results.append([*nearest(tensors[0], tensors[1], 4), *searched, weights, *grads])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
 

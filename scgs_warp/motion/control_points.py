@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from ..config import LossConfig, MotionConfig, TrainConfig
 from ..gaussians import GaussianParameters
-from ..ops.neighbors import nearest, rbf_weights
+from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.skinning import skin, skin_rbf
 from ..optim import generator, log_linear
 from ..types import Gaussians, Pose
@@ -70,6 +70,7 @@ class ControlPoints(Motion):
         self.network = network
         self.graph: Graph | None = None
         self._cached: tuple[Tensor, Tensor] | None = None
+        self._search = NeighborSearch()
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -98,7 +99,7 @@ class ControlPoints(Motion):
         if self.config.hyper_dim:
             points = torch.cat([points, gaussians.hyper.detach()], dim=1)
             nodes = torch.cat([nodes, self.hyper.detach()], dim=1)
-        return nearest(points.contiguous(), nodes.contiguous(), self.config.neighbors)[0]
+        return self._search(points, nodes, self.config.neighbors)
 
     def binding(self, gaussians: GaussianParameters) -> tuple[Tensor, Tensor]:
         """Neighbours and their RBF weights (Eq. 5): indices [N, K], weights [N, K]. They do not depend on time."""

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..kernels import neighbor_lists, neighbors_cpu
 from ..kernels import neighbors as kernels
 from ..warp_interop import launch
 
@@ -32,6 +33,21 @@ def chunk_size(nodes: int) -> int:
     return max(2048, 4 * nodes)
 
 
+def _check_nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Points and nodes without gradient, contiguous; whether the search fits a CPU's lanes is for ``_in_lanes``."""
+    if points.ndim != 2:
+        raise ValueError(f"points must be [N, D], got {tuple(points.shape)}")
+    if nodes.ndim != 2 or nodes.shape[1] != points.shape[1] or points.shape[1] == 0:
+        raise ValueError(f"nodes must be [M, {points.shape[1]}] (D > 0) as points, got {tuple(nodes.shape)}")
+    if not 1 <= k <= min(nodes.shape[0], kernels.MAX_NEIGHBORS):
+        raise ValueError(f"k must be in 1 .. min(M, {kernels.MAX_NEIGHBORS}), got {k} with M = {nodes.shape[0]} nodes")
+    return points.detach().contiguous(), nodes.detach().contiguous()
+
+
+def _in_lanes(points: Tensor) -> bool:
+    return points.device.type == "cpu" and points.shape[1] <= neighbors_cpu.MAX_DIMENSIONS
+
+
 def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
     """The exact ``k`` nearest nodes of every point, nearest first; ties go to the lower index. No gradient.
 
@@ -47,21 +63,93 @@ def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: shapes do not fit, or ``k`` is out of range.
     """
-    if points.ndim != 2:
-        raise ValueError(f"points must be [N, D], got {tuple(points.shape)}")
-    if nodes.ndim != 2 or nodes.shape[1] != points.shape[1] or points.shape[1] == 0:
-        raise ValueError(f"nodes must be [M, {points.shape[1]}] (D > 0) as points, got {tuple(nodes.shape)}")
-    if not 1 <= k <= min(nodes.shape[0], kernels.MAX_NEIGHBORS):
-        raise ValueError(f"k must be in 1 .. min(M, {kernels.MAX_NEIGHBORS}), got {k} with M = {nodes.shape[0]} nodes")
-    points, nodes = points.detach().contiguous(), nodes.detach().contiguous()
+    points, nodes = _check_nearest(points, nodes, k)
     indices = torch.empty(points.shape[0], k, dtype=torch.int32, device=points.device)
     distances = torch.empty(points.shape[0], k, device=points.device)
     arguments = points, nodes, k, indices, distances
-    if points.device.type == "cpu" and points.shape[1] <= kernels.MAX_LANE_DIMENSIONS:
-        launch(kernels.nearest_lanes, -(-points.shape[0] // kernels.LANES), *arguments, grain=16)
+    if _in_lanes(points):
+        launch(neighbors_cpu.nearest_lanes, _blocks(points), *arguments, grain=16)
     else:
         launch(kernels.nearest, points.shape[0], *arguments)
     return indices, distances
+
+
+def _blocks(points: Tensor) -> int:
+    return -(-points.shape[0] // neighbors_cpu.LANES)
+
+
+class _Lists(NamedTuple):
+    """Which nodes every block of sixteen points has to look at, and the nodes' positions when that was found."""
+
+    k: int
+    order: Tensor
+    centres: Tensor
+    counts: Tensor
+    lists: Tensor
+    nodes: Tensor
+
+    def fit(self, points: Tensor, nodes: Tensor, k: int) -> bool:
+        width = points.shape[1] + 1
+        return (
+            k == self.k
+            and self.order.shape[0] == points.shape[0]
+            and self.centres.shape[1] == width
+            and self.nodes.shape == nodes.shape
+        )
+
+
+class NeighborSearch:
+    """:func:`nearest` for points and nodes that move a little between calls.
+
+    On a CPU it remembers, for blocks of points that are close together, which nodes were within reach; later calls look
+    at those alone wherever a bound on all movements since then proves that this is enough, and at every node elsewhere.
+    Nothing has to be invalidated, and what is remembered never changes a result: it need not be saved.
+    """
+
+    def __init__(self) -> None:
+        self._lists: _Lists | None = None
+        self._searched = 0
+
+    def __call__(self, points: Tensor, nodes: Tensor, k: int) -> Tensor:
+        """Exactly the indices of ``nearest(points, nodes, k)``: [N, k] int32.
+
+        Raises:
+            ValueError: as :func:`nearest`.
+        """
+        points, nodes = _check_nearest(points, nodes, k)
+        if not _in_lanes(points):
+            return nearest(points, nodes, k)[0]
+        blocks = _blocks(points)
+        # New lists cost about as much as searching every block in full: they are due once that much was searched.
+        if self._lists is None or self._searched > blocks or not self._lists.fit(points, nodes, k):
+            indices, distances = nearest(points, nodes, k)
+            self._lists, self._searched = _make_lists(points, nodes, distances), 0
+            return indices
+        own = self._lists
+        shift, failed = torch.empty(1), torch.empty(blocks, dtype=torch.int32)
+        launch(neighbor_lists.largest_shift, 1, own.nodes, nodes, shift)
+        indices = torch.empty(points.shape[0], k, dtype=torch.int32)
+        lists = own.order, own.centres, own.counts, own.lists, shift
+        launch(neighbors_cpu.nearest_listed, blocks, points, nodes, k, *lists, indices, failed, grain=16)
+        self._searched += int(failed.sum())
+        return indices
+
+
+def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> _Lists:
+    codes = torch.empty(points.shape[0], dtype=torch.int32)
+    corners = torch.zeros(2, 3)
+    if points.shape[0]:
+        space = points[:, :3].nan_to_num(0.0, 0.0, 0.0)
+        corners[:, : space.shape[1]] = torch.stack([space.amin(0), space.amax(0)])
+    size = (corners[1] - corners[0]).clamp(min=1e-12)
+    launch(neighbor_lists.morton_codes, points.shape[0], points, corners[0].tolist(), (1.0 / size).tolist(), codes)
+    order = torch.argsort(codes).int()
+    blocks, width = _blocks(points), points.shape[1] + 1
+    centres, counts = torch.empty(blocks, width), torch.empty(blocks, dtype=torch.int32)
+    lists = torch.empty(blocks, int(neighbor_lists.LIST_SIZE), dtype=torch.int32)
+    columns = nodes.T.contiguous()
+    launch(neighbor_lists.list_blocks, blocks, points, columns, order, distances, centres, counts, lists, grain=16)
+    return _Lists(distances.shape[1], order, centres, counts, lists, nodes.clone())
 
 
 def _node_sums(
