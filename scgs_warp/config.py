@@ -158,6 +158,9 @@ class LossConfig:
     """The ARAP weight decays exponentially until this main step, then the term is off."""
     arap_every: int = 1
     """Apply it every so many steps with as many times the weight."""
+    arap_pair: Literal["frame", "random"] = "frame"
+    """The two instants that are compared. frame: the step's own and a random one, of which the network has to be asked
+    for one alone; random: two random ones."""
     arap_times: int = 8
     """Sampled times N_t whose trajectories define the neighbours."""
     arap_neighbors: int = 8

@@ -14,7 +14,7 @@ from ..optim import generator, log_linear
 from ..types import Gaussians, Pose
 from .base import Motion, TrainingPose
 from .network import DeformationNetwork
-from .rigidity import Graph, arap_weight, build_graph, rigidity
+from .rigidity import Graph, arap_times, arap_weight, build_graph, rigidity
 
 NODE_NAMES = ("positions", "log_radii", "hyper", "strength_logits")
 """Parameters with one row per control point."""
@@ -159,14 +159,14 @@ class ControlPoints(Motion):
         times = [time]
         if weight > 0.0:
             self.refresh_graph(step, config.loss)
-            times += torch.rand(2, generator=generator(seed, 21, step)).tolist()
+            times += arap_times(config.loss, generator(seed, 21, step))
         with torch.set_grad_enabled(not frozen):
             poses = self.poses(torch.tensor(times))
         posed = self.bind_and_pose(gaussians, poses[0], frozen)
         if weight == 0.0 or self.graph is None:
             return TrainingPose(posed, None)
-        first, second = (self.positions.detach() + pose.translations for pose in poses[1:])
-        return TrainingPose(posed, weight * rigidity(first, second, self.graph))
+        instants = [self.positions.detach() + pose.translations for pose in poses]
+        return TrainingPose(posed, weight * rigidity(instants, self.graph))
 
     def refresh_graph(self, step: int, loss: LossConfig) -> None:
         if self.graph is None or step % loss.arap_refresh < loss.arap_every:

@@ -36,6 +36,11 @@ def arap_weight(step: int, loss: LossConfig) -> float:
     return log_linear(loss.arap, loss.arap_end, step, loss.arap_until) * loss.arap_every
 
 
+def arap_times(loss: LossConfig, random: torch.Generator) -> list[float]:
+    """Instants to ask the network for beside the step's own."""
+    return torch.rand(1 if loss.arap_pair == "frame" else 2, generator=random).tolist()
+
+
 def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> Graph | None:
     """Neighbours by trajectory; ``positions_at(times [T]) -> [T, M, 3]`` is asked for N_t times; None if M < 2."""
     with torch.no_grad():
@@ -44,7 +49,9 @@ def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> G
         return Graph.of(*trajectory_graph(trajectories.contiguous(), count)) if count >= 1 else None
 
 
-def rigidity(first: Tensor, second: Tensor, graph: Graph) -> Tensor:
-    """Sum over control points of the energy between two instants [M, 3]; a product with ones sums in a fixed order."""
+def rigidity(instants: list[Tensor], graph: Graph) -> Tensor:
+    """Sum over control points of the energy between the last two of ``instants`` [M, 3]; a product with ones sums in a
+    fixed order."""
+    first, second = instants[-2:]
     energy = arap_energy(first, second, graph.neighbors, graph.weights, reverse=graph.reverse)
     return energy @ torch.ones_like(energy)

@@ -11,7 +11,7 @@ from ..optim import generator, log_linear
 from ..types import Gaussians
 from .base import Motion, TrainingPose
 from .network import DeformationNetwork
-from .rigidity import Graph, build_graph, rigidity
+from .rigidity import Graph, arap_times, build_graph, rigidity
 
 
 class Spheres(Motion):
@@ -50,14 +50,13 @@ class Spheres(Motion):
         times = [time]
         if rigid:
             self.refresh_graph(gaussians, step, config.loss)
-            times += torch.rand(2, generator=generator(seed, 22, step)).tolist()
+            times += arap_times(config.loss, generator(seed, 22, step))
         moves = self.translations(gaussians.means, torch.tensor(times))
         posed = self._place(gaussians, gaussians.means + moves[0])
         if not rigid or self.graph is None:
             return TrainingPose(posed, None)
-        first, second = (gaussians.means.detach() + move for move in moves[1:])
         weight = config.pretrain.arap_weight * config.loss.arap_every
-        return TrainingPose(posed, weight * rigidity(first, second, self.graph))
+        return TrainingPose(posed, weight * rigidity([gaussians.means.detach() + move for move in moves], self.graph))
 
     def refresh_graph(self, gaussians: GaussianParameters, step: int, loss: LossConfig) -> None:
         if self.graph is None or step % loss.arap_refresh < loss.arap_every:
