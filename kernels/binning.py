@@ -1,4 +1,4 @@
-"""Which tiles each splat touches: count, then emit with the same arithmetic, then the range of each tile.
+"""Which tiles a splat touches: the geometry that CPU (``binning_cpu``) and GPU (``binning_cuda``) share.
 
 A splat reaches the pixels where its alpha is at least 1/255, the ellipse ``q <= 2 ln(255 o)``. A tile is touched where
 the rectangle of its pixel centres meets that ellipse. Of each row of tiles the touched ones are an interval: the
@@ -21,6 +21,11 @@ DEPTH_CULLED = wp.constant(3.0e38)
 REACH_SLACK = wp.constant(1.0e-3)
 """Added to the ellipse: what float32 rounding may take from q, so that no pixel at the threshold loses its splat."""
 
+LOG2_COEFFICIENTS = (1.4426933, -0.72116273, 0.47770593, -0.33924777, 0.21558853, -0.096066249, 0.020490346)
+"""log2(1 + m) / m on [0, 1], lowest power first, from a fit at Chebyshev points; log2 is right to 2e-6."""
+
+LOG2_0, LOG2_1, LOG2_2, LOG2_3, LOG2_4, LOG2_5, LOG2_6 = (wp.constant(value) for value in LOG2_COEFFICIENTS)
+
 
 @wp.struct
 class Ellipse:
@@ -32,6 +37,22 @@ class Ellipse:
     tip: float  # dy of the rightmost point; the leftmost lies at -tip
     spread: float  # reach / A
     steepness: float  # determinant / A^2
+
+
+@wp.func
+def reach_of(opacity: float) -> float:
+    """``2 ln(255 o)``, at least 0, and slack. Not the library's logarithm, which rounds differently on each device."""
+    bits = wp.cast(opacity / ALPHA_MIN, wp.uint32)
+    m = wp.cast((bits & wp.uint32(0x7FFFFF)) | wp.uint32(0x3F800000), float) - 1.0
+    log2 = float(LOG2_6)
+    log2 = log2 * m + LOG2_5
+    log2 = log2 * m + LOG2_4
+    log2 = log2 * m + LOG2_3
+    log2 = log2 * m + LOG2_2
+    log2 = log2 * m + LOG2_1
+    log2 = log2 * m + LOG2_0
+    log2 = log2 * m + float(int(bits >> wp.uint32(23)) - 127)
+    return wp.max(1.3862943611198906 * log2, 0.0) + REACH_SLACK
 
 
 @wp.func
@@ -47,7 +68,7 @@ def splat_ellipse(mean: wp.vec2, conic: wp.vec3, opacity: float, depth: float, r
     determinant = float(wp.float64(conic[0]) * wp.float64(conic[2]) - wp.float64(conic[1]) * wp.float64(conic[1]))
     if determinant > 0.0 and conic[0] > 0.0:
         e.mean = mean
-        e.reach = wp.max(2.0 * wp.log(opacity / ALPHA_MIN), 0.0) + REACH_SLACK
+        e.reach = reach_of(opacity)
         scale = 1.0 / conic[0]
         e.shear = -conic[1] * scale
         e.spread = e.reach * scale
@@ -89,159 +110,84 @@ def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: i
     return touched(e.mean[0] + x_left, e.mean[0] + x_right, tile_size, columns, width)
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __ffsll(mask) - 1;
-#else
-    return __builtin_ctzll(mask);
-#endif
-""")
-def lowest_bit(mask: wp.uint64) -> int: ...
+ELLIPSE_SIMD = f"""
+    #pragma clang fp contract(off)
+    typedef float vf __attribute__((vector_size(64)));
+    typedef int vi __attribute__((vector_size(64)));
+    typedef unsigned vu __attribute__((vector_size(64)));
+    typedef double vd __attribute__((vector_size(128)));
+    const vi LANE = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
+    const vf ZERO = {{}};
+    const vi ZEROS = {{}};
+    const float ALPHA_MIN = {float(ALPHA_MIN)!r}f, REACH_SLACK = {float(REACH_SLACK)!r}f;
+    const float LOG2[] = {{{", ".join(f"{c!r}f" for c in LOG2_COEFFICIENTS)}}};
+    const int LOG2_COUNT = {len(LOG2_COEFFICIENTS)};
 
+    auto least = [](vf a, vf b) -> vf {{ return b < a ? b : a; }};
+    auto most = [](vf a, vf b) -> vf {{ return b > a ? b : a; }};
+    auto floats = [](vi v) -> vf {{ return __builtin_convertvector(v, vf); }};
 
-@wp.kernel
-def count_tiles(
-    first: int,
-    # In:
-    means2d_in: wp.array[wp.vec2],  # [N]
-    conics_in: wp.array[wp.vec3],  # [N]
-    opacities_in: wp.array[float],  # [N]
-    depths_in: wp.array[float],  # [N]
-    radii_in: wp.array[wp.vec2i],  # [N]
-    width: int,
-    height: int,
-    columns: int,
-    rows: int,
-    tile_size: int,
-    # Out:
-    counts_out: wp.array[int],  # [N] tiles touched; 0: culled
-    corners_out: wp.array[int],  # [N] first tile of a window of 8 x 8
-    windows_out: wp.array[wp.int64],  # [N] the tiles touched there, a bit each; 0: they do not fit
-    depth_keys_out: wp.array[float],  # [2 N] what to sort the splats by, in the first half; empty: not wanted
-    order_out: wp.array[int],  # [2 N] 0, 1, 2, ... in the first half; empty too
-):
-    i = first + wp.tid()
-    e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
-    count = int(0)
-    corner = int(0)
-    window = wp.uint64(0)
-    if e.reach >= 0.0:
-        span = touched_rows(e, tile_size, rows, height)
-        left = touched(e.mean[0] - e.half_width, e.mean[0] + e.half_width, tile_size, columns, width)[0]
-        fits = span[1] - span[0] <= 8
-        corner = span[0] * columns + left
-        for row in range(span[0], span[1]):
-            reach = touched_columns(e, row, tile_size, columns, width, height)
-            length = reach[1] - reach[0]
-            count += length
-            if length > 0:
-                fits = fits and reach[0] >= left and reach[1] <= left + 8
-                if fits:
-                    bits = (wp.uint64(1) << wp.uint64(length)) - wp.uint64(1)
-                    window = window | (bits << wp.uint64((row - span[0]) * 8 + reach[0] - left))
-        if not fits:
-            window = wp.uint64(0)
-    counts_out[i] = count
-    corners_out[i] = corner
-    windows_out[i] = wp.int64(window)
-    if order_out.shape[0] > 0:
-        key = float(DEPTH_CULLED)
-        if count > 0:
-            key = depths_in[i]
-        depth_keys_out[i] = key
-        order_out[i] = i
-
-
-@wp.kernel
-def scan_counts(
-    first: int,
-    # In:
-    counts_in: wp.array[int],  # [N]
-    # Out:
-    offsets_out: wp.array[wp.int64],  # [N + 1] sum of the counts before each
-):
-    """In one grid index, for a CPU, where torch would start its threads for it."""
-    total = wp.int64(0)
-    for i in range(counts_in.shape[0]):
-        offsets_out[i] = total
-        total += wp.int64(counts_in[i])
-    offsets_out[counts_in.shape[0]] = total
-
-
-@wp.kernel
-def emit_pairs(
-    first: int,
-    # In:
-    means2d_in: wp.array[wp.vec2],  # [N]
-    conics_in: wp.array[wp.vec3],  # [N]
-    opacities_in: wp.array[float],  # [N]
-    depths_in: wp.array[float],  # [N]
-    radii_in: wp.array[wp.vec2i],  # [N]
-    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
-    corners_in: wp.array[int],  # [N]
-    windows_in: wp.array[wp.int64],  # [N] what count_tiles found, where it fits; else it is found again
-    width: int,
-    height: int,
-    columns: int,
-    rows: int,
-    tile_size: int,
-    # Out:
-    tiles_out: wp.array[int],  # [P] tile of each slot
-):
-    i = first + wp.tid()
-    slot = int(offsets_in[i])
-    end = int(offsets_in[i + 1])
-    window = wp.uint64(windows_in[i])
-    corner = corners_in[i]
-    while window != wp.uint64(0):
-        bit = lowest_bit(window)
-        window = window & (window - wp.uint64(1))
-        tiles_out[slot] = corner + (bit >> 3) * columns + (bit & 7)
-        slot += 1
-    if slot < end:
-        e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
-        span = touched_rows(e, tile_size, rows, height)
-        for row in range(span[0], span[1]):
-            reach = touched_columns(e, row, tile_size, columns, width, height)
-            for column in range(reach[0], reach[1]):
-                if slot < end:
-                    tiles_out[slot] = row * columns + column
-                slot += 1
-        while slot < end:  # never, as long as both passes find the same tiles; but no slot may stay unwritten
-            tiles_out[slot] = corner
-            slot += 1
-
-
-@wp.kernel
-def place_pairs(
-    first: int,
-    # In:
-    order_in: wp.array[int],  # [2 N] splats by depth in the first half
-    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
-    tiles_in: wp.array[int],  # [P] tile of each slot
-    # Out:
-    cursors_out: wp.array[int],  # [T] scratch
-    ranges_out: wp.array[wp.vec2i],  # [T]
-    splats_out: wp.array[int],  # [P] sorted by tile, then depth
-    slots_out: wp.array[int],  # [P]
-):
-    """Counting sort by tile of splats that are sorted by depth, for a CPU: one grid index does it all, because three
-    walks over the pairs are faster than a radix sort that could be shared."""
-    for tile in range(cursors_out.shape[0]):
-        cursors_out[tile] = 0
-    for slot in range(tiles_in.shape[0]):
-        cursors_out[tiles_in[slot]] = cursors_out[tiles_in[slot]] + 1
-    begin = int(0)
-    for tile in range(cursors_out.shape[0]):
-        end = begin + cursors_out[tile]
-        ranges_out[tile] = wp.vec2i(begin, end)
-        cursors_out[tile] = begin
-        begin = end
-    for rank in range(offsets_in.shape[0] - 1):
-        i = order_in[rank]
-        for slot in range(int(offsets_in[i]), int(offsets_in[i + 1])):
-            tile = tiles_in[slot]
-            p = cursors_out[tile]
-            cursors_out[tile] = p + 1
-            splats_out[p] = i
-            slots_out[p] = slot
+    // splat_ellipse of 16 splats.
+    struct Ellipse {{
+        vf x, y, shear, half_width, half_height, tip, spread, steepness;
+        vi usable;
+    }};
+    auto ellipse_of = [&](vf x, vf y, vf a, vf b, vf c, vf opacity, vf depth, vi radius_x, vi radius_y) -> Ellipse {{
+        #pragma clang fp contract(off)
+        Ellipse e;
+        const vf sum = x + y + a + b + c + opacity + depth;
+        const vd da = __builtin_convertvector(a, vd), db = __builtin_convertvector(b, vd);
+        const vf determinant = __builtin_convertvector(da * __builtin_convertvector(c, vd) - db * db, vf);
+        e.usable = (radius_x > 0) & (radius_y > 0) & (opacity >= ALPHA_MIN) & (sum - sum == 0.0f) & (determinant > 0.0f)
+            & (a > 0.0f);
+        const vu bits = (vu)(opacity / ALPHA_MIN);
+        const vf m = (vf)((bits & 0x7fffffu) | 0x3f800000u) - 1.0f;
+        vf log2 = ZERO + LOG2[LOG2_COUNT - 1];
+        for (int k = LOG2_COUNT - 2; k >= 0; --k) log2 = log2 * m + LOG2[k];
+        log2 = log2 * m + floats((vi)(bits >> 23) - 127);
+        const vf reach = most(ZERO, 1.3862943611198906f * log2) + REACH_SLACK;
+        const vf scale = 1.0f / a;
+        e.x = x;
+        e.y = y;
+        e.shear = -b * scale;
+        e.spread = reach * scale;
+        e.steepness = determinant * scale * scale;
+        e.half_width = __builtin_elementwise_sqrt(reach * c / determinant);
+        e.half_height = __builtin_elementwise_sqrt(reach * a / determinant);
+        e.tip = -b * __builtin_elementwise_sqrt(reach / (c * determinant));
+        return e;
+    }};
+    struct Span {{
+        vi begin, end;
+    }};
+    auto touched = [&](vf low, vf high, int tiles, int extent) -> Span {{
+        #pragma clang fp contract(off)
+        const vi meets = (high >= 0.5f) & (low <= (float)extent - 0.5f);
+        const float scale = 1.0f / (float)tile_size;
+        low = meets ? low : ZERO;
+        high = meets ? high : ZERO;
+        vi begin = __builtin_convertvector((most(ZERO + 0.5f, low) - 0.5f) * scale, vi);
+        begin -= low > floats((begin + 1) * tile_size) - 0.5f;  // a true lane is -1
+        vi end = __builtin_convertvector((least(ZERO + (float)extent, high) - 0.5f) * scale, vi) + 1;
+        end = end < begin ? begin : end;
+        end = end > tiles ? ZEROS + tiles : end;
+        return {{meets ? begin : ZEROS, meets ? end : ZEROS}};
+    }};
+    auto touched_rows = [&](const Ellipse& e) -> Span {{
+        Span span = touched(e.y - e.half_height, e.y + e.half_height, rows, height);
+        return {{e.usable ? span.begin : ZEROS, e.usable ? span.end : ZEROS}};
+    }};
+    auto touched_columns = [&](const Ellipse& e, vi row) -> Span {{
+        #pragma clang fp contract(off)
+        const vi below = (row + 1) * tile_size;
+        const vf low = most(-e.half_height, floats(row * tile_size) + 0.5f - e.y);
+        const vf high = least(e.half_height, floats(below < height ? below : ZEROS + height) - 0.5f - e.y);
+        const vf right = least(high, most(low, e.tip)), left = least(high, most(low, -e.tip));
+        const vf x_right = e.shear * right
+            + __builtin_elementwise_sqrt(most(ZERO, e.spread - e.steepness * right * right));
+        const vf x_left = e.shear * left - __builtin_elementwise_sqrt(most(ZERO, e.spread - e.steepness * left * left));
+        return touched(e.x + x_left, e.x + x_right, columns, width);
+    }};
+"""
+"""The same functions for native bodies on a CPU, of 16 splats, or of 16 rows of one splat, at a time: operation by
+operation, so that they find the same tiles. They see ``tile_size``, ``columns``, ``rows``, ``width`` and ``height``."""

@@ -12,7 +12,7 @@ from splats import random_splats
 
 from reference.binning import needed_pairs, usable
 from scgs_warp import environment
-from scgs_warp.ops.binning import _bin_by_counting, bin_splats
+from scgs_warp.ops.binning import _bin_by_bands, bin_splats
 from scgs_warp.ops.binning_cuda import bin_by_radix
 from scgs_warp.types import Splats, Tiles
 
@@ -129,7 +129,7 @@ def test_both_sorts_agree(device: str, seed: int):
     geometry = [splats.means2d, splats.conics, splats.opacities, splats.depths, splats.radii]
     size = (90, 70, 6, 5, 16)
     by_radix = bin_by_radix([t.to(device) for t in geometry], size)
-    for got, expected in zip(by_radix, _bin_by_counting(geometry, size)):
+    for got, expected in zip(by_radix, _bin_by_bands(geometry, size)):
         assert torch.equal(got.cpu(), expected)
 
 

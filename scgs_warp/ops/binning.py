@@ -5,11 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..kernels import binning as kernels
+from ..kernels import binning_cpu as kernels
 from ..kernels.types import TILE_SIZE
 from ..types import Splats, Tiles
 from ..warp_interop import launch
-from .binning_cuda import MAX_PAIRS, bin_by_radix, pair_total, radix_sort
+from .binning_cuda import MAX_PAIRS, bin_by_radix
+
+CHUNK_SIZE = 1024
+"""Fewest splats worth a chunk on a CPU."""
+MAX_CHUNKS = 128
+"""A chunk counts what it has in each row of tiles: with many chunks the counts outweigh the splats."""
 
 
 def bin_splats(splats: Splats, tile_size: int = TILE_SIZE) -> Tiles:
@@ -38,27 +43,37 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE) -> Tiles:
     ]
     size = (splats.width, splats.height, columns, rows, tile_size)
 
-    lists = _bin_by_counting if device.type == "cpu" else bin_by_radix
+    lists = _bin_by_bands if device.type == "cpu" else bin_by_radix
     ranges, sorted_splats, slots, offsets = lists(geometry, size)
     return Tiles(ranges, sorted_splats, slots, offsets, splats.width, splats.height, columns, rows, tile_size)
 
 
-def _bin_by_counting(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Ranges, splats, slots, offsets, on a CPU: splats sorted by depth once, their pairs put in place tile by tile."""
-    count, tile_count = len(geometry[0]), size[2] * size[3]
-    counts, corners = (torch.empty(count, dtype=torch.int32) for _ in range(2))
-    windows = torch.empty(count, dtype=torch.int64)
-    depth_keys, order = torch.empty(2 * count), torch.empty(2 * count, dtype=torch.int32)
-    launch(kernels.count_tiles, count, *geometry, *size, counts, corners, windows, depth_keys, order)
-    offsets = torch.empty(count + 1, dtype=torch.int64)
-    launch(kernels.scan_counts, 1, counts, offsets)
-    pairs = pair_total(offsets, MAX_PAIRS)
-    radix_sort(depth_keys, order, count, 32)
-    tiles, splats, slots = (torch.empty(pairs, dtype=torch.int32) for _ in range(3))
-    launch(kernels.emit_pairs, count, *geometry, offsets, corners, windows, *size, tiles)
-    cursors = torch.empty(tile_count, dtype=torch.int32)
-    ranges = torch.empty(tile_count, 2, dtype=torch.int32)
-    launch(kernels.place_pairs, 1, order, offsets, tiles, cursors, ranges, splats, slots)
+def _bin_by_bands(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Ranges, splats, slots, offsets, on a CPU: what each splat touches is dealt to the rows of tiles, each of which is
+    sorted by itself; see ``kernels.binning_cpu``."""
+    count, (_, _, columns, rows, _) = len(geometry[0]), size
+    chunk_size = max(CHUNK_SIZE, -(-count // (16 * MAX_CHUNKS)) * 16)
+    chunks = max(-(-count // chunk_size), 1)
+    windows, offsets = torch.empty(count, dtype=torch.int64), torch.empty(count + 1, dtype=torch.int64)
+    corners, ranges = torch.empty(count, 2, dtype=torch.int32), torch.empty(rows * columns, 2, dtype=torch.int32)
+    begins, before = (torch.empty(chunks, rows + 1, dtype=torch.int32) for _ in range(2))
+    band_begins = torch.empty(rows + 1, dtype=torch.int32)
+    first_slots = torch.empty(chunks + 2, dtype=torch.int64)
+
+    found = (windows, corners)
+    launch(kernels.count_chunks, chunks, *geometry, chunk_size, *size, *found, begins, first_slots, grain=1)
+    launch(kernels.place_chunks, 1, begins, first_slots, band_begins)
+    pairs, stretches = first_slots[chunks:].tolist()
+    if max(pairs, stretches) > MAX_PAIRS:
+        raise ValueError(f"splats: {pairs} pairs of splat and tile, more than {MAX_PAIRS}; reduce the image or them")
+    keys, spare = (torch.empty(stretches, dtype=torch.int64) for _ in range(2))
+    dealt = torch.empty(stretches, 4, dtype=torch.int32)
+    lists = (offsets, dealt, keys, before)
+    launch(kernels.deal_chunks, chunks, *geometry[:4], chunk_size, *size, *found, first_slots, begins, *lists, grain=1)
+    splats, slots = (torch.empty(pairs, dtype=torch.int32) for _ in range(2))
+    cursors = torch.empty(rows, columns, dtype=torch.int32)
+    tiles = (cursors, ranges, splats, slots)
+    launch(kernels.sort_bands, rows, band_begins, dealt, before, keys, spare, *tiles, grain=1)
     return ranges, splats, slots, offsets
 
 
