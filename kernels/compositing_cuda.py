@@ -1,67 +1,310 @@
-"""Alpha compositing, one block a tile, one thread a pixel, through Warp's tile API.
+"""Alpha compositing on CUDA: one block of 256 threads a tile of 16 x 16, one thread a pixel, native bodies.
 
-Same meaning and arguments as ``compositing``; ``tile_size`` is 16. The block fetches a tile's splats in batches of
-256, one a thread, into shared memory, and every thread walks the batch for its own pixel. Nothing here is CUDA only:
-with ``wp.config.enable_cpu_blocks`` the same kernels run (slowly) on a CPU, where they are tested.
+Same meaning as ``compositing``, the readable truth. How the work is laid out:
 
-The calls that the whole block must reach together are ``tile_max``, ``tile_sum``, ``tile_scatter_masked`` and reading
-their results; loops around them therefore have bounds that all threads share. Reading a shared tile is no such call.
-``tile_max`` at the head of a batch is also the barrier that keeps the next batch from overwriting the last one early.
+- A warp holds 8 x 4 pixels. Splats are staged through shared memory in batches; whoever stages one finds which of the
+  tile's eight such parts its ellipse may reach, and each warp walks only its own splats, by the bits of a ballot.
+- In base 2: ``alpha = o 2^power``, where ``power = -q / (2 ln 2)`` has its factor folded into the staged conic.
+- The adjoint adds a warp's 16 sums of a pair (the columns of a slot) up in 16 shuffles, each of which halves what a
+  lane is left with, instead of 5 a sum. The partial sums of the eight warps meet in shared memory, 32 pairs at a time,
+  and are added in the order of the warps into the pair's own slot: no atomics, the same bits every time.
+
+On a CPU the bodies are empty; tests compile them with a shim that runs a block's threads as fibres.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from .compositing import squared_distance
 from .types import ALPHA_MAX, ALPHA_MIN, SLOT_GEOMETRY, TILE_SIZE, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
 
 BLOCK_DIM = TILE_SIZE * TILE_SIZE
-_LANES = wp.constant(BLOCK_DIM)
-GROUP = wp.constant(4)
-"""Channels composited in one walk (colour and depth). More channels walk again, four at a time."""
-_SUMS = wp.constant(SLOT_GEOMETRY + 4)
+SLOT_WIDTH = 16
+"""Columns of a gradient slot, the only width the adjoint serves."""
+MAX_CHANNELS = SLOT_WIDTH - SLOT_GEOMETRY
+"""Channels that fit a slot; the forward pass has no such bound."""
 
-Splat = wp.types.vector(length=6, dtype=wp.float32)
-"""Mean (2), conic (3), opacity (1)."""
-Sums = wp.types.vector(length=SLOT_GEOMETRY + 4, dtype=wp.float32)
-"""The leading columns of a gradient slot."""
+_PLACE = """
+    const unsigned ALL = 0xffffffffu;
+    const int thread = threadIdx.x, lane = thread & 31, warp = thread >> 5;
+    const int corner_x = (tile % columns) * 16, corner_y = (tile / columns) * 16;
+    const int x = corner_x + (warp & 1) * 8 + (lane & 7);
+    const int y = corner_y + (warp >> 1) * 4 + (lane >> 3);
+    const bool inside = x < width && y < height;
+    const float centre_x = x + 0.5f, centre_y = y + 0.5f;
+    const long long plane = (long long)width * height, pixel = (long long)y * width + x;
+    const int begin = ((const int*)ranges.data)[2 * tile], end = ((const int*)ranges.data)[2 * tile + 1];
+    const float* means = (const float*)means2d.data;
+    const float* all_conics = (const float*)conics.data;
+
+    // The parts (a bit each, in the order of the warps) where alpha may be 1/255 or more; rather one too many.
+    auto parts_of = [&](float mx, float my, float a, float b, float c, float opacity) -> unsigned {
+        if (!(opacity >= ALPHA_MIN)) return 0u;
+        const float squared = b * b;  // a c - b b, exact to the last bit: of a needle's little else is left
+        const float determinant = fmaf(a, c, -squared) + fmaf(-b, b, squared);
+        if (!(determinant > 0.0f)) return 255u;
+        const float reach = fmaxf(2.0f * logf(opacity * 255.0f), 0.0f) + 1.0e-3f;
+        const float half_width = 1.0001f * sqrtf(reach * c / determinant) + 0.01f;
+        const float half_height = 1.0001f * sqrtf(reach * a / determinant) + 0.01f;
+        unsigned parts = 0u;
+        for (int part = 0; part < 8; ++part) {
+            const float left = corner_x + (part & 1) * 8 + 0.5f, top = corner_y + (part >> 1) * 4 + 0.5f;
+            const bool beside = mx + half_width < left || mx - half_width > left + 7.0f;
+            const bool above = my + half_height < top || my - half_height > top + 3.0f;
+            if (!beside && !above) parts |= 1u << part;
+        }
+        return parts;
+    };
+"""
+
+_FORWARD = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 shape[256];  // mean, then the first two of the scaled conic
+    __shared__ float4 rest[256];  // its third, the opacity
+    __shared__ float4 color[256];
+    __shared__ unsigned reached[256];
+    PLACE
+    const int count = image.shape.dims[0], stride = channels.shape.dims[1];
+
+    for (int base = 0; base < count; base += 4) {
+        float sum[4] = {0.0f, 0.0f, 0.0f, 0.0f};
+        float transmittance = 1.0f;
+        int last = 0;
+        bool open = inside;
+        for (int at = begin; at < end; at += 256) {
+            // Also the barrier after which nobody reads the batch before.
+            if (__syncthreads_count(open) == 0) break;
+            unsigned parts = 0u;
+            if (at + thread < end) {
+                const int i = splats.data[at + thread];
+                const float mx = means[2 * i], my = means[2 * i + 1], opacity = opacities.data[i];
+                const float a = all_conics[3 * i], b = all_conics[3 * i + 1], c = all_conics[3 * i + 2];
+                const float* own = channels.data + (long long)i * stride + base;
+                const int rest_of = count - base;
+                parts = parts_of(mx, my, a, b, c, opacity);
+                shape[thread] = make_float4(mx, my, -0.5f * LOG2_E * a, -LOG2_E * b);
+                rest[thread] = make_float4(-0.5f * LOG2_E * c, opacity, 0.0f, 0.0f);
+                color[thread] = make_float4(own[0], rest_of > 1 ? own[1] : 0.0f, rest_of > 2 ? own[2] : 0.0f,
+                    rest_of > 3 ? own[3] : 0.0f);
+            }
+            reached[thread] = parts;
+            __syncthreads();
+            for (int word = 0; word < 8; ++word) {
+                unsigned left = __ballot_sync(ALL, (reached[32 * word + lane] >> warp) & 1u);
+                if (!__any_sync(ALL, open)) break;
+                while (left) {
+                    const int j = 32 * word + __ffs(left) - 1;
+                    left &= left - 1u;
+                    const float4 s = shape[j];
+                    const float4 r = rest[j];
+                    const float dx = centre_x - s.x, dy = centre_y - s.y;
+                    const float power = dx * (s.z * dx + s.w * dy) + r.x * dy * dy;
+                    const float alpha = fminf(ALPHA_MAX, r.y * exp2f(power));
+                    if (open && power <= 0.0f && alpha >= ALPHA_MIN) {
+                        const float remaining = transmittance * (1.0f - alpha);
+                        if (remaining <= TRANSMITTANCE_MIN) {
+                            open = false;
+                        } else {
+                            const float weight = alpha * transmittance;
+                            const float4 c = color[j];
+                            sum[0] += c.x * weight;
+                            sum[1] += c.y * weight;
+                            sum[2] += c.z * weight;
+                            sum[3] += c.w * weight;
+                            transmittance = remaining;
+                            last = at + j + 1;
+                        }
+                    }
+                }
+            }
+        }
+        if (inside) {
+            for (int c = 0; c < 4; ++c)
+                if (base + c < count)
+                    image.data[(base + c) * plane + pixel] = sum[c] + background.data[base + c] * transmittance;
+            alpha_image.data[pixel] = 1.0f - transmittance;
+            if (last_image.data) {
+                transmittance_image.data[pixel] = transmittance;
+                last_image.data[pixel] = last;
+            }
+        }
+        __syncthreads();
+    }
+#endif
+"""
+
+_ADJOINT = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 shape[128];
+    __shared__ float4 rest[128];
+    __shared__ float color[128][8];
+    __shared__ unsigned reached[128];
+    __shared__ int slot_of[128];
+    __shared__ float partial[8][32][16];  // of each warp: the sums of each pair it hit
+    __shared__ unsigned hits[8];
+    __shared__ int deepest[8];
+    PLACE
+    const int count = channels.shape.dims[1];
+    float transmittance = 1.0f, behind = 0.0f, v_pixel[8];
+    int last = 0;
+    for (int c = 0; c < 8; ++c) v_pixel[c] = inside && c < count ? v_image.data[c * plane + pixel] : 0.0f;
+    if (inside) {
+        last = last_image.data[pixel];
+        transmittance = transmittance_image.data[pixel];
+        behind = -v_alpha.data[pixel];  // what lies behind the current splat, weighted by v_image
+        for (int c = 0; c < 8; ++c)
+            if (c < count) behind += v_pixel[c] * background.data[c];
+        behind *= transmittance;
+    }
+    int warp_last = last;
+    for (int step = 16; step > 0; step >>= 1) {
+        const int other = __shfl_xor_sync(ALL, warp_last, step);
+        warp_last = other > warp_last ? other : warp_last;
+    }
+    if (lane == 0) deepest[warp] = warp_last;
+    __syncthreads();
+    int stop = begin;
+    for (int w = 0; w < 8; ++w) stop = deepest[w] > stop ? deepest[w] : stop;
+    for (int p = stop + (thread >> 4); p < end; p += 16)  // pairs that no pixel used
+        v_slots.data[(long long)slots.data[p] * 16 + (thread & 15)] = 0.0f;
+
+    for (; stop > begin; stop -= 128) {
+        const int start = stop - 128 > begin ? stop - 128 : begin, size = stop - start;
+        if (thread < 128) {
+            unsigned parts = 0u;
+            if (thread < size) {
+                const int i = splats.data[start + thread];
+                const float mx = means[2 * i], my = means[2 * i + 1], opacity = opacities.data[i];
+                const float a = all_conics[3 * i], b = all_conics[3 * i + 1], c = all_conics[3 * i + 2];
+                parts = parts_of(mx, my, a, b, c, opacity);
+                shape[thread] = make_float4(mx, my, -0.5f * LOG2_E * a, -LOG2_E * b);
+                rest[thread] = make_float4(-0.5f * LOG2_E * c, opacity, 0.0f, 0.0f);
+                slot_of[thread] = slots.data[start + thread];
+                for (int k = 0; k < 8; ++k)
+                    color[thread][k] = k < count ? channels.data[(long long)i * count + k] : 0.0f;
+            }
+            reached[thread] = parts;
+        }
+        __syncthreads();
+        for (int group = (size - 1) >> 5; group >= 0; --group) {
+            unsigned left = __ballot_sync(ALL, (reached[32 * group + lane] >> warp) & 1u);
+            const int over = start + 32 * group + 32 - warp_last;  // pairs behind the last that this warp used
+            if (over > 0) left = over >= 32 ? 0u : left & (ALL >> over);
+            unsigned hit = 0u;
+            while (left) {
+                const int bit = 31 - __clz(left), j = 32 * group + bit;
+                left ^= 1u << bit;
+                const float4 s = shape[j];
+                const float4 r = rest[j];
+                const float dx = centre_x - s.x, dy = centre_y - s.y;
+                const float power = dx * (s.z * dx + s.w * dy) + r.x * dy * dy;
+                const float falloff = exp2f(power), raw = r.y * falloff;
+                const float alpha = fminf(ALPHA_MAX, raw);
+                const bool valid = start + j < last && power <= 0.0f && alpha >= ALPHA_MIN;
+                if (!__any_sync(ALL, valid)) continue;
+                hit |= 1u << bit;
+                float v[16];
+                #pragma unroll
+                for (int k = 0; k < 16; ++k) v[k] = 0.0f;
+                if (valid) {
+                    const float inverse = __fdividef(1.0f, 1.0f - alpha);
+                    transmittance *= inverse;
+                    const float weight = alpha * transmittance;
+                    float seen = 0.0f;
+                    #pragma unroll
+                    for (int c = 0; c < 8; ++c) {
+                        seen += color[j][c] * v_pixel[c];
+                        v[8 + c] = weight * v_pixel[c];
+                    }
+                    const float v_alpha_here = seen * transmittance - behind * inverse;
+                    behind += seen * weight;
+                    if (raw <= ALPHA_MAX) {
+                        const float g = v_alpha_here * raw;  // gradient to -q / 2
+                        v[0] = -LN_2 * g * (2.0f * s.z * dx + s.w * dy);
+                        v[1] = -LN_2 * g * (s.w * dx + 2.0f * r.x * dy);
+                        v[2] = -0.5f * g * dx * dx;
+                        v[3] = -g * dx * dy;
+                        v[4] = -0.5f * g * dy * dy;
+                        v[5] = v_alpha_here * falloff;
+                        v[6] = fabsf(v[0]);
+                        v[7] = fabsf(v[1]);
+                    }
+                }
+                // Each step halves the sums a lane holds and doubles the lanes a sum has seen: in the end sum k lies
+                // in the lanes 2 k and 2 k + 1.
+                #pragma unroll
+                for (int half = 8; half > 0; half >>= 1) {
+                    const bool upper = (lane & (2 * half)) != 0;
+                    #pragma unroll
+                    for (int k = 0; k < half; ++k) {
+                        const float kept = upper ? v[k + half] : v[k], given = upper ? v[k] : v[k + half];
+                        v[k] = kept + __shfl_xor_sync(ALL, given, 2 * half);
+                    }
+                }
+                v[0] += __shfl_xor_sync(ALL, v[0], 1);
+                if ((lane & 1) == 0) partial[warp][bit][lane >> 1] = v[0];
+            }
+            if (lane == 0) hits[warp] = hit;
+            __syncthreads();
+            for (int j = thread >> 4; j < 32 && 32 * group + j < size; j += 16) {
+                float sum = 0.0f;
+                for (int w = 0; w < 8; ++w)
+                    if ((hits[w] >> j) & 1u) sum += partial[w][j][thread & 15];
+                v_slots.data[(long long)slot_of[32 * group + j] * 16 + (thread & 15)] = sum;
+            }
+            __syncthreads();
+        }
+    }
+    __syncthreads();
+#endif
+"""
 
 
-@wp.func
-def pack(mean: wp.vec2, conic: wp.vec3, opacity: float) -> Splat:
-    return Splat(mean[0], mean[1], conic[0], conic[1], conic[2], opacity)
+def _complete(body: str) -> str:
+    """The body with its common beginning and the shared constants written out."""
+    constants = {
+        "ALPHA_MAX": ALPHA_MAX,
+        "ALPHA_MIN": ALPHA_MIN,
+        "TRANSMITTANCE_MIN": TRANSMITTANCE_MIN,
+        "LOG2_E": 1.4426950408889634,
+        "LN_2": 0.6931471805599453,
+    }
+    body = body.replace("    PLACE\n", _PLACE)
+    for name, value in constants.items():
+        body = body.replace(name, f"{float(value):.9e}f")
+    return body
 
 
-@wp.func
-def squared_distance_of(splat: Splat, d: wp.vec2) -> float:
-    return squared_distance(wp.vec3(splat[2], splat[3], splat[4]), d)
+FORWARD = _complete(_FORWARD)
+ADJOINT = _complete(_ADJOINT)
 
 
-@wp.func
-def group_of(channels: wp.array2d[float], i: int, base: int) -> wp.vec4:
-    """Four channels of a splat, zero beyond the last."""
-    values = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for c in range(4):
-        if base + c < channels.shape[1]:
-            values[c] = channels[i, base + c]
-    return values
+# Parameters stand on few lines here: the bodies above are long enough.
+# fmt: off
+@wp.func_native(FORWARD)
+def composite_tile(
+    tile: int, means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], opacities: wp.array[float],
+    channels: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i], splats: wp.array[int],
+    width: int, height: int, columns: int, image: wp.array3d[float], alpha_image: wp.array2d[float],
+    transmittance_image: wp.array2d[float], last_image: wp.array2d[int],
+): ...
 
 
-@wp.func
-def pixel_group(image: wp.array3d[float], y: int, x: int, base: int) -> wp.vec4:
-    """Four channels of a pixel, zero beyond the last."""
-    values = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for c in range(4):
-        if base + c < image.shape[0]:
-            values[c] = image[base + c, y, x]
-    return values
+@wp.func_native(ADJOINT)
+def composite_tile_adjoint(
+    tile: int, means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], opacities: wp.array[float],
+    channels: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i], splats: wp.array[int],
+    slots: wp.array[int], transmittance_image: wp.array2d[float], last_image: wp.array2d[int],
+    v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int,
+    v_slots: wp.array2d[float],
+): ...
+# fmt: on
 
 
 @wp.kernel
-def composite_blocks(
+def composite_tiles(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N] pixels
@@ -74,7 +317,6 @@ def composite_blocks(
     width: int,
     height: int,
     columns: int,
-    tile_size: int,
     # Out:
     image_out: wp.array3d[float],  # [C, H, W] on the background
     alpha_out: wp.array2d[float],  # [H, W] 1 - final transmittance
@@ -82,88 +324,21 @@ def composite_blocks(
     last_out: wp.array2d[int],  # [H, W] index in the sorted list of the last contributor, + 1; 0: none; empty too
 ):
     """Grid: T x 256."""
-    block, lane = wp.tid()
-    tile = first + block
-    x = (tile % columns) * tile_size + lane % tile_size
-    y = (tile // columns) * tile_size + lane // tile_size
-    inside = x < width and y < height
-    centre = wp.vec2(float(x) + 0.5, float(y) + 0.5)
-    span = ranges_in[tile]
-    staged = wp.tile_zeros(shape=_LANES, dtype=Splat, storage="shared")
-    colors = wp.tile_zeros(shape=_LANES, dtype=wp.vec4, storage="shared")
-    count = image_out.shape[0]
-    for base in range(0, count, GROUP):
-        total = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        transmittance = float(1.0)
-        last = int(0)
-        open = int(1)
-        if not inside:
-            open = int(0)
-        begin = int(span[0])
-        while begin < span[1]:
-            some_open = wp.tile_max(wp.tile(open))
-            if some_open[0] == 0:
-                break
-            mine = begin + lane
-            splat = Splat()
-            color = wp.vec4(0.0, 0.0, 0.0, 0.0)
-            if mine < span[1]:
-                i = splats_in[mine]
-                splat = pack(means2d_in[i], conics_in[i], opacities_in[i])
-                color = group_of(channels_in, i, base)
-            wp.tile_scatter_masked(staged, lane, splat, True)
-            wp.tile_scatter_masked(colors, lane, color, True)
-            j = int(0)
-            size = wp.min(_LANES, span[1] - begin)
-            while open == 1 and j < size:
-                own = wp.tile_extract(staged, j)
-                q = squared_distance_of(own, centre - wp.vec2(own[0], own[1]))
-                alpha = wp.min(ALPHA_MAX, own[5] * wp.exp(-0.5 * q))
-                if q >= 0.0 and alpha >= ALPHA_MIN:
-                    remaining = transmittance * (1.0 - alpha)
-                    if remaining <= TRANSMITTANCE_MIN:
-                        open = int(0)
-                    else:
-                        total += wp.tile_extract(colors, j) * (alpha * transmittance)
-                        transmittance = remaining
-                        last = begin + j + 1
-                j += 1
-            begin += _LANES
-        if inside:
-            for c in range(4):
-                if base + c < count:
-                    image_out[base + c, y, x] = total[c] + background_in[base + c] * transmittance
-            alpha_out[y, x] = 1.0 - transmittance
-            if last_out.shape[0] > 0:
-                transmittance_out[y, x] = transmittance
-                last_out[y, x] = last
-
-
-@wp.func
-def geometry_sums(own: Splat, d: wp.vec2, falloff: float, v_alpha: float) -> Sums:
-    """What a gradient to one pixel's alpha says of the splat's mean, conic and opacity; nothing where clamped."""
-    sums = Sums()
-    if own[5] * falloff <= ALPHA_MAX:
-        g = v_alpha * own[5] * falloff  # gradient to -q / 2
-        sums[0] = g * (own[2] * d[0] + own[3] * d[1])
-        sums[1] = g * (own[3] * d[0] + own[4] * d[1])
-        sums[2] = -0.5 * g * d[0] * d[0]
-        sums[3] = -g * d[0] * d[1]
-        sums[4] = -0.5 * g * d[1] * d[1]
-        sums[5] = v_alpha * falloff
-        sums[6] = wp.abs(sums[0])
-        sums[7] = wp.abs(sums[1])
-    return sums
+    block, _lane = wp.tid()
+    composite_tile(
+        first + block, means2d_in, conics_in, opacities_in, channels_in, background_in, ranges_in, splats_in,
+        width, height, columns, image_out, alpha_out, transmittance_out, last_out,
+    )  # fmt: skip
 
 
 @wp.kernel
-def composite_blocks_adjoint(
+def composite_tiles_adjoint(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N]
     conics_in: wp.array[wp.vec3],  # [N]
     opacities_in: wp.array[float],  # [N]
-    channels_in: wp.array2d[float],  # [N, C]
+    channels_in: wp.array2d[float],  # [N, C], C <= 8
     background_in: wp.array[float],  # [C]
     ranges_in: wp.array[wp.vec2i],  # [T]
     splats_in: wp.array[int],  # [P]
@@ -175,83 +350,45 @@ def composite_blocks_adjoint(
     width: int,
     height: int,
     columns: int,
-    tile_size: int,
-    absolute: int,  # whether columns 6 and 7 are wanted (they are written all the same)
     # Out:
-    v_slots_out: wp.array2d[float],  # [P, S], S >= 8 + C; row: mean 2, conic 3, opacity 1, |mean| 2, channels C, rest
+    v_slots_out: wp.array2d[float],  # [P, 16] row: mean 2, conic 3, opacity 1, |mean| 2, channels C, zeros
 ):
-    """Back to front from the tile's last contributor; a pair's gradient is summed over the block. Grid: T x 256."""
-    block, lane = wp.tid()
-    tile = first + block
-    x = (tile % columns) * tile_size + lane % tile_size
-    y = (tile // columns) * tile_size + lane // tile_size
-    centre = wp.vec2(float(x) + 0.5, float(y) + 0.5)
-    span = ranges_in[tile]
-    count = channels_in.shape[1]
-    transmittance = float(1.0)
-    last = int(0)
-    behind = float(0.0)  # what lies behind the current splat, weighted by v_image
-    v_pixel = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    if x < width and y < height:
-        last = last_in[y, x]
-        transmittance = transmittance_in[y, x]
-        behind = -v_alpha_in[y, x]
-        for c in range(count):
-            behind += v_image_in[c, y, x] * background_in[c]
-        behind *= transmittance
-        v_pixel = pixel_group(v_image_in, y, x, 0)
-    deepest = wp.tile_max(wp.tile(last))
-    end = int(wp.max(deepest[0], span[0]))
-    for p in range(end + lane, span[1], _LANES):  # pairs that no pixel used
-        for k in range(v_slots_out.shape[1]):
-            v_slots_out[slots_in[p], k] = 0.0
-    staged = wp.tile_zeros(shape=_LANES, dtype=Splat, storage="shared")
-    colors = wp.tile_zeros(shape=_LANES, dtype=wp.vec4, storage="shared")
-    while end > span[0]:
-        begin = wp.max(span[0], end - _LANES)
-        mine = begin + lane
-        splat = Splat()
-        color = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        if mine < end:
-            i = splats_in[mine]
-            splat = pack(means2d_in[i], conics_in[i], opacities_in[i])
-            color = group_of(channels_in, i, 0)
-        wp.tile_scatter_masked(staged, lane, splat, True)
-        wp.tile_scatter_masked(colors, lane, color, True)
-        for back in range(end - begin):
-            p = end - 1 - back
-            own = wp.tile_extract(staged, p - begin)
-            d = centre - wp.vec2(own[0], own[1])
-            q = squared_distance_of(own, d)
-            falloff = wp.exp(-0.5 * q)
-            alpha = wp.min(ALPHA_MAX, own[5] * falloff)
-            weight = float(0.0)
-            sums = Sums()
-            if p < last and q >= 0.0 and alpha >= ALPHA_MIN:
-                transmittance /= 1.0 - alpha
-                weight = alpha * transmittance
-                seen = wp.dot(wp.tile_extract(colors, p - begin), v_pixel)
-                for c in range(GROUP, count):
-                    seen += channels_in[splats_in[p], c] * v_image_in[c, y, x]
-                v_alpha = seen * transmittance - behind / (1.0 - alpha)
-                behind += seen * weight
-                sums = geometry_sums(own, d, falloff, v_alpha)
-                for c in range(4):
-                    sums[SLOT_GEOMETRY + c] = weight * v_pixel[c]
-            totals = wp.tile_sum(wp.tile(sums, preserve_type=True))
-            column = wp.tile_extract(totals, 0, wp.min(lane, _SUMS - 1))
-            slot = slots_in[p]
-            if lane < wp.min(_SUMS, v_slots_out.shape[1]):
-                v_slots_out[slot, lane] = column
-            for k in range(_SUMS + lane, v_slots_out.shape[1], _LANES):
-                v_slots_out[slot, k] = 0.0
-            for base in range(GROUP, count, GROUP):
-                v_more = wp.vec4(0.0, 0.0, 0.0, 0.0)
-                if weight > 0.0:
-                    v_more = weight * pixel_group(v_image_in, y, x, base)
-                more = wp.tile_sum(wp.tile(v_more, preserve_type=True))
-                extra = wp.tile_extract(more, 0, wp.min(lane, 3))
-                # tile_sum's barriers come after the zeros above
-                if lane < 4 and base + lane < count:
-                    v_slots_out[slot, SLOT_GEOMETRY + base + lane] = extra
-        end = begin
+    """Grid: T x 256."""
+    block, _lane = wp.tid()
+    composite_tile_adjoint(
+        first + block, means2d_in, conics_in, opacities_in, channels_in, background_in, ranges_in, splats_in, slots_in,
+        transmittance_in, last_in, v_image_in, v_alpha_in, width, height, columns, v_slots_out,
+    )  # fmt: skip
+
+
+@wp.kernel
+def sum_slot_columns(
+    first: int,
+    # In:
+    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
+    v_slots_in: wp.array2d[float],  # [P, 16]
+    # Out:
+    v_means2d_out: wp.array2d[float],  # [N, 2]
+    v_conics_out: wp.array2d[float],  # [N, 3]
+    v_opacities_out: wp.array[float],  # [N]
+    v_channels_out: wp.array2d[float],  # [N, C], C <= 8
+    absgrad_out: wp.array2d[float],  # [N, 2]; empty: not wanted
+):
+    """``compositing.sum_slots`` with a thread for every column, so that neighbours read neighbours. Grid: 16 N."""
+    t = first + wp.tid()
+    i = t // SLOT_WIDTH
+    column = t - i * SLOT_WIDTH
+    total = float(0.0)
+    for s in range(int(offsets_in[i]), int(offsets_in[i + 1])):
+        total += v_slots_in[s, column]
+    if column < 2:
+        v_means2d_out[i, column] = total
+    elif column < 5:
+        v_conics_out[i, column - 2] = total
+    elif column < 6:
+        v_opacities_out[i] = total
+    elif column < SLOT_GEOMETRY:
+        if absgrad_out.shape[0] > 0:
+            absgrad_out[i, column - 6] = total
+    elif column - SLOT_GEOMETRY < v_channels_out.shape[1]:
+        v_channels_out[i, column - SLOT_GEOMETRY] = total

@@ -1,4 +1,5 @@
-"""The block form of compositing against the pixel form, on CUDA where there is one, else on the CPU's block emulation.
+"""The block forms of compositing against the pixel form, on CUDA where there is one; else the portable one on the CPU's
+block emulation (the native one: ``test_compositing_native``).
 
 The emulation is a setting of the process that must be made before a kernel is compiled, so it runs in one of its own.
 """
@@ -74,9 +75,9 @@ def run_form(case: str, form: str, device: str) -> list[torch.Tensor]:
     return [t.detach().cpu() for t in results]
 
 
-def largest_differences(case: str, device: str) -> list[float]:
-    """Per result of ``run_form``, the largest difference between the forms, relative to the largest value."""
-    theirs, ours = run_form(case, "pixel", device), run_form(case, "cuda", device)
+def largest_differences(case: str, form: str, device: str) -> list[float]:
+    """Per result of ``run_form``, the largest difference to the pixel form, relative to the largest value."""
+    theirs, ours = run_form(case, "pixel", device), run_form(case, form, device)
     differences = []
     for a, b in zip(theirs, ours):
         assert a.shape == b.shape and torch.isfinite(b).all(), (case, a, b)
@@ -89,7 +90,8 @@ def largest_differences(case: str, device: str) -> list[float]:
 def differences() -> dict[str, list[float]]:
     """All cases at once: one process, one compilation."""
     if torch.cuda.is_available():
-        return {case: largest_differences(case, "cuda") for case in CASES}
+        found = {f"{case}, native": largest_differences(case, "cuda", "cuda") for case in CASES}
+        return found | {case: largest_differences(case, "blocks", "cuda") for case in CASES}
     result = subprocess.run(
         [sys.executable, __file__],
         capture_output=True,
@@ -105,6 +107,8 @@ def differences() -> dict[str, list[float]]:
 @pytest.mark.parametrize("case", CASES)
 def test_same_as_the_pixel_form(case, differences):
     assert max(differences[case]) < 1e-5, differences[case]
+    if torch.cuda.is_available():
+        assert max(differences[f"{case}, native"]) < 1e-5, differences[f"{case}, native"]
 
 
 def test_the_cases_contain_what_they_are_for():
@@ -120,11 +124,11 @@ def test_blocks_without_a_gpu_raise_instead_of_running_one_lane():
     if torch.cuda.is_available():
         pytest.skip("there is a GPU")
     with pytest.raises(RuntimeError, match="enable_cpu_blocks"):
-        run_form("one tile", "cuda", "cpu")
+        run_form("one tile", "blocks", "cpu")
 
 
 if __name__ == "__main__":
     import warp
 
     warp.config.enable_cpu_blocks = True
-    print(json.dumps({case: largest_differences(case, "cpu") for case in CASES}))
+    print(json.dumps({case: largest_differences(case, "blocks", "cpu") for case in CASES}))

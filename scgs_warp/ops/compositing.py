@@ -12,9 +12,10 @@ from ..kernels import compositing as kernels
 from ..kernels import compositing_cpu as cpu_kernels
 from ..kernels.types import SLOT_GEOMETRY
 from ..types import Splats, Stats, Tiles
-from ..warp_interop import launch, launch_blocks
+from ..warp_interop import launch
+from . import compositing_cuda
 
-Form = Literal["auto", "pixel", "cpu", "cuda"]
+Form = Literal["auto", "pixel", "cpu", "cuda", "blocks"]
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def composite(
         absgrad: [N, 2] buffer that the backward pass overwrites with the sum over pixels of the absolute gradients of
             ``means2d``.
         form: which of the kernels runs; ``auto`` takes the fastest for the device. ``pixel`` is the readable
-            reference on any device.
+            reference on any device, ``blocks`` the portable sibling of ``cuda``.
 
     Returns:
         image [C, H, W] on the background, alpha [H, W] in [0, 1).
@@ -100,8 +101,7 @@ class _Composite(torch.autograd.Function):
             absgrad = torch.empty_like(v_means2d)
         count = len(v_means2d)
         outputs = (v_means2d, v_conics, v_opacities, v_channels, absgrad)
-        sum_slots = kernels.sum_line_slots if v_slots.shape[1] == kernels.SLOT_WIDTH else kernels.sum_slots
-        launch(sum_slots, count, job.tiles.offsets, v_slots, *outputs)
+        compositing_cuda.sum_slots(job.form, job.tiles.offsets, v_slots, outputs)
         if job.stats is not None:
             norm_of = absgrad if job.stats.absolute else v_means2d
             stats, size = job.stats, (job.tiles.width, job.tiles.height)
@@ -112,8 +112,8 @@ class _Composite(torch.autograd.Function):
 
 
 def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
-    if form not in ("auto", "pixel", "cpu", "cuda"):
-        raise ValueError(f"form must be auto, pixel, cpu or cuda, got {form!r}")
+    if form not in ("auto", "pixel", "cpu", "cuda", "blocks"):
+        raise ValueError(f"form must be auto, pixel, cpu, cuda or blocks, got {form!r}")
     if form == "auto":
         form = "cuda" if device.type == "cuda" else "cpu"
         return form if tile_size == cpu_kernels.TILE_SIDE else "pixel"
@@ -147,11 +147,7 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
         if job.form == "pixel":
             launch(kernels.composite_pixels, alpha.numel(), *lists, *size, tiles.tile_size, *outputs, grain=256)
         else:
-            from ..kernels import compositing_cuda as cuda_kernels
-
-            blocks, block_dim = len(tiles.ranges), cuda_kernels.BLOCK_DIM
-            arguments = (*lists, *size, tiles.tile_size, *outputs)
-            launch_blocks(cuda_kernels.composite_blocks, blocks, *arguments, block_dim=block_dim)
+            compositing_cuda.forward(job.form, lists, size, outputs)
     return image, alpha, *((source, transmittance, last) if keep else (None, None, None))
 
 
@@ -186,13 +182,12 @@ def _adjoint(
     if job.form == "cpu":
         launch(cpu_kernels.composite_tiles_adjoint, count, source, *lists, *size, int(absolute), v_slots, grain=1)
         return v_slots
-    arguments = (means2d, conics, source, channels, *lists, *size, tiles.tile_size, int(absolute), v_slots)
+    lists = (means2d, conics, source, channels, *lists)
     if job.form == "pixel":
-        launch(kernels.composite_pixels_adjoint, count, *arguments, grain=1)
+        rest = (*size, tiles.tile_size, int(absolute), v_slots)
+        launch(kernels.composite_pixels_adjoint, count, *lists, *rest, grain=1)
     else:
-        from ..kernels import compositing_cuda as cuda_kernels
-
-        launch_blocks(cuda_kernels.composite_blocks_adjoint, count, *arguments, block_dim=cuda_kernels.BLOCK_DIM)
+        compositing_cuda.adjoint(job.form, lists, size, absolute, v_slots)
     return v_slots
 
 

@@ -1,0 +1,64 @@
+"""Launches of the forms of compositing that take a block of threads a tile: ``cuda``, and the portable ``blocks``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..kernels import compositing, compositing_blocks
+from ..kernels import compositing_cuda as native
+from ..warp_interop import launch, launch_blocks
+
+
+def forward(form: str, lists: tuple[Tensor, ...], size: tuple[int, ...], outputs: tuple[Tensor | None, ...]) -> None:
+    """``lists``: the kernels' tensors up to the sorted list; ``size``: width, height, columns."""
+    blocks = len(lists[-2])
+    if form == "cuda":
+        launch_native(native.composite_tiles, blocks, *lists, *size, *outputs)
+    else:
+        launch_blocks(
+            compositing_blocks.composite_blocks,
+            blocks,
+            *(*lists, *size, compositing_blocks.TILE_SIZE, *outputs),
+            block_dim=compositing_blocks.BLOCK_DIM,
+        )
+
+
+def adjoint(form: str, lists: tuple[Tensor, ...], size: tuple[int, ...], absolute: bool, v_slots: Tensor) -> None:
+    """``lists``: the kernels' tensors up to ``v_alpha``. More channels than the native form's slot holds go to the
+    portable one."""
+    blocks = len(lists[5])
+    if form == "cuda" and lists[3].shape[1] <= native.MAX_CHANNELS:
+        launch_native(native.composite_tiles_adjoint, blocks, *lists, *size, v_slots)
+    else:
+        launch_blocks(
+            compositing_blocks.composite_blocks_adjoint,
+            blocks,
+            *(*lists, *size, compositing_blocks.TILE_SIZE, int(absolute), v_slots),
+            block_dim=compositing_blocks.BLOCK_DIM,
+        )
+
+
+def sum_slots(form: str, offsets: Tensor, v_slots: Tensor, outputs: tuple[Tensor | None, ...]) -> None:
+    """Sum each splat's slots into the gradients of mean, conic, opacity, channels and the absolute one of the mean."""
+    count = len(offsets) - 1
+    if v_slots.shape[1] != native.SLOT_WIDTH:
+        launch(compositing.sum_slots, count, offsets, v_slots, *outputs)
+    elif form == "cuda":
+        launch(native.sum_slot_columns, native.SLOT_WIDTH * count, offsets, v_slots, *outputs)
+    else:
+        launch(compositing.sum_line_slots, count, offsets, v_slots, *outputs)
+
+
+def launch_native(kernel: Any, blocks: int, *args: Any) -> None:
+    """Launch a kernel whose body is empty on a CPU.
+
+    Raises:
+        RuntimeError: the tensors are on a CPU.
+    """
+    device: torch.device = args[0].device
+    if device.type != "cuda":
+        raise RuntimeError(f"form cuda needs a GPU, got tensors on {device}; form pixel runs everywhere")
+    launch_blocks(kernel, blocks, *args, block_dim=native.BLOCK_DIM)
