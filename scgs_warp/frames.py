@@ -49,6 +49,7 @@ class Frames:
         self.background = data.background_color.to(device)
         self.random_background = data.background == "random"
         self._halved: dict[int, tuple[Frame, Camera]] = {}
+        self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
         self.by_time = sorted(range(len(self.frames)), key=lambda i: self.frames[i].time)
 
     def __len__(self) -> int:
@@ -66,8 +67,10 @@ class Frames:
                 first = max(0, allowed - max(1, round(PROGRESSIVE_SHARE * len(self.frames))))
         count = allowed - first
         epoch, place = divmod(step, count)
-        order = torch.randperm(count, generator=generator(self.config.seed, 41, epoch, count))
-        return self.by_time[first + int(order[place])]
+        if self._order[0] != (epoch, count):
+            order = torch.randperm(count, generator=generator(self.config.seed, 41, epoch, count))
+            self._order = ((epoch, count), order.tolist())
+        return self.by_time[first + self._order[1][place]]
 
     def halved(self, index: int) -> tuple[Frame, Camera]:
         """Frame and normalised camera at half the size, each pixel the mean of four; made once."""

@@ -40,6 +40,30 @@ def render(
     Raises:
         ValueError: a shape, a size or the degree is wrong.
     """
+    image, alpha = draw(
+        gaussians, camera, background, sh_degree=sh_degree, stats=stats, antialiased=antialiased, depth=True
+    )
+    return Image(image[:3].permute(1, 2, 0), alpha, expected_depth(image[3], alpha))
+
+
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor | None = None,
+    *,
+    sh_degree: int | None = None,
+    stats: Stats | None = None,
+    antialiased: bool = False,
+    depth: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """As :func:`render`, planar, and depth only on demand: it costs a training step that has no use for it.
+
+    Args:
+        depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
+
+    Returns:
+        image [3 or 4, H, W] and alpha [H, W].
+    """
     if background is not None and tuple(background.shape) != (3,):
         raise ValueError(f"background must be [3], got {tuple(background.shape)}")
     if sh_degree is None:
@@ -48,12 +72,11 @@ def render(
     shape = gaussians.quats, gaussians.scales, gaussians.opacities
     size = camera.width, camera.height
     splats = project(means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased)
-    colors = spherical_harmonics(gaussians.sh_dc, gaussians.sh_rest, means, camera.position, sh_degree)
-    channels = torch.cat([colors, splats.depths[:, None]], dim=1)
-    if background is not None:
-        background = torch.cat([background, background.new_zeros(1)])
-    image, alpha = composite(splats, channels, bin_splats(splats), background, stats=stats)
-    return Image(image[:3].permute(1, 2, 0), alpha, expected_depth(image[3], alpha))
+    channels = spherical_harmonics(gaussians.sh_dc, gaussians.sh_rest, means, camera.position, sh_degree)
+    if depth:
+        channels = torch.cat([channels, splats.depths[:, None]], dim=1)
+        background = None if background is None else torch.cat([background, background.new_zeros(1)])
+    return composite(splats, channels, bin_splats(splats), background, stats=stats)
 
 
 def expected_depth(accumulated: Tensor, alpha: Tensor) -> Tensor:

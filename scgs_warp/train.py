@@ -28,7 +28,7 @@ from .ops.ssim import photometric_loss
 from .optim import generator, log_linear
 from .pretrain import densify_spheres, thin_spheres
 from .progress import Progress, progress
-from .render import render
+from .render import draw
 from .run_folder import RunFolder
 from .scene import Scene
 from .train_state import TrainState
@@ -61,7 +61,7 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
 
     posed, regulariser = state.motion.train_at(state.gaussians, frame.time, step, config, config.seed)
     collecting = pretraining or step < config.densify.until
-    image = render(
+    picture, _ = draw(
         posed,
         camera,
         background,
@@ -69,7 +69,6 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
         stats=state.stats if collecting else None,
         antialiased=config.antialiased,
     )
-    picture = image.rgb.permute(2, 0, 1)
     loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim)
     total = loss if regulariser is None else loss + regulariser
 

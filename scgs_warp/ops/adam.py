@@ -76,10 +76,10 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
         if math.isfinite(float(torch.nn.utils.get_total_norm(tensors, math.inf))):
             return None
         return next(i for i, tensor in enumerate(tensors) if not bool(torch.isfinite(tensor).all()))
-    tensors = [tensor.detach().contiguous() for tensor in tensors]
     for tensor in tensors:
         if tensor.dtype != torch.float32:
             raise ValueError(f"tensors must be float32, got {tensor.dtype}")
+    tensors = [tensor if tensor.is_contiguous() else tensor.contiguous() for tensor in tensors]
     sizes, chunks = _layout(tuple(tensor.numel() for tensor in tensors), tensors[0].device)
     bad = torch.empty(len(chunks), dtype=torch.int32)
     launch(
@@ -104,7 +104,7 @@ def _simd(form: str, device: torch.device) -> bool:
 def _validate(update: Update, device: torch.device) -> None:
     shape = update.value.shape
     for name, tensor in zip(Update._fields, update[:4]):
-        if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device != device:
+        if tensor.shape != shape or tensor.dtype is not torch.float32 or tensor.device != device:
             raise ValueError(
                 f"{name} must be {list(shape)} float32 on {device}, "
                 f"got {list(tensor.shape)} {tensor.dtype} on {tensor.device}"
