@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..kernels import projection as kernels
+from ..kernels import projection_cpu as cpu_kernels
 from ..types import Splats
 from ..warp_interop import launch
 from .reduction import sum_rows
+
+
+Form = Literal["auto", "plain", "cpu"]
 
 
 class _Settings(NamedTuple):
@@ -25,7 +29,7 @@ class _Settings(NamedTuple):
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, viewmat, K, settings: _Settings):
+    def forward(ctx: Any, means, quats, scales, opacities, viewmat, K, settings: _Settings, form: Form):
         count, device = means.shape[0], means.device
         means2d = torch.empty(count, 2, device=device)
         conics = torch.empty(count, 3, device=device)
@@ -33,9 +37,14 @@ class _Project(torch.autograd.Function):
         seen = torch.empty(count, device=device)
         radii = torch.empty(count, 2, device=device, dtype=torch.int32)
         inputs = means, quats, scales, opacities, viewmat[None], K[None]
-        launch(kernels.project, count, *inputs, *settings, means2d, conics, depths, seen, radii)
+        outputs = means2d, conics, depths, seen, radii
+        if form == "cpu":
+            blocks = -(-count // cpu_kernels.LANES)
+            launch(cpu_kernels.project_lanes, blocks, *inputs, *settings, *outputs, grain=32)
+        else:
+            launch(kernels.project, count, *inputs, *settings, *outputs)
         ctx.save_for_backward(means, quats, scales, opacities, viewmat, K, radii)
-        ctx.settings = settings
+        ctx.settings, ctx.form = settings, form
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         return means2d, conics, depths, seen, radii
@@ -55,17 +64,17 @@ class _Project(torch.autograd.Function):
         inputs = means, quats, scales, opacities, viewmat[None], K[None]
         camera = settings.width, settings.height, settings.eps2d, settings.antialiased
         incoming = v_means2d, v_conics, v_depths, v_opacities
-        launch(
-            kernels.project_adjoint,
-            count,
-            *(*inputs, *camera, radii, *incoming, int(wants_view)),
-            *(*v_inputs, v_views),
-        )
+        known = *inputs, *camera, radii, *incoming
+        if ctx.form == "cpu" and not wants_view:
+            blocks = -(-count // cpu_kernels.LANES)
+            launch(cpu_kernels.project_lanes_adjoint, blocks, *known, *v_inputs, grain=32)
+        else:
+            launch(kernels.project_adjoint, count, *known, int(wants_view), *v_inputs, v_views)
         v_viewmat = None
         if v_views is not None:
             v_viewmat = torch.zeros_like(viewmat)
             v_viewmat[:3] = sum_rows(v_views.view(count, 12)).view(4, 3).T
-        return *v_inputs, v_viewmat, None, None
+        return *v_inputs, v_viewmat, None, None, None
 
 
 def _validate(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, K: Tensor) -> None:
@@ -99,6 +108,7 @@ def project(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     antialiased: bool = False,
+    form: Form = "auto",
 ) -> Splats:
     """Project Gaussians to a pinhole camera's image (EWA splatting, conventions of gsplat 1.5.3).
 
@@ -120,6 +130,7 @@ def project(
         radius_clip: splats no larger than this are dropped, pixels.
         eps2d: added to both variances of the 2D covariance, px^2.
         antialiased: multiply the opacity by sqrt(det / det with eps2d) (Mip-Splatting, section 5.2), before the extent.
+        form: which of the kernels runs: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the device's own.
 
     Returns:
         Splats of this image. Gradients reach means, quats, scales, opacities and viewmat; the clamp of the Jacobian to
@@ -135,5 +146,7 @@ def project(
         int(width), int(height), float(near_plane), float(far_plane), float(radius_clip), float(eps2d), int(antialiased)
     )
     tensors = (x.contiguous() for x in (means, quats, scales, opacities, viewmat, K))
-    means2d, conics, depths, seen, radii = _Project.apply(*tensors, settings)
+    if form == "auto":
+        form = "cpu" if means.device.type == "cpu" else "plain"
+    means2d, conics, depths, seen, radii = _Project.apply(*tensors, settings, form)
     return Splats(means2d, conics, depths, seen, radii, settings.width, settings.height)
