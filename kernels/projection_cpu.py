@@ -15,8 +15,8 @@ LANES = 16
 _PRELUDE = f"""
 #if !defined(__CUDA_ARCH__)
     {SIMD}
-    const float ALPHA_MIN = {float(ALPHA_MIN)!r}f, MARGIN = {float(FRUSTUM_MARGIN)!r}f, RADIUS_MAX = {float(RADIUS_MAX)!r}f;
-    const float INFINITE = __builtin_inff();
+    const float ALPHA_MIN = {float(ALPHA_MIN)!r}f, MARGIN = {float(FRUSTUM_MARGIN)!r}f;
+    const float RADIUS_MAX = {float(RADIUS_MAX)!r}f, INFINITE = __builtin_inff();
     const vf ONE = ZERO + 1.0f;
     const int total = means.shape.dims[0], n = total - begin < 16 ? total - begin : 16;
     // Rows of C floats to C vectors with a Gaussian a lane, and back; lanes past the end are 0.
@@ -130,8 +130,8 @@ _FORWARD = (
     visible = visible & ((radius_x > radius_clip) | (radius_y > radius_clip)) & (radius_x > 0.0f) & (radius_y > 0.0f);
     visible = visible & (mean2d[0] + radius_x > 0.0f) & (mean2d[0] - radius_x < w);
     visible = visible & (mean2d[1] + radius_y > 0.0f) & (mean2d[1] - radius_y < h);
-    visible = visible & finite(conic[0] + conic[2] + xx + yy) & finite(conic[1]) & finite(mean2d[0]) & finite(mean2d[1]);
-    visible = visible & finite(z);
+    visible = visible & finite(conic[0] + conic[2] + xx + yy) & finite(conic[1]);
+    visible = visible & finite(mean2d[0]) & finite(mean2d[1]) & finite(z);
     for (int c = 0; c < 3; ++c) conic[c] = visible ? conic[c] : ZERO;
     for (int c = 0; c < 2; ++c) mean2d[c] = visible ? mean2d[c] : ZERO;
     const vf depth[1] = {visible ? z : ZERO}, out_opacity[1] = {visible ? seen : ZERO};

@@ -13,7 +13,6 @@ from ..types import Splats
 from ..warp_interop import launch
 from .reduction import sum_rows
 
-
 Form = Literal["auto", "plain", "cpu"]
 
 
