@@ -16,15 +16,17 @@ from __future__ import annotations
 
 import warp as wp
 
+from .slots_cuda import SLOT_WIDTH
 from .types import ALPHA_MAX, ALPHA_MIN, SLOT_GEOMETRY, TILE_SIZE, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
 
 BLOCK_DIM = TILE_SIZE * TILE_SIZE
-SLOT_WIDTH = 16
-"""Columns of a gradient slot, the only width the adjoint serves."""
 MAX_CHANNELS = SLOT_WIDTH - SLOT_GEOMETRY
 """Channels that fit a slot; the forward pass has no such bound."""
+
+_BOUNDS = (BLOCK_DIM, 4)
+"""Four blocks a multiprocessor: 64 registers a thread, of which next to nothing is spilled."""
 
 _PLACE = """
     const unsigned ALL = 0xffffffffu;
@@ -234,15 +236,7 @@ _ADJOINT = """
                 }
                 // Each step halves the sums a lane holds and doubles the lanes a sum has seen: in the end sum k lies
                 // in the lanes 2 k and 2 k + 1.
-                #pragma unroll
-                for (int half = 8; half > 0; half >>= 1) {
-                    const bool upper = (lane & (2 * half)) != 0;
-                    #pragma unroll
-                    for (int k = 0; k < half; ++k) {
-                        const float kept = upper ? v[k + half] : v[k], given = upper ? v[k] : v[k + half];
-                        v[k] = kept + __shfl_xor_sync(ALL, given, 2 * half);
-                    }
-                }
+                FOLD
                 v[0] += __shfl_xor_sync(ALL, v[0], 1);
                 if ((lane & 1) == 0) partial[warp][bit][lane >> 1] = v[0];
             }
@@ -261,6 +255,15 @@ _ADJOINT = """
 #endif
 """
 
+_FOLD = """
+                #pragma unroll
+                for (int k = 0; k < HALF; ++k) {
+                    const bool upper = (lane & (2 * HALF)) != 0;
+                    const float kept = upper ? v[k + HALF] : v[k], given = upper ? v[k] : v[k + HALF];
+                    v[k] = kept + __shfl_xor_sync(ALL, given, 2 * HALF);
+                }
+"""
+
 
 def _complete(body: str) -> str:
     """The body with its common beginning and the shared constants written out."""
@@ -272,6 +275,8 @@ def _complete(body: str) -> str:
         "LN_2": 0.6931471805599453,
     }
     body = body.replace("    PLACE\n", _PLACE)
+    # Written out: of a loop over the halves the compiler keeps the sums in memory.
+    body = body.replace("FOLD", "".join(_FOLD.replace("HALF", str(half)) for half in (8, 4, 2, 1)))
     for name, value in constants.items():
         body = body.replace(name, f"{float(value):.9e}f")
     return body
@@ -303,7 +308,7 @@ def composite_tile_adjoint(
 # fmt: on
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=_BOUNDS)
 def composite_tiles(
     first: int,
     # In:
@@ -331,7 +336,7 @@ def composite_tiles(
     )  # fmt: skip
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=_BOUNDS)
 def composite_tiles_adjoint(
     first: int,
     # In:
@@ -359,36 +364,3 @@ def composite_tiles_adjoint(
         first + block, means2d_in, conics_in, opacities_in, channels_in, background_in, ranges_in, splats_in, slots_in,
         transmittance_in, last_in, v_image_in, v_alpha_in, width, height, columns, v_slots_out,
     )  # fmt: skip
-
-
-@wp.kernel
-def sum_slot_columns(
-    first: int,
-    # In:
-    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
-    v_slots_in: wp.array2d[float],  # [P, 16]
-    # Out:
-    v_means2d_out: wp.array2d[float],  # [N, 2]
-    v_conics_out: wp.array2d[float],  # [N, 3]
-    v_opacities_out: wp.array[float],  # [N]
-    v_channels_out: wp.array2d[float],  # [N, C], C <= 8
-    absgrad_out: wp.array2d[float],  # [N, 2]; empty: not wanted
-):
-    """``compositing.sum_slots`` with a thread for every column, so that neighbours read neighbours. Grid: 16 N."""
-    t = first + wp.tid()
-    i = t // SLOT_WIDTH
-    column = t - i * SLOT_WIDTH
-    total = float(0.0)
-    for s in range(int(offsets_in[i]), int(offsets_in[i + 1])):
-        total += v_slots_in[s, column]
-    if column < 2:
-        v_means2d_out[i, column] = total
-    elif column < 5:
-        v_conics_out[i, column - 2] = total
-    elif column < 6:
-        v_opacities_out[i] = total
-    elif column < SLOT_GEOMETRY:
-        if absgrad_out.shape[0] > 0:
-            absgrad_out[i, column - 6] = total
-    elif column - SLOT_GEOMETRY < v_channels_out.shape[1]:
-        v_channels_out[i, column - SLOT_GEOMETRY] = total

@@ -11,7 +11,7 @@ from cuda_emulation import COMPILER, build, launcher
 from test_compositing_cuda import CASES, largest_differences, run_form
 
 from scgs_warp.kernels import compositing
-from scgs_warp.kernels import compositing_cuda as kernels
+from scgs_warp.kernels.slots_cuda import SLOT_WIDTH
 from scgs_warp.ops import compositing_cuda
 from scgs_warp.warp_interop import launch
 
@@ -56,7 +56,7 @@ def test_slots_are_summed_column_by_column(device: str, channels: int):
     generator = torch.Generator().manual_seed(channels)
     counts = torch.randint(0, 5, (40,), generator=generator)
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)]).to(device)
-    slots = torch.randn(int(counts.sum()), kernels.SLOT_WIDTH, generator=generator).to(device)
+    slots = torch.randn(int(counts.sum()), SLOT_WIDTH, generator=generator).to(device)
     found = []
     for form in ("cuda", "blocks"):
         outputs = tuple(torch.full((40, *shape), 7.0, device=device) for shape in ((2,), (3,), (), (channels,), (2,)))

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels import compositing, compositing_blocks
+from ..kernels import compositing, compositing_blocks, slots_cuda
 from ..kernels import compositing_cuda as native
 from ..warp_interop import launch, launch_blocks
 
@@ -44,10 +44,10 @@ def adjoint(form: str, lists: tuple[Tensor, ...], size: tuple[int, ...], absolut
 def sum_slots(form: str, offsets: Tensor, v_slots: Tensor, outputs: tuple[Tensor | None, ...]) -> None:
     """Sum each splat's slots into the gradients of mean, conic, opacity, channels and the absolute one of the mean."""
     count = len(offsets) - 1
-    if v_slots.shape[1] != native.SLOT_WIDTH:
+    if v_slots.shape[1] != slots_cuda.SLOT_WIDTH:
         launch(compositing.sum_slots, count, offsets, v_slots, *outputs)
     elif form == "cuda":
-        launch(native.sum_slot_columns, native.SLOT_WIDTH * count, offsets, v_slots, *outputs)
+        launch(slots_cuda.sum_slot_columns, slots_cuda.SLOT_WIDTH * count, offsets, v_slots, *outputs)
     else:
         launch(compositing.sum_line_slots, count, offsets, v_slots, *outputs)
 
