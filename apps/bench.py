@@ -1,4 +1,4 @@
-"""Measure what a frame, a rasterisation or a training step costs, and which stage takes how much of it."""
+"""Measure what a frame, a rasterisation or a training step costs, which stage takes how much, and how it grows."""
 
 from __future__ import annotations
 
@@ -9,25 +9,21 @@ from typing import Any, Literal
 
 from scgs_warp.apps.cli import Device, prepare, run
 
-LARGEST = 8192
+FIGURES = Path("docs/images")
 
 
 @dataclass(frozen=True)
-class Options:
+class Common:
     """What every benchmark takes."""
 
-    run: Path | None = None
-    """Measure this run's scene instead of a synthetic one."""
     gaussians: int | None = None
     """Size of the synthetic scene; 49,000 by default, the mean of the paper's D-NeRF scenes."""
     nodes: int | None = None
     """Control points of the synthetic scene; 512 by default."""
-    size: int = 800
-    """Longer side of the images in pixels."""
+    size: str = "800"
+    """Longer side of the images in pixels, or WIDTHxHEIGHT."""
     motion: str | None = None
     """Motion models, with commas between: control-points, per-gaussian, hexplane, static. control-points by default."""
-    against: Literal["gsplat"] | None = None
-    """Time gsplat on the same Gaussians beside this project; raster alone, on a GPU."""
     seconds: float = 2.0
     """How long each row is measured; slow ones take longer, for five repeats."""
     json: Path | None = None
@@ -36,6 +32,16 @@ class Options:
     """Where to compute; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; by default everything is measured on one and on all."""
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """What the measurements of one size take."""
+
+    run: Path | None = None
+    """Measure this run's scene instead of a synthetic one."""
+    against: Literal["gsplat"] | None = None
+    """Time gsplat on the same Gaussians beside this project; raster alone, on a GPU."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +62,21 @@ class Step(Options):
     """A training step of the joint phase, with and without the ARAP term."""
 
 
-COMMANDS = {"frame": Frame, "raster": Raster, "step": Step}
+@dataclass(frozen=True)
+class Scaling(Common):
+    """Frames and rasterisations as Gaussians, pixels, control points and threads grow, beside the machine's limits."""
+
+    sweeps: str = "gaussians,resolution,nodes,threads"
+    """What to vary, with commas between; own points after a colon: nodes:64/128. What a sweep does not vary stays at
+    --gaussians, --nodes, --size and all threads (or --threads)."""
+    figures: Path = FIGURES
+    """Folder for one figure a sweep: scaling-NAME.png."""
 
 
-def check(options: Options) -> None:
+COMMANDS = {"frame": Frame, "raster": Raster, "step": Step, "scaling": Scaling}
+
+
+def check(options: Common) -> None:
     """Refuse what cannot work before anything is loaded.
 
     Raises:
@@ -68,8 +85,9 @@ def check(options: Options) -> None:
     from scgs_warp.config import MotionConfig
     from scgs_warp.errors import UserError
 
+    run, against = getattr(options, "run", None), getattr(options, "against", None)
     for name in ("gaussians", "nodes", "motion", "table_s2"):
-        if options.run is not None and getattr(options, name, None) not in (None, False):
+        if run is not None and getattr(options, name, None) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: the run in --run has its own; leave one of the two out")
     if getattr(options, "table_s2", False) and options.motion is not None:
         raise UserError("--motion: --table-s2 measures all four models; leave one of the two out")
@@ -80,12 +98,10 @@ def check(options: Options) -> None:
         raise UserError(f"--nodes {nodes}: give at least {least}")
     if gaussians < nodes:
         raise UserError(f"--gaussians {gaussians}: give at least as many as there are control points ({nodes})")
-    if not 16 <= options.size <= LARGEST:
-        raise UserError(f"--size {options.size}: give 16 to {LARGEST} pixels")
     if not 0 <= options.seconds <= 600:
         raise UserError(f"--seconds {options.seconds:g}: give 0 to 600")
-    if options.against is not None and not isinstance(options, Raster):
-        raise UserError(f"--against {options.against}: it has no motion and no training step; compare with raster")
+    if against is not None and not isinstance(options, Raster):
+        raise UserError(f"--against {against}: it has no motion and no training step; compare with raster")
 
 
 def show(report: dict[str, Any]) -> None:
@@ -97,7 +113,7 @@ def show(report: dict[str, Any]) -> None:
     table = Table(title=f"{machine['gpu'] or machine['processor']}, {machine['cores']} cores")
     for column in ("name", "motion"):
         table.add_column(column, overflow="fold")
-    for column in ("threads", "ms median", "ms min", "frames/s", "share", "peak MiB", "2-thread"):
+    for column in ("threads", "ms median", "ms min", "frames/s", "share", "extra MiB", "2-thread"):
         table.add_column(column, justify="right")
     several = len({row["renderer"] for row in report["rows"]}) > 1
     for row in report["rows"]:
@@ -111,7 +127,7 @@ def show(report: dict[str, Any]) -> None:
             f"{row['ms_min']:.2f}",
             f"{row['fps']:.1f}" if whole else "",
             "" if whole else f"{100 * row['share']:.1f} %",
-            f"{row['peak_mib']:,.0f}" if whole and row["peak_mib"] is not None else "",
+            f"{row['extra_mib']:,.0f}" if whole and row["extra_mib"] is not None else "",
             f"{row['two_thread_scaling']:.2f}" if whole else "",
         )
     console = Console() if sys.stdout.isatty() else Console(width=120)
@@ -120,53 +136,98 @@ def show(report: dict[str, Any]) -> None:
     console.print(
         f"{first['gaussians']:,} Gaussians, {first['control_points']:,} control points, {first['width']} x "
         f"{first['height']}, {first['pairs']:,} pairs of splat and tile, "
-        f"{first['contributors']:.1f} splats a covered pixel"
+        f"{first['contributors']:.1f} splats a covered pixel; the first model holds {first['model_mib']:,.1f} MiB"
     )
     if any(row["threads"] > 1 and row["two_thread_scaling"] < 1.8 for row in report["rows"] if row["device"] == "cpu"):
         console.print("two threads were not twice as fast as one at plain arithmetic: take the one-thread rows")
 
 
-def show_table_s2(report: dict[str, Any], paper: dict[str, float]) -> None:
-    """Speeds relative to Gaussians at rest, here and in the paper: the machines differ, the ratios compare."""
-    for threads in sorted({row["threads"] for row in report["rows"]}):
-        wholes = [row for row in report["rows"] if row["share"] is None and row["threads"] == threads]
-        rest = next(row["fps"] for row in wholes if row["motion"] == "static")
-        for row in wholes:
-            name = row["motion"]
-            print(
-                f"{name}, {threads} threads: {row['fps']:.1f} frames/s, {row['fps'] / rest:.2f} of static "
-                f"(paper: {paper[name]:.1f} frames/s, {paper[name] / paper['static']:.2f})"
-            )
+def show_motion(report: dict[str, Any]) -> None:
+    """What moving the scene costs, and what is left of the speed of Gaussians at rest."""
+    for cost in report["motion"]:
+        rest = cost["ratio_to_static"]
+        print(
+            f"{cost['motion']}, {cost['threads']} threads: motion (network and skinning) takes "
+            f"{cost['ms_median']:.2f} ms of a frame" + ("" if rest is None else f"; {rest:.2f} of static's frames/s")
+        )
+
+
+def show_table_s2(report: dict[str, Any]) -> None:
+    """Speeds relative to Gaussians at rest, here and in the paper."""
+    for row in report["table_s2"]:
+        print(
+            f"{row['motion']}, {row['threads']} threads: {row['fps']:.1f} frames/s, {row['ratio_to_static']:.2f} of "
+            f"static, {row['ratio_to_per_gaussian']:.2f} x per-gaussian (paper: {row['paper_fps']:.1f} frames/s, "
+            f"{row['paper_ratio_to_static']:.2f}, {row['paper_ratio_to_per_gaussian']:.2f} x)"
+        )
+
+
+def show_scaling(report: dict[str, Any]) -> None:
+    """Whole frames and rasterisations, and the machine's limits."""
+    for limit in report["limits"].values():
+        best = f"{limit['gigabytes']:.1f} GB/s copied, {limit['gigaflops']:.0f} GFLOP/s"
+        print(f"at best, {limit['threads']} threads: {best}")
+    for name, entries in report["sweeps"].items():
+        for entry in entries:
+            wholes = [row for row in entry["rows"] if row["share"] is None]
+            texts = []
+            for row in wholes:
+                limit = "" if entry["limits"] is None else f" (limit {entry['limits'][row['name']]:.2f})"
+                texts.append(f"{row['name']} {row['ms_median']:.2f} ms{limit}")
+            print(f"{name} {entry['point']:,}: {', '.join(texts)}")
+
+
+def measure(options: Options, plan: Any) -> dict[str, Any]:
+    """One size: rows, and what they say together."""
+    from scgs_warp import bench, bench_summary
+
+    report = bench.bench(type(options).__name__.lower(), plan)  # type: ignore[arg-type]
+    if getattr(options, "table_s2", False):
+        report["table_s2"] = bench_summary.table_s2(report["rows"])
+    return report
 
 
 def main(args: list[str] | None) -> None:
     import tyro
 
-    options: Options = tyro.extras.subcommand_cli_from_dict(COMMANDS, args=args, prog="bench.py", description=__doc__)
+    options: Common = tyro.extras.subcommand_cli_from_dict(COMMANDS, args=args, prog="bench.py", description=__doc__)
     check(options)
     device = prepare(options.device, options.threads)
 
-    from scgs_warp import bench
+    from scgs_warp import bench, bench_plot, bench_scaling
+    from scgs_warp.bench_scene import camera_size
+    from scgs_warp.bench_summary import PAPER_FPS
 
     table = isinstance(options, Frame) and options.table_s2
     plan = bench.Plan(
-        run=options.run,
+        run=getattr(options, "run", None),
         gaussians=49_000 if options.gaussians is None else options.gaussians,
         nodes=512 if options.nodes is None else options.nodes,
-        size=options.size,
-        motions=tuple(bench.PAPER_FPS) if table else bench.check_motions(options.motion or "control-points"),
+        size=camera_size(options.size),
+        motions=tuple(PAPER_FPS) if table else bench.check_motions(options.motion or "control-points"),
         device=device,
         threads=bench.thread_counts(options.threads, device),
         seconds=options.seconds,
-        against=options.against,
+        against=getattr(options, "against", None),
         report=lambda text: print(text, file=sys.stderr, flush=True),
     )
-    report = bench.bench(type(options).__name__.lower(), plan)  # type: ignore[arg-type]
+    if isinstance(options, Scaling):
+        report = bench_scaling.scaling(plan, bench_scaling.parse_sweeps(options.sweeps))
+    else:
+        assert isinstance(options, Options)
+        report = measure(options, plan)
     if options.json is not None:
         bench.write(report, options.json)
+    if isinstance(options, Scaling):
+        show_scaling(report)
+        for path in bench_plot.draw(report, options.figures):
+            print(path)
+        return
     show(report)
+    if "motion" in report:
+        show_motion(report)
     if table:
-        show_table_s2(report, bench.PAPER_FPS)
+        show_table_s2(report)
 
 
 def cli(args: list[str] | None = None) -> int:

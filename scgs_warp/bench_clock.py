@@ -159,32 +159,6 @@ def two_thread_scaling() -> float:
     return statistics.median(times[1]) / statistics.median(times[2])
 
 
-def reset_peak(device: str) -> None:
-    """From here on :func:`peak_mib` counts anew, where the system can do that."""
-    if device == "cuda":
-        torch.cuda.reset_peak_memory_stats()
-        return
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-
-
-def peak_mib(device: str) -> float | None:
-    """Most memory since :func:`reset_peak` (CUDA: what torch allocated; Linux: resident) or since the process began
-    (elsewhere: resident); None where the system does not say."""
-    if device == "cuda":
-        return torch.cuda.max_memory_allocated() / 2**20
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 2**10
-    try:
-        import resource
-    except ImportError:
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if platform.system() == "Darwin" else 2**10)
-
-
 def processor() -> str:
     """The processor's name, as well as the system tells it."""
     with contextlib.suppress(OSError):

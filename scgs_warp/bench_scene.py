@@ -14,6 +14,7 @@ from .cameras import Overview, orbit_camera
 from .config import MotionConfig, OptimConfig, TrainConfig
 from .data.dataset import Dataset
 from .data.normalise import Normalisation
+from .errors import UserError
 from .gaussians import SH_C0, GaussianParameters, neighbor_distance
 from .kernels import benchmark as kernels
 from .motion import ControlPoints, HexPlane, PerGaussian, build_motion
@@ -28,6 +29,8 @@ from .types import Camera, Frame, Gaussians
 from .warp_interop import launch
 
 SEED = 20
+SMALLEST, LARGEST = 16, 8192
+"""Sides of an image."""
 PARTS = (  # centre, half axes, share of the Gaussians
     ((0.0, 0.0, 0.30), (0.36, 0.25, 0.50), 0.40),  # trunk
     ((0.0, 0.0, 1.00), (0.19, 0.21, 0.23), 0.14),  # head
@@ -109,9 +112,36 @@ def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int 
     return scene
 
 
-def scene_camera(scene: Scene, size: int, turn: float = 0.0) -> Camera:
-    """A world camera on the rig of the training cameras, ``turn`` degrees from where a film starts."""
-    return orbit_camera(scene.overview, scene.overview.azimuth + turn, size).to(scene.device)
+Size = int | tuple[int, int]
+"""The longer side of an image with the scene's proportions, or (width, height)."""
+
+
+def camera_size(text: str) -> Size:
+    """``"800"`` or ``"1920x1080"``.
+
+    Raises:
+        UserError: it is neither, or a side is not one of ``SMALLEST`` to ``LARGEST`` pixels.
+    """
+    sides = text.lower().split("x")
+    if not (1 <= len(sides) <= 2 and all(side.isascii() and side.isdigit() for side in sides)):
+        raise UserError(f"--size {text}: give the longer side, such as 800, or width and height, such as 1920x1080")
+    numbers = [int(side) for side in sides]
+    if not all(SMALLEST <= number <= LARGEST for number in numbers):
+        raise UserError(f"--size {text}: give {SMALLEST} to {LARGEST} pixels a side")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def scene_camera(scene: Scene, size: Size, turn: float = 0.0) -> Camera:
+    """A world camera on the rig of the training cameras, ``turn`` degrees from where a film starts. The horizontal
+    field of view is theirs, whatever the image's proportions."""
+    azimuth = scene.overview.azimuth + turn
+    if isinstance(size, int):
+        return orbit_camera(scene.overview, azimuth, size).to(scene.device)
+    width, height = size
+    placed = orbit_camera(scene.overview, azimuth, width)
+    focal = width / (2 * math.tan(math.radians(scene.overview.fov_x) / 2))
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(placed.viewmat, K, width, height).to(scene.device)
 
 
 class Load(NamedTuple):
@@ -121,6 +151,8 @@ class Load(NamedTuple):
     """Pairs of splat and tile."""
     contributors: float
     """Mean over covered pixels of the splats blended there: alpha at least 1/255, before the pixel ends."""
+    covered: int = 0
+    """Pixels with at least one of them."""
 
 
 @torch.no_grad()
@@ -135,10 +167,11 @@ def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     lists = [tensor.contiguous() for tensor in tensors]
     launch(kernels.count_contributors, len(counts), *lists, camera.width, tiles.columns, tiles.tile_size, counts)
     covered = counts > 0
-    return Load(len(tiles.splats), float(counts[covered].double().mean()) if bool(covered.any()) else 0.0)
+    mean = float(counts[covered].double().mean()) if bool(covered.any()) else 0.0
+    return Load(len(tiles.splats), mean, int(covered.sum()))
 
 
-def training_data(scene: Scene, size: int, seed: int = SEED) -> Dataset:
+def training_data(scene: Scene, size: Size, seed: int = SEED) -> Dataset:
     """Images of the scene itself from around, with noise: a loss whose gradient reaches everything."""
     frames = []
     for index in range(FRAMES):

@@ -8,7 +8,17 @@ import types
 import pytest
 import torch
 
-from scgs_warp import bench, bench_clock, bench_scene, train
+from scgs_warp import (
+    bench,
+    bench_clock,
+    bench_memory,
+    bench_peers,
+    bench_place,
+    bench_rows,
+    bench_scene,
+    bench_summary,
+    train,
+)
 from scgs_warp import render as render_module
 from scgs_warp.apps import bench as app
 from scgs_warp.checkpoint import write as write_checkpoint
@@ -23,22 +33,27 @@ pytestmark = pytest.mark.usefixtures("all_threads")
 TINY = ["--gaussians", "120", "--nodes", "12", "--size", "48", "--seconds", "0", "--threads", "1"]
 
 
-def rows_of(tmp_path, *arguments: str) -> list[dict]:
+def report_of(tmp_path, *arguments: str) -> dict:
     path = tmp_path / "rows.json"
     assert app.cli([*arguments, "--json", str(path)]) == 0
     report = json.loads(path.read_text(encoding="utf-8"))
     assert report["date"] and report["machine"]["processor"] and report["machine"]["cores"] >= 1
     assert "host" not in path.read_text(encoding="utf-8") and str(tmp_path) not in path.read_text(encoding="utf-8")
-    return report["rows"]
+    return report
+
+
+def rows_of(tmp_path, *arguments: str) -> list[dict]:
+    return report_of(tmp_path, *arguments)["rows"]
 
 
 def check_rows(rows: list[dict], device: str) -> None:
     for row in rows:
-        assert tuple(row) == bench.KEYS
+        assert tuple(row) == bench_place.KEYS
         assert row["device"] == device and row["threads"] == 1 and (row["width"], row["height"]) == (48, 48)
         assert 0 <= row["ms_min"] <= row["ms_median"]
         assert row["pairs"] > 0 and 1 <= row["contributors"] < 120 and row["two_thread_scaling"] > 0.3
-        assert row["peak_mib"] > 0
+        assert row["peak_mib"] > row["extra_mib"] >= 0 and row["model_mib"] > 0
+        assert 0 < row["covered"] <= 48 * 48
         assert (row["fps"] is None) != (row["share"] is None)
     whole = None
     shares = {}
@@ -73,10 +88,45 @@ def test_frames_of_every_motion_model(tmp_path, device, capsys):
 
 
 def test_the_paper_s_table_is_put_beside(tmp_path, capsys):
-    rows = rows_of(tmp_path, "frame", *TINY, "--table-s2", "--device", "cpu")
-    assert {row["motion"] for row in rows} == set(MOTIONS)
+    report = report_of(tmp_path, "frame", *TINY, "--table-s2", "--device", "cpu")
+    table = {row["motion"]: row for row in report["table_s2"]}
+    assert set(table) == set(MOTIONS)
+    fps = {row["motion"]: row["fps"] for row in report["rows"] if row["share"] is None}
+    for name, row in table.items():
+        assert row["fps"] == fps[name] and row["threads"] == 1
+        assert row["ratio_to_static"] == pytest.approx(fps[name] / fps["static"])
+        assert row["ratio_to_per_gaussian"] == pytest.approx(fps[name] / fps["per-gaussian"])
+    assert table["control-points"]["paper_ratio_to_per_gaussian"] == pytest.approx(2.61, abs=0.005)
     printed = capsys.readouterr().out
-    assert "(paper: 295.4 frames/s, 0.99)" in printed and "(paper: 145.8 frames/s, 0.49)" in printed
+    assert "(paper: 295.4 frames/s, 0.99, 2.61 x)" in printed and "(paper: 145.8 frames/s, 0.49, 1.29 x)" in printed
+
+
+def test_what_motion_costs(tmp_path, capsys):
+    report = report_of(tmp_path, "frame", *TINY, "--motion", "control-points,static", "--device", "cpu")
+    (cost,) = report["motion"]
+    median = {row["name"]: row["ms_median"] for row in report["rows"] if row["motion"] == "control-points"}
+    assert cost["ms_median"] == pytest.approx(median["frame/network"] + median["frame/skin"])
+    fps = {row["motion"]: row["fps"] for row in report["rows"] if row["share"] is None}
+    assert cost["ratio_to_static"] == pytest.approx(fps["control-points"] / fps["static"])
+    assert "of static's frames/s" in capsys.readouterr().out
+    alone = bench_summary.motion_costs([row for row in report["rows"] if row["motion"] != "static"])
+    assert alone == [{**cost, "ratio_to_static": None}]
+
+
+@pytest.mark.parametrize("what", ["frame", "raster", "step"])
+def test_width_and_height(tmp_path, what):
+    arguments = ["--gaussians", "120", "--nodes", "12", "--size", "70x41", "--seconds", "0", "--threads", "1"]
+    rows = rows_of(tmp_path, what, *arguments, "--device", "cpu")
+    assert {(row["width"], row["height"]) for row in rows} == {(70, 41)}
+
+
+def test_a_wide_camera_sees_as_wide_and_the_middle():
+    scene = bench_scene.synthetic_scene("static", 60, 12, "cpu")
+    square, wide = (bench_scene.scene_camera(scene, size) for size in (64, (64, 36)))
+    assert torch.equal(square.viewmat, wide.viewmat)
+    assert wide.K.tolist() == [[square.K[0, 0], 0, 32], [0, square.K[0, 0], 18], [0, 0, 1]]
+    same = bench_scene.scene_camera(scene, (64, 64))
+    assert torch.equal(square.K, same.K) and (same.width, same.height) == (square.width, square.height)
 
 
 def test_rasterisation_forward_and_both(tmp_path, device):
@@ -123,6 +173,10 @@ def test_a_run_s_scene(tmp_path):
         (["frame", "--nodes", "3"], "--nodes 3"),
         (["frame", "--gaussians", "100"], "--gaussians 100"),
         (["step", "--size", "4"], "--size 4"),
+        (["frame", "--size", "1920x"], "--size 1920x"),
+        (["frame", "--size", "800x9000"], "--size 800x9000"),
+        (["frame", "--size", "1x2x3"], "--size 1x2x3"),
+        (["raster", "--size", "big"], "--size big"),
         (["frame", "--run", "nowhere"], "nowhere"),
         (["frame", "--run", "nowhere", "--gaussians", "1000"], "--gaussians"),
         (["frame", "--run", "nowhere", "--table-s2"], "--table-s2"),
@@ -145,24 +199,24 @@ def test_a_file_that_cannot_be_written(tmp_path):
 
 def test_renderers_must_agree_before_they_are_timed():
     image = torch.rand(3, 40, 50)
-    bench.agree(image, image + 5e-5)
+    bench_peers.agree(image, image + 5e-5)
     flipped = image.clone()
     flipped[0, 3, 4] += 1 / 255
-    bench.agree(image, flipped)
+    bench_peers.agree(image, flipped)
     for changed in (image + 2e-4, image.where(torch.arange(50) != 7, image + 1e-3), image * torch.nan):
         with pytest.raises(UserError, match="differ"):
-            bench.agree(image, changed)
+            bench_peers.agree(image, changed)
     flipped[0, 3, 4] += 1.0
     with pytest.raises(UserError, match="differ"):
-        bench.agree(image, flipped)
+        bench_peers.agree(image, flipped)
 
 
 def test_against_a_peer_that_is_ours_and_one_that_is_wrong():
     scene = bench_scene.synthetic_scene("static", 120, 12, "cpu")
     plan = bench.Plan(None, 120, 12, 48, ("static",), "cpu", (1,), 0.0)
     place = bench.Place(scene, plan, bench_scene.Load(1, 1.0), 1)
-    ours = bench.rasterize.rasterization
-    rows = bench.Peers(ours).rows(place)
+    ours = bench_peers.rasterize.rasterization
+    rows = bench_peers.Peers(ours).rows(place)
     assert [(row["renderer"], row["name"]) for row in rows] == [
         ("scgs_warp", "raster/forward"),
         ("scgs_warp", "raster/both"),
@@ -170,7 +224,7 @@ def test_against_a_peer_that_is_ours_and_one_that_is_wrong():
         ("gsplat", "raster/both"),
     ]
     with pytest.raises(UserError, match="differ"):
-        bench.Peers(lambda *args, **kwargs: (0.5 * ours(*args, **kwargs)[0],)).rows(place)
+        bench_peers.Peers(lambda *args, **kwargs: (0.5 * ours(*args, **kwargs)[0],)).rows(place)
 
 
 def test_stages_unwrap_what_they_wrap_and_count_nested_ones_once():
@@ -190,7 +244,12 @@ def test_stages_unwrap_what_they_wrap_and_count_nested_ones_once():
 
 
 def test_nothing_stays_wrapped(tmp_path):
-    names = [(render_module, "project"), (train, "photometric_loss"), (torch.Tensor, "backward"), (bench, "project")]
+    names = [
+        (render_module, "project"),
+        (train, "photometric_loss"),
+        (torch.Tensor, "backward"),
+        (bench_rows, "project"),
+    ]
     before = [getattr(*place) for place in names]
     rows_of(tmp_path, "step", *TINY)
     assert [getattr(*place) for place in names] == before
@@ -268,3 +327,20 @@ def test_two_threads_scaling_leaves_the_thread_count_alone():
     bench.environment.configure(1)
     assert 0.3 < bench_clock.two_thread_scaling() < 3.0
     assert bench.environment.thread_count() == 1
+
+
+@pytest.mark.skipif(bench_memory.resident_mib("cpu") is None, reason="the system does not say what is resident")
+def test_extra_memory_is_what_measuring_takes():
+    """A call that holds 64 MiB, then one that holds nothing: the peak counts anew for each row."""
+    scene = bench_scene.synthetic_scene("static", 120, 12, "cpu")
+    plan = bench.Plan(None, 120, 12, 48, ("static",), "cpu", (1,), 0.0)
+    before = bench_memory.resident_mib("cpu")
+    place = bench_place.Place(scene, plan, bench_scene.Load(1, 1.0), 1, before)
+    held, idle = (
+        place.rows("x", function, {})[0] for function in (lambda i: torch.ones(16, 2**20).sum(), lambda i: None)
+    )
+    if idle["peak_mib"] > held["peak_mib"] - 32:
+        pytest.skip("the peak cannot be reset here")
+    assert 60 < held["extra_mib"] < 100 and idle["extra_mib"] < 20
+    assert held["model_mib"] == pytest.approx(120 * 4 * (3 + 4 + 3 + 1 + 48) / 2**20)
+    assert bench_memory.extra_mib(None, 1.0) is None and bench_memory.extra_mib(1.0, None) is None
