@@ -1,7 +1,7 @@
 """The control points as a palette of rows for ``skinning_cpu.py``: two rows of sixteen floats a node, a register each.
 
 - ``motion``: the affine map ``[R | p + T - R p]`` (12, row by row), then the unit shape rotation (4);
-- ``reach``: position and hyper-coordinates (REACH_POINT, zero-padded), log scales (3), ``-1 / (2 r^2)``, ``log s``.
+- ``reach``: position (3), ``-1 / (2 r^2)``, ``log s``, log scales (3), hyper-coordinates (MAX_HYPER, zero-padded).
 """
 
 import warp as wp
@@ -12,8 +12,8 @@ from .quaternion import quat_matrix, quat_matrix_adjoint, quat_normalise, quat_n
 wp.set_module_options({"enable_backward": False})
 
 ROW = 16
-REACH_POINT = wp.constant(11)
-"""Most dimensions of a point: three, and eight hyper-coordinates."""
+MAX_HYPER = 8
+"""Most hyper-coordinates of a point."""
 row = wp.types.vector(length=16, dtype=float)
 
 
@@ -24,7 +24,8 @@ def palette(
     nodes_in: wp.array[wp.vec3],  # [M]
     hyper_in: wp.array2d[float],  # [M, H], touched only with has_hyper
     has_hyper: int,
-    radii_in: wp.array[float],  # [M]
+    radii_in: wp.array[float],  # [M], touched only with has_radii
+    has_radii: int,
     strengths_in: wp.array[float],  # [M], touched only with has_strengths
     has_strengths: int,
     translations_in: wp.array[wp.vec3],  # [M]
@@ -53,20 +54,36 @@ def palette(
     for d in range(3):
         reach_out[m, d] = p[d]
         if has_log_scales != 0:
-            reach_out[m, REACH_POINT + d] = log_scales_in[m][d]
+            reach_out[m, 5 + d] = log_scales_in[m][d]
+    if has_radii != 0:
+        reach_out[m, 3] = -0.5 / (radii_in[m] * radii_in[m])
+    if has_strengths != 0:
+        reach_out[m, 4] = wp.log(wp.max(strengths_in[m], MIN_STRENGTH))
     if has_hyper != 0:
         for d in range(hyper_in.shape[1]):
-            reach_out[m, 3 + d] = hyper_in[m, d]
-    reach_out[m, 14] = -0.5 / (radii_in[m] * radii_in[m])
-    if has_strengths != 0:
-        reach_out[m, 15] = wp.log(wp.max(strengths_in[m], MIN_STRENGTH))
+            reach_out[m, 8 + d] = hyper_in[m, d]
+
+
+_SUM_ROWS = """
+    wp::vec_t<16, float> total;
+    const long long stride = 16ll * parts.shape[1];
+    const float* at = parts.data + 16ll * m;
+    for (int chunk = 0; chunk < parts.shape[0]; ++chunk, at += stride)
+        for (int c = 0; c < 16; ++c) total.c[c] += at[c];
+    return total;
+"""
+
+
+@wp.func_native(_SUM_ROWS)
+def _sum_rows(m: int, parts: wp.array3d[float]) -> row:  # type: ignore[valid-type]
+    """Row m of every chunk, added in order."""
+    ...
 
 
 @wp.kernel
 def palette_adjoint(
     first: int,
     # In:
-    chunks: int,
     nodes_in: wp.array[wp.vec3],  # [M]
     has_hyper: int,
     radii_in: wp.array[float],  # [M]
@@ -90,12 +107,8 @@ def palette_adjoint(
 ):
     """Gradients of one node from those of its two rows."""
     m = first + wp.tid()
-    motion = row(0.0)
-    reach = row(0.0)
-    for chunk in range(chunks):
-        for c in range(16):
-            motion[c] = motion[c] + v_motion_in[chunk, m, c]
-            reach[c] = reach[c] + v_reach_in[chunk, m, c]
+    motion = _sum_rows(m, v_motion_in)
+    reach = _sum_rows(m, v_reach_in)
     p = nodes_in[m]
     r = quat_normalise(rotations_in[m])
     v_t = wp.vec3(motion[3], motion[7], motion[11])
@@ -113,8 +126,8 @@ def palette_adjoint(
     inverse = 1.0 / (radii_in[m] * radii_in[m])
     v_p = v_t - wp.transpose(quat_matrix(r)) * v_t
     v_radius = float(0.0)
-    if reach[15] != 0.0 or reach[14] != 0.0:
-        v_radius = reach[14] * inverse / radii_in[m]
+    if reach[3] != 0.0:
+        v_radius = reach[3] * inverse / radii_in[m]
     for d in range(3):
         if reach[d] != 0.0:
             v_p[d] = v_p[d] + reach[d] * inverse
@@ -123,13 +136,13 @@ def palette_adjoint(
     if has_hyper != 0:
         for d in range(v_hyper_out.shape[1]):
             v_h = float(0.0)
-            if reach[3 + d] != 0.0:
-                v_h = reach[3 + d] * inverse
+            if reach[8 + d] != 0.0:
+                v_h = reach[8 + d] * inverse
             v_hyper_out[m, d] = v_h
     if has_strengths != 0:
         v_strength = float(0.0)
         if strengths_in[m] > MIN_STRENGTH:
-            v_strength = reach[15] / strengths_in[m]
+            v_strength = reach[4] / strengths_in[m]
         v_strengths_out[m] = v_strength
     if has_log_scales != 0:
-        v_log_scales_out[m] = wp.vec3(reach[11], reach[12], reach[13])
+        v_log_scales_out[m] = wp.vec3(reach[5], reach[6], reach[7])

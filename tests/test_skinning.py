@@ -12,6 +12,7 @@ from reference import neighbors as neighbors_twin
 from reference import skinning as twin
 from reference.neighbors import nearest
 from scgs_warp import environment
+from scgs_warp.ops import skinning as ops
 from scgs_warp.ops.neighbors import node_lists
 from scgs_warp.ops.skinning import skin, skin_rbf
 from scgs_warp.types import Pose
@@ -19,8 +20,9 @@ from scgs_warp.types import Pose
 FIELDS = ("translations", "rotations", "shape_rotations", "log_scales")
 
 
-def inputs(seed: int, n: int, m: int, k: int, *, shape: bool = False, scales: bool = False):
-    """[means, quats, nodes, weights, pose fields ...] and indices; quaternions are far from unit, on purpose."""
+def inputs(seed: int, n: int, m: int, k: int, *, shape: bool = False, scales: bool = False, near: bool = False):
+    """[means, quats, nodes, weights, pose fields ...] and indices; quaternions are far from unit, on purpose. ``near``:
+    no control point turns by 90 degrees, as in most scenes; the SIMD kernels have a shorter way then."""
     generator = torch.Generator().manual_seed(seed)
 
     def randn(*size):
@@ -30,6 +32,9 @@ def inputs(seed: int, n: int, m: int, k: int, *, shape: bool = False, scales: bo
     indices = nearest(means, nodes, k)[0].int()
     weights = torch.softmax(randn(n, k), 1)
     fields = [0.3 * randn(m, 3), randn(m, 4), randn(m, 4) if shape else None, randn(m, 3) if scales else None]
+    if near:
+        identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        fields[1:3] = [None if x is None else 3 * identity + (x / x.norm(dim=1, keepdim=True)) for x in fields[1:3]]
     return [means, 2 * randn(n, 4), nodes, weights, *fields], indices
 
 
@@ -72,6 +77,42 @@ def test_values_and_gradients(device, seed, n, m, k, shape, scales):
     assert_gradients(grads, expected_grads)
     if k > 1:
         assert all(float(e.abs().max()) > 1e-3 for e in expected_grads)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"shape": True}, {"scales": True}, {"shape": True, "scales": True}, {"near": True, "shape": True}]
+)
+@pytest.mark.parametrize(
+    ("n", "m", "k"), [(333, 40, 4), (64, 20, 3), (1, 1, 1), (15, 6, 4), (50, 6, 6), (47, 40, 16), (40, 30, 17)]
+)
+def test_values_without_gradients(device, n, m, k, options):
+    """What renders: on a CPU another kernel."""
+    tensors, indices = inputs(11, n, m, k, **options)
+    means, quats, nodes, weights, *fields = to(tensors, device)
+    with torch.no_grad():
+        outputs = skin(means, quats, nodes, Pose(*fields), indices.to(device), weights)
+    expected, _ = run(twin.skin, to(tensors, torch.float64), indices)
+    assert (outputs[2] is None) == (fields[3] is None)
+    for a, e in zip((o for o in outputs if o is not None), expected, strict=True):
+        torch.testing.assert_close(a.cpu().double(), e, rtol=1e-5, atol=2e-5)
+
+
+@torch.no_grad()
+def test_poison_without_gradients(device):
+    tensors, indices = inputs(4, 300, 20, 4, scales=True)
+    means, quats, nodes, weights, *fields = to(tensors, device)
+    assert means is not None and quats is not None and weights is not None
+    rest = nodes, Pose(*fields), indices.to(device), weights
+    clean = skin(means, quats, *rest)
+    means, quats = means.clone(), quats.clone()
+    means[7, 1], quats[40], quats[41] = float("nan"), float("inf"), 0.0
+    good = [i for i in range(300) if i not in (7, 40, 41)]
+    moved = skin(means, quats, *rest)
+    assert all(a is not None and b is not None and torch.equal(a[good], b[good]) for a, b in zip(moved, clean))
+    assert moved[1][41].isfinite().all()
+    assert [o.shape[0] for o in skin(means[:0], quats[:0], *rest[:2], rest[2][:0], rest[3][:0]) if o is not None] == [
+        0
+    ] * 3
 
 
 def test_nothing_to_skin(device):
@@ -173,9 +214,9 @@ def test_shapes_that_do_not_fit():
         skin(means, quats, nodes, pose, indices.long(), weights)
 
 
-def fused_inputs(seed, n, m, k, *, shape=False, scales=False, strong=False, hyper=0):
+def fused_inputs(seed, n, m, k, *, shape=False, scales=False, strong=False, hyper=0, near=False):
     """The tensors of ``skin_rbf`` by name, and indices."""
-    tensors, indices = inputs(seed, n, m, k, shape=shape, scales=scales)
+    tensors, indices = inputs(seed, n, m, k, shape=shape, scales=scales, near=near)
     generator = torch.Generator().manual_seed(1000 + seed)
     names = "means", "quats", "nodes", None, *FIELDS
     named = {name: t for name, t in zip(names, tensors, strict=True) if name and t is not None}
@@ -209,7 +250,8 @@ def run_fused(function, named, indices, seed=7):
 @pytest.mark.parametrize(
     "options",
     [{}, {"shape": True}, {"scales": True}, {"strong": True}, {"hyper": 2},
-     {"shape": True, "scales": True, "strong": True, "hyper": 8}, {"hyper": 9, "strong": True}],
+     {"shape": True, "scales": True, "strong": True, "hyper": 8}, {"hyper": 9, "strong": True},
+     {"near": True}, {"near": True, "shape": True, "scales": True, "hyper": 5}],
 )  # fmt: skip
 @pytest.mark.parametrize(
     ("n", "m", "k"), [(333, 40, 4), (5001, 20, 3), (1, 1, 1), (50, 6, 6), (60, 30, 1), (47, 40, 16)]
@@ -226,6 +268,20 @@ def test_weights_and_skinning_in_one_pass(device, n, m, k, options):
             grads[name].cpu().double(), e, rtol=3e-4, atol=3e-5 * scale + 1e-6, msg=lambda s, n=name: f"{n}: {s}"
         )
         assert k == 1 or scale > 1e-3, name
+
+
+def test_rotations_on_one_side_take_a_shorter_way_to_the_same_bits(monkeypatch):
+    near, indices = fused_inputs(5, 3000, 64, 4, scales=True, near=True)
+    far = fused_inputs(5, 3000, 64, 4)[0]
+    results = []
+    for limit in (ops.NEAR, 2.0):
+        monkeypatch.setattr(ops, "NEAR", limit)
+        pose = tuple(near.get(name) for name in FIELDS)
+        assert ops._palette(near["nodes"], pose).aligned == (limit < 1.0)
+        assert not ops._palette(far["nodes"], tuple(far.get(name) for name in FIELDS)).aligned
+        outputs, grads = run_fused(skin_rbf, near, indices)
+        results.append([*outputs, *grads.values()])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
 def test_one_pass_of_nothing_and_of_shapes_that_do_not_fit(device):
@@ -254,10 +310,13 @@ def test_poison_in_one_pass(device):
 
 def test_one_pass_gives_the_same_bits_for_any_number_of_threads(all_threads):
     named, indices = fused_inputs(8, 20_001, 512, 4, scales=True, strong=True)
+    means, quats, nodes, weights, *fields = inputs(8, 20_001, 512, 4, scales=True)[0]
     results = []
     for threads in (1, 2, 3):
         environment.configure(threads=threads)
         outputs, grads = run_fused(skin_rbf, named, indices)
-        results.append([*outputs, *grads.values()])
+        with torch.no_grad():
+            stored = skin(means, quats, nodes, Pose(*fields), indices, weights)
+        results.append([*outputs, *grads.values(), *(o for o in stored if o is not None)])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))

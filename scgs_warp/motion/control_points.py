@@ -70,6 +70,7 @@ class ControlPoints(Motion):
         self.network = network
         self.graph: Graph | None = None
         self._cached: tuple[Tensor, Tensor] | None = None
+        self._cached_for: list[tuple[Tensor, int, int]] | None = None
         self._search = NeighborSearch()
 
     def __len__(self) -> int:
@@ -115,11 +116,8 @@ class ControlPoints(Motion):
         """Linear blend skinning of all Gaussians (Eq. 6-7). Editing replaces ``pose``, nothing else."""
         return _posed(gaussians, skin(gaussians.means, gaussians.quats, self.positions, pose, *binding))
 
-    def bind_and_pose(
-        self, gaussians: GaussianParameters, pose: Pose, frozen: bool, indices: Tensor | None = None
-    ) -> Gaussians:
-        """As :meth:`apply_pose` with :meth:`binding`, in one pass; ``frozen`` control points get no gradient.
-        ``indices``: :meth:`neighbors`, where they are known already."""
+    def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
+        """As :meth:`apply_pose` with :meth:`binding`, in one pass; ``frozen`` control points get no gradient."""
         hyper = self.config.hyper_dim > 0
         rows = (
             self.positions,
@@ -132,7 +130,7 @@ class ControlPoints(Motion):
         nodes, radii, strengths, hyper_nodes = rows
         assert nodes is not None and radii is not None
         hyper_points = gaussians.hyper if hyper else None
-        found = self.neighbors(gaussians) if indices is None else indices
+        found = self.neighbors(gaussians)
         moved = skin_rbf(
             gaussians.means, gaussians.quats, nodes, radii, pose, found, strengths, hyper_points, hyper_nodes
         )
@@ -142,13 +140,27 @@ class ControlPoints(Motion):
         """For rendering: neighbours and weights do not depend on time. None forgets them."""
         with torch.no_grad():
             self._cached = None if gaussians is None else self.binding(gaussians)
+        self._cached_for = None if gaussians is None else self._binding_state(gaussians)
+
+    def _binding_state(self, gaussians: GaussianParameters) -> list[tuple[Tensor, int, int]]:
+        """What :meth:`binding` depends on. Two of these are equal if no tensor was replaced or changed in place."""
+        own = self.positions, self.log_radii, self.hyper, self.strength_logits
+        return [
+            (x, x.data_ptr(), 0 if x.is_inference() else x._version) for x in (gaussians.means, gaussians.hyper, *own)
+        ]
+
+    def _cache_holds(self, gaussians: GaussianParameters) -> bool:
+        if self._cached_for is None:
+            return False
+        pairs = zip(self._cached_for, self._binding_state(gaussians), strict=True)
+        return all(old[0] is new[0] and old[1:] == new[1:] for old, new in pairs)
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
         pose = self.poses(torch.tensor([time]))[0]
-        if self._cached is None or gaussians.means.device.type == "cpu":
-            # On a CPU weights and skinning in one SIMD pass are faster than skinning with stored weights.
-            indices = None if self._cached is None else self._cached[0]
-            return self.bind_and_pose(gaussians, pose, frozen=False, indices=indices)
+        if self._cached is None or torch.is_grad_enabled():
+            return self.bind_and_pose(gaussians, pose, frozen=False)
+        if not self._cache_holds(gaussians):
+            self.cache_binding(gaussians)
         return self.apply_pose(gaussians, pose, self._cached)
 
     def train_at(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..kernels import skinning as kernels
-from ..kernels import skinning_cpu, skinning_palette
+from ..kernels import skinning_cpu, skinning_cpu_adjoint, skinning_palette
 from ..types import Pose
 from ..warp_interop import launch
 from .neighbors import NodeLists, chunk_size, node_lists, rbf_weights
@@ -16,7 +16,7 @@ from .neighbors import NodeLists, chunk_size, node_lists, rbf_weights
 
 class _Skin(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means, quats, nodes, translations, rotations, shapes, log_scales, indices, weights, lists):
+    def forward(ctx: Any, means, quats, nodes, translations, rotations, shapes, log_scales, weights, indices, lists):
         scaled = int(log_scales is not None)
         outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(means) if scaled else None
         both = rotations if shapes is None else shapes
@@ -51,7 +51,16 @@ class _Skin(torch.autograd.Function):
             grain=128,
         )
         of_pose = v_translations, v_rotations, v_shapes, v_log_scales
-        return v_means, v_quats, v_nodes, *of_pose, None, v_weights, None
+        return v_means, v_quats, v_nodes, *of_pose, v_weights, None, None
+
+
+def _skin_lanes(means, quats, nodes, translations, rotations, shapes, log_scales, weights, indices) -> tuple:
+    """``skin`` without gradients, on a CPU."""
+    scaled = int(log_scales is not None)
+    outputs = _like(means, quats, means if scaled else None)
+    palette = _palette(nodes, (translations, rotations, shapes, log_scales))
+    launch(skinning_cpu.skin_lanes, _lanes(means), means, quats, *palette, scaled, indices, weights, *outputs, grain=32)
+    return tuple(outputs)
 
 
 def _node_sums(pairs: tuple, scaled: int, lists: NodeLists | None) -> tuple[int, Tensor]:
@@ -133,38 +142,62 @@ def skin(
         ValueError: shapes do not fit.
     """
     _validate(means, quats, nodes, pose, indices, weights)
-    floats = means, quats, nodes, *_pose_tensors(pose)
-    values = (None if value is None else value.contiguous() for value in floats)
-    return _Skin.apply(*values, indices.contiguous(), weights.contiguous(), lists)  # type: ignore[return-value]
+    floats = means, quats, nodes, *_pose_tensors(pose), weights
+    values = [None if value is None else value.contiguous() for value in floats]
+    indices = indices.contiguous()
+    if means.device.type == "cpu" and not torch.is_grad_enabled() and indices.shape[1] <= skinning_cpu.MAX_NEIGHBORS:
+        return _skin_lanes(*values, indices=indices)
+    return _Skin.apply(*values, indices, lists)  # type: ignore[return-value]
+
+
+NEAR = 0.7072
+"""Unit quaternions whose first component is at least this are less than 45 degrees from the identity (as directions in
+four dimensions), and so on the same side as each other."""
+
+
+class _Palette(NamedTuple):
+    """The control points as rows for the SIMD kernels."""
+
+    motion: Tensor
+    reach: Tensor
+    aligned: int
+    """1: no two shape rotations lie on different sides, so none has to be turned. Saves time, changes nothing."""
+
+
+def _palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None) -> _Palette:
+    """Of contiguous tensors; ``pose``: translations, rotations, shape rotations, log scales."""
+    translations, rotations, shapes, log_scales = pose
+    count = nodes.shape[0]
+    motion, reach = (torch.empty(count, skinning_palette.ROW) for _ in range(2))
+    launch(
+        skinning_palette.palette,
+        count,
+        *(nodes, hyper, int(hyper is not None), radii, int(radii is not None), strengths, int(strengths is not None)),
+        *(translations, rotations, rotations if shapes is None else shapes),
+        *(log_scales, int(log_scales is not None), motion, reach),
+        grain=128,
+    )
+    return _Palette(motion, reach, int(bool((motion[:, 12] > NEAR).all())))
 
 
 class _SkinRbf(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose_and_indices):
-        translations, rotations, shapes, log_scales, indices = pose_and_indices
-        flags = tuple(int(value is not None) for value in (hyper, strengths, log_scales))
-        total, count = means.shape[0], nodes.shape[0]
-        both = rotations if shapes is None else shapes
-        motion, reach = (torch.empty(count, skinning_palette.ROW) for _ in range(2))
-        launch(
-            skinning_palette.palette,
-            count,
-            *(nodes, hyper_nodes, flags[0], radii, strengths, flags[1]),
-            *(translations, rotations, both, log_scales, flags[2], motion, reach),
-            grain=128,
-        )
+        *pose, indices = pose_and_indices
+        has_hyper, has_strengths, has_log_scales = (int(value is not None) for value in (hyper, strengths, pose[3]))
+        palette = _palette(nodes, tuple(pose), radii, strengths, hyper_nodes)
         weights = torch.empty(indices.shape)
-        outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(means) if flags[2] else None
+        outputs = _like(means, quats, means if has_log_scales else None)
         launch(
             skinning_cpu.skin_rbf_lanes,
-            -(-total // skinning_cpu.LANES),
-            *(means, quats, hyper, flags[0], motion, reach, flags[2], indices, weights, *outputs),
+            _lanes(means),
+            *(means, quats, hyper, has_hyper, *palette, has_strengths, has_log_scales, indices, weights, *outputs),
             grain=32,
         )
-        saved = means, quats, hyper, nodes, hyper_nodes, radii, strengths, translations, rotations, shapes, log_scales
-        ctx.save_for_backward(*saved, indices, weights, motion, reach)
-        ctx.flags = flags
-        return outputs
+        saved = means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose
+        ctx.save_for_backward(*saved, indices, weights, palette.motion, palette.reach)
+        ctx.flags = has_hyper, has_strengths, has_log_scales, palette.aligned
+        return tuple(outputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -173,16 +206,17 @@ class _SkinRbf(torch.autograd.Function):
             ctx.saved_tensors
         )
         translations, rotations, shapes, log_scales = pose
-        (has_hyper, has_strengths, has_log_scales), count = ctx.flags, nodes.shape[0]
+        (has_hyper, has_strengths, has_log_scales, aligned), count = ctx.flags, nodes.shape[0]
         v_outputs = (None if v is None else v.contiguous() for v in gradients)
         size = chunk_size(count)
         chunks = -(-means.shape[0] // size)
         v_motion, v_reach = (torch.empty(chunks, count, skinning_palette.ROW) for _ in range(2))
         v_means, v_quats, v_hyper = _like(means, quats, hyper)
         launch(
-            skinning_cpu.skin_rbf_lanes_adjoint,
+            skinning_cpu_adjoint.skin_rbf_lanes_adjoint,
             chunks,
-            *(size, means, quats, hyper, has_hyper, motion, reach, has_log_scales, indices, weights, *v_outputs),
+            *(size, means, quats, hyper, has_hyper, motion, reach, aligned, has_strengths, has_log_scales),
+            *(indices, weights, *v_outputs),
             *(v_means, v_quats, v_hyper, v_motion.view(-1, 16), v_reach.view(-1, 16)),
             grain=1,
         )
@@ -192,11 +226,15 @@ class _SkinRbf(torch.autograd.Function):
         launch(
             skinning_palette.palette_adjoint,
             count,
-            *(chunks, nodes, has_hyper, radii, strengths, has_strengths),
+            *(nodes, has_hyper, radii, strengths, has_strengths),
             *(rotations, both, int(shapes is not None), has_log_scales, v_motion, v_reach, *of_nodes, *of_pose),
             grain=64,
         )
         return v_means, v_quats, v_hyper, *of_nodes, *of_pose, None
+
+
+def _lanes(means: Tensor) -> int:
+    return -(-means.shape[0] // skinning_cpu.LANES)
 
 
 def _like(*values: Tensor | None) -> list[Tensor | None]:
@@ -240,7 +278,7 @@ def skin_rbf(
         "hyper_nodes": (hyper_nodes, (count, width)),
     }
     _check_shapes(expected)
-    fits = indices.shape[1] <= skinning_cpu.MAX_NEIGHBORS and 3 + width <= skinning_palette.REACH_POINT
+    fits = indices.shape[1] <= skinning_cpu.MAX_NEIGHBORS and width <= skinning_palette.MAX_HYPER
     if means.device.type != "cpu" or not fits:
         points = means if hyper_points is None else torch.cat([means, hyper_points], 1)
         centers = nodes if hyper_nodes is None else torch.cat([nodes, hyper_nodes], 1)
