@@ -39,17 +39,33 @@ _SHARED = f"""
     const int block = ((width + blocks - 1) / blocks + 15) / 16 * 16;
 """
 
-_BLUR_ROW = """
-            for (int map = 0; map < MAPS; ++map)
-                for (int v = 0; v < vectors; ++v) {
-                    const float* at = rows[map] + 16 + 16 * v;
-                    lanes sum = w[0] * *(const lanes*)at;
-                    #pragma unroll
-                    for (int k = 1; k < 6; ++k)
-                        sum += w[k] * (*(const lanes*)(at - k) + *(const lanes*)(at + k));
-                    *(lanes*)(ring[map][slot] + 16 * v) = sum;
-                }
+
+def _shifted(first: str, second: str, start: int) -> str:
+    """16 neighbours of the 32 in two vectors, from ``start`` on."""
+    return f"__builtin_shufflevector({first}, {second}, {', '.join(str(start + k) for k in range(16))})"
+
+
+# Of the vector before the last one; shifts in registers, as a load from two cache lines costs as much as two.
+_BLUR_ROW = (
+    """
+                    if (v >= 2)
+                        for (int map = 0; map < MAPS; ++map) {
+                            const lanes before = past[0][map], middle = past[1][map], after = fresh[map];
+                            lanes sum = w[0] * middle;
 """
+    + "".join(
+        f"sum += w[{k}] * ({_shifted('before', 'middle', 16 - k)} + {_shifted('middle', 'after', k)});\n"
+        for k in range(1, 6)
+    )
+    + """
+                            *(lanes*)(ring[map][slot] + 16 * (v - 2)) = sum;
+                        }
+                    for (int map = 0; map < MAPS; ++map) {
+                        past[0][map] = past[1][map];
+                        past[1][map] = fresh[map];
+                    }
+"""
+)
 
 _BLUR_COLUMN = """
                     lanes blurred[MAPS];
@@ -66,7 +82,6 @@ _BLUR_COLUMN = """
 
 # The walk down a band: ROW is blurred into the ring, then the row five above it is complete and RESULT uses it.
 _WALK = f"""
-    alignas(64) float rows[MAPS][{BLOCK} + 32];  // column ``left - 16 + j`` at j
     alignas(64) float ring[MAPS][11][{BLOCK}];
     for (int left = 0; left < width; left += block) {{
         const int columns = left + block < width ? block : width - left;
@@ -77,13 +92,17 @@ _WALK = f"""
                 for (int map = 0; map < MAPS; ++map)
                     for (int v = 0; v < vectors; ++v) *(lanes*)(ring[map][slot] + 16 * v) = lanes{{}};
             }} else {{
+                lanes past[2][MAPS];
                 for (int v = 0; v < vectors + 2; ++v) {{
                     const int column = left - 16 + 16 * v;
                     const size_t at = size_t(row) * width + column;
                     const bool whole = column >= 0 && column + 16 <= width;
-                    ROW
+                    lanes fresh[MAPS] = {{}};
+                    if (column > -16 && column < width) {{
+                        ROW
+                    }}
+                    {_BLUR_ROW}
                 }}
-                {_BLUR_ROW}
             }}
             const int out = row - 5;
             if (out < top) continue;
@@ -130,10 +149,10 @@ _LOAD_PAIR = """
 _FORWARD_ROW = (
     _LOAD_PAIR.replace("COUNT == 16", "whole")
     + """
-                *(lanes*)(rows[0] + 16 * v) = x;
-                *(lanes*)(rows[1] + 16 * v) = y;
-                *(lanes*)(rows[2] + 16 * v) = x * x + y * y;
-                *(lanes*)(rows[3] + 16 * v) = x * y;
+                fresh[0] = x;
+                fresh[1] = y;
+                fresh[2] = x * x + y * y;
+                fresh[3] = x * y;
 """
 )
 
@@ -191,7 +210,7 @@ _ADJOINT_ROW = """
                     else
                         for (int k = 0; k < 16; ++k)
                             if (column + k >= 0 && column + k < width) value[k] = from[k];
-                    *(lanes*)(rows[j] + 16 * v) = value;
+                    fresh[j] = value;
                 }
 """
 
