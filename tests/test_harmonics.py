@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import functools
+
 import pytest
 import torch
 from scenes import random_gaussians
 
 from reference.harmonics import spherical_harmonics as harmonics_reference
 from scgs_warp import environment
-from scgs_warp.ops.harmonics import spherical_harmonics
+from scgs_warp.ops import harmonics
+
+
+@pytest.fixture(params=["plain", "cpu"])
+def spherical_harmonics(request, device):
+    if request.param == "cpu" and device != "cpu":
+        pytest.skip("SIMD is for the CPU")
+    return functools.partial(harmonics.spherical_harmonics, form=request.param)
+
 
 CAMERA = (0.5, -3.0, 2.0)
 
@@ -26,8 +36,8 @@ def gradients(function, inputs, degree, weights):
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize(("seed", "n"), [(0, 1), (1, 333), (2, 1024)])
-def test_values_and_gradients(seed, n, degree, device):
+@pytest.mark.parametrize(("seed", "n"), [(0, 1), (1, 333), (2, 1024), (3, 16)])
+def test_values_and_gradients(seed, n, degree, device, spherical_harmonics):
     inputs = inputs_of(seed, n, device)
     weights = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed))
     ours, ours_grad = gradients(spherical_harmonics, inputs, degree, weights)
@@ -44,7 +54,7 @@ def test_values_and_gradients(seed, n, degree, device):
     assert torch.equal(unused, torch.zeros_like(unused))
 
 
-def test_exact_size_and_empty(device):
+def test_exact_size_and_empty(device, spherical_harmonics):
     for degree in range(4):
         dc, rest, means, camera = inputs_of(degree, 20, device, degree)
         more = inputs_of(degree, 20, device, 3)
@@ -58,7 +68,7 @@ def test_exact_size_and_empty(device):
     assert not empty[3].grad.any()
 
 
-def test_against_gsplat(device):
+def test_against_gsplat(device, spherical_harmonics):
     oracle = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is not installed")
     dc, rest, means, camera = inputs_of(5, 500, "cpu")
     directions = torch.nn.functional.normalize(means - camera, dim=-1)
@@ -68,7 +78,7 @@ def test_against_gsplat(device):
         torch.testing.assert_close(ours.cpu(), (theirs + 0.5).clamp_min(0.0), rtol=1e-5, atol=5e-6)
 
 
-def test_broken_inputs_stay_where_they_are(device):
+def test_broken_inputs_stay_where_they_are(device, spherical_harmonics):
     inputs = inputs_of(3, 6, device)
     inputs[0][1] = float("nan")
     inputs[1][2] = float("nan")
@@ -88,7 +98,7 @@ def test_same_bits_for_any_thread_count(all_threads):
     results = []
     for threads in (1, 2, 3):
         environment.configure(threads=threads)
-        ours, grads = gradients(spherical_harmonics, inputs, 3, weights)
+        ours, grads = gradients(harmonics.spherical_harmonics, inputs, 3, weights)
         results.append([ours, *grads])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
@@ -97,12 +107,12 @@ def test_same_bits_for_any_thread_count(all_threads):
 def test_wrong_arguments_are_named():
     dc, rest, means, camera = inputs_of(0, 4, "cpu", degree=1)
     with pytest.raises(ValueError, match="degree"):
-        spherical_harmonics(dc, rest, means, camera, 2)
+        harmonics.spherical_harmonics(dc, rest, means, camera, 2)
     with pytest.raises(ValueError, match="degree"):
-        spherical_harmonics(dc, rest, means, camera, -1)
+        harmonics.spherical_harmonics(dc, rest, means, camera, -1)
     with pytest.raises(ValueError, match="sh_rest"):
-        spherical_harmonics(dc, rest[:3], means, camera, 1)
+        harmonics.spherical_harmonics(dc, rest[:3], means, camera, 1)
     with pytest.raises(ValueError, match="camera_position"):
-        spherical_harmonics(dc, rest, means, camera[None], 1)
+        harmonics.spherical_harmonics(dc, rest, means, camera[None], 1)
     with pytest.raises(ValueError, match="means"):
-        spherical_harmonics(dc, rest, means[:2], camera, 1)
+        harmonics.spherical_harmonics(dc, rest, means[:2], camera, 1)

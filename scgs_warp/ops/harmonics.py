@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from ..kernels import harmonics as kernels
+from ..kernels import harmonics_cpu as cpu_kernels
 from ..warp_interop import launch
 from .reduction import sum_rows
 
 MAX_DEGREE = 3
+Form = Literal["auto", "plain", "cpu"]
 
 
 class _SphericalHarmonics(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera: Tensor, degree: int) -> Tensor:
+    def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera: Tensor, degree: int, form: Form):
         count, rest = sh_rest.shape[:2]
         colors = torch.empty_like(sh_dc)
         flat = sh_rest.view(count * rest, 3)
-        launch(kernels.spherical_harmonics, count, sh_dc, flat, rest, means, camera[None], degree, colors)
+        arguments = sh_dc, flat, rest, means, camera[None], degree, colors
+        if form == "cpu":
+            blocks = -(-count // cpu_kernels.LANES)
+            launch(cpu_kernels.spherical_harmonics_lanes, blocks, *arguments, grain=32)
+        else:
+            launch(kernels.spherical_harmonics, count, *arguments)
         ctx.save_for_backward(sh_rest, means, camera, colors)
-        ctx.degree = degree
+        ctx.degree, ctx.form = degree, form
         return colors
 
     @staticmethod
@@ -30,7 +37,7 @@ class _SphericalHarmonics(torch.autograd.Function):
     def backward(ctx: Any, v_colors: Tensor):  # type: ignore[override]
         sh_rest, means, camera, colors = ctx.saved_tensors
         count, rest = sh_rest.shape[:2]
-        _, wants_rest, wants_means, wants_camera, _ = ctx.needs_input_grad
+        _, wants_rest, wants_means, wants_camera, _, _ = ctx.needs_input_grad
         wants_means = (wants_means or wants_camera) and ctx.degree > 0
         v_dc = torch.empty_like(colors)
         v_rest = torch.empty_like(sh_rest) if wants_rest else None
@@ -39,13 +46,20 @@ class _SphericalHarmonics(torch.autograd.Function):
         v_flat = v_rest.view(count * rest, 3) if v_rest is not None else None
         inputs = flat, rest, means, camera[None], ctx.degree, colors, v_colors.contiguous()
         flags = int(wants_rest), int(wants_means)
-        launch(kernels.spherical_harmonics_adjoint, count, *inputs, *flags, v_dc, v_flat, v_means)
+        arguments = *inputs, *flags, v_dc, v_flat, v_means
+        if ctx.form == "cpu":
+            blocks = -(-count // cpu_kernels.LANES)
+            launch(cpu_kernels.spherical_harmonics_lanes_adjoint, blocks, *arguments, grain=32)
+        else:
+            launch(kernels.spherical_harmonics_adjoint, count, *arguments)
         # Only mean minus camera enters, so the camera's gradient is minus the sum of the means'.
         v_camera = -sum_rows(v_means) if wants_camera and v_means is not None else None
-        return v_dc, v_rest, v_means, v_camera, None
+        return v_dc, v_rest, v_means, v_camera, None, None
 
 
-def spherical_harmonics(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_position: Tensor, degree: int) -> Tensor:
+def spherical_harmonics(
+    sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_position: Tensor, degree: int, *, form: Form = "auto"
+) -> Tensor:
     """Colours of Gaussians seen from one point: harmonics + 0.5, clamped at 0 (3D-GS; signs as there).
 
     Args:
@@ -54,6 +68,7 @@ def spherical_harmonics(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_po
         means: [N, 3] float32, world.
         camera_position: [3] float32, world.
         degree: 0 to 3.
+        form: which of the kernels runs: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the device's own.
 
     Returns:
         [N, 3] colours >= 0. Gradients reach all four tensors; a clamped channel passes none.
@@ -76,4 +91,6 @@ def spherical_harmonics(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_po
         needed = (degree + 1) ** 2 - 1
         raise ValueError(f"degree {degree} needs {needed} coefficients in sh_rest, got {sh_rest.shape[1]}")
     tensors = (x.contiguous() for x in (sh_dc, sh_rest, means, camera_position))
-    return _SphericalHarmonics.apply(*tensors, degree)
+    if form == "auto":
+        form = "cpu" if sh_dc.device.type == "cpu" else "plain"
+    return _SphericalHarmonics.apply(*tensors, degree, form)  # type: ignore[return-value]
