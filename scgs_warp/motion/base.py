@@ -29,8 +29,11 @@ class Motion(nn.Module):
 
     name: ClassVar[str]
     moves: ClassVar[bool] = True
+    takes_time_tensor: ClassVar[bool] = False
+    """Whether :meth:`gaussians_at` also takes the time as a tensor [1] on its device and then neither reads from the
+    device nor writes to it: such a frame can be recorded once and replayed (``FrameGraph``)."""
 
-    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
+    def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         """Activated Gaussians, posed at ``time``; differentiable."""
         raise NotImplementedError
 

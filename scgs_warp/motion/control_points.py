@@ -45,7 +45,7 @@ def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> Defo
 
 def unit_rotations(raw: Tensor) -> Tensor:
     """Network output [..., 4] to unit quaternions near the identity."""
-    return F.normalize(raw + raw.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
+    return F.normalize(raw + torch.eye(1, 4, device=raw.device, dtype=raw.dtype), dim=-1)
 
 
 def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | None]) -> Gaussians:
@@ -58,6 +58,7 @@ class ControlPoints(Motion):
     """Positions [M, 3], radii [M], optional hyper-coordinates [M, H] and weights [M], and the network."""
 
     name = "control-points"
+    takes_time_tensor = True
 
     def __init__(self, positions: Tensor, radii: Tensor, network: DeformationNetwork, config: MotionConfig) -> None:
         super().__init__()
@@ -155,8 +156,8 @@ class ControlPoints(Motion):
         pairs = zip(self._cached_for, self._binding_state(gaussians), strict=True)
         return all(old[0] is new[0] and old[1:] == new[1:] for old, new in pairs)
 
-    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
-        pose = self.poses(torch.tensor([time]))[0]
+    def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
+        pose = self.poses(time if isinstance(time, Tensor) else torch.tensor([time]))[0]
         if self._cached is None or torch.is_grad_enabled():
             return self.bind_and_pose(gaussians, pose, frozen=False)
         if not self._cache_holds(gaussians):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from ..config import TrainConfig
 from ..gaussians import GaussianParameters
@@ -16,13 +17,15 @@ class PerGaussian(Motion):
     """Position, rotation and scale residuals predicted for each Gaussian from its rest position and the time."""
 
     name = "per-gaussian"
+    takes_time_tensor = True
 
     def __init__(self, network: DeformationNetwork) -> None:
         super().__init__()
         self.network = network
 
-    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
-        out = self.network(gaussians.means.detach(), torch.tensor([time], device=gaussians.means.device))
+    def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
+        times = time if isinstance(time, Tensor) else torch.tensor([time], device=gaussians.means.device)
+        out = self.network(gaussians.means.detach(), times)
         return Gaussians(
             gaussians.means + out["translations"][0],
             gaussians.quats + out["rotations"][0],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from torch import Tensor
+
 from ..gaussians import GaussianParameters
 from ..types import Gaussians
 from .base import Motion
@@ -12,6 +14,7 @@ class Static(Motion):
 
     name = "static"
     moves = False
+    takes_time_tensor = True
 
-    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
+    def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         return gaussians.activate()
