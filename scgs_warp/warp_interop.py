@@ -1,7 +1,8 @@
 """The one place that hands torch tensors to Warp: ``launch`` and ``launch_blocks``.
 
 On a CPU a Warp launch runs its grid in one thread and releases the GIL, so ``launch`` cuts the grid into chunks and
-lets a small pool of threads take them one by one. Kernels find their place through their first argument, ``first``.
+lets a few threads take them one by one (``cpu_threads``). Kernels find their place through their first argument,
+``first``. Their arguments are packed here, not by Warp: a step has some 60 launches, of a few tens of microseconds.
 On CUDA a launch goes to torch's current stream, whole.
 """
 
@@ -9,15 +10,17 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import itertools
+import functools
 import os
-from concurrent.futures import ThreadPoolExecutor
+import struct
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 import warp as wp
 
 from . import environment
+from .cpu_threads import cut_by_load, cut_evenly, share
 from .cuda_graph import on_torch_stream
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
@@ -43,9 +46,6 @@ _init_quietly()
 _descriptor_type: Any = type(wp.from_torch(torch.zeros(1), return_ctype=True))
 """Warp's C array descriptor (data, grad, shape, strides), which has no public name."""
 
-CHUNKS_PER_THREAD = 8
-"""Chunks a thread, so that a few heavy ones (tiles full of splats) still balance."""
-
 _TORCH_DTYPES = {
     wp.float32: torch.float32,
     wp.float64: torch.float64,
@@ -66,18 +66,8 @@ class _ArrayParameter(NamedTuple):
     element_size: int
 
 
-class _Cpu(NamedTuple):
-    """A kernel made ready for the CPU: its compiled entry and the ctypes structure of its arguments."""
-
-    command: Any  # a wp.Launch; keeps the module loaded
-    arguments: type[ctypes.Structure]
-    bounds: type[ctypes.Structure]
-
-
-_pool: ThreadPoolExecutor | None = None
-_pool_state = (0, False)
 _parameters: dict[wp.Kernel, list[_ArrayParameter | None]] = {}
-_cpu_kernels: dict[wp.Kernel, _Cpu] = {}
+_cpu_kernels: dict[wp.Kernel, _CpuKernel] = {}
 
 
 def _describe_parameters(kernel: wp.Kernel) -> list[_ArrayParameter | None]:
@@ -119,11 +109,7 @@ def _array(kernel: wp.Kernel, parameter: _ArrayParameter, tensor: torch.Tensor) 
 
 def _pack(kernel: wp.Kernel, args: tuple) -> tuple[list, torch.device | None]:
     """Torch tensors to Warp array descriptors of the kernel's types; everything else as it is."""
-    parameters = _parameters.get(kernel)
-    if parameters is None:
-        parameters = _parameters[kernel] = _describe_parameters(kernel)
-    if len(parameters) != len(args):
-        raise TypeError(f"kernel {kernel.key} takes {len(parameters)} arguments after 'first', got {len(args)}")
+    parameters = _parameters_of(kernel, args)
     packed, device = [], None
     for parameter, value in zip(parameters, args):
         if isinstance(value, torch.Tensor):
@@ -138,26 +124,119 @@ def _pack(kernel: wp.Kernel, args: tuple) -> tuple[list, torch.device | None]:
     return packed, device
 
 
-def _prepare_cpu(kernel: wp.Kernel, packed: list) -> _Cpu:
-    command: Any = wp.launch(kernel, dim=1, inputs=[0, *packed], device="cpu", record_cmd=True)
-    fields = [(argument.label, type(value)) for argument, value in zip(kernel.adj.args, command.params[1:])]
-    arguments = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
-    return _Cpu(command, arguments, type(command.params[0]))
+MOST_LAYOUTS = 256
+"""Shapes a parameter remembers: those of most tensors stay the same, some change with every frame."""
 
 
-def _cpu_arguments(kernel: wp.Kernel, cpu: _Cpu, packed: list) -> ctypes.Structure:
-    arguments = cpu.arguments()
-    fields: Any = cpu.arguments._fields_[1:]
-    for (label, ctype), value in zip(fields, packed):
-        if value is None:
-            continue  # a null array
-        if type(value) is not ctype:
-            value = value.__ctype__() if hasattr(value, "__ctype__") else ctype(value)
-        setattr(arguments, label, value)
-    return arguments
+class _CpuKernel:
+    """A kernel made ready for the CPU: its compiled entry, and how its arguments lie in memory."""
+
+    def __init__(self, kernel: wp.Kernel, args: tuple) -> None:
+        self.kernel = kernel
+        self.parameters = _parameters_of(kernel, args)
+        packed, _ = _pack(kernel, args)
+        self._command: Any = wp.launch(kernel, dim=1, inputs=[0, *packed], device="cpu", record_cmd=True)  # loads it
+        self._entry = self._command.hooks.forward
+        params = self._command.params
+        self._bounds = functools.lru_cache(maxsize=4096)(lambda size: bytes(type(params[0])((size,))))
+        self.types = [type(value) for value in params[2:]]
+        fields = [(f"f{k}", type(value)) for k, value in enumerate(params[1:])]
+        structure: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+        self.layouts: list[dict[torch.Size, bytes]] = [{} for _ in self.types]
+        self._packer = struct.Struct(self._format(structure, fields))
+
+    @staticmethod
+    def _format(structure: Any, fields: list[tuple[str, Any]]) -> str:
+        """Of ``struct``, with the compiler's padding written out; ``first`` is prepended to each chunk's arguments."""
+        text, end = "=", ctypes.sizeof(ctypes.c_int)
+        for label, ctype in fields[1:]:
+            offset, size = getattr(structure, label).offset, ctypes.sizeof(ctype)
+            text += f"{offset - end}x"
+            if ctype is _descriptor_type:
+                text += f"Q{size - 8}s"  # address, and a tail that depends on nothing but the shape
+            else:
+                text += _SCALAR_FORMATS.get(ctype, f"{size}s")
+            end = offset + size
+        return text + f"{ctypes.sizeof(structure) - end}x"
+
+    def pack(self, args: tuple) -> bytes:
+        """The arguments after ``first``, checked."""
+        values: list[Any] = []
+        for parameter, ctype, layouts, value in zip(self.parameters, self.types, self.layouts, args):
+            if isinstance(value, torch.Tensor):
+                tail = layouts.get(value.shape)
+                if (
+                    tail is None
+                    or parameter is None
+                    or value.dtype is not parameter.dtype
+                    or not value.is_contiguous()
+                    or not value.is_cpu
+                ):
+                    tail = self._new_layout(parameter, layouts, value)
+                values.append(value.data_ptr())
+                values.append(tail)
+            elif ctype in _SCALAR_FORMATS:
+                values.append(0 if value is None else value)
+            else:
+                if value is None:
+                    value = ctype()  # an array that the kernel will not touch
+                elif type(value) is not ctype:  # Warp's structures and vectors
+                    value = value.__ctype__() if hasattr(value, "__ctype__") else ctype(value)
+                raw = bytes(value)
+                values += [int.from_bytes(raw[:8], "little"), raw[8:]] if ctype is _descriptor_type else [raw]
+        try:
+            return self._packer.pack(*values)
+        except struct.error as error:
+            raise TypeError(f"kernel {self.kernel.key}: {error}") from None
+
+    def _new_layout(
+        self, parameter: _ArrayParameter | None, layouts: dict[torch.Size, bytes], value: torch.Tensor
+    ) -> bytes:
+        if parameter is None:
+            raise TypeError(f"kernel {self.kernel.key}: a tensor was given for a parameter that is no array")
+        if not value.is_cpu:
+            raise ValueError(f"kernel {self.kernel.key}: {parameter.label} is on {value.device}, others on cpu")
+        tail = bytes(_array(self.kernel, parameter, value))[8:]
+        if len(layouts) >= MOST_LAYOUTS:
+            layouts.clear()
+        layouts[value.shape] = tail
+        return tail
+
+    def bind(self, arguments: bytes, tensors: tuple) -> Callable[[int, int], None]:
+        """What runs a part of the grid, given its first index and its size; holds on to the tensors."""
+        entry, bounds = self._entry, self._bounds
+
+        def call(first: int, size: int, _tensors: tuple = tensors) -> None:
+            entry(bounds(size), first.to_bytes(4, "little") + arguments)
+
+        return call
 
 
-def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512) -> None:
+_SCALAR_FORMATS = {
+    ctypes.c_int8: "b",
+    ctypes.c_uint8: "B",
+    ctypes.c_int16: "h",
+    ctypes.c_uint16: "H",
+    ctypes.c_int32: "i",
+    ctypes.c_uint32: "I",
+    ctypes.c_int64: "q",
+    ctypes.c_uint64: "Q",
+    ctypes.c_float: "f",
+    ctypes.c_double: "d",
+    ctypes.c_bool: "?",
+}
+
+
+def _parameters_of(kernel: wp.Kernel, args: tuple) -> list[_ArrayParameter | None]:
+    parameters = _parameters.get(kernel)
+    if parameters is None:
+        parameters = _parameters[kernel] = _describe_parameters(kernel)
+    if len(parameters) != len(args):
+        raise TypeError(f"kernel {kernel.key} takes {len(parameters)} arguments after 'first', got {len(args)}")
+    return parameters
+
+
+def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.Tensor | None = None) -> None:
     """Run ``kernel`` for the grid indices 0 .. count - 1.
 
     Args:
@@ -166,56 +245,33 @@ def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512) -> None:
         args: the kernel's other arguments, in order: contiguous tensors on one device, numbers, Warp values, or None
             for an array that the kernel will not touch.
         grain: fewest grid indices worth a chunk of their own on a CPU (1 for kernels whose index is a whole tile).
+        load: [count] integers on the CPU that never fall: what the indices up to each cost, itself included. Chunks are
+            then cut by cost, and ``grain`` only says from how many indices on threads share the work.
 
     Raises:
         ValueError: a tensor's dtype, shape, strides or device is not what the kernel declares.
     """
     if count <= 0:
         return
-    packed, device = _pack(kernel, args)
-    if device is not None and device.type == "cuda":
-        with _torch_stream(device):
-            wp.launch(kernel, dim=count, inputs=[0, *packed], device=wp.device_from_torch(device))
-        return
+    for value in args:
+        if isinstance(value, torch.Tensor):
+            if value.is_cuda:
+                packed, _ = _pack(kernel, args)
+                with _torch_stream(value.device):
+                    wp.launch(kernel, dim=count, inputs=[0, *packed], device=wp.device_from_torch(value.device))
+                return
+            break
     cpu = _cpu_kernels.get(kernel)
     if cpu is None:
-        cpu = _cpu_kernels[kernel] = _prepare_cpu(kernel, packed)
-    arguments = _cpu_arguments(kernel, cpu, packed)
+        cpu = _cpu_kernels[kernel] = _CpuKernel(kernel, args)
+    elif len(args) != len(cpu.parameters):
+        _parameters_of(kernel, args)
+    call = cpu.bind(cpu.pack(args), args)
     threads = min(environment.thread_count(), -(-count // grain))
     if threads <= 1:
-        cpu.command.hooks.forward(ctypes.byref(cpu.bounds((count,))), ctypes.byref(arguments))
+        call(0, count)
     else:
-        _launch_chunks(cpu, arguments, count, threads, grain)
-
-
-def _launch_chunks(cpu: _Cpu, arguments: ctypes.Structure, count: int, threads: int, grain: int) -> None:
-    size = max(grain, -(-count // (threads * CHUNKS_PER_THREAD)))
-    starts = range(0, count, size)
-    first_label = cpu.arguments._fields_[0][0]
-    ticket = itertools.count()
-
-    def work() -> None:
-        own = cpu.arguments.from_buffer_copy(arguments)
-        while (turn := next(ticket)) < len(starts):
-            first = starts[turn]
-            setattr(own, first_label, first)
-            cpu.command.hooks.forward(ctypes.byref(cpu.bounds((min(size, count - first),))), ctypes.byref(own))
-
-    pool = _workers(threads - 1)
-    helpers = [pool.submit(work) for _ in range(threads - 1)]
-    work()
-    for helper in helpers:
-        helper.result()
-
-
-def _workers(count: int) -> ThreadPoolExecutor:
-    global _pool, _pool_state
-    flush = environment.configured()
-    if _pool is None or _pool_state[0] < count or _pool_state[1] != flush:
-        # Denormals are flushed in every thread or in none: results must not depend on who computes them.
-        _pool = ThreadPoolExecutor(count, "warp", initializer=lambda: torch.set_flush_denormal(flush))
-        _pool_state = (count, flush)
-    return _pool
+        share(call, cut_evenly(count, threads, grain) if load is None else cut_by_load(load, threads), threads)
 
 
 def _torch_stream(device: torch.device) -> contextlib.AbstractContextManager:

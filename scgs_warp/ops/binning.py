@@ -73,7 +73,7 @@ def _bin_by_bands(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor
     splats, slots = (torch.empty(pairs, dtype=torch.int32) for _ in range(2))
     cursors = torch.empty(rows, columns, dtype=torch.int32)
     tiles = (cursors, ranges, splats, slots)
-    launch(kernels.sort_bands, rows, band_begins, dealt, before, keys, spare, *tiles, grain=1)
+    launch(kernels.sort_bands, rows, band_begins, dealt, before, keys, spare, *tiles, grain=1, load=band_begins[1:])
     return ranges, splats, slots, offsets
 
 

@@ -18,6 +18,10 @@ from . import compositing_cuda
 Form = Literal["auto", "pixel", "cpu", "cuda", "blocks"]
 
 
+EMPTY_TILE = 8
+"""What reading and writing a tile's pixels costs on a CPU, in pairs of splat and tile."""
+
+
 @dataclass(frozen=True)
 class _Job:
     """What one call of ``composite`` holds beside its differentiable tensors."""
@@ -139,7 +143,9 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
     if job.form == "cpu":
         source = _pack(means2d, conics, opacities, channels)
         lists = (background, tiles.ranges, tiles.splats)
-        launch(cpu_kernels.composite_tiles, len(tiles.ranges), source, *lists, *size, *outputs, grain=1)
+        launch(
+            cpu_kernels.composite_tiles, len(tiles.ranges), source, *lists, *size, *outputs, grain=1, load=_load(tiles)
+        )
     else:
         source = torch.empty_like(opacities)  # opacities of the splats that may be added
         launch(kernels.finite_opacities, len(opacities), opacities, channels, source)
@@ -149,6 +155,11 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
         else:
             compositing_cuda.forward(job.form, lists, size, outputs)
     return image, alpha, *((source, transmittance, last) if keep else (None, None, None))
+
+
+def _load(tiles: Tiles) -> Tensor:
+    """[T] what the tiles up to each cost on a CPU, in pairs."""
+    return tiles.ranges[:, 1] + torch.arange(EMPTY_TILE, (len(tiles.ranges) + 1) * EMPTY_TILE, EMPTY_TILE)
 
 
 def _pack(means2d: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor) -> Tensor:
@@ -180,7 +191,8 @@ def _adjoint(
     size = (tiles.width, tiles.height, tiles.columns)
     count = len(tiles.ranges)
     if job.form == "cpu":
-        launch(cpu_kernels.composite_tiles_adjoint, count, source, *lists, *size, int(absolute), v_slots, grain=1)
+        rest = (*size, int(absolute), v_slots)
+        launch(cpu_kernels.composite_tiles_adjoint, count, source, *lists, *rest, grain=1, load=_load(tiles))
         return v_slots
     lists = (means2d, conics, source, channels, *lists)
     if job.form == "pixel":

@@ -1,0 +1,126 @@
+"""How a grid is shared among CPU threads: where it is cut, and who takes which chunk.
+
+Chunks get smaller towards the end (guided self-scheduling, Polychronopoulos and Kuck 1987): a few large ones cost
+little, and small last ones let all threads end at about the same time. Where the cost of each grid index is known
+beforehand, chunks are cut by cost and the heaviest come first.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import threading
+from collections.abc import Callable, Sequence
+from queue import SimpleQueue
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import environment
+
+Chunk = tuple[int, int]
+"""First grid index and number of indices."""
+
+PARTS = 3
+"""A chunk is this part of a thread's fair share of what is left: costs are estimates, the first must not end last."""
+SMALLEST = 32
+"""No chunk is a smaller part of a thread's fair share of the whole."""
+
+
+@functools.cache
+def _shares(threads: int) -> np.ndarray:
+    """Where chunks end, as parts of the whole, ascending to 1."""
+    ends, left = [], 1.0
+    while left > 0.0:
+        left -= max(left / (PARTS * threads), 1.0 / (SMALLEST * threads))
+        ends.append(1.0 - max(left, 0.0))
+    return np.array(ends)
+
+
+@functools.lru_cache(maxsize=1024)
+def cut_evenly(count: int, threads: int, grain: int) -> list[Chunk]:
+    """Chunks of ``grain`` indices and multiples of it (the last may be smaller), every index in one of them."""
+    ends = np.minimum(np.ceil(_shares(threads) * (count / grain)).astype(np.int64) * grain, count)
+    return _chunks(np.unique(ends))
+
+
+def cut_by_load(load: Tensor, threads: int) -> list[Chunk]:
+    """Chunks by cost, heaviest first, every index in one of them.
+
+    Args:
+        load: [count] integers, on the CPU: the cost of all indices up to each, itself included.
+        threads: how many share the work.
+    """
+    running = load.numpy()
+    last = np.searchsorted(running, _shares(threads) * float(running[-1]))
+    ends = np.unique(np.append(np.minimum(last + 1, len(running)), len(running)))
+    costs = np.diff(running[ends - 1], prepend=0)
+    chunks = _chunks(ends)
+    return [chunks[k] for k in np.argsort(-costs, kind="stable").tolist()]
+
+
+def _chunks(ends: np.ndarray) -> list[Chunk]:
+    begins = [0, *ends[:-1].tolist()]
+    return [(begin, end - begin) for begin, end in zip(begins, ends.tolist())]
+
+
+class _Helpers:
+    """Threads that wait for work for as long as the process lives."""
+
+    def __init__(self, flush_denormals: bool) -> None:
+        # Denormals are flushed in every thread or in none: results must not depend on who computes them.
+        self.flush_denormals = flush_denormals
+        self.jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self.count = 0
+
+    def submit(self, job: Callable[[], None], copies: int) -> None:
+        while self.count < copies:
+            self.count += 1
+            threading.Thread(target=self._serve, name=f"warp-{self.count}", daemon=True).start()
+        for _ in range(copies):
+            self.jobs.put(job)
+
+    def dismiss(self) -> None:
+        for _ in range(self.count):
+            self.jobs.put(None)
+
+    def _serve(self) -> None:
+        torch.set_flush_denormal(self.flush_denormals)
+        while (job := self.jobs.get()) is not None:
+            job()
+            del job  # and with it the tensors it holds, before the next one comes
+
+
+_helpers = _Helpers(False)
+
+
+def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: int) -> None:
+    """``call(first, size)`` once for each chunk, by this thread and up to ``threads - 1`` others.
+
+    Returns when all are done. It waits for chunks, not for threads: a helper that wakes up late finds nothing left and
+    holds up nobody. What ``call`` refers to lives until the last helper has let go of it.
+    """
+    global _helpers
+    flush = environment.configured()
+    if _helpers.flush_denormals != flush:
+        _helpers.dismiss()
+        _helpers = _Helpers(flush)
+    ticket, finished, all_done = itertools.count(), itertools.count(1), threading.Lock()
+    all_done.acquire()
+    errors: list[BaseException] = []
+
+    def work() -> None:
+        while (turn := next(ticket)) < len(chunks):
+            try:
+                call(*chunks[turn])
+            except BaseException as error:  # raised again below, in the thread that asked
+                errors.append(error)
+            if next(finished) == len(chunks):
+                all_done.release()
+
+    _helpers.submit(work, min(threads, len(chunks)) - 1)
+    work()
+    all_done.acquire()
+    if errors:
+        raise errors[0]
