@@ -19,9 +19,10 @@ from scgs_warp import environment
 from scgs_warp.config import with_steps
 from scgs_warp.errors import UserError
 from scgs_warp.evaluate import evaluate
+from scgs_warp.frames import Frames
 from scgs_warp.metrics import psnr
 from scgs_warp.scene import Scene
-from scgs_warp.train import fit
+from scgs_warp.train import fit, training_step
 from scgs_warp.train_state import TrainState
 
 MODELS = ["control-points", "per-gaussian", "hexplane", "static"]
@@ -75,7 +76,7 @@ import sys, scgs_warp
 from scgs_warp import environment
 environment.configure()
 from tiny import tiny_config, tiny_dataset
-from scgs_warp.train import fit
+from scgs_warp.train import fit, training_step
 from scgs_warp import train_state
 import os, signal
 save = train_state.TrainState.save
@@ -134,6 +135,37 @@ def test_a_bad_frame_is_dropped_and_named(tmp_path, capsys):
     assert dropped and all(entry["dropped"] == "image loss" for entry in dropped)
     assert 8 <= len(dropped) <= 12, "one frame of six, 60 steps"
     assert all(bool(torch.isfinite(value).all()) for value in scene.tensors().values())
+
+
+@pytest.mark.parametrize(("owner", "name"), [("gaussians", "sh_rest"), ("motion", "network.head.weight")])
+def test_a_bad_gradient_changes_nothing_and_is_named(owner, name, device):
+    data = tiny_dataset(6)
+    config = tiny_config(60, pretrain={"steps": 0}, freeze=0)
+    state = TrainState.begin(config, data, device)
+    frames = Frames(data, state.normalisation, config, device)
+    for _ in range(3):
+        assert training_step(state, frames).failed is None
+        state.step += 1
+    assert state.motion_optimizer is not None
+
+    def everything() -> dict[str, torch.Tensor]:
+        tensors = {**state.scene().tensors(), **state.gaussian_optimizer.tensors("a")}
+        tensors |= state.motion_optimizer.tensors("b") if state.motion_optimizer is not None else {}
+        return {key: value.detach().clone() for key, value in tensors.items()}
+
+    def poison(gradient: torch.Tensor) -> torch.Tensor:
+        gradient = gradient.clone()
+        gradient.view(-1)[-1] = float("inf")
+        return gradient
+
+    before = everything()
+    hook = getattr(state, owner).get_parameter(name).register_hook(poison)
+    assert training_step(state, frames).failed == f"gradient of {name}"
+    after = everything()
+    assert before.keys() == after.keys() and all(torch.equal(before[key], after[key]) for key in before)
+    hook.remove()
+    assert training_step(state, frames).failed is None
+    assert not torch.equal(everything()["b.network.head.weight.exp_avg"], before["b.network.head.weight.exp_avg"])
 
 
 def test_repeated_failure_stops_at_the_last_good_state(tmp_path):
