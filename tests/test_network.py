@@ -40,17 +40,42 @@ def rows(shape: tuple, positions: int, times: int, seed: int) -> tuple[Tensor, T
 def test_values_and_gradients(shape, positions, times, seed):
     weights, biases = parameters(shape, seed)
     where, when = rows(shape, positions, times, seed)
+    where.requires_grad_()
     found = network(where, when, weights, biases)
-    own = [p.detach().double().requires_grad_() for p in (*weights, *biases)]
+    own = [p.detach().double().requires_grad_() for p in (where, *weights, *biases)]
     half = len(weights)
-    expected = twin(where.double(), when.double(), own[:half], own[half:])
+    expected = twin(own[0], when.double(), own[1 : half + 1], own[half + 1 :])
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
     v = torch.randn(found.shape, generator=torch.Generator().manual_seed(seed))
-    gradients = torch.autograd.grad(found, (*weights, *biases), v)
+    gradients = torch.autograd.grad(found, (where, *weights, *biases), v)
     truth = torch.autograd.grad(expected, own, v.double())
     for got, want in zip(gradients, truth):
         # Relative to the whole tensor: a value within rounding of 0 may lie on either side of the ReLU.
         assert float((got.double() - want).norm() / want.norm().clamp_min(1e-6)) < 2e-3
+
+
+def test_inputs_without_a_gradient_change_no_bit_of_the_others(monkeypatch):
+    weights, biases = parameters(SHAPES[2], 11)
+    where, when = rows(SHAPES[2], 13, 2, 11)
+    asked: list[bool] = []
+    inner = Layers.inputs_gradient
+    monkeypatch.setattr(Layers, "inputs_gradient", lambda *args: asked.append(True) or inner(*args))
+    results = []
+    for wanted in (False, True):
+        out = network(where.clone().requires_grad_(wanted), when, weights, biases)
+        results.append([out, *torch.autograd.grad(out.sum(), (*weights, *biases))])
+        assert len(asked) == wanted, "computed although nobody wants it"
+    assert all(torch.equal(a, b) for a, b in zip(*results))
+
+
+def test_gradient_of_the_inputs_alone():
+    weights, biases = ([p.detach() for p in group] for group in parameters(SHAPES[1], 12))
+    where, when = rows(SHAPES[1], 5, 1, 12)
+    where.requires_grad_()
+    (found,) = torch.autograd.grad(network(where, when, weights, biases).sum(), where)
+    own = where.detach().double().requires_grad_()
+    expected = twin(own, when.double(), [w.double() for w in weights], [b.double() for b in biases])
+    torch.testing.assert_close(found.double(), torch.autograd.grad(expected.sum(), own)[0], rtol=1e-4, atol=1e-6)
 
 
 def test_without_gradient_in_parts_and_packed_gives_the_same_bits():
@@ -65,13 +90,14 @@ def test_without_gradient_in_parts_and_packed_gives_the_same_bits():
 def test_same_bits_on_any_number_of_threads():
     weights, biases = parameters(SHAPES[0], 4)
     where, when = rows(SHAPES[0], 101, 3, 4)
+    where.requires_grad_()
     results = []
     before = environment.thread_count()
     try:
         for threads in (1, 2, 3):
             environment.configure(threads)
             out = network(where, when, weights, biases)
-            results.append([out, *torch.autograd.grad(out, (*weights, *biases), torch.ones_like(out))])
+            results.append([out, *torch.autograd.grad(out, (where, *weights, *biases), torch.ones_like(out))])
     finally:
         environment.configure(before)
     for other in results[1:]:
@@ -81,9 +107,11 @@ def test_same_bits_on_any_number_of_threads():
 def test_no_positions():
     weights, biases = parameters(SHAPES[1], 5)
     where, when = rows(SHAPES[1], 0, 2, 5)
+    where.requires_grad_()
     out = network(where, when, weights, biases)
     assert out.shape == (0, 1)
-    assert all(not bool(g.any()) for g in torch.autograd.grad(out.sum(), (*weights, *biases)))
+    gradients = torch.autograd.grad(out.sum(), (where, *weights, *biases))
+    assert gradients[0].shape == where.shape and all(not bool(g.any()) for g in gradients)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 3e38])

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..config import TrainConfig
 from ..gaussians import GaussianParameters
+from ..ops.network import Layers, evaluate, network
+from ..ops.planes import CHANNELS, PAIRS, plane_features, plane_features_and_variation, plane_variation
 from ..optim import generator, log_linear
 from ..types import Gaussians
 from .base import Motion, TrainingPose
 
-PAIRS = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
-"""Axes of the six planes; 3 is time."""
-CHANNELS = 32
 SPATIAL = 64
 TEMPORAL = 25
 MULTIPLES = (1, 2)
 """Spatial resolutions: 64 and 128; time keeps 25 in both, as in the 4D-GS configuration for D-NeRF."""
 WIDTH = 64
+HEADS = {"means": 3, "quats": 4, "log_scales": 3}
+"""What the heads change, and how many numbers of it."""
 BOUND = 1.6
 """Half size of the planes' cube, normalised units."""
 
@@ -37,16 +39,16 @@ class HexPlane(Motion):
         for multiple in MULTIPLES:
             for _, second in PAIRS:
                 rows = TEMPORAL if second == 3 else SPATIAL * multiple
-                shape = (1, CHANNELS, rows, SPATIAL * multiple)
+                shape = (CHANNELS, rows, SPATIAL * multiple)
                 # Space planes vary at first, time planes are 1: the scene starts at rest.
                 plane = torch.ones(shape) if second == 3 else 0.1 + 0.4 * torch.rand(shape, generator=random)
-                self.planes.append(nn.Parameter(plane))
+                # Channels last: a texel is two cache lines.
+                self.planes.append(nn.Parameter(plane.permute(1, 2, 0).contiguous()))
         self.trunk = nn.Linear(CHANNELS * len(MULTIPLES), WIDTH)
-        widths = {"means": 3, "quats": 4, "log_scales": 3}
         self.heads = nn.ModuleDict(
             {
                 name: nn.Sequential(nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, width))
-                for name, width in widths.items()
+                for name, width in HEADS.items()
             }
         )
         for layer in self.modules():
@@ -56,45 +58,18 @@ class HexPlane(Motion):
         for head in self.heads.values():
             last = head[-1]  # type: ignore[index]
             nn.init.normal_(last.weight, std=1e-4, generator=random)
+        self._packed: tuple[tuple[tuple[int, int], ...], Layers] | None = None
 
     def features(self, positions: Tensor, time: float) -> Tensor:
-        """[N, 64] bilinear samples; positions outside the cube take the border's value."""
-        when = positions.new_full((positions.shape[0], 1), 2.0 * time - 1.0)
-        where = torch.cat([positions / BOUND, when], dim=1)
-        found = []
-        for level in range(len(MULTIPLES)):
-            product = None
-            for place, pair in enumerate(PAIRS):
-                grid = where[:, pair].view(1, 1, -1, 2)
-                plane = self.planes[level * len(PAIRS) + place]
-                sample = F.grid_sample(plane, grid, align_corners=True, padding_mode="border")[0, :, 0]
-                product = sample if product is None else product * sample
-            found.append(product)
-        return torch.cat(found).T
+        """[N, 64] products of bilinear samples; positions outside the cube take the border's value."""
+        return plane_features(positions / BOUND, time, list(self.planes))
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
-        hidden = self.trunk(self.features(gaussians.means, time))
-        change = {name: head(hidden) for name, head in self.heads.items()}
-        return Gaussians(
-            gaussians.means + change["means"],
-            gaussians.quats + change["quats"],
-            (gaussians.log_scales + change["log_scales"]).exp(),
-            gaussians.opacities(),
-            gaussians.sh_dc,
-            gaussians.sh_rest,
-        )
+        return self._moved(gaussians, self.features(gaussians.means, time))
 
     def smoothness(self) -> Tensor:
         """Total variation of all planes: squared first differences in space, squared second differences in time."""
-        terms = []
-        for place, plane in enumerate(self.planes):
-            across = plane[..., 1:] - plane[..., :-1]
-            down = plane[..., 1:, :] - plane[..., :-1, :]
-            if PAIRS[place % len(PAIRS)][1] == 3:
-                down = down[..., 1:, :] - down[..., :-1, :]
-            # Per-row sums first: their order does not depend on the number of threads.
-            terms += [across.square().mean(-1).mean(-1).mean(), down.square().mean(-1).mean(-1).mean()]
-        return torch.stack(terms).sum()
+        return plane_variation(list(self.planes))
 
     def train_at(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
@@ -102,7 +77,50 @@ class HexPlane(Motion):
         if step < config.freeze:  # coarse: a static scene first (4D-GS)
             return TrainingPose(gaussians.activate(), None)
         weight = config.loss.hexplane_tv
-        return TrainingPose(self.gaussians_at(gaussians, time), weight * self.smoothness() if weight > 0 else None)
+        if weight <= 0:
+            return TrainingPose(self.gaussians_at(gaussians, time), None)
+        found, variation = plane_features_and_variation(gaussians.means / BOUND, time, list(self.planes))
+        return TrainingPose(self._moved(gaussians, found), weight * variation)
+
+    def train(self, mode: bool = True) -> HexPlane:
+        self._packed = None  # the optimiser writes where torch does not count
+        return super().train(mode)
+
+    def _moved(self, gaussians: GaussianParameters, features: Tensor) -> Gaussians:
+        means, quats, log_scales = self._decode(features).split(list(HEADS.values()), dim=1)
+        return Gaussians(
+            gaussians.means + means,
+            gaussians.quats + quats,
+            (gaussians.log_scales + log_scales).exp(),
+            gaussians.opacities(),
+            gaussians.sh_dc,
+            gaussians.sh_rest,
+        )
+
+    def _decode(self, features: Tensor) -> Tensor:
+        """[N, 10]: trunk and heads as one network of three layers, which are the trunk, the heads' first layers side
+        by side, and their last ones in a block diagonal."""
+        if features.device.type != "cpu":
+            hidden = self.trunk(features)
+            return torch.cat([head(hidden) for head in self.heads.values()], dim=1)
+        when = features.new_empty(1, 0)
+        if self.training or torch.is_grad_enabled():
+            return network(features, when, *self._layers())
+        # Packed weights are kept for the next frame; in training they would be old after one step.
+        key = tuple((p.data_ptr(), p._version) for module in (self.trunk, self.heads) for p in module.parameters())
+        if self._packed is None or self._packed[0] != key:
+            self._packed = key, Layers(*self._layers(), features.shape[1])
+        return evaluate(self._packed[1], features, when)
+
+    def _layers(self) -> tuple[list[Tensor], list[Tensor]]:
+        first, last = ([cast(nn.Linear, head[place]) for head in self.heads.values()] for place in (1, 3))  # type: ignore[index]
+        weights = [
+            self.trunk.weight,
+            torch.cat([layer.weight for layer in first]),
+            torch.block_diag(*(layer.weight for layer in last)),
+        ]
+        biases = [self.trunk.bias, *(torch.cat([layer.bias for layer in heads]) for heads in (first, last))]
+        return weights, biases
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
         joint = max(0, step - config.freeze)

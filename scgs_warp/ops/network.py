@@ -7,7 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..kernels import network_adjoint_cpu as adjoint_kernels
 from ..kernels import network_cpu as kernels
+from ..kernels.network_panels import BLOCK, PANEL
 from ..warp_interop import launch
 
 ROWS = 8
@@ -25,55 +27,76 @@ class Layers:
         biases: [out] of every layer.
         inputs: columns of the inputs. A layer whose weights are that much wider than its predecessor's output reads
             them again, before that output (a skip connection).
+        inputs_adjoint: whether :meth:`inputs_gradient` will be called.
     """
 
-    def __init__(self, weights: list[Tensor], biases: list[Tensor], inputs: int) -> None:
+    def __init__(self, weights: list[Tensor], biases: list[Tensor], inputs: int, inputs_adjoint: bool = False) -> None:
         self.weights, self.biases = [w.detach() for w in weights], [b.detach() for b in biases]
         self.inputs = inputs
-        self.panels = max(-(-w.shape[0] // kernels.PANEL) for w in weights)
+        self.panels = max(-(-w.shape[0] // PANEL) for w in weights)
         self.outputs = weights[-1].shape[0]
         self.gradient_begin: list[int] = []
         rows, at, behind, before = [], 0, 0, 0
         for layer, weight in enumerate(self.weights):
             out, columns = weight.shape
             own = columns - before
-            panels = -(-out // kernels.PANEL)
-            adjoint = at + panels * kernels.PANEL * columns
+            panels = -(-out // PANEL)
+            adjoint = at + panels * PANEL * columns
+            to_inputs = adjoint + before * out
             own_row = [weight.data_ptr(), self.biases[layer].data_ptr(), own, before, out, at]
-            rows.append([*own_row, adjoint if before else -1, 0])
-            at = adjoint + before * out
+            wanted = inputs_adjoint and own > 0
+            rows.append([*own_row, adjoint if before else -1, to_inputs if wanted else -1, 0])
+            at = to_inputs + (-(-own // PANEL) * PANEL * out if wanted else 0)
             self.gradient_begin.append(behind)
             behind += out * columns + out
             before = out
         self.gradient_size = behind
         self.table = torch.tensor(rows, dtype=torch.int64)
         self.packed = torch.empty(at)
-        launch(kernels.pack_weights, len(rows) * self.panels, self.panels, self.table, self.packed, grain=1)
+        widest = max(self.panels, -(-inputs // PANEL)) if inputs_adjoint else self.panels
+        launch(kernels.pack_weights, len(rows) * widest, widest, self.table, self.packed, grain=1)
 
     def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Inputs and hidden values in panels, and the outputs [T M, out]."""
         count = where.shape[0] * when.shape[0]
         rows = -(-count // ROWS) * ROWS
-        inputs = torch.empty(-(-self.inputs // kernels.PANEL), rows, kernels.PANEL)
+        inputs = torch.empty(-(-self.inputs // PANEL), rows, PANEL)
         launch(kernels.pack_inputs, rows, where, when, inputs)
-        hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * kernels.PANEL)
+        hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * PANEL)
         out = torch.empty(count, self.outputs)
-        blocks, size = -(-rows // kernels.BLOCK), kernels.BLOCK
+        blocks, size = -(-rows // BLOCK), BLOCK
         launch(kernels.network_values, blocks, size, int(keep), self.table, self.packed, inputs, hidden, out, grain=1)
         return inputs, hidden, out
 
-    def gradients(self, inputs: Tensor, hidden: Tensor, v_out: Tensor) -> list[Tensor]:
-        """Of every layer's weights, then of every layer's bias."""
-        rows, count, layers = hidden.shape[1], v_out.shape[0], len(self.weights)
+    def hidden_gradient(self, hidden: Tensor, v_out: Tensor) -> Tensor:
+        """Before every layer's ReLU, in panels."""
         v_hidden = torch.empty_like(hidden)
-        blocks, size = -(-rows // kernels.BLOCK), kernels.BLOCK
-        launch(kernels.network_adjoint, blocks, size, self.table, self.packed, hidden, v_out, v_hidden, grain=1)
+        blocks = -(-hidden.shape[1] // BLOCK)
+        launch(
+            adjoint_kernels.network_adjoint, blocks, BLOCK, self.table, self.packed, hidden, v_out, v_hidden, grain=1
+        )
+        return v_hidden
+
+    def inputs_gradient(self, v_hidden: Tensor, positions: int, times: int, columns: int) -> Tensor:
+        """[M, columns] of the first columns of the inputs; over all times, in order."""
+        v_inputs = torch.empty(times, positions, columns)
+        blocks = -(-v_hidden.shape[1] // BLOCK)
+        rows = v_inputs.view(times * positions, columns)
+        launch(adjoint_kernels.network_inputs_adjoint, blocks, BLOCK, self.table, self.packed, v_hidden, rows, grain=1)
+        total = v_inputs[0] if times else torch.zeros(positions, columns)
+        for own in v_inputs[1:]:
+            total += own
+        return total
+
+    def gradients(self, inputs: Tensor, hidden: Tensor, v_hidden: Tensor, count: int) -> list[Tensor]:
+        """Of every layer's weights, then of every layer's bias."""
+        layers = len(self.weights)
         flat = torch.empty(self.gradient_size)
         table = self.table.clone()
-        table[:, 7] = torch.tensor(self.gradient_begin) * flat.element_size() + flat.data_ptr()
+        table[:, 8] = torch.tensor(self.gradient_begin) * flat.element_size() + flat.data_ptr()
         parts = 2
         shared = self.panels, parts, count, table, inputs, hidden, v_hidden
-        launch(kernels.network_weights_adjoint, layers * self.panels * parts, *shared, grain=1)
+        launch(adjoint_kernels.network_weights_adjoint, layers * self.panels * parts, *shared, grain=1)
         weights, biases = [], []
         for begin, weight in zip(self.gradient_begin, self.weights):
             end = begin + weight.numel()
@@ -86,45 +109,50 @@ class _Network(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, where, when, *parameters):
         half = len(parameters) // 2
-        layers = Layers(list(parameters[:half]), list(parameters[half:]), where.shape[1] + when.shape[1])
+        columns = where.shape[1] + when.shape[1]
+        layers = Layers(list(parameters[:half]), list(parameters[half:]), columns, ctx.needs_input_grad[0])
         inputs, hidden, out = layers.values(where, when, keep=True)
-        ctx.layers = layers
+        ctx.layers, ctx.sizes = layers, (where.shape[0], when.shape[0], where.shape[1])
         ctx.save_for_backward(inputs, hidden)
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients):  # type: ignore[override]
-        return None, None, *ctx.layers.gradients(*ctx.saved_tensors, gradients[0].contiguous())
+        inputs, hidden = ctx.saved_tensors
+        v_out = gradients[0].contiguous()
+        v_hidden = ctx.layers.hidden_gradient(hidden, v_out)
+        v_where = ctx.layers.inputs_gradient(v_hidden, *ctx.sizes) if ctx.needs_input_grad[0] else None
+        return v_where, None, *ctx.layers.gradients(inputs, hidden, v_hidden, v_out.shape[0])
 
 
 def supported(weights: list[Tensor], biases: list[Tensor]) -> bool:
     """Whether :func:`network` takes them: float32 on a CPU, hidden widths multiples of 32."""
     return all(
         p.device.type == "cpu" and p.dtype == torch.float32 and p.is_contiguous() for p in (*weights, *biases)
-    ) and all(w.shape[0] % kernels.PANEL == 0 for w in weights[:-1])
+    ) and all(w.shape[0] % PANEL == 0 for w in weights[:-1])
 
 
 def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
     """Hidden layers with ReLU and a last one without, for every position at every time.
 
     Args:
-        where: [M, A] inputs that depend on the position. No gradient.
+        where: [M, A] inputs that depend on the position.
         when: [T, B] inputs that depend on the time. No gradient.
         weights: [out, in] of every layer; ``in`` is A + B for the first, and for the others the width of the layer
             before, or that and A + B more: then the inputs are read again, in front (a skip connection).
         biases: [out] of every layer.
 
     Returns:
-        [T M, out of the last layer], rows ``t M + m``. Gradients go to weights and biases; their sums are taken in a
-        fixed order.
+        [T M, out of the last layer], rows ``t M + m``. Gradients go to weights, biases and ``where``; their sums
+        are taken in a fixed order.
 
     Raises:
         ValueError: shapes do not fit, or the parameters are not :func:`supported`.
     """
     _validate(where, when, weights, biases)
-    where, when = where.detach().contiguous(), when.detach().contiguous()
-    if torch.is_grad_enabled() and any(p.requires_grad for p in (*weights, *biases)):
+    where, when = where.contiguous(), when.detach().contiguous()
+    if torch.is_grad_enabled() and any(p.requires_grad for p in (where, *weights, *biases)):
         return _Network.apply(where, when, *weights, *biases)  # type: ignore[return-value]
     return evaluate(Layers(weights, biases, where.shape[1] + when.shape[1]), where, when)
 
