@@ -12,6 +12,7 @@ from splats import random_splats
 
 from reference.binning import needed_pairs, usable
 from scgs_warp import environment
+from scgs_warp.ops import binning
 from scgs_warp.ops.binning import _bin_by_bands, bin_splats
 from scgs_warp.ops.binning_cuda import bin_by_radix
 from scgs_warp.types import Splats, Tiles
@@ -120,27 +121,95 @@ def test_equal_depths_keep_index_order(device: str):
         assert tiles.splats[begin:end].tolist() == sorted(tiles.splats[begin:end].tolist())
 
 
+FIELDS = ("means2d", "conics", "opacities", "depths", "radii")
+LISTS = ("ranges", "splats", "slots", "offsets")
+
+
+def assert_both_sorts_agree(splats: Splats, device: str = "cpu", tile_size: int = 16) -> int:
+    """By bands on a CPU, by radix sorts as on a GPU: the same lists, bit for bit. How many pairs there are."""
+    geometry = [getattr(splats, name) for name in FIELDS]
+    columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
+    size = (splats.width, splats.height, columns, rows, tile_size)
+    by_radix = bin_by_radix([t.to(device) for t in geometry], size)
+    for name, got, expected in zip(LISTS, _bin_by_bands(geometry, size), by_radix, strict=True):
+        assert torch.equal(got, expected.cpu()), name
+    return len(by_radix[1])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_both_sorts_agree(device: str, seed: int):
-    """Counting on a CPU, radix sort on a GPU: the same lists, with equal and negative depths too."""
+    """Equal and negative depths, and both zeros."""
     splats = random_splats(seed, 300, 90, 70)
     depths = torch.round(4 * splats.depths) / 4 - 2.0
-    splats = replace(splats, depths=torch.where(depths == 0, -depths, depths))  # 0 and -0
-    geometry = [splats.means2d, splats.conics, splats.opacities, splats.depths, splats.radii]
-    size = (90, 70, 6, 5, 16)
-    by_radix = bin_by_radix([t.to(device) for t in geometry], size)
-    for got, expected in zip(by_radix, _bin_by_bands(geometry, size)):
-        assert torch.equal(got.cpu(), expected)
+    splats = replace(splats, depths=torch.where(depths == 0, -depths, depths))
+    assert assert_both_sorts_agree(splats, device) > 500
 
 
-def test_threads_change_nothing(all_threads: None):
+@pytest.mark.parametrize(("log_scale", "aspect"), [(-1.0, 0.5), (2.0, 2.0), (4.5, 1.5), (3.0, 4.0)])
+@pytest.mark.parametrize("tile_size", [3, 16])
+def test_both_sorts_agree_on_any_size_of_splat(device: str, log_scale: float, aspect: float, tile_size: int):
+    """Within a window of 8 x 8 tiles, beyond it, needles, and slabs that end between two pixel centres."""
+    splats = random_splats(11, 2000, 333, 250, log_scale=log_scale, aspect=aspect)
+    assert assert_both_sorts_agree(splats, device, tile_size) > 1000
+
+
+def test_both_sorts_agree_on_many_splats(device: str):
+    """More than 16 bits count, in chunks of different lengths; a third of them culled."""
+    splats = random_splats(12, 70_001, 640, 300, log_scale=0.0)
+    radii = splats.radii * (torch.arange(70_001) % 3 != 0)[:, None].int()
+    assert assert_both_sorts_agree(replace(splats, radii=radii), device) > 2**16
+
+
+def test_many_splats_in_one_tile(device: str):
+    """One band has it all, and few depths: sorted by depth, then by index."""
+    splats = random_splats(13, 30_000, 8, 8, log_scale=-1.0, opacity=(0.5, 1.0))
+    depths = torch.round(20.0 * splats.depths) / 20.0
+    splats = replace(splats, means2d=splats.means2d + 36.0, depths=depths, width=800, height=800)
+    assert assert_both_sorts_agree(splats, device) > 30_000
+    tiles = bin_splats(splats)
+    begin, end = tiles.ranges[2 * 50 + 2].tolist()
+    inside = tiles.splats[begin:end].long()
+    assert len(inside) > 20_000
+    order = torch.argsort(depths[inside.sort().values], stable=True)
+    assert torch.equal(inside, inside.sort().values[order])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_both_sorts_agree_on_extreme_values(device: str, seed: int):
+    """Values that overflow, underflow or are none, anywhere: two forms of the same arithmetic find the same tiles."""
+    extremes = torch.tensor([0.0, -0.0, 1e-45, -1e-38, 1e-20, 1e20, -1e30, 3e38, torch.inf, -torch.inf, torch.nan])
+    g = torch.Generator().manual_seed(seed)
+    splats = random_splats(seed, 4000, 200, 120, log_scale=2.0)
+    poisoned = {}
+    for name in FIELDS[:4]:
+        tensor = getattr(splats, name).clone()
+        hit = torch.rand(tensor.shape, generator=g) < 0.15
+        tensor[hit] = extremes[torch.randint(len(extremes), (int(hit.sum()),), generator=g)]
+        poisoned[name] = tensor
+    radii = torch.where(torch.rand(4000, 2, generator=g) < 0.05, -splats.radii, splats.radii)
+    assert assert_both_sorts_agree(replace(splats, **poisoned, radii=radii), device) > 1000
+
+
+def test_all_culled(device: str):
+    splats = random_splats(14, 500, 100, 60, device)
+    tiles = bin_splats(replace(splats, radii=torch.zeros_like(splats.radii)))
+    assert len(tiles.splats) == len(tiles.slots) == 0
+    assert not tiles.ranges.any() and not tiles.offsets.any()
+    assert tiles.ranges.shape == (7 * 4, 2) and tiles.offsets.shape == (501,)
+
+
+def test_neither_threads_nor_chunks_change_anything(all_threads: None, monkeypatch: pytest.MonkeyPatch):
     splats = random_splats(7, 5000, 300, 200)
+    splats = replace(splats, depths=torch.round(10.0 * splats.depths))
     results = []
-    for threads in (1, 2):
+    for threads, chunk in ((1, 1024), (2, 1024), (3, 1024), (1, 16), (3, 48), (2, 8192)):
         environment.configure(threads=threads)
+        monkeypatch.setattr(binning, "CHUNK_SIZE", chunk)
+        monkeypatch.setattr(binning, "MAX_CHUNKS", 1000)
         results.append(bin_splats(splats))
-    for name in ("ranges", "splats", "slots", "offsets"):
-        assert torch.equal(getattr(results[0], name), getattr(results[1], name)), name
+    for result in results[1:]:
+        for name in LISTS:
+            assert torch.equal(getattr(results[0], name), getattr(result, name)), name
 
 
 def test_wrong_arguments():

@@ -1,0 +1,170 @@
+"""Launches: arguments are checked and arrive, every grid index runs once, whoever runs it."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from scgs_warp import cpu_threads, environment
+from scgs_warp.cpu_threads import cut_by_load, cut_evenly, share
+from scgs_warp.warp_interop import launch
+
+
+@wp.struct
+class Pair:
+    a: wp.int64
+    b: float
+
+
+@wp.kernel(enable_backward=False)
+def mixed(
+    first: int,
+    flag: bool,
+    values: wp.array[wp.vec3],
+    nothing: wp.array[float],
+    scale: float,
+    corner: wp.vec2i,
+    pair: Pair,
+    big: wp.uint64,
+    small: wp.uint8,
+    out: wp.array2d[float],
+):
+    i = first + wp.tid()
+    total = scale * values[i][2] + float(corner[1]) + float(pair.a) + pair.b + float(small)
+    if flag and nothing.shape[0] == 0 and big == wp.uint64(1) << wp.uint64(63):
+        total += 1000.0
+    out[i, 0] = out[i, 0] + total
+
+
+def mixed_arguments(count: int) -> list:
+    pair = Pair()
+    pair.a, pair.b = 7, 0.5
+    values = torch.arange(3.0 * count).view(count, 3)
+    return [True, values, None, 2.0, wp.vec2i(3, 4), pair, 2**63, 200, torch.zeros(count, 2)]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 2, 37, 1000])
+def test_every_kind_of_argument_arrives_once(all_threads: None, threads: int, count: int):
+    environment.configure(threads=threads)
+    arguments = mixed_arguments(count)
+    expected = 2.0 * arguments[1][:, 2] + 4.0 + 7.0 + 0.5 + 200.0 + 1000.0
+    for load in (None, torch.arange(count) ** 2):
+        arguments[-1].zero_()
+        launch(mixed, count, *arguments, grain=1, load=load)
+        assert torch.equal(arguments[-1][:, 0], expected)
+        assert not arguments[-1][:, 1].any()
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "error", "message"),
+    [
+        (1, torch.zeros(4, 2), ValueError, "values must be contiguous"),
+        (1, torch.zeros(4, 3, dtype=torch.float64), ValueError, "values must be contiguous"),
+        (1, torch.zeros(4, 6)[:, ::2], ValueError, "values must be contiguous"),
+        (1, torch.zeros(4, 3, device="meta"), ValueError, "values is on meta"),
+        (3, torch.zeros(1), TypeError, "no array"),
+        (3, "two", TypeError, "mixed"),
+    ],
+)
+def test_wrong_arguments_are_named(place: int, value: object, error: type[Exception], message: str):
+    arguments = mixed_arguments(4)
+    launch(mixed, 4, *arguments)  # known shapes must not hide what else is wrong
+    arguments[place] = value
+    with pytest.raises(error, match=message):
+        launch(mixed, 4, *arguments)
+    with pytest.raises(TypeError, match="takes 9 arguments"):
+        launch(mixed, 4, *arguments[:-1])
+
+
+def test_many_shapes(all_threads: None):
+    """More than are remembered."""
+    for count in range(1, 600):
+        arguments = mixed_arguments(count)
+        launch(mixed, count, *arguments)
+        assert bool((arguments[-1][:, 0] > 1000.0).all()), count
+
+
+def covered(chunks: list[tuple[int, int]]) -> list[int]:
+    return sorted(i for begin, size in chunks for i in range(begin, begin + size))
+
+
+@pytest.mark.parametrize("threads", [2, 3, 16])
+@pytest.mark.parametrize("grain", [1, 7, 512])
+@pytest.mark.parametrize("count", [1, 2, 50, 2500, 49_001])
+def test_even_chunks(count: int, grain: int, threads: int):
+    chunks = cut_evenly(count, threads, grain)
+    assert covered(chunks) == list(range(count))
+    sizes = [size for _, size in chunks]
+    assert all(size >= grain for size in sizes[:-1])
+    assert max(sizes) <= max(grain, count / (2 * threads) + grain)
+
+
+def makespan(costs: list[int], threads: int) -> int:
+    """When all are done if each goes to the thread that is free first."""
+    ends = [0] * threads
+    for cost in costs:
+        ends[ends.index(min(ends))] += cost
+    return max(ends)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8])
+@pytest.mark.parametrize("seed", range(4))
+def test_chunks_by_load_balance(seed: int, threads: int):
+    """A few indices hold nearly all the work, next to each other; the heaviest is a lower bound."""
+    random = np.random.default_rng(seed)
+    costs = random.integers(0, 3, 2500)
+    at = int(random.integers(0, 2480))
+    costs[at : at + 20] += random.integers(0, 20_000, 20)
+    chunks = cut_by_load(torch.from_numpy(np.cumsum(costs)), threads)
+    assert covered(chunks) == list(range(2500))
+    taken = [int(costs[begin : begin + size].sum()) for begin, size in chunks]
+    assert taken == sorted(taken, reverse=True)
+    least = max(costs.sum() / threads, costs.max())
+    assert makespan(taken, threads) <= least + costs.max() / 2 + costs.sum() / (8 * threads)
+    assert len(chunks) < 40 * threads
+
+
+@pytest.mark.parametrize("load", [[0, 0, 0], [5], [0, 0, 9, 9], [9, 9, 9]])
+def test_chunks_of_no_load(load: list[int]):
+    assert covered(cut_by_load(torch.tensor(load), 2)) == list(range(len(load)))
+
+
+def test_an_error_in_a_chunk_comes_back_after_all_others_ran():
+    ran: list[int] = []
+
+    def call(first: int, size: int) -> None:
+        ran.append(first)
+        if first == 3:
+            raise ValueError("chunk 3")
+
+    with pytest.raises(ValueError, match="chunk 3"):
+        share(call, [(k, 1) for k in range(10)], 3)
+    assert sorted(ran) == list(range(10))
+
+
+def test_nobody_waits_for_a_helper_that_found_nothing(monkeypatch: pytest.MonkeyPatch):
+    """The only helper is busy with another job: the asking thread does its own job alone."""
+    monkeypatch.setattr(cpu_threads, "_helpers", cpu_threads._Helpers(environment.configured()))
+    hold, started = threading.Event(), threading.Event()
+
+    def slow(first: int, size: int) -> None:
+        if threading.current_thread() is asking:
+            assert started.wait(10)
+        else:
+            started.set()
+            assert hold.wait(10)
+
+    asking = threading.Thread(target=lambda: share(slow, [(0, 1), (1, 1)], 2))
+    asking.start()
+    assert started.wait(10)
+    ran: list[int] = []
+    share(lambda first, size: ran.append(first), [(0, 1), (1, 1)], 2)
+    assert sorted(ran) == [0, 1] and not hold.is_set()
+    hold.set()
+    asking.join(10)
+    assert not asking.is_alive()
