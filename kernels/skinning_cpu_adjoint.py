@@ -25,12 +25,12 @@ _ADJOINT = (
     __builtin_memset(reach_sum, 0, 64ll * M);
     auto add4 = [&](float* table, int K, int k, const vf* columns) INLINE {
         vf parts[4];
-        join4(columns, parts);
+        quads(columns, parts);  // quarter l of parts[i]: lane 4 l + i
         float from[64];
         for (int i = 0; i < 4; ++i) put(from + 16 * i, parts[i]);
         for (int l = 0; l < 16; ++l) {
             float* sum = table + 16ll * pick[l * K + k];
-            *(v4u*)sum = *(const v4u*)sum + *(const v4u*)(from + 4 * l);
+            *(v4u*)sum = *(const v4u*)sum + *(const v4u*)(from + 16 * (l % 4) + 4 * (l / 4));
         }
     };
     auto run = [&](auto kc, int begin) INLINE {
@@ -97,7 +97,7 @@ _ADJOINT = (
                 float* sum = motion_sum + 16ll * pick[l * K + k];
                 put(sum, load(sum) + weight[l * K + k] * g);
             }
-            v_weight[k] = row_sums(products);
+            v_weight[k] = lane_sums(products);
             if (has_log_scales) {
                 vf node[4];
                 gather4(reach.data + 4, K, k, node);

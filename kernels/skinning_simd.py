@@ -6,6 +6,8 @@ Between them lie shuffles of whole registers: a Gaussian's fields are never read
 
 from __future__ import annotations
 
+from .simd import LANE_SUMS
+
 LANES = range(16)
 
 
@@ -57,13 +59,40 @@ def _join4() -> str:
     return text
 
 
-def _steps(body: str) -> str:
-    """The four steps of a 16 x 16 transposition: which elements of rows i (0..15) and i + step (16..31) go together."""
+def _quads(rows: tuple[str, str, str, str], to: tuple[str, str, str, str], name: str) -> str:
+    """4 x 4 transpositions within quarters of registers, the cheapest shuffles there are."""
+    quarters = range(0, 16, 4)
+    low = [q + 16 * s + c for q in quarters for c in range(2) for s in range(2)]
+    high = [lane + 2 for lane in low]
+    near = [q + 16 * s + c for q in quarters for s in range(2) for c in range(2)]
+    far = [lane + 2 for lane in near]
     text = ""
-    for step in (8, 4, 2, 1):
-        low = [(lane & ~step) + (16 if lane & step else 0) for lane in LANES]
-        high = [(lane | step) + (16 if lane & step else 0) for lane in LANES]
-        text += body.format(step=step, low=_shuffle("a", "b", low), high=_shuffle("a", "b", high))
+    for p in range(2):
+        for half, lanes in (("l", low), ("h", high)):
+            text += f"vf {name}{half}{p} = {_shuffle(rows[2 * p], rows[2 * p + 1], lanes)};\n"
+    for c in range(4):
+        half = "lh"[c // 2]
+        text += f"{to[c]} = {_shuffle(f'{name}{half}0', f'{name}{half}1', far if c % 2 else near)};\n"
+    return text
+
+
+def _four(pattern: str) -> tuple[str, str, str, str]:
+    return pattern.format(0), pattern.format(1), pattern.format(2), pattern.format(3)
+
+
+def _transpose() -> str:
+    """Of 16 x 16: four rows at a time within quarters, then whole quarters."""
+    even, odd = ([16 * s + 8 * h + first + i for s in range(2) for h in range(2) for i in range(4)] for first in (0, 4))
+    text = ""
+    for g in range(4):
+        rows = _four(f"rows[{4 * g} + {{}}]")
+        text += f"vf q{g}[4];\n" + _quads(rows, _four(f"q{g}[{{}}]"), f"g{g}")
+    for j in range(4):
+        for pair in (0, 2):
+            for name, lanes in (("e", even), ("o", odd)):
+                text += f"vf {name}{pair}{j} = {_shuffle(f'q{pair}[{j}]', f'q{pair + 1}[{j}]', lanes)};\n"
+        for column, name, lanes in ((0, "e", even), (8, "e", odd), (4, "o", even), (12, "o", odd)):
+            text += f"rows[{column + j}] = {_shuffle(f'{name}0{j}', f'{name}2{j}', lanes)};\n"
     return text
 
 
@@ -96,23 +125,13 @@ SIMD = (
     + """
     auto transpose = [](vf* rows) INLINE {
 """
-    + _steps("""
-        for (int i = 0; i < 16; ++i) if (!(i & {step})) {{
-            vf a = rows[i], b = rows[i + {step}];
-            rows[i] = {low}; rows[i + {step}] = {high};
-        }}""")
+    + _transpose()
     + """
     };
-    auto row_sums = [](vf* rows) INLINE -> vf {  // lane i: the sum of row i; destroys the rows
 """
-    + _steps("""
-        for (int i = 0; i < {step}; ++i) {{
-            vf a = rows[i], b = rows[i + {step}];
-            rows[i] = {low} + {high};
-        }}""")
+    + _lambda("quads", _quads(_four("a[{}]"), _four("to[{}]"), "g"))
+    + LANE_SUMS
     + """
-        return rows[0];
-    };
     auto inverse_norm = [&](vf a, vf b, vf c, vf d) INLINE -> vf {  // 0 where the norm is 0 or not a number
         vf n = a * a + b * b + c * c + d * d;
         return ((n > 0.0f) & (n < infinity)) ? 1.0f / __builtin_elementwise_sqrt(n) : (vf){};
@@ -174,15 +193,15 @@ BLOCK = """
     };
     // Four floats of the nodes' rows, from `offset` on, of neighbour k.
     auto gather4 = [&](const float* table, int K, int k, vf* to) INLINE {
-        vf a[4];
+        vf a[4];  // quarter l of a[i]: lane 4 l + i
         for (int i = 0; i < 4; ++i) {
             v4 r[4];
-            for (int l = 0; l < 4; ++l) r[l] = *(const v4u*)(table + 16ll * pick[(4 * i + l) * K + k]);
+            for (int l = 0; l < 4; ++l) r[l] = *(const v4u*)(table + 16ll * pick[(4 * l + i) * K + k]);
             auto low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
             auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
             a[i] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
         }
-        split4(a, to);
+        quads(a, to);
     };
     // Weights as columns and as rows of memory.
     auto weight_rows = [&](const vf* columns, int K, float* to) INLINE {
