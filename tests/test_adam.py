@@ -103,6 +103,20 @@ def test_gradients_and_parameters_with_strides(device):
     torch.testing.assert_close(parameter.detach(), expected)
 
 
+def test_changed_values_are_told_from_old_ones(device):
+    parameter = nn.Parameter(torch.ones(3, device=device))
+    optimizer = Adam({"a": parameter}, {"a": 0.5})
+    versions = [parameter._version]
+    for _ in range(2):
+        result = (parameter * parameter).sum()
+        parameter.grad = torch.ones_like(parameter)
+        optimizer.step()
+        versions.append(parameter._version)
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            result.backward()
+    assert len(set(versions)) == 3
+
+
 def test_what_torch_saved_is_read(device):
     """Names and contents of a checkpoint are those that torch's optimiser gave."""
     shapes = {name: SHAPES[name] for name in ("a", "d")}

@@ -64,6 +64,8 @@ def adam_step(
         launch(kernels.adam_chunks, len(chunks), *tables, *numbers, grain=4)
     else:
         launch(kernels.adam, len(chunks) * kernels.CHUNK, *tables, *numbers)
+    # As torch's own in-place operations do: what was computed from the old values can tell that they are gone.
+    torch.autograd.graph.increment_version([tensor for update in updates for tensor in (update.value, *update[2:4])])
 
 
 def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
