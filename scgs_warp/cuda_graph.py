@@ -37,6 +37,9 @@ class CudaGraph:
     and are overwritten by every replay.
     """
 
+    overwrites = True
+    """Whether the next replay changes the result of the last."""
+
     def __init__(self, body: Callable[[], Any], device: torch.device) -> None:
         """Run ``body`` twice to load and compile everything it needs, then capture it.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import isqrt
 
 import torch
@@ -11,7 +12,7 @@ from .ops.binning import bin_splats
 from .ops.compositing import composite
 from .ops.harmonics import MAX_DEGREE, spherical_harmonics
 from .ops.projection import project
-from .types import Camera, Gaussians, Image, Stats
+from .types import Camera, Gaussians, Image, Splats, Stats, Tiles
 
 
 def render(
@@ -55,11 +56,13 @@ def draw(
     stats: Stats | None = None,
     antialiased: bool = False,
     depth: bool = False,
+    binned: Callable[[Splats], Tiles] = bin_splats,
 ) -> tuple[Tensor, Tensor]:
     """As :func:`render`, planar, and depth only on demand: it costs a training step that has no use for it.
 
     Args:
         depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
+        binned: lists which splats touch which tile.
 
     Returns:
         image [3 or 4, H, W] and alpha [H, W].
@@ -76,7 +79,7 @@ def draw(
     if depth:
         channels = torch.cat([channels, splats.depths[:, None]], dim=1)
         background = None if background is None else torch.cat([background, background.new_zeros(1)])
-    return composite(splats, channels, bin_splats(splats), background, stats=stats)
+    return composite(splats, channels, binned(splats), background, stats=stats)
 
 
 def expected_depth(accumulated: Tensor, alpha: Tensor) -> Tensor:

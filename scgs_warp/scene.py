@@ -16,6 +16,7 @@ from .config import FREE_TO_CHANGE, TrainConfig, from_dict, to_dict
 from .data.dataset import BACKGROUND_COLORS
 from .data.normalise import Normalisation
 from .errors import UserError
+from .frame_graph import FrameGraph
 from .gaussians import GaussianParameters
 from .motion import build_motion
 from .motion.base import Motion
@@ -44,6 +45,7 @@ class Scene:
         self.gaussians, self.motion, self.normalisation = gaussians, motion, normalisation
         self.config, self.overview, self.step = config, overview, step
         self.settings = settings if settings is not None else to_dict(config)
+        self._frames: FrameGraph | None = None
 
     @staticmethod
     def load(run: str | Path, device: str = "cpu") -> Scene:
@@ -123,11 +125,27 @@ class Scene:
             time: clamped to [0, 1].
             background: colour in [0, 1]; None: ``background_color``.
         """
-        posed = self.motion.gaussians_at(self.gaussians, min(max(float(time), 0.0), 1.0))
+        time = min(max(float(time), 0.0), 1.0)
         color = torch.as_tensor(self.background_color if background is None else background, dtype=torch.float32)
-        view = self.normalisation.apply_camera(camera).to(self.device)
-        image = render(posed, view, color.to(self.device), antialiased=self.config.antialiased)
+        view = self.normalisation.apply_camera(camera)
+        if self.device.type == "cuda" and self.motion.takes_time_tensor:
+            return self.frame_graph().render(view, time, color)
+        posed = self.motion.gaussians_at(self.gaussians, time)
+        image = render(posed, view.to(self.device), color.to(self.device), antialiased=self.config.antialiased)
         return Image(image.rgb, image.alpha, self.normalisation.undo_scale(image.depth))
+
+    def frame_graph(self) -> FrameGraph:
+        """What draws this scene's frames on CUDA; it takes cameras of the normalised scene. The same one every time,
+        until ``gaussians`` or ``motion`` is replaced."""
+        found = self._frames
+        if found is None or found.gaussians is not self.gaussians or found.motion is not self.motion:
+            found = self._frames = FrameGraph(
+                self.gaussians,
+                self.motion,
+                antialiased=self.config.antialiased,
+                depth_of=self.normalisation.undo_scale,
+            )
+        return found
 
     @torch.no_grad()
     def control_points_at(self, time: float) -> Tensor:
