@@ -106,8 +106,8 @@ def _picture(name: str, entries: list[dict[str, Any]], report: dict[str, Any]) -
 
 
 def _short(value: float) -> str:
-    for unit, letter in ((1e6, "M"), (1e3, "k")):
-        if value >= unit and value % (unit / 10) == 0:
+    for least, unit, letter in ((1e6, 1e6, "M"), (1e4, 1e3, "k")):
+        if value >= least and value % (unit / 10) == 0:
             return f"{value / unit:g}{letter}"
     return f"{value:g}"
 
