@@ -89,7 +89,6 @@ class _Helpers:
         torch.set_flush_denormal(self.flush_denormals)
         while (job := self.jobs.get()) is not None:
             job()
-            del job  # and with it the tensors it holds, before the next one comes
 
 
 _helpers = _Helpers(False)
@@ -99,7 +98,7 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
     """``call(first, size)`` once for each chunk, by this thread and up to ``threads - 1`` others.
 
     Returns when all are done. It waits for chunks, not for threads: a helper that wakes up late finds nothing left and
-    holds up nobody. What ``call`` refers to lives until the last helper has let go of it.
+    holds up nobody, nor does it hold on to ``call`` and its tensors: their memory is wanted by what comes next.
     """
     global _helpers
     flush = environment.configured()
@@ -109,11 +108,12 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
     ticket, finished, all_done = itertools.count(), itertools.count(1), threading.Lock()
     all_done.acquire()
     errors: list[BaseException] = []
+    calls = [call]
 
     def work() -> None:
         while (turn := next(ticket)) < len(chunks):
             try:
-                call(*chunks[turn])
+                calls[0](*chunks[turn])
             except BaseException as error:  # raised again below, in the thread that asked
                 errors.append(error)
             if next(finished) == len(chunks):
@@ -122,5 +122,6 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
     _helpers.submit(work, min(threads, len(chunks)) - 1)
     work()
     all_done.acquire()
+    calls.clear()
     if errors:
         raise errors[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 
 import numpy as np
 import pytest
@@ -162,9 +163,12 @@ def test_nobody_waits_for_a_helper_that_found_nothing(monkeypatch: pytest.Monkey
     asking = threading.Thread(target=lambda: share(slow, [(0, 1), (1, 1)], 2))
     asking.start()
     assert started.wait(10)
-    ran: list[int] = []
-    share(lambda first, size: ran.append(first), [(0, 1), (1, 1)], 2)
-    assert sorted(ran) == [0, 1] and not hold.is_set()
+    ran = torch.zeros(2)
+    share(lambda first, size, ran=ran: ran[first : first + size].add_(1.0), [(0, 1), (1, 1)], 2)
+    assert ran.tolist() == [1.0, 1.0] and not hold.is_set()
+    memory = weakref.ref(ran)
+    del ran
+    assert memory() is None, "a helper that has not woken up yet holds on to the tensors"
     hold.set()
     asking.join(10)
     assert not asking.is_alive()
