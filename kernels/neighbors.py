@@ -173,27 +173,6 @@ def rbf_reduce_chunks(
 
 
 @wp.kernel
-def rbf_reduce_lists(
-    first: int,
-    # In:
-    order_in: wp.array[wp.int32],  # [N * K] pairs i * K + k sorted by node
-    begin_in: wp.array[wp.int32],  # [M + 1] a node's pairs lie at begin[m] .. begin[m + 1]
-    points_in: wp.array2d[float],  # [N, D]
-    nodes_in: wp.array2d[float],  # [M, D]
-    v_logits_in: wp.array2d[float],  # [N, K]
-    # Out:
-    sums_out: wp.array2d[float],  # [M, 2 + D] zero on entry
-):
-    """Node sums of one node, through its list of pairs: for CUDA, where chunks would leave the device idle."""
-    m = first + wp.tid()
-    K = v_logits_in.shape[1]
-    for at in range(begin_in[m], begin_in[m + 1]):
-        pair = order_in[at]
-        i = pair // K
-        _rbf_add(i, m, m, v_logits_in[i, pair - i * K], points_in, nodes_in, sums_out)
-
-
-@wp.kernel
 def rbf_finish(
     first: int,
     # In:

@@ -1,8 +1,9 @@
 """Linear blend skinning of Gaussians by their control points (SC-GS, Eq. 6 and 7).
 
 The adjoint runs in three launches: one thread a Gaussian for its own gradients, then the sums over each node's
-Gaussians (chunks of Gaussians on a CPU, lists of pairs on CUDA), then one thread a node. The rotation's gradient is
-summed as the matrix ``G = sum w v (x - p)^T``, which turns into the quaternion's only once a node.
+Gaussians (chunks of Gaussians on a CPU, segments of all pairs on CUDA: ``node_sums_cuda``), then one thread a node. The
+rotation's gradient is summed as the matrix ``G = sum w v (x - p)^T``, which turns into the quaternion's only once a
+node.
 """
 
 import warp as wp
@@ -211,37 +212,6 @@ def skin_reduce_chunks(
                 i, k, row, means_in, quats_in, nodes_in, shape_rotations_in, indices_in, weights_in,
                 v_means_in, v_blends_in, v_log_scales_in, has_log_scales, sums_out,
             )  # fmt: skip
-
-
-@wp.kernel
-def skin_reduce_lists(
-    first: int,
-    # In:
-    order_in: wp.array[wp.int32],  # [N * K] pairs i * K + k sorted by node
-    begin_in: wp.array[wp.int32],  # [M + 1]
-    means_in: wp.array[wp.vec3],  # [N]
-    quats_in: wp.array[wp.vec4],  # [N]
-    nodes_in: wp.array[wp.vec3],  # [M]
-    shape_rotations_in: wp.array[wp.vec4],  # [M]
-    indices_in: wp.array2d[wp.int32],  # [N, K]
-    weights_in: wp.array2d[float],  # [N, K]
-    v_means_in: wp.array[wp.vec3],  # [N]
-    v_blends_in: wp.array[wp.vec4],  # [N]
-    v_log_scales_in: wp.array[wp.vec3],  # [N], touched only with has_log_scales
-    has_log_scales: int,
-    # Out:
-    sums_out: wp.array2d[float],  # [M, SUMS (+ 3)] zero on entry
-):
-    """Node sums of one node, through its list of pairs: for CUDA, where chunks would leave the device idle."""
-    m = first + wp.tid()
-    K = indices_in.shape[1]
-    for at in range(begin_in[m], begin_in[m + 1]):
-        pair = order_in[at]
-        i = pair // K
-        _add(
-            i, pair - i * K, m, means_in, quats_in, nodes_in, shape_rotations_in, indices_in, weights_in,
-            v_means_in, v_blends_in, v_log_scales_in, has_log_scales, sums_out,
-        )  # fmt: skip
 
 
 @wp.kernel

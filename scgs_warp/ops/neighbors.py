@@ -10,6 +10,7 @@ from torch import Tensor
 from ..kernels import neighbor_lists, neighbors_cpu
 from ..kernels import neighbors as kernels
 from ..warp_interop import launch
+from .node_sums import rbf_node_sums
 
 
 class NodeLists(NamedTuple):
@@ -163,10 +164,7 @@ def _node_sums(
         sums = torch.zeros(chunks * count, width)
         launch(kernels.rbf_reduce_chunks, chunks, size, points, nodes, indices, v_logits, sums, grain=1)
         return chunks, sums
-    lists = lists or node_lists(indices, count)
-    sums = torch.zeros(count, width, device=points.device)
-    launch(kernels.rbf_reduce_lists, count, *lists, points, nodes, v_logits, sums, grain=8)
-    return 1, sums
+    return 1, rbf_node_sums(*(lists or node_lists(indices, count)), points, nodes, indices, v_logits)
 
 
 class _RbfWeights(torch.autograd.Function):

@@ -12,6 +12,7 @@ from ..kernels import skinning_cpu, skinning_cpu_adjoint, skinning_palette
 from ..types import Pose
 from ..warp_interop import launch
 from .neighbors import NodeLists, chunk_size, node_lists, rbf_weights
+from .node_sums import skin_node_sums
 
 
 class _Skin(torch.autograd.Function):
@@ -73,10 +74,7 @@ def _node_sums(pairs: tuple, scaled: int, lists: NodeLists | None) -> tuple[int,
         sums = torch.zeros(chunks * count, width)
         launch(kernels.skin_reduce_chunks, chunks, size, *pairs, sums, grain=1)
         return chunks, sums
-    lists = lists or node_lists(indices, count)
-    sums = torch.zeros(count, width, device=means.device)
-    launch(kernels.skin_reduce_lists, count, *lists, *pairs, sums, grain=8)
-    return 1, sums
+    return 1, skin_node_sums(*(lists or node_lists(indices, count)), pairs, scaled)
 
 
 def _pose_tensors(pose: Pose) -> tuple[Tensor | None, ...]:

@@ -1,0 +1,44 @@
+"""Gradients of control points on CUDA: sums over the sorted list of all pairs of Gaussian and control point."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..kernels import node_sums_cuda as kernels
+from ..kernels.skinning import SUMS
+from ..warp_interop import launch
+
+
+def skin_node_sums(order: Tensor, begin: Tensor, pairs: tuple, scaled: int) -> Tensor:
+    """[M, SUMS (+ 3)] for ``skin_finish``; ``pairs``: arguments of ``skin_segments`` from ``means_in`` on, in which
+    ``nodes`` are the third."""
+    rows = _rows(order, pairs[2], SUMS + 3 * scaled)
+    launch(kernels.skin_segments, _segments(order), order, *pairs, rows, grain=8)
+    return _sum(begin, rows)
+
+
+def rbf_node_sums(
+    order: Tensor, begin: Tensor, points: Tensor, nodes: Tensor, indices: Tensor, v_logits: Tensor
+) -> Tensor:
+    """[M, 2 + D] for ``rbf_finish``."""
+    parts = -(-nodes.shape[1] // kernels.LANES)
+    rows = _rows(order, nodes, 2 + nodes.shape[1])
+    launch(
+        kernels.rbf_segments, parts * _segments(order), parts, order, points, nodes, indices, v_logits, rows, grain=8
+    )
+    return _sum(begin, rows)
+
+
+def _segments(order: Tensor) -> int:
+    return -(-len(order) // kernels.SEGMENT)
+
+
+def _rows(order: Tensor, nodes: Tensor, width: int) -> Tensor:
+    return torch.empty(_segments(order) + len(nodes), width, device=order.device)
+
+
+def _sum(begin: Tensor, rows: Tensor) -> Tensor:
+    sums = torch.empty(len(begin) - 1, rows.shape[1], device=rows.device)
+    launch(kernels.sum_segments, sums.numel(), begin, rows, sums)
+    return sums
