@@ -34,7 +34,8 @@ def largest_shift(
         if poison == 0.0:
             if wp.isnan(d2):
                 most = wp.inf
-            most = wp.max(most, d2)
+            elif d2 > most:
+                most = d2
     shift_out[first + wp.tid()] = wp.sqrt(most)
 
 

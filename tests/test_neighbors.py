@@ -135,12 +135,14 @@ def test_the_memory_is_used_and_renewed():
         lists = search._lists
 
 
-def test_one_far_jump_is_noticed():
+@pytest.mark.parametrize("afar", [50.0, 1e25, float("nan"), float("inf")])
+def test_one_far_jump_is_noticed(afar):
     """One node that comes from afar into the midst of all, and one point that goes elsewhere."""
     points, nodes = cloud(8, 4000, 200, 3)
-    nodes[17] = 50.0
+    nodes[17] = afar
     search = NeighborSearch()
     search(points, nodes, 4)
+    assert torch.equal(search(points, nodes, 4), nearest(points, nodes, 4)[0]) and full_searches(search) == 0
     nodes[17] = 0.0
     points[9], points[10] = points[2000], 30.0
     found = search(points, nodes, 4)
