@@ -7,6 +7,7 @@ from torch import Tensor
 from reference.network import network as twin
 from scgs_warp import environment
 from scgs_warp.motion.network import DeformationNetwork
+from scgs_warp.ops import network as ops
 from scgs_warp.ops.network import Layers, evaluate, network, supported
 
 SHAPES = [  # inputs of position and time, hidden widths, layers that read the inputs again, outputs
@@ -54,18 +55,30 @@ def test_values_and_gradients(shape, positions, times, seed):
         assert float((got.double() - want).norm() / want.norm().clamp_min(1e-6)) < 2e-3
 
 
-def test_inputs_without_a_gradient_change_no_bit_of_the_others(monkeypatch):
+def test_inputs_without_a_gradient_cost_nothing_and_change_no_bit(monkeypatch):
     weights, biases = parameters(SHAPES[2], 11)
     where, when = rows(SHAPES[2], 13, 2, 11)
-    asked: list[bool] = []
-    inner = Layers.inputs_gradient
-    monkeypatch.setattr(Layers, "inputs_gradient", lambda *args: asked.append(True) or inner(*args))
+    launched: list[str] = []
+    launch = ops.launch
+    monkeypatch.setattr(ops, "launch", lambda kernel, *a, **k: launched.append(kernel.key) or launch(kernel, *a, **k))
     results = []
     for wanted in (False, True):
         out = network(where.clone().requires_grad_(wanted), when, weights, biases)
         results.append([out, *torch.autograd.grad(out.sum(), (*weights, *biases))])
-        assert len(asked) == wanted, "computed although nobody wants it"
+        assert launched.count("network_inputs_adjoint") == wanted
     assert all(torch.equal(a, b) for a, b in zip(*results))
+
+
+@pytest.mark.parametrize("largest", [32, 64])
+def test_the_adjoint_in_parts_gives_the_same_bits(largest, monkeypatch):
+    weights, biases = parameters(SHAPES[2], 13)
+    where, when = rows(SHAPES[2], 51, 2, 13)
+    where.requires_grad_()
+    v = torch.randn(102, 40, generator=torch.Generator().manual_seed(13))
+    whole = torch.autograd.grad(network(where, when, weights, biases), (where, *weights, *biases), v)
+    monkeypatch.setattr(ops, "LARGEST_ADJOINT", largest)
+    parts = torch.autograd.grad(network(where, when, weights, biases), (where, *weights, *biases), v)
+    assert all(torch.equal(a, b) for a, b in zip(whole, parts))
 
 
 def test_gradient_of_the_inputs_alone():

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels import network_adjoint_cpu as adjoint_kernels
+from ..kernels import network_adjoint_cpu as kernels_adjoint
 from ..kernels import network_cpu as kernels
 from ..kernels.network_panels import BLOCK, PANEL
 from ..warp_interop import launch
@@ -19,6 +19,10 @@ LARGEST = 8192
 """Rows evaluated at once where no gradient is wanted: what they pass from layer to layer stays in the cache."""
 
 
+LARGEST_ADJOINT = 2048
+"""The same for the adjoint; the bits do not depend on it."""
+
+
 class Layers:
     """Weights of all layers in the form that the kernels read, made anew when a parameter has changed.
 
@@ -27,7 +31,7 @@ class Layers:
         biases: [out] of every layer.
         inputs: columns of the inputs. A layer whose weights are that much wider than its predecessor's output reads
             them again, before that output (a skip connection).
-        inputs_adjoint: whether :meth:`inputs_gradient` will be called.
+        inputs_adjoint: whether :meth:`gradients` will be asked for that of the inputs.
     """
 
     def __init__(self, weights: list[Tensor], biases: list[Tensor], inputs: int, inputs_adjoint: bool = False) -> None:
@@ -68,41 +72,44 @@ class Layers:
         launch(kernels.network_values, blocks, size, int(keep), self.table, self.packed, inputs, hidden, out, grain=1)
         return inputs, hidden, out
 
-    def hidden_gradient(self, hidden: Tensor, v_out: Tensor) -> Tensor:
-        """Before every layer's ReLU, in panels."""
-        v_hidden = torch.empty_like(hidden)
-        blocks = -(-hidden.shape[1] // BLOCK)
-        launch(
-            adjoint_kernels.network_adjoint, blocks, BLOCK, self.table, self.packed, hidden, v_out, v_hidden, grain=1
-        )
-        return v_hidden
-
-    def inputs_gradient(self, v_hidden: Tensor, positions: int, times: int, columns: int) -> Tensor:
-        """[M, columns] of the first columns of the inputs; over all times, in order."""
-        v_inputs = torch.empty(times, positions, columns)
-        blocks = -(-v_hidden.shape[1] // BLOCK)
-        rows = v_inputs.view(times * positions, columns)
-        launch(adjoint_kernels.network_inputs_adjoint, blocks, BLOCK, self.table, self.packed, v_hidden, rows, grain=1)
-        total = v_inputs[0] if times else torch.zeros(positions, columns)
-        for own in v_inputs[1:]:
-            total += own
-        return total
-
-    def gradients(self, inputs: Tensor, hidden: Tensor, v_hidden: Tensor, count: int) -> list[Tensor]:
-        """Of every layer's weights, then of every layer's bias."""
-        layers = len(self.weights)
-        flat = torch.empty(self.gradient_size)
+    def gradients(
+        self, inputs: Tensor, hidden: Tensor, v_out: Tensor, sizes: tuple[int, int, int] | None
+    ) -> tuple[Tensor | None, list[Tensor]]:
+        """Of the inputs' first columns, summed over the times ([M, A]; ``sizes`` are M, T, A, None where nobody wants
+        it), and of every layer's weights, then of every layer's bias."""
+        layers, rows, count = len(self.weights), hidden.shape[1], v_out.shape[0]
+        flat = torch.zeros(self.gradient_size) if count == 0 else torch.empty(self.gradient_size)
         table = self.table.clone()
         table[:, 8] = torch.tensor(self.gradient_begin) * flat.element_size() + flat.data_ptr()
+        v_inputs = None if sizes is None else torch.empty(count, sizes[2])
+        v_hidden = torch.empty(layers, min(rows, LARGEST_ADJOINT), hidden.shape[2])
         parts = 2
-        shared = self.panels, parts, count, table, inputs, hidden, v_hidden
-        launch(adjoint_kernels.network_weights_adjoint, layers * self.panels * parts, *shared, grain=1)
+        for begin in range(0, rows, LARGEST_ADJOINT):
+            own = min(LARGEST_ADJOINT, rows - begin)
+            grid, where = -(-own // BLOCK), (BLOCK, begin, table, self.packed)
+            launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
+            if v_inputs is not None:
+                launch(kernels_adjoint.network_inputs_adjoint, grid, *where, v_hidden, v_inputs, grain=1)
+            shared = self.panels, parts, begin, min(own, count - begin), table, inputs, hidden, v_hidden
+            launch(kernels_adjoint.network_weights_adjoint, layers * self.panels * parts, *shared, grain=1)
+        v_where = None if v_inputs is None or sizes is None else _over_times(v_inputs, *sizes)
         weights, biases = [], []
-        for begin, weight in zip(self.gradient_begin, self.weights):
-            end = begin + weight.numel()
-            weights.append(flat[begin:end].view_as(weight))
+        for place, weight in zip(self.gradient_begin, self.weights):
+            end = place + weight.numel()
+            weights.append(flat[place:end].view_as(weight))
             biases.append(flat[end : end + weight.shape[0]])
-        return weights + biases
+        return v_where, weights + biases
+
+
+def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> Tensor:
+    """[T M, A] to [M, A], in order."""
+    if times == 0:
+        return torch.zeros(positions, columns)
+    instants = v_inputs.view(times, positions, columns)
+    total = instants[0]
+    for own in instants[1:]:
+        total += own
+    return total
 
 
 class _Network(torch.autograd.Function):
@@ -119,11 +126,9 @@ class _Network(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients):  # type: ignore[override]
-        inputs, hidden = ctx.saved_tensors
-        v_out = gradients[0].contiguous()
-        v_hidden = ctx.layers.hidden_gradient(hidden, v_out)
-        v_where = ctx.layers.inputs_gradient(v_hidden, *ctx.sizes) if ctx.needs_input_grad[0] else None
-        return v_where, None, *ctx.layers.gradients(inputs, hidden, v_hidden, v_out.shape[0])
+        sizes = ctx.sizes if ctx.needs_input_grad[0] else None
+        v_where, of_parameters = ctx.layers.gradients(*ctx.saved_tensors, gradients[0].contiguous(), sizes)
+        return v_where, None, *of_parameters
 
 
 def supported(weights: list[Tensor], biases: list[Tensor]) -> bool:
