@@ -64,14 +64,15 @@ class Place:
         function: Callable[[int], Any],
         targets: dict[str, list[tuple[Any, str]]],
         renderer: str = "scgs_warp",
+        staged: Callable[[int], Any] | None = None,
     ) -> list[dict[str, Any]]:
-        """The whole, undisturbed, then its stages, in calls of their own."""
+        """The whole, undisturbed, then its stages, in calls of their own (of ``staged`` where that differs)."""
         plan, device = self.plan, self.plan.device
         plan.report(f"{name}, {self.scene.motion_name}, {self.threads} threads")
         scaling = two_thread_scaling()
         reset_peak(device)
         whole = repeat(function, plan.seconds, device)
-        parts = Stages(device, targets).repeat(function, plan.seconds) if targets else {}
+        parts = Stages(device, targets).repeat(staged or function, plan.seconds) if targets else {}
         camera = scene_camera(self.scene, plan.size)
         peak = peak_mib(device)
         common = {

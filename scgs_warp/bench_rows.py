@@ -32,8 +32,8 @@ RENDER_STAGES = {
 
 
 def motion_stages(motion: Motion, training: bool = False) -> dict[str, list[tuple[Any, str]]]:
-    """Where a motion model spends its time: the network (planes and their heads included), and skinning (which in
-    training includes the search for neighbours)."""
+    """Where a motion model spends its time: the network (planes, their heads and in training their smoothness
+    included), and skinning (which in training includes the search for neighbours)."""
     if isinstance(motion, ControlPoints):
         found: dict[str, list[tuple[Any, str]]] = {"network": [(motion, "poses")]}
         found["skin"] = [(motion, "bind_and_pose"), (motion, "apply_pose")]
@@ -42,7 +42,9 @@ def motion_stages(motion: Motion, training: bool = False) -> dict[str, list[tupl
         return found
     if isinstance(motion, PerGaussian):
         return {"network": [(motion.network, "forward")]}
-    return {"network": [(motion, "gaussians_at")]} if isinstance(motion, HexPlane) else {}
+    if isinstance(motion, HexPlane):
+        return {"network": [(motion, "train_at" if training else "gaussians_at")]}
+    return {}
 
 
 def draw_stages(module: Any) -> dict[str, list[tuple[Any, str]]]:
@@ -50,11 +52,28 @@ def draw_stages(module: Any) -> dict[str, list[tuple[Any, str]]]:
 
 
 def frame_rows(place: Place) -> list[dict[str, Any]]:
-    """Frames of the moving scene: each at another time, so that the network runs for each; neighbours are cached."""
+    """Frames of the moving scene: each at another time, so that the network runs for each; neighbours are cached.
+
+    On CUDA the whole is a recorded graph, in which nothing can be timed: its stages are those of a frame drawn step by
+    step."""
     scene = place.scene
     camera = scene_camera(scene, place.plan.size)
     targets = {**motion_stages(scene.motion), **draw_stages(render)}
-    return place.rows("frame", lambda index: scene.render(camera, 0.5 + 0.4 * ((0.37 * index) % 1.0 - 0.5)), targets)
+
+    def time(index: int) -> float:
+        return 0.5 + 0.4 * ((0.37 * index) % 1.0 - 0.5)
+
+    @torch.no_grad()
+    def steps(index: int) -> None:
+        view = scene.normalisation.apply_camera(camera).to(scene.device)
+        color = torch.tensor(scene.background_color, device=scene.device)
+        posed = scene.motion.gaussians_at(scene.gaussians, time(index))
+        render.render(posed, view, color, antialiased=scene.config.antialiased)
+
+    def whole(index: int) -> None:
+        scene.render(camera, time(index))
+
+    return place.rows("frame", whole, targets, staged=steps if place.plan.device == "cuda" else None)
 
 
 class Leaves:
@@ -141,5 +160,6 @@ def step_rows(place: Place) -> list[dict[str, Any]]:
             state.step += 1
 
         rows += place.rows(name, step, targets)
+    scene.motion.eval()
     scene.freeze_binding()
     return rows

@@ -108,6 +108,7 @@ def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int 
             model.log_radii.fill_(math.log(float(neighbor_distance(positions).median())))
     _loosen(model, seed)
     scene = Scene(gaussians.to(device), model.to(device), Normalisation.identity(), config, OVERVIEW)
+    scene.motion.eval()  # as a loaded run's: some models keep what training would change
     scene.freeze_binding()
     return scene
 
@@ -191,7 +192,8 @@ def _background(scene: Scene) -> str:
 
 
 def training_state(scene: Scene, arap: bool) -> TrainState:
-    """The scene in the joint phase of training, at full harmonics, statistics for densification on; rates near 0."""
+    """The scene in the joint phase of training, at full harmonics, statistics for densification on; rates near 0.
+    The scene's motion is in training mode from here on."""
     own = scene.config
     base = TrainConfig(seed=own.seed, data=own.data, motion=own.motion, antialiased=own.antialiased)
     rates = OptimConfig()
@@ -203,6 +205,7 @@ def training_state(scene: Scene, arap: bool) -> TrainState:
     loss = base.loss if arap else dataclasses.replace(base.loss, arap=0.0)
     config = dataclasses.replace(base, optim=dataclasses.replace(rates, **slow), loss=loss)
     step = config.pretrain_steps + max(config.freeze, 3 * config.densify.sh_every)
+    scene.motion.train()
     nothing: Tensor = torch.zeros(0, 3)
     rest = (scene.normalisation, scene.overview, 1.0, nothing, nothing)
     return TrainState(config, scene.gaussians, scene.motion, *rest, stage="main", fingerprint="", step=step)

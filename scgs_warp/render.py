@@ -56,13 +56,13 @@ def draw(
     stats: Stats | None = None,
     antialiased: bool = False,
     depth: bool = False,
-    binned: Callable[[Splats], Tiles] = bin_splats,
+    binned: Callable[[Splats], Tiles] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """As :func:`render`, planar, and depth only on demand: it costs a training step that has no use for it.
 
     Args:
         depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
-        binned: lists which splats touch which tile.
+        binned: lists which splats touch which tile. None: ``bin_splats``.
 
     Returns:
         image [3 or 4, H, W] and alpha [H, W].
@@ -79,7 +79,8 @@ def draw(
     if depth:
         channels = torch.cat([channels, splats.depths[:, None]], dim=1)
         background = None if background is None else torch.cat([background, background.new_zeros(1)])
-    return composite(splats, channels, binned(splats), background, stats=stats)
+    tiles = bin_splats(splats) if binned is None else binned(splats)
+    return composite(splats, channels, tiles, background, stats=stats)
 
 
 def expected_depth(accumulated: Tensor, alpha: Tensor) -> Tensor:

@@ -147,6 +147,35 @@ def test_steps_with_and_without_arap(tmp_path, device):
     assert "step/arap" not in [row["name"] for row in rows if row["motion"] == "static"]
 
 
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_frames_are_drawn_as_of_a_loaded_run_and_steps_as_in_training(motion):
+    scene = bench_scene.synthetic_scene(motion, 60, 12, "cpu")
+    assert not scene.motion.training
+    assert bench_scene.training_state(scene, arap=False).motion.training
+    plan = bench.Plan(None, 60, 12, 32, (motion,), "cpu", (1,), 0.0)
+    place = bench_place.Place(scene, plan, bench_scene.Load(1, 1.0), 1)
+    names = [row["name"] for row in bench_rows.step_rows(place)]
+    assert not scene.motion.training and ("step/network" in names) == (motion != "static")
+
+
+def test_on_a_gpu_stages_are_those_of_a_frame_drawn_step_by_step(monkeypatch):
+    """The whole is a recorded graph there; the steps that are timed instead draw the same picture."""
+    scene = bench_scene.synthetic_scene("control-points", 120, 12, "cpu")
+    plan = bench.Plan(None, 120, 12, 48, ("control-points",), "cuda", (1,), 0.0)
+    place = bench_place.Place(scene, plan, bench_scene.Load(1, 1.0), 1)
+    given, drawn = {}, []
+    monkeypatch.setattr(
+        bench_place.Place, "rows", lambda self, *args, **options: given.update(options, args=args) or []
+    )
+    bench_rows.frame_rows(place)
+    draw = render_module.render
+    monkeypatch.setattr(render_module, "render", lambda *args, **kw: drawn.append(draw(*args, **kw)) or drawn[-1])
+    given["staged"](3)
+    whole = scene.render(bench_scene.scene_camera(scene, 48), 0.5 + 0.4 * ((0.37 * 3) % 1.0 - 0.5))
+    assert len(drawn) == 1 and torch.equal(drawn[0].rgb, whole.rgb) and torch.equal(drawn[0].depth, whole.depth)
+    assert "bin" in bench_clock.Stages("cpu", given["args"][2]).repeat(given["staged"], 0.0)
+
+
 def test_one_and_all_threads_by_default(monkeypatch):
     monkeypatch.setattr(bench.environment, "available_threads", lambda: 6)
     assert bench.thread_counts(None, "cpu") == (1, 6)
