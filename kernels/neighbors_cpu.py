@@ -177,8 +177,10 @@ _LISTED = (
         if (listed >= 0) {
             begin_list(kc, best, index);
             const int dims = decltype(dc)::value == 3 ? 3 : D;
-            for (int at = 0; at < listed; ++at)
-                insert(kc, best, index, squared(dc, x, node_data + (long long)list[at] * dims), list[at]);
+            for (int at = 0; at < listed; ++at) {
+                vf s = squared(dc, x, node_data + (long long)list[at] * dims);
+                if (__builtin_reduce_or(s < best[S - 1])) insert(kc, best, index, s, list[at]);
+            }
             vf last = best[S - 1], off = squared(dc, x, centre), poison = x[0] * 0.0f;
             #pragma clang loop unroll(full)
             for (int j = 0; j < S; ++j) last = j == K - 1 ? best[j] : last;
