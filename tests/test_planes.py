@@ -2,12 +2,18 @@ from __future__ import annotations
 
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from reference import planes as twin
 from scgs_warp import environment
-from scgs_warp.ops.planes import PAIRS, plane_features, plane_features_and_variation, plane_variation
+from scgs_warp.ops.planes import (
+    PAIRS,
+    _features_in_torch,
+    _variation_in_torch,
+    plane_features,
+    plane_features_and_variation,
+    plane_variation,
+)
 
 EXTENTS = [[(5, 7, 4, 3)], [(8, 8, 8, 5), (16, 16, 16, 5)], [(2, 3, 2, 2), (3, 2, 4, 7)]]
 """x, y, z, t of every level."""
@@ -66,22 +72,30 @@ def test_exact_texels(time, device):
 
 
 def test_agrees_with_grid_sample():
-    """What the planes were before they had kernels: torch's sampling of channels-first planes."""
+    """The form for CUDA, torch's sampling of channels-first planes, here on the CPU."""
     planes, positions = planes_of(EXTENTS[1], 4), positions_of(200, 4)
-    where = torch.cat([positions, torch.full((200, 1), 2.0 * 0.3 - 1.0)], dim=1)
-    levels = []
-    for level in (0, 6):
-        product = torch.ones(32, 200)
-        for pair, plane in zip(PAIRS, planes[level : level + 6]):
-            grid, image = where[:, pair].view(1, 1, -1, 2), plane.permute(2, 0, 1)[None]
-            product = product * F.grid_sample(image, grid, align_corners=True, padding_mode="border")[0, :, 0]
-        levels.append(product)
-    expected = torch.cat(levels).T
-    found = plane_features(positions, 0.3, planes)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-    v = torch.randn(found.shape, generator=torch.Generator().manual_seed(4))
-    for got, want in zip(*(torch.autograd.grad(f, (positions, *planes), v) for f in (found, expected))):
+    forms = plane_features(positions, 0.3, planes), _features_in_torch(positions, 0.3, planes)
+    torch.testing.assert_close(*forms, rtol=1e-5, atol=1e-5)
+    smooth = plane_variation(planes), _variation_in_torch(planes)
+    torch.testing.assert_close(*smooth)
+    v = torch.randn(forms[0].shape, generator=torch.Generator().manual_seed(4)), torch.tensor(2.0)
+    inputs = (positions, *planes)
+    for got, want in zip(*(torch.autograd.grad(both, inputs, v) for both in zip(forms, smooth))):
         torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4)
+    where = torch.tensor([[float("nan"), float("inf"), -3e38]], requires_grad=True)
+    forms = plane_features(where, 0.3, planes), _features_in_torch(where, 0.3, planes)
+    torch.testing.assert_close(*forms, rtol=1e-5, atol=1e-5)
+    for found in forms:
+        assert not bool(torch.autograd.grad(found.sum(), where)[0].any())
+
+
+def test_the_time_may_be_a_tensor(device):
+    planes, positions = planes_of(EXTENTS[0], 12, device), positions_of(7, 12, device)
+    found = plane_features(positions, torch.tensor([0.25], device=device), planes)
+    assert torch.equal(found, plane_features(positions, 0.25, planes))
+    where = positions.detach().cpu(), [plane.detach().cpu() for plane in planes]
+    in_torch = _features_in_torch(where[0], torch.tensor([0.25]), where[1])
+    torch.testing.assert_close(found.cpu(), in_torch, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 3e38, -3e38])

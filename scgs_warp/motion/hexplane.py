@@ -60,11 +60,11 @@ class HexPlane(Motion):
             nn.init.normal_(last.weight, std=1e-4, generator=random)
         self._packed: tuple[tuple[tuple[int, int], ...], Layers] | None = None
 
-    def features(self, positions: Tensor, time: float) -> Tensor:
+    def features(self, positions: Tensor, time: float | Tensor) -> Tensor:
         """[N, 64] products of bilinear samples; positions outside the cube take the border's value."""
         return plane_features(positions / BOUND, time, list(self.planes))
 
-    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
+    def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         return self._moved(gaussians, self.features(gaussians.means, time))
 
     def smoothness(self) -> Tensor:

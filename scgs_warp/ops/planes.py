@@ -96,14 +96,15 @@ class _Planes(torch.autograd.Function):
         return v_positions, None, None, *v_planes
 
 
-def plane_features(positions: Tensor, time: float, planes: list[Tensor]) -> Tensor:
+def plane_features(positions: Tensor, time: float | Tensor, planes: list[Tensor]) -> Tensor:
     """The product of six bilinear samples for each Gaussian and level; levels side by side.
 
     Args:
         positions: [N, 3]; the planes span [-1, 1], first and last texels at the ends. Outside, the border's value
             counts and has no gradient to the position, nor has it on the border itself. A coordinate that is not a
             number counts as -1.
-        time: in [0, 1]; the time planes span that.
+        time: in [0, 1], or such a tensor [1] on the positions' device (no gradient; on CUDA the host does not read it);
+            the time planes span that.
         planes: six a level, in the order of :data:`PAIRS`: [second axis, first axis, 32], float32, two texels a side
             at least. The planes of a level have the same extent along the same axis.
 
@@ -117,7 +118,9 @@ def plane_features(positions: Tensor, time: float, planes: list[Tensor]) -> Tens
     return _run(positions, time, planes, False)[0]
 
 
-def plane_features_and_variation(positions: Tensor, time: float, planes: list[Tensor]) -> tuple[Tensor, Tensor]:
+def plane_features_and_variation(
+    positions: Tensor, time: float | Tensor, planes: list[Tensor]
+) -> tuple[Tensor, Tensor]:
     """:func:`plane_features` and :func:`plane_variation` in one: their gradients share one pass over the planes."""
     features, variation = _run(positions, time, planes, True)
     return features, variation
@@ -130,23 +133,25 @@ def plane_variation(planes: list[Tensor]) -> Tensor:
     return _run(nowhere, 0.0, planes, True)[1]
 
 
-def _run(positions: Tensor, time: float, planes: list[Tensor], with_variation: bool) -> tuple[Tensor, Any]:
+def _run(positions: Tensor, time: float | Tensor, planes: list[Tensor], with_variation: bool) -> tuple[Tensor, Any]:
     _validate(positions, planes)
     if positions.device.type != "cpu":
         return _features_in_torch(positions, time, planes), _variation_in_torch(planes) if with_variation else None
     contiguous = [plane.contiguous() for plane in planes]
-    return _Planes.apply(positions.contiguous(), time, with_variation, *contiguous)  # type: ignore[return-value]
+    return _Planes.apply(positions.contiguous(), float(time), with_variation, *contiguous)  # type: ignore[return-value]
 
 
-def _features_in_torch(positions: Tensor, time: float, planes: list[Tensor]) -> Tensor:
+def _features_in_torch(positions: Tensor, time: float | Tensor, planes: list[Tensor]) -> Tensor:
     """On CUDA; torch's kernel adds the planes' gradients atomically."""
     kept = positions.nan_to_num(nan=-1.0)  # no gradient there, as on a CPU
-    where = torch.cat([kept, kept.new_full((kept.shape[0], 1), 2.0 * time - 1.0)], dim=1)
+    when = 2.0 * time - 1.0
+    last = when.detach().expand(len(kept)) if isinstance(when, Tensor) else kept.new_full((len(kept),), when)
+    axes = [*kept.unbind(1), last]
     found = []
     for level in range(0, len(planes), len(PAIRS)):
         product = None
-        for pair, plane in zip(PAIRS, planes[level : level + len(PAIRS)]):
-            grid = where[:, pair].view(1, 1, -1, 2)
+        for (first, second), plane in zip(PAIRS, planes[level : level + len(PAIRS)]):
+            grid = torch.stack([axes[first], axes[second]], dim=1)[None, None]
             image = plane.permute(2, 0, 1)[None]
             sample = F.grid_sample(image, grid, align_corners=True, padding_mode="border")[0, :, 0]
             product = sample if product is None else product * sample
