@@ -1,0 +1,54 @@
+"""How ``gpu_check`` times, and when it says that two results agree."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+PIXEL_TOLERANCE = 1e-4
+LARGEST_DIFFERENCE = 8e-3
+"""One alpha threshold that flips moves a pixel by up to 1/255, two by up to this."""
+GRADIENT_TOLERANCE = 1e-2
+
+
+def time_of(function: Callable[[], Any], device: str, repeats: int) -> dict[str, float]:
+    """Milliseconds of a call after three to warm up: median and least of calls that are waited for one by one, and the
+    mean of as many in a row."""
+    wait = torch.cuda.synchronize if device == "cuda" else lambda: None
+    for _ in range(3):
+        function()
+    times = []
+    for _ in range(repeats):
+        wait()
+        start = time.perf_counter()
+        function()
+        wait()
+        times.append(1e3 * (time.perf_counter() - start))
+    start = time.perf_counter()
+    for _ in range(repeats):
+        function()
+    wait()
+    in_a_row = 1e3 * (time.perf_counter() - start) / repeats
+    return {"ms_median": statistics.median(times), "ms_min": min(times), "ms_in_a_row": in_a_row}
+
+
+def compare_images(a: Tensor, b: Tensor) -> dict[str, Any]:
+    """The rule of agreement: 99.9 % of pixels within the tolerance, none beyond one flipped threshold."""
+    difference = (a.detach().cpu() - b.detach().cpu()).abs().amax(0)
+    within = float((difference <= PIXEL_TOLERANCE).double().mean())
+    largest = float(difference.max())
+    passed = within >= 0.999 and largest <= LARGEST_DIFFERENCE
+    return {"pixels_within_1e-4": within, "largest_difference": largest, "passed": passed}
+
+
+def compare_gradients(ours: Tensor, theirs: Tensor) -> dict[str, Any]:
+    """Relative L2 per Gaussian, with a floor of 1e-6 of the tensor's norm."""
+    a, b = (t.detach().cpu().double().reshape(len(t), -1) for t in (ours, theirs))
+    error = (a - b).norm(dim=1) / torch.maximum(b.norm(dim=1), 1e-6 * b.norm())
+    p99 = float(error.kthvalue(max(1, int(0.99 * len(error)))).values)
+    return {"median": float(error.median()), "p99": p99, "passed": p99 <= GRADIENT_TOLERANCE}
