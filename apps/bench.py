@@ -183,7 +183,7 @@ def measure(options: Options, plan: Any) -> dict[str, Any]:
 
     report = bench.bench(type(options).__name__.lower(), plan)  # type: ignore[arg-type]
     if getattr(options, "table_s2", False):
-        report["table_s2"] = bench_summary.table_s2(report["rows"])
+        report["table_s2"] = bench_summary.table_s2(report["compared"])
     return report
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,9 +12,9 @@ from .bench_clock import machine, now
 from .bench_memory import resident_mib
 from .bench_peers import Peers
 from .bench_place import MIDDLE, Place, Plan, posed
-from .bench_rows import frame_rows, raster_rows, step_rows
+from .bench_rows import frame_rows, frames_of, raster_rows, step_rows
 from .bench_scene import load_of, synthetic_scene
-from .bench_summary import motion_costs
+from .bench_summary import compare_frames, motion_costs
 from .config import MOTIONS
 from .errors import UserError
 from .scene import Scene
@@ -34,7 +34,7 @@ def bench(what: What, plan: Plan) -> dict[str, Any]:
 
     Returns:
         ``date``, ``machine``, ``what`` and ``rows``, dictionaries with ``KEYS``; of frames also ``motion``, what moving
-        the scene costs. Ready for JSON.
+        the scene costs, and ``compared``, several motion models in turns. Ready for JSON.
 
     Raises:
         UserError: the run cannot be read, gsplat is asked for and not usable, or the renderers disagree.
@@ -42,6 +42,8 @@ def bench(what: What, plan: Plan) -> dict[str, Any]:
     measure = {"frame": frame_rows, "raster": raster_rows, "step": step_rows}[what]
     peers = Peers.find(plan) if plan.against else None
     rows: list[dict[str, Any]] = []
+    compared: list[dict[str, Any]] = []
+    drawn: dict[str, Callable[[int], None]] = {}
     before = environment.thread_count()
     try:
         for scene in scenes(plan, what):
@@ -51,10 +53,16 @@ def bench(what: What, plan: Plan) -> dict[str, Any]:
                 environment.configure(threads)
                 place = Place(scene, plan, load, threads, resident)
                 rows += measure(place) if peers is None else peers.rows(place)
+            if what == "frame":
+                drawn[scene.motion_name] = frames_of(scene, plan.size)
+        for threads in plan.threads if len(drawn) > 1 else ():
+            environment.configure(threads)
+            plan.report(f"all in turns, {threads} threads")
+            compared += compare_frames(drawn, threads, plan.seconds, plan.device)
     finally:
         environment.configure(before)
     report = {"date": now(), "machine": machine(plan.device), "what": what, "rows": rows}
-    return {**report, "motion": motion_costs(rows)} if what == "frame" else report
+    return {**report, "motion": motion_costs(rows, compared), "compared": compared} if what == "frame" else report
 
 
 def scenes(plan: Plan, what: What) -> Iterator[Scene]:

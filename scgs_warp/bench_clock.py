@@ -52,6 +52,25 @@ def repeat(function: Callable[[int], Any], seconds: float, device: str) -> Timin
     return Timing(1e3 * statistics.median(times), 1e3 * min(times))
 
 
+def turns(functions: list[Callable[[int], Any]], seconds: float, device: str) -> list[list[float]]:
+    """Milliseconds of every function's calls, one call each in turn, warm-up left out; as many turns as take about
+    ``seconds`` per function, at least ``FEWEST``."""
+    wait = torch.cuda.synchronize if device == "cuda" else _nothing
+    times: list[list[float]] = [[] for _ in functions]
+    for index in range(WARM_UP):
+        for function in functions:
+            function(index)
+    with _no_garbage_collection():
+        while len(times[0]) < FEWEST or (sum(map(sum, times)) < 1e3 * seconds * len(times) and len(times[0]) < MOST):
+            for own, function in zip(times, functions):
+                wait()
+                began = time.perf_counter()
+                function(WARM_UP + len(own))
+                wait()
+                own.append(1e3 * (time.perf_counter() - began))
+    return times
+
+
 def _nothing() -> None:
     pass
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from . import render, train
 from .bench_place import MIDDLE, Place, posed
-from .bench_scene import scene_camera, training_data, training_state
+from .bench_scene import Size, scene_camera, training_data, training_state
 from .errors import UserError
 from .frames import Frames
 from .motion import ControlPoints, HexPlane, PerGaussian, control_points
@@ -21,6 +21,7 @@ from .ops.compositing import composite
 from .ops.harmonics import spherical_harmonics
 from .ops.projection import project
 from .optim import generator
+from .scene import Scene
 from .types import Camera, Gaussians
 
 RENDER_STAGES = {
@@ -51,6 +52,21 @@ def draw_stages(module: Any) -> dict[str, list[tuple[Any, str]]]:
     return {stage: [(module, name)] for stage, name in RENDER_STAGES.items()}
 
 
+def instant(index: int) -> float:
+    """The time that frame ``index`` shows: another for each, in [0.3, 0.7]."""
+    return 0.5 + 0.4 * ((0.37 * index) % 1.0 - 0.5)
+
+
+def frames_of(scene: Scene, size: Size) -> Callable[[int], None]:
+    """Draws frame ``index``, as a viewer would."""
+    camera = scene_camera(scene, size)
+
+    def draw(index: int) -> None:
+        scene.render(camera, instant(index))
+
+    return draw
+
+
 def frame_rows(place: Place) -> list[dict[str, Any]]:
     """Frames of the moving scene: each at another time, so that the network runs for each; neighbours are cached.
 
@@ -60,19 +76,14 @@ def frame_rows(place: Place) -> list[dict[str, Any]]:
     camera = scene_camera(scene, place.plan.size)
     targets = {**motion_stages(scene.motion), **draw_stages(render)}
 
-    def time(index: int) -> float:
-        return 0.5 + 0.4 * ((0.37 * index) % 1.0 - 0.5)
-
     @torch.no_grad()
     def steps(index: int) -> None:
         view = scene.normalisation.apply_camera(camera).to(scene.device)
         color = torch.tensor(scene.background_color, device=scene.device)
-        posed = scene.motion.gaussians_at(scene.gaussians, time(index))
+        posed = scene.motion.gaussians_at(scene.gaussians, instant(index))
         render.render(posed, view, color, antialiased=scene.config.antialiased)
 
-    def whole(index: int) -> None:
-        scene.render(camera, time(index))
-
+    whole = frames_of(scene, place.plan.size)
     return place.rows("frame", whole, targets, staged=steps if place.plan.device == "cuda" else None)
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import statistics
+from collections.abc import Callable
 from typing import Any
+
+from .bench_clock import turns
 
 PAPER_FPS = {"control-points": 295.4, "static": 298.5, "hexplane": 145.8, "per-gaussian": 113.3}
 """Frames a second in the seed's Table S2: 800 x 800, 48,980 Gaussians on average, RTX 3090 (SC-GS, 3D-GS, 4D-GS, and
@@ -11,49 +15,56 @@ the baseline that asks the network for every Gaussian)."""
 Rows = list[dict[str, Any]]
 
 
-def wholes(rows: Rows, name: str = "frame") -> Rows:
-    """The rows of that name, in their order; stages have other names."""
-    return [row for row in rows if row["name"] == name]
+def compare_frames(scenes: dict[str, Callable[[int], Any]], threads: int, seconds: float, device: str) -> Rows:
+    """Frames of several motion models in turns, one frame each: what disturbs the machine meets all of them alike.
 
+    Args:
+        scenes: per motion model, what draws frame ``index``.
+        threads: they draw on; for the rows only.
+        seconds: for each model.
 
-def _fps(frames: Rows, motion: str) -> float | None:
-    return next((row["fps"] for row in frames if row["motion"] == motion), None)
-
-
-def motion_costs(rows: Rows) -> Rows:
-    """For every moving model and number of threads: ``ms_median`` and ``ms_min`` of network and skinning together,
-    and ``ratio_to_static``, its frames a second divided by those of Gaussians at rest (None unless measured)."""
+    Returns:
+        Per model ``ms_median``, ``ms_min``, ``fps`` by the median, and ``ratios``: to every model's speed, the median
+        over turns of its time divided by one's own in the same turn.
+    """
+    times = dict(zip(scenes, turns(list(scenes.values()), seconds, device)))
     found = []
-    for whole in wholes(rows):
-        same = [row for row in rows if all(row[key] == whole[key] for key in ("motion", "threads"))]
-        parts = [row for row in same if row["name"] in ("frame/network", "frame/skin")]
-        if not parts:
-            continue
-        rest = _fps([row for row in wholes(rows) if row["threads"] == whole["threads"]], "static")
-        figures = {key: sum(row[key] for row in parts) for key in ("ms_median", "ms_min")}
-        ratio = None if rest is None else whole["fps"] / rest
-        found.append({"motion": whole["motion"], "threads": whole["threads"], **figures, "ratio_to_static": ratio})
+    for motion, own in times.items():
+        ratios = {peer: statistics.median(b / a for a, b in zip(own, other)) for peer, other in times.items()}
+        middle = statistics.median(own)
+        figures = {"ms_median": middle, "ms_min": min(own), "fps": 1e3 / middle, "ratios": ratios}
+        found.append({"motion": motion, "threads": threads, **figures})
     return found
 
 
-def table_s2(rows: Rows) -> Rows:
+def motion_costs(rows: Rows, compared: Rows) -> Rows:
+    """For every moving model and number of threads: ``ms_median`` and ``ms_min`` of network and skinning together, and
+    ``ratio_to_static``, its frames a second divided by those of Gaussians at rest (None unless compared)."""
+    ratios = {(one["motion"], one["threads"]): one["ratios"].get("static") for one in compared}
+    found: dict[tuple[str, int], dict[str, Any]] = {}
+    for row in rows:
+        if row["name"] in ("frame/network", "frame/skin"):
+            key = row["motion"], row["threads"]
+            fresh = {"motion": key[0], "threads": key[1], "ms_median": 0.0, "ms_min": 0.0}
+            cost = found.setdefault(key, {**fresh, "ratio_to_static": ratios.get(key)})
+            for figure in ("ms_median", "ms_min"):
+                cost[figure] += row[figure]
+    return list(found.values())
+
+
+def table_s2(compared: Rows) -> Rows:
     """Speeds relative to Gaussians at rest and to the model that asks the network for every Gaussian, here and in the
     paper: the machines differ, the ratios compare."""
-    found = []
-    for threads in sorted({row["threads"] for row in rows}):
-        frames = [row for row in wholes(rows) if row["threads"] == threads]
-        here = {row["motion"]: row["fps"] for row in frames}
-        for name, fps in here.items():
-            found.append(
-                {
-                    "motion": name,
-                    "threads": threads,
-                    "fps": fps,
-                    "ratio_to_static": fps / here["static"],
-                    "ratio_to_per_gaussian": fps / here["per-gaussian"],
-                    "paper_fps": PAPER_FPS[name],
-                    "paper_ratio_to_static": PAPER_FPS[name] / PAPER_FPS["static"],
-                    "paper_ratio_to_per_gaussian": PAPER_FPS[name] / PAPER_FPS["per-gaussian"],
-                }
-            )
-    return found
+    return [
+        {
+            "motion": one["motion"],
+            "threads": one["threads"],
+            "fps": one["fps"],
+            "ratio_to_static": one["ratios"]["static"],
+            "ratio_to_per_gaussian": one["ratios"]["per-gaussian"],
+            "paper_fps": PAPER_FPS[one["motion"]],
+            "paper_ratio_to_static": PAPER_FPS[one["motion"]] / PAPER_FPS["static"],
+            "paper_ratio_to_per_gaussian": PAPER_FPS[one["motion"]] / PAPER_FPS["per-gaussian"],
+        }
+        for one in compared
+    ]
