@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from scgs_warp import environment
 from scgs_warp.config import TrainConfig
 from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.motion.hexplane import BOUND, HexPlane
@@ -92,3 +93,18 @@ def test_same_bits_with_and_without_gradients():
     trained = model.gaussians_at(gaussians, 0.6)
     with torch.no_grad():
         assert torch.equal(model.eval().gaussians_at(gaussians, 0.6).means, trained.means)
+
+
+def test_same_bits_on_any_number_of_threads(all_threads):
+    model, gaussians = model_and_gaussians(6, 5001)  # more rows than the adjoint takes at once
+    config = TrainConfig()
+    results = []
+    for threads in (1, 2, 3):
+        environment.configure(threads)
+        pose = model.train_at(gaussians, 0.4, config.freeze, config, seed=0)
+        posed = [pose.gaussians.means, pose.gaussians.quats, pose.gaussians.scales, pose.regulariser]
+        v = [torch.linspace(-1.0, 1.0, p.numel()).view_as(p) for p in posed if p is not None]
+        parameters = [gaussians.means, gaussians.quats, gaussians.log_scales, *model.parameters()]
+        results.append([*posed, *torch.autograd.grad(posed, parameters, v)])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
