@@ -8,7 +8,6 @@ On CUDA a launch goes to torch's current stream, whole.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
 import os
@@ -21,7 +20,8 @@ import warp as wp
 
 from . import environment
 from .cpu_threads import cut_by_load, cut_evenly, share
-from .cuda_graph import on_torch_stream
+from .cuda_graph import warp_stream
+from .cuda_launch import RecordedKernel
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 
@@ -68,6 +68,7 @@ class _ArrayParameter(NamedTuple):
 
 _parameters: dict[wp.Kernel, list[_ArrayParameter | None]] = {}
 _cpu_kernels: dict[wp.Kernel, _CpuKernel] = {}
+_cuda_kernels: dict[tuple[wp.Kernel, int | None, int], RecordedKernel] = {}
 
 
 def _describe_parameters(kernel: wp.Kernel) -> list[_ArrayParameter | None]:
@@ -256,9 +257,7 @@ def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.T
     for value in args:
         if isinstance(value, torch.Tensor):
             if value.is_cuda:
-                packed, _ = _pack(kernel, args)
-                with _torch_stream(value.device):
-                    wp.launch(kernel, dim=count, inputs=[0, *packed], device=wp.device_from_torch(value.device))
+                _launch_on_cuda(kernel, count, args, value.device)
                 return
             break
     cpu = _cpu_kernels.get(kernel)
@@ -274,8 +273,17 @@ def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.T
         share(call, cut_evenly(count, threads, grain) if load is None else cut_by_load(load, threads), threads)
 
 
-def _torch_stream(device: torch.device) -> contextlib.AbstractContextManager:
-    return on_torch_stream(device)
+def _launch_on_cuda(
+    kernel: wp.Kernel, dim: int | tuple[int, int], args: tuple, device: torch.device, block_dim: int = 256
+) -> None:
+    """Launch on torch's current stream of ``device``."""
+    key = kernel, device.index, block_dim
+    ready = _cuda_kernels.get(key)
+    if ready is None:
+        packed, _ = _pack(kernel, args)
+        ready = RecordedKernel(kernel, _parameters[kernel], packed, _array, dim, device, block_dim)
+        _cuda_kernels[key] = ready
+    ready.launch(dim, args, warp_stream(device))
 
 
 def launch_blocks(kernel: wp.Kernel, blocks: int, *args, block_dim: int) -> None:
@@ -286,18 +294,14 @@ def launch_blocks(kernel: wp.Kernel, blocks: int, *args, block_dim: int) -> None
     """
     if blocks <= 0:
         return
-    packed, device = _pack(kernel, args)
-    on_cuda = device is not None and device.type == "cuda"
-    if not on_cuda and not wp.config.enable_cpu_blocks:
+    device = next((value.device for value in args if isinstance(value, torch.Tensor)), None)
+    if device is not None and device.type == "cuda":
+        _launch_on_cuda(kernel, (blocks, block_dim), args, device, block_dim)
+        return
+    if not wp.config.enable_cpu_blocks:
         raise RuntimeError(f"kernel {kernel.key} needs a GPU (or wp.config.enable_cpu_blocks, in a test process)")
-    with _torch_stream(device) if on_cuda and device else contextlib.nullcontext():
-        wp.launch(
-            kernel,
-            dim=(blocks, block_dim),
-            inputs=[0, *packed],
-            device=wp.device_from_torch(device) if on_cuda and device else "cpu",
-            block_dim=block_dim,
-        )
+    packed, _ = _pack(kernel, args)
+    wp.launch(kernel, dim=(blocks, block_dim), inputs=[0, *packed], device="cpu", block_dim=block_dim)
 
 
 def warp_view(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
