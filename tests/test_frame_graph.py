@@ -10,14 +10,15 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from scgs_warp import bench_scene, frame_graph
+from scgs_warp.config import MOTIONS
 from scgs_warp.frame_graph import GRANULE, RECORD_AFTER, FrameGraph
 from scgs_warp.kernels import skinning_cpu
 from scgs_warp.motion import network
+from scgs_warp.motion.base import Motion
+from scgs_warp.ops import planes
 from scgs_warp.render import render
 from scgs_warp.scene import Scene
 from scgs_warp.types import Camera, Image
-
-MODELS = ("control-points", "per-gaussian", "static")
 
 
 def scene_of(model: str, device: str) -> Scene:
@@ -60,7 +61,7 @@ def graphs_overwrite(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frame_graph, "_Steps", Overwriting)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", MOTIONS)
 def test_frames_are_those_drawn_step_by_step(device: str, model: str):
     scene = scene_of(model, device)
     scene.normalisation = type(scene.normalisation)(scene.normalisation.centre + 0.1, 1.3)
@@ -85,12 +86,11 @@ def test_scene_renders_through_it_on_cuda_only(device: str):
 
 
 def test_a_motion_that_needs_the_time_on_the_host_is_refused(device: str):
-    scene = scene_of("hexplane", device)
-    if scene.motion.takes_time_tensor:
-        pytest.skip("it does not need it any more")
-    with pytest.raises(ValueError, match="hexplane"):
-        scene.frame_graph()
-    scene.render(bench_scene.scene_camera(scene, (32, 32)), 0.5)
+    class Host(Motion):
+        name = "host"
+
+    with pytest.raises(ValueError, match="motion host"):
+        FrameGraph(scene_of("static", device).gaussians, Host())
 
 
 def test_overflow_draws_the_frame_again_with_more_room(device: str, monkeypatch: pytest.MonkeyPatch):
@@ -159,11 +159,12 @@ class NoHost(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", MOTIONS)
 @torch.no_grad()
 def test_nothing_in_a_frame_asks_the_host(model: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(network, "supported", lambda *_: False)  # network and skinning as on CUDA
     monkeypatch.setattr(skinning_cpu, "MAX_NEIGHBORS", 0)
+    monkeypatch.setattr(planes, "_run", lambda *args: (planes._features_in_torch(*args[:3]).contiguous(), None))
     scene = scene_of(model, "cpu")
     frames = scene.frame_graph()
     frames.render(bench_scene.scene_camera(scene, (64, 48)), 0.5, torch.zeros(3))

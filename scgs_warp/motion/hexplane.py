@@ -31,6 +31,7 @@ class HexPlane(Motion):
     heads for position, rotation and log scale."""
 
     name = "hexplane"
+    takes_time_tensor = True
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__()
