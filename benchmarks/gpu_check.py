@@ -287,6 +287,8 @@ def two_under_way(graph: FrameGraph, scene: Scene, camera: Camera, repeats: int)
 def dynamic(s: Setting) -> Report:
     """The moving scene's frame with every motion model: frames a second, the share of motion, Table S2."""
     rows = [dynamic_row(name, s) for name in MOTIONS]
+    for row in rows:
+        row["ratios"] = {peer["motion"]: row["fps"] / peer["fps"] for peer in rows}
     moving = next(row for row in rows if row["motion"] == "control-points")
     goals = {"frames a second": moving["fps"] >= FRAMES_A_SECOND, "motion": moving["motion_ms"] <= MOTION_MS}
     share = moving["motion_ms"] * moving["fps"] / 1e3
