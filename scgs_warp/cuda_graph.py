@@ -46,14 +46,19 @@ class CudaGraph:
         Raises:
             RuntimeError: something in ``body`` cannot be captured.
         """
-        side = torch.cuda.Stream(device)
-        side.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(side):
+        warming, capturing = torch.cuda.Stream(device), torch.cuda.Stream(device)
+        warming.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(warming):
             for _ in range(2):
                 body()
-        torch.cuda.current_stream(device).wait_stream(side)
+        torch.cuda.current_stream(device).wait_stream(warming)
+        with torch.cuda.stream(capturing):
+            warp_stream(device)  # Warp makes an event for a stream it does not know, better not during the capture
         self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.device(device), torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
+        with (
+            torch.cuda.device(device),
+            torch.cuda.graph(self.graph, stream=capturing, capture_error_mode="thread_local"),
+        ):
             # Warp must know of the capture: its radix sort then takes its memory from the graph.
             capture = wp.ScopedCapture(stream=warp_stream(device), external=True)
             with capture:

@@ -108,7 +108,8 @@ def differences() -> dict[str, list[float]]:
 def test_same_as_the_pixel_form(case, differences):
     assert max(differences[case]) < 1e-5, differences[case]
     if torch.cuda.is_available():
-        assert max(differences[f"{case}, native"]) < 1e-5, differences[f"{case}, native"]
+        # The native form's exponentials and divisions are the device's own.
+        assert max(differences[f"{case}, native"]) < 1e-4, differences[f"{case}, native"]
 
 
 def test_the_cases_contain_what_they_are_for():

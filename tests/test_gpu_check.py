@@ -30,7 +30,11 @@ def test_quick_run_on_the_cpu(tmp_path: Path):
     assert report["passed"] and report["date"] and report["gpu"] is None and report["agreement"]["same_bits"]
     assert report["agreement"]["gradients"].keys() == {"means", "quats", "scales", "opacities", "sh_dc", "sh_rest"}
     moving = report["frames"]["control-points"]
-    assert all(moving["checks"].values()) and {"frame 4", "room grew", "recorded", "cpu"} < moving["checks"].keys()
+    assert (
+        all(moving["same_bits"])
+        and all(moving["checks"].values())
+        and {"frame 4", "room grew", "recorded", "cpu"} < moving["checks"].keys()
+    )
     assert report["forms"]["tiny/cpu"]["both"]["ms_median"] > 0
     assert report["raster"]["small"]["both"]["ms_median"] > 0 and report["raster"]["small"]["pairs"] > 100
     assert len(report["dynamic"]["table_s2"]) == len(report["dynamic"]["rows"]) == 4
