@@ -53,6 +53,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FRAMES_A_SECOND = 1000.0
 MOTION_MS = 0.15
 """What the dynamic frame shall reach on a GPU, and what its motion may cost."""
+TESTS_SECONDS = 500.0
 SLOWEST_FORM = 50_000
 """The pixel form and the portable one are timed up to so many Gaussians."""
 
@@ -329,7 +330,9 @@ def tests(s: Setting) -> Report:
     """The tests that run on CUDA: those whose ``device`` is that, and those of its own files."""
     selection = ["tests/test_ssim.py", "-k", "bad_arguments"] if s.quick else ["-k", "cuda and not gpu_check"]
     command = [sys.executable, "-m", "pytest", "-x" if s.quick else "--maxfail=50", "-p", "no:cacheprovider"]
-    result = subprocess.run([*command, *selection], cwd=ROOT, capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [*command, *selection], cwd=ROOT, capture_output=True, text=True, check=False, timeout=TESTS_SECONDS
+    )
     lines = result.stdout.strip().splitlines()
     failures = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
     return {
