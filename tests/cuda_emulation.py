@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import warp as wp
 from scgs_warp.kernels import compositing_cuda
 
 SHIM = Path(__file__).resolve().parent / "cuda_shim.h"
-COMPILER = shutil.which("g++")
+COMPILER = shutil.which("g++") if sys.platform == "linux" else None
 _TYPES = {wp.vec2: "wp::vec2", wp.vec3: "wp::vec3", wp.vec2i: "wp::vec2i", float: "float", int: "int"}
 _TYPES.update({wp.float32: "float", wp.int32: "int"})
 BODIES = {
