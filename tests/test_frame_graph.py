@@ -139,7 +139,7 @@ def test_recorded_anew_only_when_something_changed(device: str):
     scene.gaussians.sh_dc = torch.nn.Parameter(scene.gaussians.sh_dc + 0.1)
     check(large, 4)
     with torch.no_grad():
-        scene.motion.network.head.bias.add_(0.02)
+        scene.motion.get_parameter("network.head.bias").add_(0.02)
     check(large, 5)
     scene.freeze_binding()
     check(large, 5)
