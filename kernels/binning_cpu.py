@@ -38,9 +38,9 @@ _COUNT = (
         __builtin_memcpy(to, from, n * size);
         __builtin_memset((char*)to + n * size, 0, (16 - n) * size);
     };
-    int* stretches = stretches_of_chunk.data + (long)chunk * (bands + 1);
+    int* stretches = stretches_of_chunk.data + (long long)chunk * (bands + 1);
     __builtin_memset(stretches, 0, (bands + 1) * sizeof(int));
-    long pairs = 0;
+    long long pairs = 0;
     for (int i = begin; i < end; i += 16) {
         const int n = end - i < 16 ? end - i : 16;
         vf m[2], q[3], opacity, depth;
@@ -110,23 +110,23 @@ _DEAL = (
     _CHUNK
     + """
     typedef int v4 __attribute__((vector_size(16)));
-    int* cursors = cursors_of_chunk.data + (long)chunk * (bands + 1);
-    int* pairs = pairs_before.data + (long)chunk * (bands + 1);
+    int* cursors = cursors_of_chunk.data + (long long)chunk * (bands + 1);
+    int* pairs = pairs_before.data + (long long)chunk * (bands + 1);
     __builtin_memset(pairs, 0, (bands + 1) * sizeof(int));
-    long slot = first_slots.data[chunk];
+    long long slot = first_slots.data[chunk];
     for (int i = begin; i < end; ++i) {
         offsets.data[i] = slot;
-        unsigned long window = windows.data[i];
+        unsigned long long window = windows.data[i];
         const int top = corners.data[i].c[0], left = corners.data[i].c[1];
         if (window == 0 && left >= 0) continue;
         // The bits of the depth, turned so that they sort as unsigned numbers; + 0: minus zero becomes zero.
         const float depth = depths.data[i] + 0.0f;
         const unsigned bits = __builtin_bit_cast(unsigned, depth);
-        const unsigned long key = (unsigned long)(bits ^ ((unsigned)((int)bits >> 31) | 0x80000000u)) << 32;
+        const unsigned long long key = (unsigned long long)(bits ^ ((unsigned)((int)bits >> 31) | 0x80000000u)) << 32;
         auto deal = [&](int row, int column, int length) {
             const int at = cursors[row]++;
             const v4 stretch = {i, (int)slot, column, column + length};
-            __builtin_memcpy(stretches.data + 4l * at, &stretch, 16);
+            __builtin_memcpy(stretches.data + 4ll * at, &stretch, 16);
             keys.data[at] = key | (unsigned)at;
             pairs[row] += length;
             slot += length;
@@ -161,18 +161,19 @@ _DEAL = (
 
 _SORT = """
 #if !defined(__CUDA_ARCH__)
-    typedef unsigned long u64;
+    typedef unsigned long long u64;
     const int begin = band_begins.data[band], n = band_begins.data[band + 1] - begin;
     const int columns = cursors.shape.dims[1];
     int pair = 0;
     for (int chunk = 0; chunk < pairs_before.shape.dims[0]; ++chunk)
-        pair += pairs_before.data[(long)chunk * pairs_before.shape.dims[1] + band];
+        pair += pairs_before.data[(long long)chunk * pairs_before.shape.dims[1] + band];
 
     // How many pairs each tile has: +1 where a stretch begins, -1 behind its end, and running sums.
-    int* cursor = cursors.data + (long)band * columns;
+    int* cursor = cursors.data + (long long)band * columns;
     __builtin_memset(cursor, 0, columns * sizeof(int));
     for (int k = begin; k < begin + n; ++k) {
-        const int* stretch = stretches.data + 4l * k;
+        const int* stretch = stretches.data + 4ll * k;
+        if (stretch[2] == stretch[3]) continue;  // a row between others that the splat's pixels leave out
         ++cursor[stretch[2]];
         if (stretch[3] < columns) --cursor[stretch[3]];
     }
@@ -180,9 +181,9 @@ _SORT = """
     for (int column = 0; column < columns; ++column) {
         open += cursor[column];
         cursor[column] = pair;
-        ranges.data[(long)band * columns + column].c[0] = pair;
+        ranges.data[(long long)band * columns + column].c[0] = pair;
         pair += open;
-        ranges.data[(long)band * columns + column].c[1] = pair;
+        ranges.data[(long long)band * columns + column].c[1] = pair;
     }
 
     // Radix sort by depth, the lowest digit first; only the bits in which a band's depths differ.
@@ -215,7 +216,7 @@ _SORT = """
     }
 
     for (int k = 0; k < n; ++k) {
-        const int* stretch = stretches.data + 4l * (unsigned)from[k];
+        const int* stretch = stretches.data + 4ll * (unsigned)from[k];
         int slot = stretch[1];
         for (int column = stretch[2]; column < stretch[3]; ++column, ++slot) {
             const int at = cursor[column]++;

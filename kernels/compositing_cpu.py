@@ -106,7 +106,7 @@ _PRELUDE = f"""
     const int begin = ranges.data[tile].c[0], end = ranges.data[tile].c[1];
     const int x0 = 16 * (tile % columns), y0 = 16 * (tile / columns);
     const int wide = width - x0 < 16 ? width - x0 : 16, tall = height - y0 < 16 ? height - y0 : 16;
-    const long plane = (long)width * height, corner = (long)y0 * width + x0;
+    const long long plane = (long long)width * height, corner = (long long)y0 * width + x0;
     const int stride = packed.shape.dims[1];
 """
 
@@ -138,7 +138,7 @@ _FORWARD = (
         for (int p0 = begin; p0 < end && alive; p0 += 32) {
             const int n = end - p0 < 32 ? end - p0 : 32;
             for (int k = 0; k < n; ++k) {
-                const float* s = packed.data + (long)splats.data[p0 + k] * stride;
+                const float* s = packed.data + (long long)splats.data[p0 + k] * stride;
                 chunk[k] = read(s);
                 reached[k] = (short)reached_rows(chunk[k], s[7]);
                 for (int c = 0; c < C; ++c) channel[k][c] = s[GEOMETRY + c0 + c];
@@ -175,7 +175,7 @@ _FORWARD = (
         }
         for (int r = 0; r < tall; ++r) {
             const vf t = (vf)((vu)T[r] & 0x7fffffffu);
-            const long at = corner + (long)r * width;
+            const long long at = corner + (long long)r * width;
             for (int c = 0; c < count; ++c)
                 store(image.data + (c0 + c) * plane + at, sum[r][c] + t * background.data[c0 + c], wide);
             if (c0 == 0) store(alpha_image.data + at, 1.0f - t, wide);
@@ -217,7 +217,7 @@ _ADJOINT = (
         int last_pair = begin;
         for (int r = 0; r < 16; ++r) {
             const int n = r < tall ? wide : 0;
-            const long at = corner + (long)r * width;
+            const long long at = corner + (long long)r * width;
             T[r] = load(transmittance.data + at, n);
             ends[r] = (vi)load((const float*)last.data + at, n);
             vf total = ZERO - load(v_alpha.data + at, n);
@@ -228,11 +228,11 @@ _ADJOINT = (
             last_pair = row_ends[r] > last_pair ? row_ends[r] : last_pair;
         }
         for (int p = last_pair; p < end; ++p)
-            __builtin_memset(v_slots.data + (long)slots.data[p] * row_size, 0, row_size * sizeof(float));
+            __builtin_memset(v_slots.data + (long long)slots.data[p] * row_size, 0, row_size * sizeof(float));
 
         for (int p = last_pair - 1; p >= begin; --p) {
-            const float* s = packed.data + (long)splats.data[p] * stride;
-            float* out = v_slots.data + (long)slots.data[p] * row_size;
+            const float* s = packed.data + (long long)splats.data[p] * stride;
+            float* out = v_slots.data + (long long)slots.data[p] * row_size;
             const Splat g = read(s);
             unsigned rows = reached_rows(g, s[7]) & bits(row_ends > p);
             const unsigned visited = rows;
@@ -261,7 +261,7 @@ _ADJOINT = (
                 vf own = ZERO;
                 if (C > 0) for (int c = 0; c < C; ++c) own += v[r][c] * s[GEOMETRY + c];
                 else for (int c = 0; c < channels; ++c)
-                    own += load(v_image.data + c * plane + corner + (long)r * width, wide) * s[GEOMETRY + c];
+                    own += load(v_image.data + c * plane + corner + (long long)r * width, wide) * s[GEOMETRY + c];
                 vf grad = alpha * (own * t - behind[r] * inverse);
                 grad = raw > ALPHA_MAX ? ZERO : grad;
                 behind[r] += own * weight;
@@ -293,7 +293,7 @@ _ADJOINT = (
                 vf channel_sums[16] = {};
                 for (int c = 0; c < count; ++c)
                     for (unsigned left = visited; left; left &= left - 1u) {
-                        const long at = corner + (long)__builtin_ctz(left) * width;
+                        const long long at = corner + (long long)__builtin_ctz(left) * width;
                         channel_sums[c] += load(v_image.data + (c0 + c) * plane + at, wide) * w[__builtin_ctz(left)];
                     }
                 store(out + 8 + c0, lane_sums(channel_sums), count);

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import os
 import threading
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
@@ -94,6 +95,16 @@ class _Helpers:
 _helpers = _Helpers(False)
 
 
+def _forked() -> None:
+    """A child process has none of its parent's threads."""
+    global _helpers
+    _helpers = _Helpers(_helpers.flush_denormals)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)
+
+
 def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: int) -> None:
     """``call(first, size)`` once for each chunk, by this thread and up to ``threads - 1`` others.
 
@@ -119,9 +130,29 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
             if next(finished) == len(chunks):
                 all_done.release()
 
-    _helpers.submit(work, min(threads, len(chunks)) - 1)
-    work()
-    all_done.acquire()
-    calls.clear()
+    copies, left = min(threads, len(chunks)) - 1, threading.Semaphore(0)
+
+    def help_out() -> None:
+        work()
+        left.release()
+
+    _helpers.submit(help_out, copies)
+    try:
+        work()
+        all_done.acquire()
+    except BaseException:  # interrupted: helpers still write to memory that would be freed on the way out
+        _acquire_all(left, copies)
+        raise
+    finally:
+        calls.clear()
     if errors:
         raise errors[0]
+
+
+def _acquire_all(semaphore: threading.Semaphore, count: int) -> None:
+    while count > 0:
+        try:
+            semaphore.acquire()
+            count -= 1
+        except KeyboardInterrupt:
+            continue

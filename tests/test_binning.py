@@ -190,6 +190,41 @@ def test_both_sorts_agree_on_extreme_values(device: str, seed: int):
     assert assert_both_sorts_agree(replace(splats, **poisoned, radii=radii), device) > 1000
 
 
+def test_splats_that_leave_out_a_row_of_tiles_between_others(monkeypatch: pytest.MonkeyPatch):
+    """Faint needles, nearly upright: between two tiles' pixel centres they touch no tile of a row. Nothing is written
+    beyond a row's own counters."""
+    g = torch.Generator().manual_seed(5)
+    n, size = 4000, 48
+    slope, along, across = (0.08 * torch.rand(n, generator=g), 900.0 + 1200.0 * torch.rand(n, generator=g), 0.3)
+    xx, xy, yy = across + along * slope**2, along * slope, along
+    determinant = xx * yy - xy * xy
+    splats = random_splats(5, n, size, size)
+    means = torch.stack([16.0 + 0.3 * torch.randn(n, generator=g), 24.0 + 4.0 * torch.randn(n, generator=g)], 1)
+    opacities = 0.0041 + 0.002 * torch.rand(n, generator=g)
+    conics = torch.stack([yy, -xy, xx], 1) / determinant[:, None]
+    radii = torch.full((n, 2), 200, dtype=torch.int32)
+    splats = replace(splats, means2d=means, conics=conics, opacities=opacities, radii=radii)
+    beyond = []
+    original = binning.launch
+
+    def guarded(kernel, count, *args, **options):
+        if kernel is not binning.kernels.sort_bands:
+            return original(kernel, count, *args, **options)
+        shape = args[5].shape
+        counters = torch.full((shape[0] + 1, shape[1]), 7, dtype=torch.int32)
+        original(kernel, count, *args[:5], counters[:-1], *args[6:], **options)
+        beyond.append(counters[-1].tolist())
+
+    monkeypatch.setattr(binning, "launch", guarded)
+    tiles = bin_splats(splats)
+    columns = torch.zeros(n, 3, dtype=torch.bool)
+    for tile, splat in pairs_of(tiles):
+        columns[splat, tile // 3] = True
+    assert int((columns[:, 0] & ~columns[:, 1] & columns[:, 2]).sum()) > 5
+    assert beyond == [[7, 7, 7]]
+    assert assert_both_sorts_agree(splats) > n
+
+
 def test_all_culled(device: str):
     splats = random_splats(14, 500, 100, 60, device)
     tiles = bin_splats(replace(splats, radii=torch.zeros_like(splats.radii)))

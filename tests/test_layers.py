@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -112,3 +113,10 @@ def test_sizes(path):
             limit = MAX_KERNEL if in_warp else MAX_FUNCTION
             length = _body_lines(node)
             assert length < limit, f"{path.name}:{node.lineno} {node.name} has {length} lines"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "kernels").glob("*.py")), ids=lambda path: path.name)
+def test_native_code_does_not_depend_on_the_width_of_long(path: Path):
+    """It has 32 bits on Windows: 64-bit numbers are ``long long``."""
+    narrow = r"\((?:unsigned )?long\)|^\s*long (?!long\b)\w+\s*[=;,]|\b(?:const|unsigned) long (?!long\b)|\b\d+u?l\b"
+    assert not re.findall(narrow, path.read_text(encoding="utf-8"), re.MULTILINE)

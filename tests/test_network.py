@@ -195,3 +195,22 @@ def test_packed_weights_are_not_kept_when_they_change():
     model.head.bias.numpy()[:] += 1.0  # not counted, as an optimiser's kernel writes
     model.eval()
     torch.testing.assert_close(model(positions, times)["translations"], first + 2.0)
+
+
+def test_times_and_positions_get_a_gradient_where_they_want_one():
+    random = torch.Generator().manual_seed(12)
+    model = DeformationNetwork({"translations": 3}, generator=random)
+    torch.nn.init.normal_(model.head.weight, std=0.05, generator=random)
+    times = torch.tensor([0.2, 0.7], requires_grad=True)
+    model(torch.randn(5, 3, generator=random), times)["translations"].sum().backward()
+    assert times.grad is not None and bool(times.grad.any())
+
+
+def test_under_inference_mode_nothing_is_kept():
+    random = torch.Generator().manual_seed(13)
+    with torch.inference_mode():
+        model = DeformationNetwork({"translations": 3}, generator=random).eval()
+        positions, times = torch.randn(9, 3, generator=random), torch.tensor([0.3])
+        first = model(positions, times)["translations"]
+        model.head.bias.add_(1.0)
+        torch.testing.assert_close(model(positions, times)["translations"], first + 1.0)

@@ -270,6 +270,19 @@ def test_weights_and_skinning_in_one_pass(device, n, m, k, options):
         assert k == 1 or scale > 1e-3, name
 
 
+@pytest.mark.parametrize("nodes", [512, 513, 515, 518])
+def test_every_gaussian_counts_once_for_its_nodes(device, nodes):
+    """However many nodes there are: a shift of all of them shifts every Gaussian by as much."""
+    named, indices = fused_inputs(6, 5000, nodes, 3, scales=True)
+    leaves = {name: tensor.to(device).requires_grad_() for name, tensor in named.items()}
+    pose = Pose(**{name: leaves[name] for name in FIELDS if name in leaves})
+    rest = {name: leaf for name, leaf in leaves.items() if name not in FIELDS}
+    means, _, log_scales = skin_rbf(**rest, pose=pose, indices=indices.to(device))
+    (means.sum() + log_scales.sum()).backward()
+    for name in ("translations", "log_scales"):
+        assert abs(float(leaves[name].grad.double().sum()) - 15_000.0) < 0.5
+
+
 def test_rotations_on_one_side_take_a_shorter_way_to_the_same_bits(monkeypatch):
     near, indices = fused_inputs(5, 3000, 64, 4, scales=True, near=True)
     far = fused_inputs(5, 3000, 64, 4)[0]

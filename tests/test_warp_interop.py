@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import threading
+import time
 import weakref
 
 import numpy as np
@@ -172,3 +174,41 @@ def test_nobody_waits_for_a_helper_that_found_nothing(monkeypatch: pytest.Monkey
     hold.set()
     asking.join(10)
     assert not asking.is_alive()
+
+
+def test_an_interrupt_waits_until_no_helper_writes_any_more(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cpu_threads, "_helpers", cpu_threads._Helpers(environment.configured()))
+    started, ended = threading.Event(), threading.Event()
+
+    class Interrupted(list):
+        """A list of chunks whose length the asking thread fails to learn, once a helper is at work."""
+
+        def __len__(self) -> int:
+            if threading.current_thread() is threading.main_thread() and started.is_set():
+                raise KeyboardInterrupt
+            return super().__len__()
+
+    def call(first: int, size: int) -> None:
+        if threading.current_thread() is threading.main_thread():
+            assert started.wait(10)
+        else:
+            started.set()
+            time.sleep(0.2)
+            ended.set()
+
+    with pytest.raises(KeyboardInterrupt):
+        share(call, Interrupted([(0, 1), (1, 1), (2, 1)]), 2)
+    assert ended.is_set()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_starts_threads_of_its_own():
+    share(lambda first, size: None, [(0, 1), (1, 1)], 2)
+    child = os.fork()
+    if child == 0:
+        done: list[int] = []
+        share(lambda first, size: done.append(first), [(k, 1) for k in range(4)], 2)
+        own = any(thread.name.startswith("warp-") for thread in threading.enumerate())
+        os._exit(0 if sorted(done) == [0, 1, 2, 3] and own else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

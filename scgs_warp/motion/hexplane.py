@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ..config import TrainConfig
 from ..gaussians import GaussianParameters
-from ..ops.network import Layers, evaluate, network
+from ..ops.network import Layers, PackedLayers, evaluate, network
 from ..ops.planes import CHANNELS, PAIRS, plane_features, plane_features_and_variation, plane_variation
 from ..optim import generator, log_linear
 from ..types import Gaussians
@@ -59,7 +59,7 @@ class HexPlane(Motion):
         for head in self.heads.values():
             last = head[-1]  # type: ignore[index]
             nn.init.normal_(last.weight, std=1e-4, generator=random)
-        self._packed: tuple[tuple[tuple[int, int], ...], Layers] | None = None
+        self._packed = PackedLayers()
 
     def features(self, positions: Tensor, time: float | Tensor) -> Tensor:
         """[N, 64] products of bilinear samples; positions outside the cube take the border's value."""
@@ -84,7 +84,7 @@ class HexPlane(Motion):
         return TrainingPose(self._moved(gaussians, found), weight * variation)
 
     def train(self, mode: bool = True) -> HexPlane:
-        self._packed = None  # the optimiser writes where torch does not count
+        self._packed.forget()  # the optimiser writes where torch need not count
         return super().train(mode)
 
     def _moved(self, gaussians: GaussianParameters, features: Tensor) -> Gaussians:
@@ -107,11 +107,9 @@ class HexPlane(Motion):
         when = features.new_empty(1, 0)
         if self.training or torch.is_grad_enabled():
             return network(features, when, *self._layers())
-        # Packed weights are kept for the next frame; in training they would be old after one step.
-        key = tuple((p.data_ptr(), p._version) for module in (self.trunk, self.heads) for p in module.parameters())
-        if self._packed is None or self._packed[0] != key:
-            self._packed = key, Layers(*self._layers(), features.shape[1])
-        return evaluate(self._packed[1], features, when)
+        parameters = (p for module in (self.trunk, self.heads) for p in module.parameters())
+        packed = self._packed(parameters, lambda: Layers(*self._layers(), features.shape[1]))
+        return evaluate(packed, features, when)
 
     def _layers(self) -> tuple[list[Tensor], list[Tensor]]:
         first, last = ([cast(nn.Linear, head[place]) for head in self.heads.values()] for place in (1, 3))  # type: ignore[index]

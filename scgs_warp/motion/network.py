@@ -7,7 +7,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from ..ops.network import Layers, evaluate, network, supported
+from ..ops.network import Layers, PackedLayers, evaluate, network, supported
 
 
 def encode(values: Tensor, frequencies: int) -> Tensor:
@@ -51,10 +51,10 @@ class DeformationNetwork(nn.Module):
         self.head = nn.Linear(width, sum(heads.values()))
         nn.init.normal_(self.head.weight, std=1e-5, generator=generator)
         nn.init.zeros_(self.head.bias)
-        self._packed: tuple[tuple[tuple[int, int], ...], Layers] | None = None
+        self._packed = PackedLayers()
 
     def train(self, mode: bool = True) -> DeformationNetwork:
-        self._packed = None  # the optimiser writes where torch does not count
+        self._packed.forget()  # the optimiser writes where torch need not count
         return super().train(mode)
 
     def forward(self, positions: Tensor, times: Tensor) -> dict[str, Tensor]:
@@ -76,7 +76,7 @@ class DeformationNetwork(nn.Module):
         return dict(zip(self.heads, out.split(list(self.heads.values()), dim=-1)))
 
     def _layered(self, where: Tensor, when: Tensor) -> Tensor:
-        """Layer by layer in torch: on CUDA, in bfloat16, and where the positions want a gradient."""
+        """Layer by layer in torch: on CUDA, in bfloat16, and where positions or times want a gradient."""
         count, instants = where.shape[0], when.shape[0]
         both = [where[None].expand(instants, -1, -1), when[:, None].expand(-1, count, -1)]
         inputs = torch.cat(both, dim=-1).reshape(instants * count, -1)
@@ -93,12 +93,11 @@ class DeformationNetwork(nn.Module):
         layers = [cast(nn.Linear, layer) for layer in (*self.layers, self.head)]
         weights: list[Tensor] = [layer.weight for layer in layers]
         biases: list[Tensor] = [layer.bias for layer in layers]
-        if (self.low_precision and self.training) or where.requires_grad or not supported(weights, biases):
+        wants_inputs = where.requires_grad or when.requires_grad
+        if (self.low_precision and self.training) or wants_inputs or not supported(weights, biases):
             return None
         if self.training or torch.is_grad_enabled():
             return network(where, when, weights, biases)
-        # Packed weights are kept for the next frame; in training they would be old after one step.
-        key = tuple((p.data_ptr(), p._version) for p in (*weights, *biases))
-        if self._packed is None or self._packed[0] != key:
-            self._packed = key, Layers(weights, biases, where.shape[1] + when.shape[1])
-        return evaluate(self._packed[1], where, when)
+        columns = where.shape[1] + when.shape[1]
+        packed = self._packed((*weights, *biases), lambda: Layers(weights, biases, columns))
+        return evaluate(packed, where, when)

@@ -30,8 +30,9 @@ def node_lists(indices: Tensor, count: int) -> NodeLists:
 
 
 def chunk_size(nodes: int) -> int:
-    """Gaussians whose node gradients are summed into one buffer on a CPU. A function of the node count alone."""
-    return max(2048, 4 * nodes)
+    """Gaussians whose node gradients are summed into one buffer on a CPU: a function of the node count alone, and a
+    multiple of the 16 that the kernels take at a time."""
+    return max(2048, -(-4 * nodes // 16) * 16)
 
 
 def _check_nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -122,11 +123,11 @@ class NeighborSearch:
             return nearest(points, nodes, k)[0]
         blocks = _blocks(points)
         # New lists cost about as much as searching every block in full: they are due once that much was searched.
-        if self._lists is None or self._searched > blocks or not self._lists.fit(points, nodes, k):
+        own = self._lists  # once: another thread may put others there
+        if own is None or self._searched > blocks or not own.fit(points, nodes, k):
             indices, distances = nearest(points, nodes, k)
             self._lists, self._searched = _make_lists(points, nodes, distances), 0
             return indices
-        own = self._lists
         shift, failed = torch.empty(1), torch.empty(blocks, dtype=torch.int32)
         launch(neighbor_lists.largest_shift, 1, own.nodes, nodes, shift)
         indices = torch.empty(points.shape[0], k, dtype=torch.int32)

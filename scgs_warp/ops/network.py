@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -110,6 +111,27 @@ def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> T
     for own in instants[1:]:
         total += own
     return total
+
+
+class PackedLayers:
+    """Weights packed for one frame are kept for the next, for as long as no parameter is replaced or changed in place.
+    What torch does not count (edits through ``.data``, other libraries' writes) is not seen: :meth:`forget` them."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[list[tuple[int, int]], Layers] | None = None
+
+    def forget(self) -> None:
+        self._kept = None
+
+    def __call__(self, parameters: Iterable[Tensor], make: Callable[[], Layers]) -> Layers:
+        """The layers that ``make`` packs from ``parameters``."""
+        parameters = list(parameters)
+        if any(p.is_inference() for p in parameters):  # torch does not count changes of these
+            return make()
+        key, kept = [(p.data_ptr(), p._version) for p in parameters], self._kept
+        if kept is None or kept[0] != key:
+            kept = self._kept = key, make()
+        return kept[1]
 
 
 class _Network(torch.autograd.Function):
