@@ -81,8 +81,11 @@ def configure(threads: int | None = None, deterministic: bool = True) -> None:
     starts them. Denormals made one stretch of 250 training steps 20 times slower.
     """
     global _threads, _configured
+    import numpy as np
     import torch
 
+    for dtype in (np.float32, np.float64):
+        np.finfo(dtype)  # numpy looks once, and older ones warn of the missing denormals if they are flushed by then
     _threads, _configured = threads, True
     _keep_freed_memory()
     torch.set_flush_denormal(True)
