@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import math
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 _threads: int | None = None
@@ -93,3 +95,18 @@ def configure(threads: int | None = None, deterministic: bool = True) -> None:
     torch.use_deterministic_algorithms(deterministic, warn_only=True)
     # With this switch on, torch.empty writes NaN into every buffer; our kernels fill what they allocate.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+
+
+@contextlib.contextmanager
+def one_piece() -> Iterator[None]:
+    """For torch's exp, sigmoid, sine and their like over large tensors. Torch cuts such work where its threads meet,
+    and computes the last elements of each piece with other instructions, which round differently: the bits would depend
+    on the number of threads. Not a matter of speed at these sizes."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

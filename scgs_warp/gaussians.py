@@ -6,10 +6,17 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
+from .environment import one_piece
 from .types import Gaussians
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh_dc."""
+
+
+def fixed_exp(values: Tensor) -> Tensor:
+    """exp, to the same bits on any number of threads."""
+    with one_piece():
+        return values.exp()
 
 
 class GaussianParameters(nn.Module):
@@ -62,11 +69,12 @@ class GaussianParameters(nn.Module):
 
     def scales(self) -> Tensor:
         """[N, 3] standard deviations."""
-        return self.log_scales.exp()
+        return fixed_exp(self.log_scales)
 
     def opacities(self) -> Tensor:
         """[N] in (0, 1)."""
-        return self.opacity_logits.sigmoid()
+        with one_piece():
+            return self.opacity_logits.sigmoid()
 
     def activate(self) -> Gaussians:
         """The Gaussians at rest: activation happens here and nowhere else."""
@@ -90,6 +98,7 @@ def gaussians_from_points(
 ) -> GaussianParameters:
     """Round Gaussians at ``points`` [N, 3], as large as the distance to their neighbours times ``scale``; ``colors``
     [N, 3] in [0, 1], grey where there are none."""
-    log_scales = (neighbor_distance(points) * scale).log()[:, None].repeat(1, 3)
+    with one_piece():
+        log_scales = (neighbor_distance(points) * scale).log()[:, None].repeat(1, 3)
     sh_dc = torch.zeros_like(points) if colors is None else (colors - 0.5) / SH_C0
     return GaussianParameters(points, log_scales, sh_dc, sh_degree=sh_degree, hyper_dim=hyper_dim)

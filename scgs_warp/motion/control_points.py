@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..config import LossConfig, MotionConfig, TrainConfig
-from ..gaussians import GaussianParameters
+from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.skinning import skin, skin_rbf
 from ..optim import generator, log_linear
@@ -50,7 +50,7 @@ def unit_rotations(raw: Tensor) -> Tensor:
 
 def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | None]) -> Gaussians:
     means, quats, log_scales = moved
-    scales = gaussians.scales() if log_scales is None else (gaussians.log_scales + log_scales).exp()
+    scales = gaussians.scales() if log_scales is None else fixed_exp(gaussians.log_scales + log_scales)
     return Gaussians(means, quats, scales, gaussians.opacities(), gaussians.sh_dc, gaussians.sh_rest)
 
 

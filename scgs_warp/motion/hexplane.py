@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..config import TrainConfig
-from ..gaussians import GaussianParameters
+from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.network import Layers, PackedLayers, evaluate, network
 from ..ops.planes import CHANNELS, PAIRS, plane_features, plane_features_and_variation, plane_variation
 from ..optim import generator, log_linear
@@ -92,7 +92,7 @@ class HexPlane(Motion):
         return Gaussians(
             gaussians.means + means,
             gaussians.quats + quats,
-            (gaussians.log_scales + log_scales).exp(),
+            fixed_exp(gaussians.log_scales + log_scales),
             gaussians.opacities(),
             gaussians.sh_dc,
             gaussians.sh_rest,

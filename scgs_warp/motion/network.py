@@ -7,6 +7,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from ..environment import one_piece
 from ..ops.network import Layers, PackedLayers, evaluate, network, supported
 
 
@@ -14,7 +15,8 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
     """[..., D] -> [..., D (1 + 2 F)]: the values, then sin and cos of 2^k times them, k = 0 .. F - 1."""
     octaves = 2.0 ** torch.arange(frequencies, device=values.device, dtype=values.dtype)
     angles = (values[..., None, :] * octaves[:, None]).flatten(-2)
-    return torch.cat([values, angles.sin(), angles.cos()], dim=-1)
+    with one_piece():
+        return torch.cat([values, angles.sin(), angles.cos()], dim=-1)
 
 
 class DeformationNetwork(nn.Module):

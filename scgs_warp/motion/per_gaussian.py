@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..config import TrainConfig
-from ..gaussians import GaussianParameters
+from ..gaussians import GaussianParameters, fixed_exp
 from ..optim import log_linear
 from ..types import Gaussians
 from .base import Motion, TrainingPose
@@ -29,7 +29,7 @@ class PerGaussian(Motion):
         return Gaussians(
             gaussians.means + out["translations"][0],
             gaussians.quats + out["rotations"][0],
-            (gaussians.log_scales + out["log_scales"][0]).exp(),
+            fixed_exp(gaussians.log_scales + out["log_scales"][0]),
             gaussians.opacities(),
             gaussians.sh_dc,
             gaussians.sh_rest,
