@@ -31,6 +31,7 @@ class Dataset(Sequence[Frame]):
         split: str,
         background: str = "black",
         points: Tensor | None = None,
+        colors: Tensor | None = None,
     ) -> None:
         self._frames = tuple(frames)
         self.folder = folder
@@ -39,6 +40,8 @@ class Dataset(Sequence[Frame]):
         """``black``, ``white`` or ``random``."""
         self.points = points
         """[P, 3] initial points, world units, where the data has some."""
+        self.colors = colors
+        """[P, 3] their colours in [0, 1], where the data has those, too."""
 
     @overload
     def __getitem__(self, index: int) -> Frame: ...

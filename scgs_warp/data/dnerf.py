@@ -7,25 +7,23 @@ Layout: Pumarola et al., D-NeRF, CVPR 2021, and NeRF's Blender scenes.
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import torch
 
 from ..errors import UserError
-from ..types import Camera, Frame
+from ..types import Frame
 from .dataset import Dataset
 from .images import Decoded, parallel_map, read_image
-
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-RIGID_TOLERANCE = 1e-3
-"""Largest entry of R^T R - I that passes as rounding."""
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+from .transforms import (
+    check_distortion,
+    find_image,
+    make_camera,
+    read_intrinsics,
+    read_pose,
+    read_times,
+    read_transforms,
+    size_text,
+)
 
 
 def transforms_path(folder: Path, split: str) -> Path:
@@ -55,12 +53,12 @@ def read(
         UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
     """
     path = transforms_path(folder, split)
-    content = _read_json(path)
+    content = read_transforms(path)
     entries = content["frames"]
-    poses = [_pose(path, index, entry) for index, entry in enumerate(entries)]
-    times = _times(path, entries)
-    files = [_image_path(path, folder, index, entry) for index, entry in enumerate(entries)]
-    _check_distortion(path, content)
+    poses = [read_pose(path, index, entry) for index, entry in enumerate(entries)]
+    times = read_times(path, entries)
+    files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
+    check_distortion(path, content)
 
     def decode(file: Path) -> Decoded:
         return read_image(file, downscale, resample, background)
@@ -70,160 +68,12 @@ def read(
     for file, image in zip(files, images):
         if image.source_size != source:
             raise UserError(
-                f"{file}: is {_size(image.source_size)}, but {files[0].name} is {_size(source)}; "
+                f"{file}: is {size_text(image.source_size)}, but {files[0].name} is {size_text(source)}; "
                 "give all images of a split one size"
             )
     frames = []
     for index, (entry, viewmat, time, file, image) in enumerate(zip(entries, poses, times, files, images)):
-        intrinsics = _intrinsics(path, {**content, **entry}, index, source)
-        camera = _camera(viewmat, intrinsics, source, image.image)
+        intrinsics = read_intrinsics(path, {**content, **entry}, index, source)
+        camera = make_camera(viewmat, intrinsics, source, image.image)
         frames.append(Frame(camera, time, image.image, image.alpha, name=file.stem))
     return Dataset(frames, folder=folder, split=split, background=background)
-
-
-def _size(size: tuple[int, int]) -> str:
-    return f"{size[0]} x {size[1]} pixels"
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; this split needs it, or choose another split") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as UTF-8 text ({type(error).__name__}); restore the file") from None
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise UserError(
-            f"{path}: not valid JSON, line {error.lineno} column {error.colno}: {error.msg}; restore or correct it"
-        ) from None
-    except RecursionError:
-        raise UserError(f"{path}: JSON nested too deeply; restore the file") from None
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames:
-        raise UserError(f"{path}: 'frames' is missing, empty or no list; list at least one frame there")
-    for index, entry in enumerate(frames):
-        if not isinstance(entry, dict):
-            raise UserError(f"{path}: frames[{index}] is no object; give file_path and transform_matrix")
-    return content
-
-
-def _number(value: Any) -> float | None:
-    """A finite number as float; None for anything else (bool and strings too)."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
-    """[4, 4] float64 world-to-camera, OpenCV."""
-    where = f"{path}: frames[{index}].transform_matrix"
-    if "transform_matrix" not in entry:
-        raise UserError(f"{where} is missing; give the 4 x 4 camera-to-world matrix")
-    try:
-        matrix = np.array(entry["transform_matrix"], np.float64)
-    except (ValueError, TypeError, OverflowError):
-        raise UserError(f"{where} is not a matrix of numbers; give 4 rows of 4 numbers") from None
-    if matrix.shape == (3, 4):
-        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
-    if matrix.shape != (4, 4):
-        raise UserError(f"{where} has shape {list(matrix.shape)}; give 4 rows of 4 numbers")
-    if not np.isfinite(matrix).all():
-        raise UserError(f"{where} holds NaN or infinity; correct the pose or drop the frame")
-    rotation = matrix[:3, :3]
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise UserError(
-            f"{where} is not rigid (scaled, sheared, mirrored, or last row not 0 0 0 1); "
-            "give a rotation and a translation, or drop the frame"
-        )
-    return np.linalg.inv(matrix @ OPENGL_TO_OPENCV)
-
-
-def _times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
-    given = ["time" in entry for entry in entries]
-    if not any(given):
-        last = max(len(entries) - 1, 1)
-        return [index / last for index in range(len(entries))]
-    times = []
-    for index, entry in enumerate(entries):
-        where = f"{path}: frames[{index}].time"
-        if "time" not in entry:
-            raise UserError(f"{where} is missing while other frames have one; give every frame a time, or none")
-        time = _number(entry["time"])
-        if time is None:
-            raise UserError(f"{where} is {str(entry['time'])[:40]!r}, not a number; give a number from 0 to 1")
-        if not 0.0 <= time <= 1.0:
-            raise UserError(f"{where} is {time:g}, outside [0, 1]; divide all times by the last one")
-        times.append(time)
-    return times
-
-
-def _image_path(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path:
-    name = entry.get("file_path")
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise UserError(f"{path}: frames[{index}].file_path is missing or no text; name the image file")
-    base = folder / name.replace("\\", "/")
-    if base.suffix.lower() in SUFFIXES or base.is_file():
-        return base
-    candidates = [base.with_name(base.name + suffix) for suffix in SUFFIXES]
-    return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
-
-
-def _check_distortion(path: Path, content: dict[str, Any]) -> None:
-    for key in DISTORTION:
-        value = content.get(key, 0)
-        if _number(value) != 0.0:
-            raise UserError(f"{path}: {key} is {value!r}, lens distortion; undistort the images and set it to 0")
-
-
-def _intrinsics(
-    path: Path, fields: dict[str, Any], index: int, source: tuple[int, int]
-) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy) in pixels of the file's full size."""
-
-    def number(key: str, default: float | None = None, positive: bool = False) -> float:
-        if key not in fields and default is not None:
-            return default
-        value = _number(fields.get(key))
-        if value is None or (positive and value <= 0):
-            kind = "positive number" if positive else "number"
-            raise UserError(f"{path}: {key} (frame {index}) is missing or no {kind}; give it in pixels")
-        return value
-
-    width, height = source
-    for key, actual in (("w", width), ("h", height)):
-        if key in fields and number(key) != actual:
-            raise UserError(
-                f"{path}: {key} is {fields[key]}, but the images are {_size(source)}; "
-                "correct w and h together with the intrinsics, or resize the images"
-            )
-    if "fl_x" in fields:
-        fx = number("fl_x", positive=True)
-        fy = number("fl_y", fx, positive=True)
-    elif "camera_angle_x" in fields:
-        angle = _number(fields["camera_angle_x"])
-        if angle is None or not 0.0 < angle < math.pi:
-            raise UserError(f"{path}: camera_angle_x is {fields['camera_angle_x']!r}; give radians between 0 and pi")
-        fx = fy = 0.5 * width / math.tan(0.5 * angle)
-    else:
-        raise UserError(f"{path}: neither camera_angle_x nor fl_x is given; add the field of view in radians")
-    return fx, fy, number("cx", 0.5 * width), number("cy", 0.5 * height)
-
-
-def _camera(
-    viewmat: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    source: tuple[int, int],
-    image: torch.Tensor,
-) -> Camera:
-    height, width = image.shape[:2]
-    fx, fy, cx, cy = intrinsics
-    sx, sy = width / source[0], height / source[1]
-    K = torch.tensor([[fx * sx, 0.0, cx * sx], [0.0, fy * sy, cy * sy], [0.0, 0.0, 1.0]], dtype=torch.float32)
-    return Camera(torch.from_numpy(viewmat).float(), K, width, height)

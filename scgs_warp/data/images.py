@@ -85,7 +85,7 @@ def read_image(path: Path, downscale: float, resample: str, background: str) -> 
     Raises:
         UserError: the file is missing or does not decode.
     """
-    pixels = _decode(path)
+    pixels = decode(path)
     height, width = pixels.shape[:2]
     size = reduced_size(width, height, downscale, path)
     color = np.asarray(BACKGROUND_COLORS[background], np.float32)
@@ -98,8 +98,8 @@ def read_image(path: Path, downscale: float, resample: str, background: str) -> 
     return Decoded(planar.permute(1, 2, 0), alpha_tensor, (width, height))
 
 
-def _decode(path: Path) -> np.ndarray:
-    """[H, W, 3 or 4] RGB(A), uint8 or uint16."""
+def decode(path: Path) -> np.ndarray:
+    """[H, W, 3 or 4] RGB(A), uint8 or uint16; UserError where the file is missing or no image."""
     try:
         data = np.fromfile(path, np.uint8)
     except FileNotFoundError:
