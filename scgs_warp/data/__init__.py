@@ -6,13 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import UserError
-from . import dnerf
+from . import dnerf, nerfstudio
 from .dataset import Dataset
 from .images import check_options
 
 __all__ = ["Dataset", "load"]
 
-READERS = (dnerf,)
+READERS = (dnerf, nerfstudio)
 """Asked in this order: ``recognises(folder)``, then ``read(folder, split, ...)``."""
 
 
@@ -28,7 +28,8 @@ def load(
     """Read one split of a data set.
 
     Args:
-        folder: holds ``transforms_train.json`` and so on (D-NeRF / Blender layout).
+        folder: holds ``transforms_train.json`` and so on (D-NeRF / Blender layout), or one ``transforms.json``
+            (nerfstudio layout).
         split: ``train``, ``test`` or ``val``.
         downscale: images become this many times smaller; the intrinsics follow.
         resample: ``area`` (float, premultiplied by alpha) or ``bicubic`` (8 bits, Pillow: as the official SC-GS).
@@ -47,10 +48,13 @@ def load(
         raise UserError(f"split is {split!r}; give train, test or val")
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; give the folder that holds transforms_train.json")
+        raise UserError(f"{folder}: no such folder; give one with transforms_train.json or transforms.json")
     for reader in READERS:
         if reader.recognises(folder):
             return reader.read(
                 folder, split, downscale=downscale, resample=resample, background=background, progress=progress
             )
-    raise UserError(f"{folder}: no transforms_{split}.json here; give the folder of a D-NeRF / Blender data set")
+    raise UserError(
+        f"{folder}: no transforms_{split}.json and no transforms.json here; give the folder of a D-NeRF / Blender or "
+        "nerfstudio data set"
+    )
