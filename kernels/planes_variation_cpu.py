@@ -1,7 +1,7 @@
-"""Total variation of feature planes on a CPU, and its gradient: squared differences between neighbouring texels.
+"""What keeps feature planes smooth, on a CPU, and its gradient: squared differences between neighbouring texels.
 
 Planes and their table are those of ``planes_cpu.py``. Along t the differences are second ones: a feature may change,
-but evenly.
+but evenly. Time planes are also drawn to 1, where nothing moves, by their mean absolute distance from it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ _PRELUDE = (
     if (row >= rows) return;
     const float* x = (const float*)own[VALUES] + (long long)row * n;
     auto at = [&](int r, int k) -> vf { return *(const vfu*)(x + (long long)r * n + k); };  // r from this row
-    const float across = 1.0f / ((float)CHANNELS * rows * (columns - 1));
+    const float across = space / ((float)CHANNELS * rows * (columns - 1));
     const int terms = rows - (timely ? 2 : 1);
-    const float down = terms > 0 ? 1.0f / ((float)CHANNELS * terms * columns) : 0.0f;
+    const float down = terms > 0 ? (timely ? time : space) / ((float)CHANNELS * terms * columns) : 0.0f;
+    const float away = timely ? rest / ((float)CHANNELS * rows * columns) : 0.0f;
 """
 )
 
@@ -37,7 +38,7 @@ _VALUES = (
 """
     + _PRELUDE
     + """
-    vf a = ZERO, d = ZERO;
+    vf a = ZERO, d = ZERO, r = ZERO;
     for (int k = 0; k < n - CHANNELS; k += 16) {
         const vf e = at(0, k + CHANNELS) - at(0, k);
         a += e * e;
@@ -47,9 +48,14 @@ _VALUES = (
             const vf e = timely ? (at(2, k) - at(1, k)) - (at(1, k) - at(0, k)) : at(1, k) - at(0, k);
             d += e * e;
         }
-    const vf both = a * across + d * down;
+    if (away != 0.0f)
+        for (int k = 0; k < n; k += 16) {
+            const vf e = at(0, k) - 1.0f;
+            r += e < 0.0f ? -e : e;
+        }
+    const vf all = a * across + d * down + r * away;
     float sum = 0.0f;
-    for (int l = 0; l < 16; ++l) sum += both[l];
+    for (int l = 0; l < 16; ++l) sum += all[l];
     sums.data[place] = sum;
 }
 #endif
@@ -68,7 +74,7 @@ _ADJOINT = (
         __builtin_memset(to, 0, n * sizeof(float));
         return;
     }
-    const float side = 2.0f * weight * across, along = 2.0f * weight * down;
+    const float side = 2.0f * weight * across, along = 2.0f * weight * down, pull = weight * away;
     auto bend = [&](int r, int k) -> vf {  // second difference that begins at row r from here, if there is one
         if (row + r < 0 || row + r >= terms) return ZERO;
         return (at(r + 2, k) - at(r + 1, k)) - (at(r + 1, k) - at(r, k));
@@ -82,7 +88,8 @@ _ADJOINT = (
             if (row > 0) sum = at(0, k) - at(-1, k);
             if (row + 1 < rows) sum -= at(1, k) - at(0, k);
         }
-        *(vfu*)(to + k) = (left - right) * side + sum * along;
+        const vf e = at(0, k) - 1.0f, sign = e > 0.0f ? ZERO + pull : (e < 0.0f ? ZERO - pull : ZERO);
+        *(vfu*)(to + k) = (left - right) * side + sum * along + sign;
     }
 }
 #endif
@@ -92,11 +99,16 @@ _ADJOINT = (
 
 # fmt: off
 @wp.func_native(_VALUES)
-def _variation(place: int, plane: int, row: int, table: wp.array2d[wp.int64], sums: wp.array[float]): ...
+def _variation(
+    place: int, plane: int, row: int, space: float, time: float, rest: float, table: wp.array2d[wp.int64],
+    sums: wp.array[float],
+): ...
 
 
 @wp.func_native(_ADJOINT)
-def _variation_adjoint(plane: int, row: int, weight: float, table: wp.array2d[wp.int64]): ...
+def _variation_adjoint(
+    plane: int, row: int, weight: float, space: float, time: float, rest: float, table: wp.array2d[wp.int64]
+): ...
 # fmt: on
 
 
@@ -105,13 +117,16 @@ def plane_variation(
     first: int,
     # In:
     rows: int,  # of the tallest plane
+    space: float,  # weight of first differences along x, y, z
+    time: float,  # of second differences along t
+    rest: float,  # of the time planes' distance from 1
     table_in: wp.array2d[wp.int64],  # [6 L, 5]
     # Out:
     sums_out: wp.array[float],  # [6 L rows] zero before
 ):
-    """Total variation row by row: squared first differences, along t second ones, each divided by their number."""
+    """Weighted sums row by row, each kind divided by the number of its terms in a plane."""
     i = first + wp.tid()
-    _variation(i, i // rows, i % rows, table_in, sums_out)
+    _variation(i, i // rows, i % rows, space, time, rest, table_in, sums_out)
 
 
 @wp.kernel
@@ -119,9 +134,12 @@ def plane_variation_adjoint(
     first: int,
     # In:
     rows: int,  # of the tallest plane
-    weight: float,  # gradient of the total variation
+    weight: float,  # gradient of the whole
+    space: float,  # weights as in plane_variation
+    time: float,
+    rest: float,
     table_in: wp.array2d[wp.int64],  # [6 L, 5]
 ):
     """Writes the planes' gradients where the table says: all of them, also where the weight is 0."""
     i = first + wp.tid()
-    _variation_adjoint(i // rows, i % rows, weight, table_in)
+    _variation_adjoint(i // rows, i % rows, weight, space, time, rest, table_in)

@@ -204,7 +204,7 @@ def training_state(scene: Scene, arap: bool) -> TrainState:
     }
     loss = base.loss if arap else dataclasses.replace(base.loss, arap=0.0)
     config = dataclasses.replace(base, optim=dataclasses.replace(rates, **slow), loss=loss)
-    step = config.pretrain_steps + max(config.freeze, 3 * config.densify.sh_every)
+    step = config.pretrain_steps + max(config.rest_steps, 3 * config.densify.sh_every)
     scene.motion.train()
     nothing: Tensor = torch.zeros(0, 3)
     rest = (scene.normalisation, scene.overview, 1.0, nothing, nothing)

@@ -66,6 +66,8 @@ class MotionConfig:
     """The network also changes the Gaussians' scales (official code); ours changes their logarithm."""
     bfloat16: bool = False
     """Hidden layers in bfloat16 while training."""
+    plane_times: int = 0
+    """Texels along t of feature planes; 0: half as many as there are training times (4D-GS)."""
 
 
 @dataclass(frozen=True)
@@ -165,8 +167,10 @@ class LossConfig:
     """Sampled times N_t whose trajectories define the neighbours."""
     arap_neighbors: int = 8
     arap_refresh: int = 200
-    hexplane_tv: float = 2e-4
-    """Total variation of the planes (4D-GS), hexplane model only."""
+    planes_space: float = 1e-4
+    planes_time: float = 1e-2
+    planes_rest: float = 1e-4
+    """Feature planes (4D-GS): differences in space, second differences in time, distance of time planes from 1."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +181,8 @@ class TrainConfig:
     steps: int = 80_000
     freeze: int = milestone(3_000)
     """Main steps during which control points and network stay as stage 1 left them."""
+    coarse: int = milestone(6_000)
+    """The same for models without stage 1: a static scene comes first."""
     init_points: int = 100_000
     """Gaussians to start with where the data brings no points."""
     init_from: Literal["points", "spheres"] = "points"
@@ -203,6 +209,11 @@ class TrainConfig:
         return self.pretrain.steps if self.motion.model == "control-points" else 0
 
     @property
+    def rest_steps(self) -> int:
+        """First main steps in which only the Gaussians learn: ``freeze`` or ``coarse``."""
+        return self.freeze if self.motion.model == "control-points" else self.coarse
+
+    @property
     def main_steps(self) -> int:
         return self.steps - self.pretrain_steps
 
@@ -215,6 +226,7 @@ def preset(name: PresetName) -> TrainConfig:
         preset="cpu",
         steps=24_000,
         freeze=400,
+        coarse=1_800,
         init_points=10_000,
         init_from="spheres",
         evaluate_every=5_000,

@@ -17,9 +17,10 @@ AT_LEAST_ONE = (
     "loss.arap_every loss.arap_times loss.arap_refresh"
 ).split()
 NOT_NEGATIVE = (
-    "seed freeze half_size checkpoint_seconds "
+    "seed freeze coarse half_size checkpoint_seconds "
     "pretrain.steps pretrain.warm_up pretrain.clone_share pretrain.arap_weight "
-    "densify.start densify.until densify.grad_threshold densify.min_opacity loss.ssim loss.arap loss.arap_end"
+    "densify.start densify.until densify.grad_threshold densify.min_opacity loss.ssim loss.arap loss.arap_end "
+    "loss.planes_space loss.planes_time loss.planes_rest"
 ).split()
 
 
@@ -47,6 +48,8 @@ def check(config: TrainConfig) -> TrainConfig:
         raise UserError(f"loss.arap_neighbors is {config.loss.arap_neighbors}; choose 1 to 15")
     if not 1 <= motion.skip < motion.layers:
         raise UserError(f"motion.skip is {motion.skip}; choose 1 to {motion.layers - 1}, below motion.layers")
+    if motion.plane_times != 0 and not 2 <= motion.plane_times <= 4096:
+        raise UserError(f"motion.plane_times is {motion.plane_times}; choose 2 to 4096, or 0 for half of the times")
     if motion.nodes < motion.neighbors + 1:
         raise UserError(f"--nodes {motion.nodes}: needs at least {motion.neighbors + 1}")
     if config.densify.max_gaussians < 100:

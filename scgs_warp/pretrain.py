@@ -8,7 +8,7 @@ from torch import Tensor
 from .config import TrainConfig
 from .densify import mean_gradient
 from .gaussians import SH_C0, GaussianParameters, gaussians_from_points, neighbor_distance
-from .motion import Motion, build_motion
+from .motion import HexPlane, Motion, build_motion
 from .motion.control_points import ControlPoints, heads_of, make_network
 from .motion.spheres import Spheres
 from .ops.sampling import farthest_points
@@ -44,8 +44,11 @@ def begin_spheres(
     return gaussians, Spheres(network, radius).to(device)
 
 
-def begin_motion(config: TrainConfig, points: Tensor) -> Motion:
-    """A motion model without a first stage; control points are then a sample of ``points`` [P, 3], at rest."""
+def begin_motion(config: TrainConfig, points: Tensor, times: int = 0) -> Motion:
+    """A motion model without a first stage; control points are then a sample of ``points`` [P, 3], at rest. ``times``:
+    number of the training frames' times, after which feature planes are made."""
+    if config.motion.model == "hexplane":
+        return HexPlane(config.seed, config.motion.plane_times or max(2, times // 2))
     if config.motion.model != "control-points":
         return build_motion(config.motion.model, config)
     positions = points[farthest_points(points, min(config.motion.nodes, len(points)))]

@@ -89,7 +89,7 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
 
 def frozen(state: TrainState) -> bool:
     """Main steps in which only the Gaussians learn (seed S4)."""
-    return state.stage == "main" and state.stage_step < state.config.freeze
+    return state.stage == "main" and state.stage_step < state.config.rest_steps
 
 
 def set_rates(state: TrainState) -> None:

@@ -70,7 +70,7 @@ class TrainState:
             spheres = begin_spheres(config, points, colors, device)
             return TrainState(config, *spheres, *rest, stage="pretrain", fingerprint=data.fingerprint)
         gaussians = begin_gaussians(config, points, colors)
-        motion = begin_motion(config, points).to(device)
+        motion = begin_motion(config, points, len(data.times.unique())).to(device)
         return TrainState(config, gaussians, motion, *rest, stage="main", fingerprint=data.fingerprint)
 
     def begin_main(self) -> None:

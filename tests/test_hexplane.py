@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from scgs_warp import environment
-from scgs_warp.config import TrainConfig
+from scgs_warp.config import LossConfig, MotionConfig, TrainConfig
 from scgs_warp.gaussians import GaussianParameters
+from scgs_warp.motion import build_motion
 from scgs_warp.motion.hexplane import BOUND, HexPlane
-from scgs_warp.ops.planes import PAIRS
+from scgs_warp.ops.planes import PAIRS, Smoothness, plane_variation
+from scgs_warp.pretrain import begin_motion
 
 
 def model_and_gaussians(seed: int, count: int = 60) -> tuple[HexPlane, GaussianParameters]:
@@ -60,17 +64,30 @@ def test_agrees_with_its_layers_in_torch(seed, time):
 def test_a_training_step_adds_the_smoothness():
     model, gaussians = model_and_gaussians(3)
     config = TrainConfig()
-    pose = model.train_at(gaussians, 0.3, config.freeze, config, seed=0)
+    pose = model.train_at(gaussians, 0.3, config.coarse, config, seed=0)
     assert pose.regulariser is not None
-    smoothness = model.smoothness()
-    assert torch.equal(pose.regulariser, config.loss.hexplane_tv * smoothness)
+    loss = config.loss
+    smoothness = plane_variation(list(model.planes), Smoothness(loss.planes_space, loss.planes_time, loss.planes_rest))
+    assert torch.equal(pose.regulariser, smoothness)
     assert torch.equal(pose.gaussians.means, model.gaussians_at(gaussians, 0.3).means)
     both = torch.autograd.grad(pose.gaussians.means.sum() + pose.regulariser, list(model.planes))
     moved = torch.autograd.grad(model.gaussians_at(gaussians, 0.3).means.sum(), list(model.planes))
-    smooth = torch.autograd.grad(config.loss.hexplane_tv * smoothness, list(model.planes))
+    smooth = torch.autograd.grad(smoothness, list(model.planes))
     for whole, *parts in zip(both, moved, smooth):
         torch.testing.assert_close(whole, parts[0] + parts[1], rtol=1e-5, atol=1e-6)
-    assert model.train_at(gaussians, 0.3, config.freeze - 1, config, seed=0).regulariser is None
+    assert model.train_at(gaussians, 0.3, config.coarse - 1, config, seed=0).regulariser is None
+    none = dataclasses.replace(config, loss=LossConfig(planes_space=0.0, planes_time=0.0, planes_rest=0.0))
+    assert model.train_at(gaussians, 0.3, config.coarse, none, seed=0).regulariser is None
+
+
+@pytest.mark.parametrize("times, expected", [(0, 7), (30, 30)])
+def test_planes_follow_the_number_of_training_times(times, expected):
+    config = TrainConfig(motion=MotionConfig("hexplane", plane_times=times))
+    model = begin_motion(config, torch.zeros(1, 3), times=15)
+    assert isinstance(model, HexPlane)
+    assert [plane.shape[0] for plane in model.planes] == [*(3 * [64] + 3 * [expected]), *(3 * [128] + 3 * [expected])]
+    again = build_motion("hexplane", config, model.state_dict())
+    again.load_state_dict(model.state_dict())
 
 
 @torch.no_grad()
@@ -101,7 +118,7 @@ def test_same_bits_on_any_number_of_threads(all_threads):
     results = []
     for threads in (1, 2, 3):
         environment.configure(threads)
-        pose = model.train_at(gaussians, 0.4, config.freeze, config, seed=0)
+        pose = model.train_at(gaussians, 0.4, config.coarse, config, seed=0)
         posed = [pose.gaussians.means, pose.gaussians.quats, pose.gaussians.scales, pose.regulariser]
         v = [torch.linspace(-1.0, 1.0, p.numel()).view_as(p) for p in posed if p is not None]
         parameters = [gaussians.means, gaussians.quats, gaussians.log_scales, *model.parameters()]

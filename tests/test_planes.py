@@ -7,7 +7,9 @@ from torch import Tensor
 from reference import planes as twin
 from scgs_warp import environment
 from scgs_warp.ops.planes import (
+    EVEN,
     PAIRS,
+    Smoothness,
     _features_in_torch,
     _variation_in_torch,
     plane_features,
@@ -31,12 +33,15 @@ def positions_of(count: int, seed: int, device: str = "cpu") -> Tensor:
     return (3.0 * torch.rand(count, 3, generator=random) - 1.5).to(device).requires_grad_()
 
 
-def compare(positions: Tensor, time: float, planes: list[Tensor], seed: int) -> None:
+WEIGHTS = [EVEN, Smoothness(0.7, 0.0, 2.0), Smoothness(0.0, 3.0, 0.5)]
+
+
+def compare(positions: Tensor, time: float, planes: list[Tensor], seed: int, weights: Smoothness = EVEN) -> None:
     """Features, variation and all gradients against the twin."""
-    found, smooth = plane_features_and_variation(positions, time, planes)
+    found, smooth = plane_features_and_variation(positions, time, planes, weights)
     own = positions.detach().cpu().double().requires_grad_()
     own_planes = [plane.detach().cpu().double().requires_grad_() for plane in planes]
-    expected, expected_smooth = twin.features(own, time, own_planes), twin.variation(own_planes)
+    expected, expected_smooth = twin.features(own, time, own_planes), twin.variation(own_planes, *weights)
     torch.testing.assert_close(found.cpu().double(), expected, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(smooth.cpu().double(), expected_smooth, rtol=1e-5, atol=1e-7)
     v = torch.randn(found.shape, generator=torch.Generator().manual_seed(seed))
@@ -54,6 +59,16 @@ def compare(positions: Tensor, time: float, planes: list[Tensor], seed: int) -> 
 @pytest.mark.parametrize("extents", EXTENTS)
 def test_values_and_gradients(extents, count, time, seed, device):
     compare(positions_of(count, seed, device), time, planes_of(extents, seed, device), seed)
+
+
+@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize("extents", EXTENTS)
+def test_each_term_of_the_smoothness(extents, weights, device):
+    planes = planes_of(extents, 11, device)
+    with torch.no_grad():
+        for plane in planes:
+            plane[0, 0] = 1.0  # at rest: no slope there
+    compare(positions_of(7, 11, device), 0.3, planes, 11, weights)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.25, 1.0])
@@ -76,7 +91,8 @@ def test_agrees_with_grid_sample():
     planes, positions = planes_of(EXTENTS[1], 4), positions_of(200, 4)
     forms = plane_features(positions, 0.3, planes), _features_in_torch(positions, 0.3, planes)
     torch.testing.assert_close(*forms, rtol=1e-5, atol=1e-5)
-    smooth = plane_variation(planes), _variation_in_torch(planes)
+    weights = Smoothness(0.5, 2.0, 0.3)
+    smooth = plane_variation(planes, weights), _variation_in_torch(planes, weights)
     torch.testing.assert_close(*smooth)
     v = torch.randn(forms[0].shape, generator=torch.Generator().manual_seed(4)), torch.tensor(2.0)
     inputs = (positions, *planes)
@@ -139,6 +155,8 @@ def test_variation_alone(device):
     even = [torch.arange(p.shape[0], device=device).float()[:, None, None].expand_as(p).contiguous() for p in planes]
     steps = sum(1.0 for place in range(len(planes)) if place % 6 < 3)
     assert float(plane_variation(even)) == pytest.approx(steps), "an even change in time is no variation"
+    away = [torch.full_like(plane, 0.7) for plane in planes]
+    assert float(plane_variation(away, Smoothness(1.0, 1.0, 2.0))) == pytest.approx(0.3 * 2.0 * len(planes) / 2)
 
 
 def test_same_bits_on_any_number_of_threads():

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..config import TrainConfig
 from .base import Motion
 from .control_points import ControlPoints, heads_of, make_network
-from .hexplane import HexPlane
+from .hexplane import TEMPORAL, HexPlane
 from .per_gaussian import PER_GAUSSIAN_HEADS, PerGaussian
 from .spheres import Spheres
 from .static import Static
@@ -19,7 +19,8 @@ __all__ = ["ControlPoints", "HexPlane", "Motion", "PerGaussian", "Spheres", "Sta
 
 
 def build_motion(name: str, config: TrainConfig, state: Mapping[str, Tensor] | None = None) -> Motion:
-    """A motion model by name; control points have as many rows as ``state``, a checkpoint's tensors, holds.
+    """A motion model by name; control points and planes are as large as those in ``state``, a
+    checkpoint's tensors.
 
     Raises:
         ValueError: no such model.
@@ -27,7 +28,8 @@ def build_motion(name: str, config: TrainConfig, state: Mapping[str, Tensor] | N
     if name == "static":
         return Static()
     if name == "hexplane":
-        return HexPlane(config.seed)
+        times = config.motion.plane_times if state is None else state["planes.3"].shape[0]
+        return HexPlane(config.seed, times or TEMPORAL)
     if name == "per-gaussian":
         return PerGaussian(make_network(config.motion, PER_GAUSSIAN_HEADS, config.seed))
     if name == "spheres":

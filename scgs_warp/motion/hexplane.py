@@ -10,15 +10,16 @@ from torch import Tensor, nn
 from ..config import TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.network import Layers, PackedLayers, evaluate, network
-from ..ops.planes import CHANNELS, PAIRS, plane_features, plane_features_and_variation, plane_variation
+from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_features_and_variation
 from ..optim import generator, log_linear
 from ..types import Gaussians
 from .base import Motion, TrainingPose
 
 SPATIAL = 64
 TEMPORAL = 25
+"""Texels along t where nobody says how many."""
 MULTIPLES = (1, 2)
-"""Spatial resolutions: 64 and 128; time keeps 25 in both, as in the 4D-GS configuration for D-NeRF."""
+"""Spatial resolutions: 64 and 128; time keeps its own in both, as in the 4D-GS configurations for D-NeRF."""
 WIDTH = 64
 HEADS = {"means": 3, "quats": 4, "log_scales": 3}
 """What the heads change, and how many numbers of it."""
@@ -33,13 +34,13 @@ class HexPlane(Motion):
     name = "hexplane"
     takes_time_tensor = True
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int = 0, times: int = TEMPORAL) -> None:
         super().__init__()
         random = generator(seed, 12)
         self.planes = nn.ParameterList()
         for multiple in MULTIPLES:
             for _, second in PAIRS:
-                rows = TEMPORAL if second == 3 else SPATIAL * multiple
+                rows = times if second == 3 else SPATIAL * multiple
                 shape = (CHANNELS, rows, SPATIAL * multiple)
                 # Space planes vary at first, time planes are 1: the scene starts at rest.
                 plane = torch.ones(shape) if second == 3 else 0.1 + 0.4 * torch.rand(shape, generator=random)
@@ -68,20 +69,17 @@ class HexPlane(Motion):
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         return self._moved(gaussians, self.features(gaussians.means, time))
 
-    def smoothness(self) -> Tensor:
-        """Total variation of all planes: squared first differences in space, squared second differences in time."""
-        return plane_variation(list(self.planes))
-
     def train_at(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
     ) -> TrainingPose:
-        if step < config.freeze:  # coarse: a static scene first (4D-GS)
+        if step < config.coarse:  # a static scene first (4D-GS)
             return TrainingPose(gaussians.activate(), None)
-        weight = config.loss.hexplane_tv
-        if weight <= 0:
+        weights = Smoothness(config.loss.planes_space, config.loss.planes_time, config.loss.planes_rest)
+        if not any(weights):
             return TrainingPose(self.gaussians_at(gaussians, time), None)
-        found, variation = plane_features_and_variation(gaussians.means / BOUND, time, list(self.planes))
-        return TrainingPose(self._moved(gaussians, found), weight * variation)
+        where = gaussians.means / BOUND
+        found, variation = plane_features_and_variation(where, time, list(self.planes), weights)
+        return TrainingPose(self._moved(gaussians, found), variation)
 
     def train(self, mode: bool = True) -> HexPlane:
         self._packed.forget()  # the optimiser writes where torch need not count
@@ -122,7 +120,7 @@ class HexPlane(Motion):
         return weights, biases
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
-        joint = max(0, step - config.freeze)
+        joint = max(0, step - config.coarse)
         optim = config.optim
         decay = log_linear(1.0, 0.01, joint, optim.network_until)
         return {

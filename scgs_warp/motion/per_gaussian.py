@@ -38,12 +38,12 @@ class PerGaussian(Motion):
     def train_at(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
     ) -> TrainingPose:
-        if step < config.freeze:
+        if step < config.coarse:
             return TrainingPose(gaussians.activate(), None)
         return TrainingPose(self.gaussians_at(gaussians, time), None)
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
-        joint = max(0, step - config.freeze)
+        joint = max(0, step - config.coarse)
         rate = log_linear(config.optim.network, config.optim.network_end, joint, config.optim.network_until)
         return {name: rate for name, _ in self.named_parameters()}
 

@@ -1,8 +1,8 @@
-"""Feature planes over (x, y, z, t): what Gaussians read from them, and their total variation (4D-GS; seed Table S2)."""
+"""Feature planes over (x, y, z, t): what Gaussians read from them, what keeps them smooth (4D-GS; seed Table S2)."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +16,20 @@ PAIRS = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
 """Axes of the six planes of a level; 3 is time."""
 
 CHANNELS = kernels.CHANNELS
+
+
+class Smoothness(NamedTuple):
+    """Weights of what keeps planes smooth. Each term is a mean over its texels, summed over the planes."""
+
+    space: float = 1.0
+    """Squared first differences along x, y and z, in all planes: total variation."""
+    time: float = 1.0
+    """Squared second differences along t: features may change, but evenly."""
+    rest: float = 0.0
+    """Absolute distances of the time planes from 1, where nothing moves."""
+
+
+EVEN = Smoothness()
 
 
 class _Table:
@@ -43,18 +57,19 @@ class _Table:
         launch(kernels.plane_features, blocks, self.table, positions, lines, features, grain=16)
         return features
 
-    def variation(self) -> Tensor:
+    def variation(self, weights: Smoothness) -> Tensor:
         sums = torch.zeros(len(self.planes) * self.tallest)
-        launch(variation_kernels.plane_variation, len(sums), self.tallest, self.table, sums, grain=64)
+        launch(variation_kernels.plane_variation, len(sums), self.tallest, *weights, self.table, sums, grain=64)
         return sums @ torch.ones_like(sums)
 
-    def gradients(self, v_variation: float) -> list[Tensor]:
+    def gradients(self, v_variation: float, weights: Smoothness) -> list[Tensor]:
         """Room for the planes' gradients, which the table names from now on: that of the variation is there."""
         flat = torch.empty(sum(plane.numel() for plane in self.planes))
         found = [part.view_as(p) for part, p in zip(flat.split([p.numel() for p in self.planes]), self.planes)]
         self.table[:, 4] = torch.tensor([gradient.data_ptr() for gradient in found])
         tasks = len(self.planes) * self.tallest
-        launch(variation_kernels.plane_variation_adjoint, tasks, self.tallest, v_variation, self.table, grain=64)
+        kernel = variation_kernels.plane_variation_adjoint
+        launch(kernel, tasks, self.tallest, v_variation, *weights, self.table, grain=64)
         return found
 
     def add_gradients(self, positions: Tensor, time: float, lines: Tensor, v_features: Tensor) -> Tensor:
@@ -75,13 +90,13 @@ class _Table:
 
 class _Planes(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, positions, time: float, with_variation: bool, *planes):
+    def forward(ctx: Any, positions, time: float, weights: Smoothness | None, *planes):
         ctx.set_materialize_grads(False)
         table = _Table(list(planes))
         lines = table.at_time(time)
-        ctx.time = time
+        ctx.time, ctx.weights = time, weights or Smoothness()
         ctx.save_for_backward(positions, lines, *planes)
-        return table.features(positions, lines), table.variation() if with_variation else None
+        return table.features(positions, lines), table.variation(weights) if weights else None
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -89,7 +104,7 @@ class _Planes(torch.autograd.Function):
         v_features, v_variation = gradients
         positions, lines, *planes = ctx.saved_tensors
         table = _Table(planes)
-        v_planes = table.gradients(0.0 if v_variation is None else float(v_variation))
+        v_planes = table.gradients(0.0 if v_variation is None else float(v_variation), ctx.weights)
         v_positions = None
         if v_features is not None:
             v_positions = table.add_gradients(positions, ctx.time, lines, v_features.contiguous())
@@ -115,30 +130,32 @@ def plane_features(positions: Tensor, time: float | Tensor, planes: list[Tensor]
     Raises:
         ValueError: a shape, dtype or device does not fit.
     """
-    return _run(positions, time, planes, False)[0]
+    return _run(positions, time, planes, None)[0]
 
 
 def plane_features_and_variation(
-    positions: Tensor, time: float | Tensor, planes: list[Tensor]
+    positions: Tensor, time: float | Tensor, planes: list[Tensor], weights: Smoothness = EVEN
 ) -> tuple[Tensor, Tensor]:
     """:func:`plane_features` and :func:`plane_variation` in one: their gradients share one pass over the planes."""
-    features, variation = _run(positions, time, planes, True)
+    features, variation = _run(positions, time, planes, weights)
     return features, variation
 
 
-def plane_variation(planes: list[Tensor]) -> Tensor:
-    """Total variation, a scalar: over all planes, the mean squared first differences along both axes, where along t
-    the second differences take their place. Planes as for :func:`plane_features`."""
+def plane_variation(planes: list[Tensor], weights: Smoothness = EVEN) -> Tensor:
+    """How uneven the planes are, a scalar: the terms of :class:`Smoothness` times their ``weights``. Planes as for
+    :func:`plane_features`."""
     nowhere = planes[0].new_empty(0, 3) if planes else torch.empty(0, 3)
-    return _run(nowhere, 0.0, planes, True)[1]
+    return _run(nowhere, 0.0, planes, weights)[1]
 
 
-def _run(positions: Tensor, time: float | Tensor, planes: list[Tensor], with_variation: bool) -> tuple[Tensor, Any]:
+def _run(
+    positions: Tensor, time: float | Tensor, planes: list[Tensor], weights: Smoothness | None
+) -> tuple[Tensor, Any]:
     _validate(positions, planes)
     if positions.device.type != "cpu":
-        return _features_in_torch(positions, time, planes), _variation_in_torch(planes) if with_variation else None
+        return _features_in_torch(positions, time, planes), _variation_in_torch(planes, weights) if weights else None
     contiguous = [plane.contiguous() for plane in planes]
-    return _Planes.apply(positions.contiguous(), float(time), with_variation, *contiguous)  # type: ignore[return-value]
+    return _Planes.apply(positions.contiguous(), float(time), weights, *contiguous)  # type: ignore[return-value]
 
 
 def _features_in_torch(positions: Tensor, time: float | Tensor, planes: list[Tensor]) -> Tensor:
@@ -159,12 +176,17 @@ def _features_in_torch(positions: Tensor, time: float | Tensor, planes: list[Ten
     return torch.cat(found).T
 
 
-def _variation_in_torch(planes: list[Tensor]) -> Tensor:
+def _variation_in_torch(planes: list[Tensor], weights: Smoothness) -> Tensor:
     terms = []
     for place, plane in enumerate(planes):
-        across, down = plane.diff(dim=1), plane.diff(dim=0, n=2 if place % len(PAIRS) >= 3 else 1)
+        timely = place % len(PAIRS) >= 3
+        down = plane.diff(dim=0, n=2 if timely else 1)
+        parts = [(weights.space, plane.diff(dim=1).square())]
+        parts.append((weights.time if timely else weights.space, down.square()))
+        if timely:
+            parts.append((weights.rest, (plane - 1.0).abs()))
         # Row by row first: the order of the sums does not depend on the number of threads.
-        terms += [part.square().mean(-1).mean(-1).mean() for part in (across, down) if part.numel()]
+        terms += [weight * part.mean(-1).mean(-1).mean() for weight, part in parts if part.numel()]
     return torch.stack(terms).sum()
 
 

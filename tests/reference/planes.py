@@ -1,4 +1,4 @@
-"""Twin of ops.planes in float64: every Gaussian's texels written out; total variation as differences."""
+"""Twin of ops.planes in float64: every Gaussian's texels written out; their smoothness as differences."""
 
 from __future__ import annotations
 
@@ -31,14 +31,16 @@ def features(positions: Tensor, time: float, planes: list[Tensor]) -> Tensor:
     return torch.cat(levels, dim=1)
 
 
-def variation(planes: list[Tensor]) -> Tensor:
+def variation(planes: list[Tensor], space: float = 1.0, time: float = 1.0, rest: float = 0.0) -> Tensor:
     total = torch.zeros((), dtype=planes[0].dtype)
     for place, plane in enumerate(planes):
-        across = plane[:, 1:] - plane[:, :-1]
+        total = total + space * ((plane[:, 1:] - plane[:, :-1]) ** 2).mean()
         down = plane[1:] - plane[:-1]
-        if place % 6 >= 3:
-            down = down[1:] - down[:-1]
-        for part in (across, down):
-            if part.numel():
-                total = total + (part**2).mean()
+        if place % 6 < 3:
+            total = total + space * (down**2).mean()
+            continue
+        bend = down[1:] - down[:-1]
+        if bend.numel():
+            total = total + time * (bend**2).mean()
+        total = total + rest * (1.0 - plane).abs().mean()
     return total
