@@ -20,6 +20,9 @@ SWING_SHARE = 0.8
 STEEPEST = 80.0
 """A turntable's largest elevation: above a pole, azimuth means nothing."""
 
+ROUNDING = 2e-6
+"""Positions closer together than this share of their distance from the origin are one: viewmats are float32."""
+
 Vector = Sequence[float] | np.ndarray | Tensor
 
 
@@ -92,19 +95,25 @@ def _centre(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
     Where the axes are parallel, or meet behind the cameras, there is none worth the name; then a point in front of
     the mean camera, three times as far away as the cameras lie apart.
     """
+    least = rounding(positions)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     matrix = across.mean(0)
     if np.linalg.eigvalsh(matrix)[0] > 1e-5:
         centre = np.linalg.solve(matrix, np.einsum("vij,vj->i", across, positions) / len(positions))
         depths = np.einsum("vi,vi->v", centre - positions, axes)
-        if np.median(depths) > 0 and (depths > 0).mean() >= 0.75:
+        if np.median(depths) > least and (depths > 0).mean() >= 0.75:
             return centre
     middle = positions.mean(0)
     spread = float(np.linalg.norm(positions - middle, axis=1).max())
     forward = axes.mean(0)
     if np.linalg.norm(forward) < 1e-3:  # a panorama: everything around the cameras is the scene
         return middle
-    return middle + _unit(forward) * (3 * spread if spread > 1e-6 else 1.0)
+    return middle + _unit(forward) * (3 * spread if spread > least else 1.0)
+
+
+def rounding(positions: np.ndarray) -> float:
+    """The least distance, among camera centres [V, 3] taken from viewmats, that is one."""
+    return ROUNDING * float(np.linalg.norm(positions, axis=1).max())
 
 
 def _horizon(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +163,7 @@ def overview(cameras: Sequence[Camera]) -> Overview:
     return Overview(
         centre=_triple(centre),
         up=_triple(up),
-        radius=max(float(np.median(distances)), 1e-6),
+        radius=float(np.median(distances)) or 1.0,
         fov_x=float(np.median(fields)),
         elevation=float(np.median(np.degrees(np.arcsin(np.clip(heights / np.maximum(distances, 1e-12), -1, 1))))),
         azimuth=azimuth % 360.0,

@@ -50,14 +50,14 @@ def depth_range(images: Iterable[Image]) -> tuple[float, float]:
     if len(depths) == 0:
         return 0.0, 1.0
     near, far = np.percentile(depths, (2, 98)).tolist()
-    margin = max(0.05 * (far - near), 1e-3 * abs(far), 1e-6)
+    margin = max(0.05 * (far - near), 1e-3 * abs(far))
     return near - margin, far + margin
 
 
 def color_depth(image: Image, near: float, far: float) -> np.ndarray:
     """[H, W, 3] uint8: the nearest is warm and bright, the farthest blue, nothing black (turbo)."""
     depth, alpha = image.depth.detach().cpu().numpy(), image.alpha.detach().cpu().numpy()
-    nearness = np.clip((far - np.nan_to_num(depth)) / max(far - near, 1e-12), 0.0, 1.0)
+    nearness = np.clip((far - np.nan_to_num(depth)) / (far - near or 1.0), 0.0, 1.0)
     # turbo is almost black at its blue end and dark at its red one
     colors = cv2.applyColorMap(to_bytes(0.1 + 0.75 * nearness), cv2.COLORMAP_TURBO)[..., ::-1]
     return (colors * np.nan_to_num(alpha)[..., None].clip(0.0, 1.0) + 0.5).astype(np.uint8)
@@ -74,7 +74,7 @@ def position_colors(points: Tensor | np.ndarray) -> np.ndarray:
     if len(positions) == 0:
         return np.zeros((0, 3), np.uint8)
     low, high = np.percentile(positions, (2, 98), axis=0)
-    inside = np.clip((positions - low) / np.maximum(high - low, 1e-9), 0.0, 1.0)
+    inside = np.clip((positions - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
     return (60 + 195 * inside).astype(np.uint8)
 
 
@@ -86,7 +86,7 @@ def project_points(points: Tensor | np.ndarray, camera: Camera) -> tuple[np.ndar
         seen = _array(points) @ viewmat[:3, :3].T + viewmat[:3, 3]
     depths = seen[..., 2]
     image = seen @ K.T
-    return image[..., :2] / np.where(np.abs(depths) < 1e-9, 1e-9, depths)[..., None], depths
+    return image[..., :2] / np.where(depths == 0, np.nan, depths)[..., None], depths
 
 
 def _array(points: Tensor | np.ndarray) -> np.ndarray:
@@ -96,7 +96,7 @@ def _array(points: Tensor | np.ndarray) -> np.ndarray:
 def _drawable(pixels: np.ndarray, depths: np.ndarray, camera: Camera) -> np.ndarray:
     """[...] in front of the camera and not so far outside that OpenCV's integers overflow."""
     limit = 4 * max(camera.width, camera.height)
-    return np.isfinite(pixels).all(-1) & (depths > 1e-6) & (np.abs(pixels) < limit).all(-1)
+    return np.isfinite(pixels).all(-1) & (depths > 0) & (np.abs(pixels) < limit).all(-1)
 
 
 def _hidden(pixels: np.ndarray, depths: np.ndarray, image: Image | None) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..cameras import rounding
 from ..types import Camera
 
 COMMON_RADIUS = 1.3654
@@ -96,11 +97,11 @@ def _nearest_to_axes(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Least squares: sum over cameras of (I - d d^T)(x - p) = 0. Near-parallel axes leave x open along them; then
     it is put ahead of the cameras by twice the rig's size."""
     projectors = np.eye(3) - np.einsum("vi,vj->vij", axes, axes)
-    A = projectors.mean(axis=0)
+    A, least = projectors.mean(axis=0), rounding(positions)
     if np.linalg.eigvalsh(A)[0] > PARALLEL:
         centre = np.linalg.solve(A, np.einsum("vij,vj->i", projectors, positions) / len(positions))
-        if np.median(np.einsum("vi,vi->v", centre - positions, axes)) > 0:
+        if np.median(np.einsum("vi,vi->v", centre - positions, axes)) > least:
             return centre
     middle = positions.mean(axis=0)
     spread = float(np.linalg.norm(positions - middle, axis=1).max())
-    return middle + axes.mean(axis=0) * (2.0 * spread if spread > 0 else 1.0)
+    return middle + axes.mean(axis=0) * (2.0 * spread if spread > least else 1.0)
