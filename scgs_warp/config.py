@@ -167,9 +167,9 @@ class LossConfig:
     """Sampled times N_t whose trajectories define the neighbours."""
     arap_neighbors: int = 8
     arap_refresh: int = 200
-    planes_space: float = 1e-4
-    planes_time: float = 1e-2
-    planes_rest: float = 1e-4
+    hexplane_tv: float = 1e-4
+    hexplane_smooth: float = 1e-2
+    hexplane_rest: float = 1e-4
     """Feature planes (4D-GS): differences in space, second differences in time, distance of time planes from 1."""
 
 

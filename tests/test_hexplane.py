@@ -67,7 +67,9 @@ def test_a_training_step_adds_the_smoothness():
     pose = model.train_at(gaussians, 0.3, config.coarse, config, seed=0)
     assert pose.regulariser is not None
     loss = config.loss
-    smoothness = plane_variation(list(model.planes), Smoothness(loss.planes_space, loss.planes_time, loss.planes_rest))
+    smoothness = plane_variation(
+        list(model.planes), Smoothness(loss.hexplane_tv, loss.hexplane_smooth, loss.hexplane_rest)
+    )
     assert torch.equal(pose.regulariser, smoothness)
     assert torch.equal(pose.gaussians.means, model.gaussians_at(gaussians, 0.3).means)
     both = torch.autograd.grad(pose.gaussians.means.sum() + pose.regulariser, list(model.planes))
@@ -76,7 +78,7 @@ def test_a_training_step_adds_the_smoothness():
     for whole, *parts in zip(both, moved, smooth):
         torch.testing.assert_close(whole, parts[0] + parts[1], rtol=1e-5, atol=1e-6)
     assert model.train_at(gaussians, 0.3, config.coarse - 1, config, seed=0).regulariser is None
-    none = dataclasses.replace(config, loss=LossConfig(planes_space=0.0, planes_time=0.0, planes_rest=0.0))
+    none = dataclasses.replace(config, loss=LossConfig(hexplane_tv=0.0, hexplane_smooth=0.0, hexplane_rest=0.0))
     assert model.train_at(gaussians, 0.3, config.coarse, none, seed=0).regulariser is None
 
 

@@ -74,7 +74,7 @@ class HexPlane(Motion):
     ) -> TrainingPose:
         if step < config.coarse:  # a static scene first (4D-GS)
             return TrainingPose(gaussians.activate(), None)
-        weights = Smoothness(config.loss.planes_space, config.loss.planes_time, config.loss.planes_rest)
+        weights = Smoothness(config.loss.hexplane_tv, config.loss.hexplane_smooth, config.loss.hexplane_rest)
         if not any(weights):
             return TrainingPose(self.gaussians_at(gaussians, time), None)
         where = gaussians.means / BOUND
