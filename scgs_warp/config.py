@@ -75,6 +75,9 @@ class PretrainConfig:
     """Stage 1: control points trained alone, rendered as same-sized spheres (seed S4)."""
 
     steps: int = milestone(10_000)
+    with_points: bool = False
+    """Also where the data brings points; else control points then begin as a sample of those, and learn with the
+    Gaussians from the first step."""
     densify_until: int = milestone(7_500)
     """Spheres are densified and pruned until here, then reduced to N_p by farthest-point sampling of trajectories."""
     warm_up: int = milestone(500)

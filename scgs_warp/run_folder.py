@@ -174,8 +174,9 @@ class RunFolder:
         values = []
         for i in wanted:
             frame = test[i]
-            image = scene.render(frame.camera, frame.time)
-            values.append(float(psnr(image.rgb.cpu(), frame.image)))
+            image = scene.render(frame.camera, frame.time).rgb.cpu()
+            valid = slice(None) if frame.mask is None else frame.mask
+            values.append(float(psnr(image[valid], frame.image[valid])))
         scene.motion.train()
         values = [value for value in values if math.isfinite(value)]
         if values:

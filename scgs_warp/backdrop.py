@@ -1,0 +1,64 @@
+"""Where to start with sparse points: they lie on texture alone, so bare walls and the far background get some, too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from .data.normalise import Normalisation
+from .optim import generator
+from .types import Camera, Frame
+
+MOST_VIEWS = 100
+NEAREST = 3
+"""Projected points whose median depth is that of a pixel."""
+FARTHEST = 1.5
+"""A surface without texture lies behind what has some: up to this many times as far."""
+
+
+def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pixels [P, 2] and depths [P] of the points [P, 3] in front of the camera, inside its image."""
+    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    local = local[local[:, 2] > 1e-3]
+    pixels = local @ camera.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
+    return pixels[inside], local[inside, 2]
+
+
+def backdrop(
+    count: int, points: Tensor, data: Sequence[Frame], normalisation: Normalisation, seed: int, key: int
+) -> tuple[Tensor, Tensor]:
+    """Points [count, 3] on random rays through the images, with the colours [count, 3] of their pixels.
+
+    The depth is that of the nearest sparse points in the image, times a factor between 1 and ``FARTHEST``.
+
+    Args:
+        points: [P, 3] the data's own, normalised.
+    """
+    frames = list(data)[:: max(1, len(data) // MOST_VIEWS)]
+    found, colors = [], []
+    for place, frame in enumerate(frames):
+        share = count * (place + 1) // len(frames) - count * place // len(frames)
+        camera = normalisation.apply_camera(frame.camera).to("cpu")
+        known, depths = _project(points.cpu(), camera)
+        if share == 0 or len(known) == 0:
+            continue
+        random = generator(seed, key, place)
+        valid = torch.ones(camera.height, camera.width) if frame.mask is None else frame.mask.float()
+        cells = torch.multinomial(valid.flatten(), share, replacement=True, generator=random)
+        rows, columns = cells // camera.width, cells % camera.width
+        pixels = torch.stack([columns, rows], 1) + torch.rand(share, 2, generator=random)
+        _, nearest = KDTree(known.double().numpy()).query(pixels.double().numpy(), k=min(NEAREST, len(known)))
+        depth = depths[torch.from_numpy(nearest).reshape(share, -1)].median(dim=1).values
+        depth = depth * torch.exp(torch.rand(share, generator=random) * math.log(FARTHEST))
+        rays = torch.cat([pixels, torch.ones(share, 1)], 1) @ torch.linalg.inv(camera.K).T * depth[:, None]
+        found.append((rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+        colors.append(frame.image[rows, columns])
+    if not found:
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    return torch.cat(found), torch.cat(colors)
