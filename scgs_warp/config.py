@@ -64,6 +64,12 @@ class MotionConfig:
     """A second rotation head for the Gaussians' shape (official code); else one rotation does both (paper Eq. 7)."""
     scale_residual: bool = False
     """The network also changes the Gaussians' scales (official code); ours changes their logarithm."""
+    mask: bool = False
+    """A learned share of the motion per Gaussian, so that what rests beside something that moves can stay sharp (an
+    option of the official code)."""
+    time_noise: float = 0.0
+    """Standard deviation of the noise on a step's time, in intervals between frames; it fades until ``network_until``
+    (official code, for real video)."""
     bfloat16: bool = False
     """Hidden layers in bfloat16 while training."""
     plane_times: int = 0
@@ -119,6 +125,8 @@ class OptimConfig:
     nodes: float = 8e-4
     """Radii, weights and hyper-coordinates of the control points."""
     node_positions: float = 8e-5
+    cameras: float = 0.0
+    """Corrections of the training cameras' poses (radians, normalised units), from the end of ``freeze``; 0: none."""
     planes: float = 8e-3
     """Feature planes of the hexplane model."""
 

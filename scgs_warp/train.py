@@ -11,9 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from . import environment
+from .camera_refinement import camera_rate
 from .config import TrainConfig
 from .data.dataset import Dataset
 from .densify import densify, mean_gradient, reset_opacities, threshold
@@ -58,8 +60,11 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
     random_background = pretraining and config.pretrain.random_background
     frame, camera, truth, background, mask = frames.view(index, state.step, random_background)
     set_rates(state)
+    if state.refines_cameras:
+        camera = state.cameras.apply(camera, index)
 
-    posed, regulariser = state.motion.train_at(state.gaussians, frame.time, step, config, config.seed)
+    time = noisy_time(frame.time, state, len(frames))
+    posed, regulariser = state.motion.train_at(state.gaussians, time, step, config, config.seed)
     collecting = pretraining or step < config.densify.until
     picture, _ = draw(
         posed,
@@ -80,9 +85,11 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
         state.gaussian_optimizer.step()
         if state.motion_optimizer is not None and not frozen(state):
             state.motion_optimizer.step()
-    state.gaussian_optimizer.zero_grad()
-    if state.motion_optimizer is not None:
-        state.motion_optimizer.zero_grad()
+        if state.refines_cameras:
+            state.camera_optimizer.step()
+            state.cameras.centre()
+    for optimizer in state.optimizers():
+        optimizer.zero_grad()
     weighted = 0.0 if regulariser is None else float(regulariser.detach())
     return StepResult(loss.detach(), l1.detach(), ssim.detach(), weighted, picture.detach(), truth, failed)
 
@@ -101,6 +108,19 @@ def set_rates(state: TrainState) -> None:
         rates = state.motion.rates(step, config)
         for name, group in state.motion_optimizer.groups.items():
             group.rate = rates[name]
+    state.camera_optimizer.groups["twists"].rate = camera_rate(step, config.optim, config.rest_steps)
+
+
+def noisy_time(time: float, state: TrainState, frames: int) -> float:
+    """The step's time with noise, for data whose cameras stand elsewhere at every time: it keeps the motion from
+    jumping from frame to frame."""
+    config = state.config
+    fade = max(0.0, 1.0 - state.stage_step / config.optim.network_until)
+    spread = config.motion.time_noise * fade / max(frames - 1, 1)
+    if spread == 0.0:
+        return time
+    noise = torch.randn(1, generator=generator(config.seed, 43, state.step))
+    return min(max(time + spread * float(noise), 0.0), 1.0)
 
 
 def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
@@ -112,9 +132,7 @@ def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
 
 
 def _bad_gradient(state: TrainState) -> str | None:
-    named = state.gaussian_optimizer.gradients()
-    if state.motion_optimizer is not None:
-        named += state.motion_optimizer.gradients()
+    named = [pair for optimizer in state.optimizers() for pair in optimizer.gradients()]
     bad = first_not_finite([gradient for _, gradient in named])
     return None if bad is None else f"gradient of {named[bad][0]}"
 

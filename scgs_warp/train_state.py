@@ -11,6 +11,7 @@ from torch import Tensor
 
 from . import checkpoint
 from .backdrop import backdrop
+from .camera_refinement import CameraRefinement
 from .cameras import Overview, overview
 from .config import FREE_TO_CHANGE, TrainConfig, to_dict
 from .data.dataset import Dataset
@@ -45,6 +46,7 @@ class TrainState:
         *,
         stage: Stage,
         fingerprint: str,
+        frames: int,
         step: int = 0,
     ) -> None:
         self.config, self.normalisation, self.overview = config, normalisation, rig
@@ -52,6 +54,8 @@ class TrainState:
         self.stage: Stage = stage
         self.step, self.fingerprint = step, fingerprint
         self.failures = 0
+        self.cameras = CameraRefinement(frames if config.optim.cameras > 0 else 0).to(gaussians.means.device)
+        self.camera_optimizer = self.cameras.optimizer()
         self.enter(gaussians, motion)
 
     def enter(self, gaussians: GaussianParameters, motion: Motion) -> None:
@@ -69,13 +73,14 @@ class TrainState:
         # A camera that stands still has no extent of its own; sizes are then judged by that of the content.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
         rest = (normalisation, overview(data.cameras), extent, points, colors)
+        seen = {"fingerprint": data.fingerprint, "frames": len(data)}
         if config.pretrain_steps > 0:
             spheres = begin_spheres(config, points, colors, device)
-            return TrainState(config, *spheres, *rest, stage="pretrain", fingerprint=data.fingerprint)
+            return TrainState(config, *spheres, *rest, stage="pretrain", **seen)
         gaussians = begin_gaussians(config, points, colors)
         rest_points = points if data.points is None or not given(data) else points[: len(data.points)]
         motion = begin_motion(config, rest_points, len(data.times.unique())).to(device)  # none on bare walls
-        return TrainState(config, gaussians, motion, *rest, stage="main", fingerprint=data.fingerprint)
+        return TrainState(config, gaussians, motion, *rest, stage="main", **seen)
 
     def begin_main(self) -> None:
         """From stage 1 to stage 2: spheres become control points, new Gaussians are made."""
@@ -93,6 +98,14 @@ class TrainState:
     @property
     def stage_step(self) -> int:
         return self.step if self.stage == "pretrain" else self.step - self.config.pretrain_steps
+
+    @property
+    def refines_cameras(self) -> bool:
+        return len(self.cameras.twists) > 0 and self.stage == "main" and self.stage_step >= self.config.rest_steps
+
+    def optimizers(self) -> list[Adam]:
+        found = [self.gaussian_optimizer, self.motion_optimizer, self.camera_optimizer]
+        return [optimizer for optimizer in found if optimizer is not None]
 
     def reset_stats(self) -> None:
         absolute = self.config.densify.absolute_grad and self.stage == "main"
@@ -120,6 +133,9 @@ class TrainState:
         tensors.update(self.gaussian_optimizer.tensors("adam.gaussians"))
         if self.motion_optimizer is not None:
             tensors.update(self.motion_optimizer.tensors("adam.motion"))
+        if len(self.cameras.twists):
+            tensors["cameras.twists"] = self.cameras.twists
+            tensors.update(self.camera_optimizer.tensors("adam.cameras"))
         tensors.update({f"extra.{name}": value for name, value in self.motion.extra_state().items()})
         for name in ("grad_norm", "count", "max_radii"):
             tensors[f"stats.{name}"] = getattr(self.stats, name)
@@ -162,11 +178,15 @@ class TrainState:
                 tensors.get("colors", nothing),
                 stage=metadata["stage"],
                 fingerprint=data.fingerprint,
+                frames=len(data),
                 step=scene.step,
             )
             state.gaussian_optimizer.load_tensors("adam.gaussians", tensors)
             if state.motion_optimizer is not None:
                 state.motion_optimizer.load_tensors("adam.motion", tensors)
+            if len(state.cameras.twists):
+                state.cameras.load_state_dict({"twists": tensors["cameras.twists"]})
+                state.camera_optimizer.load_tensors("adam.cameras", tensors)
             state.motion.load_extra_state(checkpoint.strip(tensors, "extra."))
             stats = checkpoint.strip(tensors, "stats.")
             state.stats = Stats(stats["grad_norm"], stats["count"], stats["max_radii"], absolute=state.stats.absolute)

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..config import LossConfig, MotionConfig, TrainConfig
+from ..environment import one_piece
 from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.skinning import skin, skin_rbf
@@ -48,8 +49,17 @@ def unit_rotations(raw: Tensor) -> Tensor:
     return F.normalize(raw + torch.eye(1, 4, device=raw.device, dtype=raw.dtype), dim=-1)
 
 
-def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | None]) -> Gaussians:
+def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | None], masked: bool) -> Gaussians:
+    """``masked``: the last hyper-coordinate is the logit of the share of the motion that a Gaussian takes part in."""
     means, quats, log_scales = moved
+    if masked:
+        with one_piece():
+            share = gaussians.hyper[:, -1:].sigmoid()
+        rest = F.normalize(gaussians.quats, dim=1)
+        rest = torch.where((rest * quats).sum(1, keepdim=True) < 0, -rest, rest)
+        means = gaussians.means + share * (means - gaussians.means)
+        quats = rest + share * (quats - rest)
+        log_scales = None if log_scales is None else share * log_scales
     scales = gaussians.scales() if log_scales is None else fixed_exp(gaussians.log_scales + log_scales)
     return Gaussians(means, quats, scales, gaussians.opacities(), gaussians.sh_dc, gaussians.sh_rest)
 
@@ -94,12 +104,16 @@ class ControlPoints(Motion):
             for i in range(times.shape[0])
         ]
 
+    def _hyper(self, gaussians: GaussianParameters) -> Tensor:
+        """[N, H] the Gaussians' hyper-coordinates, without the mask's logit."""
+        return gaussians.hyper[:, : self.config.hyper_dim].contiguous()
+
     def neighbors(self, gaussians: GaussianParameters) -> Tensor:
         """[N, K] int32 nearest control points of every Gaussian at rest, exact at every call: in space, with
         hyper-coordinates appended where the model has them."""
         points, nodes = gaussians.means.detach(), self.positions.detach()
         if self.config.hyper_dim:
-            points = torch.cat([points, gaussians.hyper.detach()], dim=1)
+            points = torch.cat([points, self._hyper(gaussians).detach()], dim=1)
             nodes = torch.cat([nodes, self.hyper.detach()], dim=1)
         return self._search(points, nodes, self.config.neighbors)
 
@@ -108,14 +122,16 @@ class ControlPoints(Motion):
         indices = self.neighbors(gaussians)
         points, nodes = gaussians.means, self.positions
         if self.config.hyper_dim:
-            points = torch.cat([gaussians.means, gaussians.hyper], dim=1)
+            points = torch.cat([gaussians.means, self._hyper(gaussians)], dim=1)
             nodes = torch.cat([self.positions, self.hyper], dim=1)
         strengths = self.strength_logits.sigmoid() if self.config.node_weight else None
         return indices, rbf_weights(points, nodes, self.log_radii.exp(), indices, strengths)
 
     def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
         """Linear blend skinning of all Gaussians (Eq. 6-7). Editing replaces ``pose``, nothing else."""
-        return _posed(gaussians, skin(gaussians.means, gaussians.quats, self.positions, pose, *binding))
+        return _posed(
+            gaussians, skin(gaussians.means, gaussians.quats, self.positions, pose, *binding), self.config.mask
+        )
 
     def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
         """As :meth:`apply_pose` with :meth:`binding`, in one pass; ``frozen`` control points get no gradient."""
@@ -130,12 +146,12 @@ class ControlPoints(Motion):
             rows = tuple(None if row is None else row.detach() for row in rows)
         nodes, radii, strengths, hyper_nodes = rows
         assert nodes is not None and radii is not None
-        hyper_points = gaussians.hyper if hyper else None
+        hyper_points = self._hyper(gaussians) if hyper else None
         found = self.neighbors(gaussians)
         moved = skin_rbf(
             gaussians.means, gaussians.quats, nodes, radii, pose, found, strengths, hyper_points, hyper_nodes
         )
-        return _posed(gaussians, moved)
+        return _posed(gaussians, moved, self.config.mask)
 
     def cache_binding(self, gaussians: GaussianParameters | None) -> None:
         """For rendering: neighbours and weights do not depend on time. None forgets them."""
