@@ -1,0 +1,221 @@
+"""The nerfstudio layout, written here: splits, times, masks, borders, points, and what is wrong with the data."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scenes import look_at
+
+from scgs_warp.data import load
+from scgs_warp.data.borders import border_mask, reduce_mask
+from scgs_warp.data.nerfstudio import read_ply
+from scgs_warp.errors import UserError
+
+WIDTH, HEIGHT, FOCAL = 40, 30, 50.0
+POINTS = np.random.default_rng(3).uniform(-0.6, 0.6, (60, 3))
+COLORS = np.random.default_rng(4).integers(0, 256, (60, 3))
+
+
+def viewmat(index: int) -> np.ndarray:
+    angle = 0.1 * index
+    eye = torch.tensor([4 * np.cos(angle), 4 * np.sin(angle), 1.0], dtype=torch.float64)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return look_at(eye, torch.zeros(3, dtype=torch.float64), up).numpy()
+
+
+def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None) -> None:
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")] if colors is not None else []
+    rows = points if colors is None else np.hstack([points, colors])
+    lines += ["end_header"] + [" ".join(f"{x:.9g}" for x in row) for row in rows]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write(folder: Path, count: int = 20, **changes) -> dict:
+    """A data set whose images have a bright dot of its own colour where each point is; returns the content."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = []
+    for index in range(count):
+        image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+        view = viewmat(index)
+        for point, color in zip(POINTS, COLORS):
+            x, y, z = view[:3, :3] @ point + view[:3, 3]
+            column, row = int(FOCAL * x / z + WIDTH / 2), int(FOCAL * y / z + HEIGHT / 2)
+            if 0 <= column < WIDTH and 0 <= row < HEIGHT:
+                image[row, column] = color[::-1]
+        cv2.imwrite(str(folder / f"f_{index}.png"), image)
+        pose = np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"f_{index}.png", "transform_matrix": pose.tolist(), "time": index / (count - 1)})
+    write_ply(folder / "points.ply", POINTS, COLORS)
+    content = {"fl_x": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT, "k1": 0.0, "frames": frames}
+    content |= {"ply_file_path": "points.ply", **changes}
+    save(folder, content)
+    return content
+
+
+def save(folder: Path, content: dict) -> None:
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def message(folder: Path, split: str = "train") -> str:
+    with pytest.raises(UserError) as caught:
+        load(folder, split)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def share_of_colors_found(data) -> float:
+    """How often the pixel a point projects to has the point's colour."""
+    found = []
+    for frame in data:
+        camera = frame.camera
+        pixels = (data.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
+        pixels = (pixels[:, :2] / pixels[:, 2:]).floor().long()
+        inside = ((pixels >= 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(1)
+        seen = frame.image[pixels[inside, 1], pixels[inside, 0]]
+        found.append(((seen - data.colors[inside]).abs().amax(1) < 1e-3).float().mean())
+    return float(torch.stack(found).mean())
+
+
+def test_points_project_onto_their_pixels(tmp_path):
+    write(tmp_path)
+    data = load(tmp_path)
+    assert data.points.shape == data.colors.shape == (60, 3)
+    assert share_of_colors_found(data) > 0.8  # some dots hide behind others
+    assert data[0].alpha is None and data[0].mask is None
+    half = load(tmp_path, downscale=2)[0].camera
+    assert (half.width, half.height, float(half.K[0, 0]), float(half.K[1, 1])) == (20, 15, FOCAL / 2, FOCAL / 2)
+
+
+def test_splits_by_list_and_by_every_eighth(tmp_path):
+    content = write(tmp_path)
+    assert [frame.name for frame in load(tmp_path, "test")] == ["f_4", "f_12"]
+    assert [frame.name for frame in load(tmp_path, "val")] == ["f_4", "f_12"]
+    assert len(load(tmp_path, "train")) == 18
+    save(tmp_path, {**content, "train_filenames": ["f_3.png", "f_1.png"], "test_filenames": ["f_0.png"]})
+    assert [frame.name for frame in load(tmp_path, "train")] == ["f_1", "f_3"]
+    assert [frame.name for frame in load(tmp_path, "val")] == ["f_0"]
+    save(tmp_path, {**content, "train_filenames": ["f_3.png"]})
+    assert "test_filenames is missing" in message(tmp_path, "test")
+    save(tmp_path, {**content, "train_filenames": ["f_99.png"]})
+    assert "train_filenames names 'f_99.png'" in message(tmp_path)
+
+
+def test_times_follow_the_names_where_there_are_none(tmp_path):
+    content = write(tmp_path)
+    for entry in content["frames"]:
+        del entry["time"]
+    content["frames"].sort(key=lambda entry: entry["file_path"])  # f_0, f_1, f_10, f_11, ...
+    save(tmp_path, content)
+    times = {frame.name: frame.time for frame in load(tmp_path)}
+    assert times["f_9"] == 9 / 19 and times["f_10"] == 10 / 19
+
+
+def test_intrinsics_of_a_frame_win(tmp_path):
+    content = write(tmp_path)
+    content["frames"][2] |= {"fl_x": 60.0, "fl_y": 70.0, "cx": 21.0}
+    save(tmp_path, content)
+    K = load(tmp_path)[2].camera.K
+    assert [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])] == [60.0, 70.0, 21.0, 15.0]
+
+
+@pytest.mark.parametrize("points_too", [True, False])
+def test_applied_transform_is_followed_whichever_way_it_was_meant(tmp_path, points_too):
+    content = write(tmp_path)
+    turn = np.array([[0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 1.0, -5.0], [1.0, 0.0, 0.0, 2.0]])
+    for entry in content["frames"]:
+        pose = np.array(entry["transform_matrix"])
+        entry["transform_matrix"] = (np.vstack([turn, [0, 0, 0, 1]]) @ pose).tolist()
+    save(tmp_path, {**content, "applied_transform": turn.tolist()})
+    if points_too:
+        write_ply(tmp_path / "points.ply", POINTS @ turn[:, :3].T + turn[:, 3], COLORS)
+    assert share_of_colors_found(load(tmp_path)) > 0.8
+
+
+def test_a_black_border_is_masked_but_nothing_dark_inside(tmp_path):
+    write(tmp_path)
+    for index in range(20):
+        image = cv2.imread(str(tmp_path / f"f_{index}.png"))
+        image[0, 10:20] = 2  # a border, not quite black
+        image[20:24, 20:24] = 0  # something black, inside
+        if index % 2:
+            image[:, :2] = 0  # a dark sleeve that comes and goes
+        cv2.imwrite(str(tmp_path / f"f_{index}.png"), image)
+    for split in ("train", "test"):
+        mask = load(tmp_path, split)[0].mask
+        expected = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+        expected[:2, 9:21] = False
+        assert torch.equal(mask, expected)
+    small = load(tmp_path, downscale=2)[0].mask
+    assert not small[0, 4:11].any() and small[1:].all()
+
+
+def test_a_black_ground_is_no_border():
+    images = [np.zeros((30, 40, 3), np.uint8) for _ in range(6)]
+    for image in images:
+        image[10:20, 10:30] = 100
+    assert border_mask(images) is None
+    assert border_mask(images[:2]) is None
+
+
+def test_masks_of_frames(tmp_path):
+    content = write(tmp_path)
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :9] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    content["frames"][0]["mask_path"] = "mask.png"
+    save(tmp_path, content)
+    data = load(tmp_path)
+    assert torch.equal(data[0].mask, torch.from_numpy(mask > 0)) and data[1].mask is None
+    assert not load(tmp_path, downscale=2)[0].mask[:, :5].any()
+    cv2.imwrite(str(tmp_path / "mask.png"), mask[:10])
+    assert "its mask is 40 x 10" in message(tmp_path)
+    cv2.imwrite(str(tmp_path / "mask.png"), 0 * mask)
+    assert "all black" in message(tmp_path)
+
+
+def test_a_reduced_pixel_is_valid_only_if_all_beneath_are():
+    mask = np.ones((4, 4), bool)
+    mask[0, 3] = False
+    assert reduce_mask(mask, (2, 2)).tolist() == [[True, False], [True, True]]
+
+
+def test_points_without_colours_and_bad_ones(tmp_path):
+    write_ply(tmp_path / "a.ply", np.array([[0.0, 1.0, 2.0], [np.nan, 0.0, 0.0]]), None)
+    points, colors = read_ply(tmp_path / "a.ply")
+    assert points.tolist() == [[0.0, 1.0, 2.0]] and colors is None
+    (tmp_path / "b.ply").write_bytes(b"\x00\x01nothing")
+    with pytest.raises(UserError, match="no PLY file"):
+        read_ply(tmp_path / "b.ply")
+
+
+FAULTS = {
+    "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1 is 0.1, lens distortion, which is not supp"),
+    "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", 0.1), "p2 is 0.1"),
+    "no points": (lambda content: content.__setitem__("ply_file_path", "none.ply"), "none.ply: no such file"),
+    "points": (lambda content: content.__setitem__("ply_file_path", 3), "ply_file_path is no text"),
+    "mask": (lambda content: content["frames"][0].__setitem__("mask_path", 3), "frames[0].mask_path"),
+    "no mask": (lambda content: content["frames"][0].__setitem__("mask_path", "no.png"), "no.png: no such image"),
+    "transform": (lambda content: content.__setitem__("applied_transform", [[1, 2]]), "applied_transform must be"),
+    "scale": (lambda content: content.__setitem__("applied_scale", -1), "applied_scale a positive"),
+    "focal": (lambda content: content.pop("fl_x"), "fl_x"),
+    "time": (lambda content: content["frames"][0].__setitem__("time", 3), "frames[0].time is 3, outside"),
+    "split": (lambda content: content.__setitem__("train_filenames", []), "train_filenames is empty"),
+    "pose": (lambda content: content["frames"][0].__setitem__("transform_matrix", [[1]]), "frames[0].transform_matrix"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_are_named(name, tmp_path):
+    content = write(tmp_path, 6)
+    change, expected = FAULTS[name]
+    change(content)
+    save(tmp_path, content)
+    text = message(tmp_path)
+    assert expected in text and str(tmp_path) in text
