@@ -147,6 +147,8 @@ class DensifyConfig:
     percent_dense: float = 0.01
     """Gaussians larger than this share of the extent are split, smaller ones cloned."""
     min_opacity: float = 0.005
+    prune_large: Literal["auto", "always", "never"] = "auto"
+    """Whether the next two hold; auto: where the images have alpha. Filled images show bare walls."""
     max_screen: float = 0.05
     """Prune what covers more than this share of the image (once opacities were reset)."""
     max_scale: float = 0.1

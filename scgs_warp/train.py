@@ -179,7 +179,7 @@ def _adapt_gaussians(state: TrainState, size: tuple[int, int]) -> None:
             config,
             grad_threshold=limit,
             extent=state.extent,
-            prune_large=done > config.opacity_reset_every,
+            prune_large=done > config.opacity_reset_every and config.prune_large != "never",
             random=generator(state.config.seed, 51, state.step),
         )
         state.reset_stats()
