@@ -64,9 +64,9 @@ class MotionConfig:
     """A second rotation head for the Gaussians' shape (official code); else one rotation does both (paper Eq. 7)."""
     scale_residual: bool = False
     """The network also changes the Gaussians' scales (official code); ours changes their logarithm."""
-    mask: bool = False
+    mask: Literal["auto", "always", "never"] = "auto"
     """A learned share of the motion per Gaussian, so that what rests beside something that moves can stay sharp (an
-    option of the official code)."""
+    option of the official code); auto: where the images have no alpha, and show much that rests."""
     time_noise: float = 0.0
     """Standard deviation of the noise on a step's time, in intervals between frames; it fades until ``network_until``
     (official code, for real video)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,11 +11,13 @@ import numpy as np
 import pytest
 import torch
 from scenes import look_at
+from tiny import tiny_config, tiny_dataset
 
 from scgs_warp.data import load
 from scgs_warp.data.borders import border_mask, reduce_mask
 from scgs_warp.data.nerfstudio import read_ply
 from scgs_warp.errors import UserError
+from scgs_warp.train_state import TrainState
 
 WIDTH, HEIGHT, FOCAL = 40, 30, 50.0
 POINTS = np.random.default_rng(3).uniform(-0.6, 0.6, (60, 3))
@@ -219,3 +222,26 @@ def test_faults_are_named(name, tmp_path):
     save(tmp_path, content)
     text = message(tmp_path)
     assert expected in text and str(tmp_path) in text
+
+
+def test_what_the_data_offers_decides(tmp_path):
+    """Points: no first stage, control points among them. No alpha: walls may be large, motion is masked."""
+    write(tmp_path)
+    data = load(tmp_path)
+    config = tiny_config(20)
+    state = TrainState.begin(config, data, "cpu")
+    assert state.stage == "main" and state.config.pretrain_steps == 0
+    assert (state.config.densify.prune_large, state.config.motion.mask) == ("never", "always")
+    rest, points = state.motion.positions.detach(), state.normalisation.apply(data.points)
+    assert torch.cdist(rest, points).amin(1).max() < 5e-3
+    assert torch.cdist(points, state.gaussians.means.detach()).amin(1).max() < 5e-3
+    assert len(state.gaussians) == config.init_points > len(points)
+    behind = state.gaussians.means.detach()[len(points) :]
+    for frame in data:  # all but those at the rim lie where cameras look
+        camera = state.normalisation.apply_camera(frame.camera)
+        depths = behind @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        assert depths.min() > 0
+    asked = dataclasses.replace(config, pretrain=dataclasses.replace(config.pretrain, with_points=True))
+    assert TrainState.begin(asked, data, "cpu").stage == "pretrain"
+    kept = TrainState.begin(config, tiny_dataset(4), "cpu").config
+    assert kept.pretrain_steps > 0 and (kept.densify.prune_large, kept.motion.mask) == ("always", "never")
