@@ -58,15 +58,16 @@ class MotionConfig:
     """Control points' rest positions learn in the joint phase (paper); the official code never moves them."""
     hyper_dim: int = 0
     """Hyper-coordinates appended to the neighbour search (the official code uses 8)."""
+    hyper_dim_filled: int = 4
+    """At least so many where no image has alpha: they part what moves from what rests beside it."""
     node_weight: bool = False
     """A learned weight per control point in the RBF (official code)."""
     shape_rotation: bool = False
     """A second rotation head for the Gaussians' shape (official code); else one rotation does both (paper Eq. 7)."""
     scale_residual: bool = False
     """The network also changes the Gaussians' scales (official code); ours changes their logarithm."""
-    mask: Literal["auto", "always", "never"] = "auto"
-    """A learned share of the motion per Gaussian, so that what rests beside something that moves can stay sharp (an
-    option of the official code); auto: where the images have no alpha, and show much that rests."""
+    mask: bool = False
+    """A learned share of the motion per Gaussian (an option of the official code); hyper-coordinates do it better."""
     time_noise: float = 0.0
     """Standard deviation of the noise on a step's time, in intervals between frames; it fades until ``network_until``
     (official code, for real video)."""

@@ -120,7 +120,7 @@ def begin_gaussians(
     config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None = None
 ) -> GaussianParameters:
     """The Gaussians of stage 2: at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
-    options = {"sh_degree": config.sh_degree, "hyper_dim": config.motion.hyper_dim + (config.motion.mask == "always")}
+    options = {"sh_degree": config.sh_degree, "hyper_dim": config.motion.hyper_dim + config.motion.mask}
     count = min(config.init_points, config.densify.max_gaussians)
     if spheres is None or config.init_from == "points":
         return gaussians_from_points(points[:count], colors[:count], **options)

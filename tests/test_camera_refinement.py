@@ -116,7 +116,7 @@ def test_resumed_to_the_same_bits(tmp_path, device, monkeypatch):
     import scgs_warp.train as train
 
     data = tiny_dataset(6)
-    config = tiny_config(40, optim={"cameras": 1e-3}, motion={"mask": "always", "time_noise": 0.1})
+    config = tiny_config(40, optim={"cameras": 1e-3}, motion={"mask": True, "time_noise": 0.1})
     fit(config, data, output=tmp_path / "whole", device=device)
     step = train.training_step
 

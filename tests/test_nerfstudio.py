@@ -225,13 +225,13 @@ def test_faults_are_named(name, tmp_path):
 
 
 def test_what_the_data_offers_decides(tmp_path):
-    """Points: no first stage, control points among them. No alpha: walls may be large, motion is masked."""
+    """Points: no first stage, control points among them. No alpha: walls may be large, what rests is told apart."""
     write(tmp_path)
     data = load(tmp_path)
     config = tiny_config(20)
     state = TrainState.begin(config, data, "cpu")
     assert state.stage == "main" and state.config.pretrain_steps == 0
-    assert (state.config.densify.prune_large, state.config.motion.mask) == ("never", "always")
+    assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 4)
     rest, points = state.motion.positions.detach(), state.normalisation.apply(data.points)
     assert torch.cdist(rest, points).amin(1).max() < 5e-3
     assert torch.cdist(points, state.gaussians.means.detach()).amin(1).max() < 5e-3
@@ -244,4 +244,4 @@ def test_what_the_data_offers_decides(tmp_path):
     asked = dataclasses.replace(config, pretrain=dataclasses.replace(config.pretrain, with_points=True))
     assert TrainState.begin(asked, data, "cpu").stage == "pretrain"
     kept = TrainState.begin(config, tiny_dataset(4), "cpu").config
-    assert kept.pretrain_steps > 0 and (kept.densify.prune_large, kept.motion.mask) == ("always", "never")
+    assert kept.pretrain_steps > 0 and (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 0)

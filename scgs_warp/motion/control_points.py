@@ -74,7 +74,6 @@ class ControlPoints(Motion):
         super().__init__()
         count, device = positions.shape[0], positions.device
         self.config = config
-        self.masked = config.mask == "always"
         self.positions = nn.Parameter(positions.clone())
         self.log_radii = nn.Parameter(radii.log())
         self.hyper = nn.Parameter(torch.full((count, config.hyper_dim), 1e-2, device=device))
@@ -131,7 +130,7 @@ class ControlPoints(Motion):
     def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
         """Linear blend skinning of all Gaussians (Eq. 6-7). Editing replaces ``pose``, nothing else."""
         moved = skin(gaussians.means, gaussians.quats, self.positions, pose, *binding)
-        return _posed(gaussians, moved, self.masked)
+        return _posed(gaussians, moved, self.config.mask)
 
     def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
         """As :meth:`apply_pose` with :meth:`binding`, in one pass; ``frozen`` control points get no gradient."""
@@ -151,7 +150,7 @@ class ControlPoints(Motion):
         moved = skin_rbf(
             gaussians.means, gaussians.quats, nodes, radii, pose, found, strengths, hyper_points, hyper_nodes
         )
-        return _posed(gaussians, moved, self.masked)
+        return _posed(gaussians, moved, self.config.mask)
 
     def cache_binding(self, gaussians: GaussianParameters | None) -> None:
         """For rendering: neighbours and weights do not depend on time. None forgets them."""
