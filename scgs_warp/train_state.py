@@ -46,7 +46,7 @@ class TrainState:
         *,
         stage: Stage,
         fingerprint: str,
-        frames: int,
+        frames: int = 0,
         step: int = 0,
     ) -> None:
         self.config, self.normalisation, self.overview = config, normalisation, rig
