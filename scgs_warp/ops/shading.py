@@ -1,0 +1,59 @@
+"""Colours that follow the turn of the surface they lie on, with gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..kernels import shading as kernels
+from ..warp_interop import launch
+
+COLUMNS = 9
+
+
+class _Shade(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor) -> Tensor:
+        shaded = torch.empty_like(sh_dc)
+        launch(kernels.shade, sh_dc.shape[0], sh_dc, shading, quats, quats_t, shaded)
+        ctx.save_for_backward(sh_dc, shading, quats, quats_t)
+        return shaded
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_shaded: Tensor):  # type: ignore[override]
+        sh_dc, shading, quats, quats_t = ctx.saved_tensors
+        v_sh_dc, v_shading = torch.empty_like(sh_dc), torch.empty_like(shading)
+        inputs = sh_dc, shading, quats, quats_t, v_shaded.contiguous()
+        launch(kernels.shade_adjoint, sh_dc.shape[0], *inputs, v_sh_dc, v_shading)
+        return v_sh_dc, v_shading, None, None
+
+
+def shade(sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor) -> Tensor:
+    """Base colours times ``1 + <G, R - I>``, R being the rotation from ``quats`` to ``quats_t``, within [0, 4].
+
+    What a diffuse surface sends back is, to first order, linear in its normal; the rest of G is what light and normal
+    there are, learnt for each Gaussian. At rest nothing changes.
+
+    Args:
+        sh_dc: [N, 3] spherical harmonics coefficients of degree 0 (colour less one half, over C0).
+        shading: [N, 9] the matrices G, by rows.
+        quats: [N, 4] wxyz at rest, any norm.
+        quats_t: [N, 4] wxyz at the instant, any norm.
+
+    Returns:
+        [N, 3] coefficients of degree 0. Gradients reach ``sh_dc`` and ``shading`` alone: a surface must not turn for
+        the sake of its brightness.
+
+    Raises:
+        ValueError: a shape is wrong.
+    """
+    count = sh_dc.shape[0]
+    expected = {"sh_dc": (sh_dc, 3), "shading": (shading, COLUMNS), "quats": (quats, 4), "quats_t": (quats_t, 4)}
+    for name, (value, width) in expected.items():
+        if tuple(value.shape) != (count, width):
+            raise ValueError(f"{name} must be [{count}, {width}], got {tuple(value.shape)}")
+    quats, quats_t = quats.detach().contiguous(), quats_t.detach().contiguous()
+    return _Shade.apply(sh_dc.contiguous(), shading.contiguous(), quats, quats_t)

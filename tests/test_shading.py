@@ -1,0 +1,102 @@
+"""Colours that follow the turn of their surface: against plain torch in float64, and the laws they obey."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reference.shading import shade as shade_reference
+from scgs_warp.ops.shading import shade
+
+
+def draw(seed, n, device="cpu", spread=0.8):
+    g = torch.Generator().manual_seed(seed)
+    values = torch.randn(n, 3, generator=g), spread * torch.randn(n, 9, generator=g)
+    turns = torch.randn(n, 4, generator=g), torch.randn(n, 4, generator=g)
+    return [x.to(device) for x in (*values, *turns)]
+
+
+def gradients(function, inputs, weights):
+    leaves = [x.detach().clone().requires_grad_() for x in inputs[:2]]
+    output = function(*leaves, *inputs[2:])
+    (output * weights.to(output)).sum().backward()
+    return output.detach(), [leaf.grad for leaf in leaves]
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 257])
+@pytest.mark.parametrize("seed", range(3))
+def test_values_and_gradients(seed, n, device):
+    inputs = draw(seed, n, device)
+    weights = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed))
+    ours, ours_grad = gradients(shade, inputs, weights)
+    twin, twin_grad = gradients(shade_reference, [x.double() for x in inputs], weights)
+    assert ours.shape == (n, 3) and ours.device.type == device
+    torch.testing.assert_close(ours.double(), twin, rtol=1e-5, atol=2e-5)
+    for a, b in zip(ours_grad, twin_grad, strict=True):
+        torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=1e-5)
+    if n == 257:  # the limits are reached, on both sides, or the test says nothing of them
+        gain = (0.5 + 0.28209479 * ours) / (0.5 + 0.28209479 * inputs[0])
+        assert (gain < 1e-4).any() and (gain > 3.999).any()
+
+
+def test_nothing_changes_at_rest_whatever_the_norm(device):
+    sh_dc, shading, quats, _ = draw(5, 50, device)
+    torch.testing.assert_close(shade(sh_dc, shading, quats, -3.0 * quats), sh_dc, rtol=1e-5, atol=1e-5)
+
+
+def test_a_lambertian_surface_under_one_lamp(device):
+    """G = e n^T / (c + e.n) is exactly a surface with normal n in ambient light c and a distant lamp e."""
+    normal, lamp, ambient = torch.tensor([0.0, 0.6, 0.8]), torch.tensor([0.3, 0.0, 0.5]), 0.7
+    angle = 0.9
+    quat = torch.tensor([[math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]])
+    turned = torch.tensor(
+        [0.0, 0.6 * math.cos(angle) - 0.8 * math.sin(angle), 0.6 * math.sin(angle) + 0.8 * math.cos(angle)]
+    )
+    before, after = ambient + lamp @ normal, ambient + lamp @ turned
+    matrix = (torch.outer(lamp, normal) / before).reshape(1, 9)
+    rest = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    albedo = torch.tensor([[0.2, 0.5, 0.1]])
+    sh_dc = (albedo * before - 0.5) / 0.28209479177387814
+    found = shade(*(x.to(device) for x in (sh_dc, matrix, rest, quat))).cpu() * 0.28209479177387814 + 0.5
+    torch.testing.assert_close(found, albedo * after, rtol=1e-5, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.lists(st.integers(-9, 9), min_size=4, max_size=4), st.lists(st.integers(-30, 30), min_size=9, max_size=9))
+def test_a_common_turn_of_both_changes_nothing_but_the_frame(values, matrix):
+    """Turning rest and pose by q alike gives R' = q R q*, so G' = Q G Q^T shades the same."""
+    from reference.quaternion import multiply, normalise, to_matrix
+
+    q = normalise(torch.tensor([values]).double())
+    sh_dc, _, quats, quats_t = (x.double() for x in draw(3, 1))
+    G = torch.tensor(matrix).double().view(1, 3, 3) / 40
+    Q = to_matrix(q)
+    moved = (Q @ G @ Q.transpose(1, 2)).reshape(1, 9)
+    plain = shade(sh_dc.float(), G.reshape(1, 9).float(), quats.float(), quats_t.float())
+    both = shade(sh_dc.float(), moved.float(), multiply(q, quats).float(), multiply(q, quats_t).float())
+    torch.testing.assert_close(both, plain, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 3e38])
+def test_what_is_not_finite_shades_nothing_and_passes_no_gradient_to_the_matrix(bad, device):
+    sh_dc, shading, quats, quats_t = draw(2, 4, device)
+    shading[0, 3] = bad
+    quats_t[1, 2] = bad
+    quats[2, 0] = bad
+    shading.requires_grad_()
+    out = shade(sh_dc, shading, quats, quats_t)
+    assert torch.isfinite(out).all()
+    out.sum().backward()
+    assert torch.isfinite(shading.grad).all()
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_wrong_shapes_are_named(which):
+    inputs = draw(0, 3)
+    inputs[which] = inputs[which][:, :-1]
+    with pytest.raises(ValueError, match=("sh_dc", "shading", "quats", "quats_t")[which]):
+        shade(*inputs)
