@@ -66,6 +66,8 @@ class MotionConfig:
     """A second rotation head for the Gaussians' shape (official code); else one rotation does both (paper Eq. 7)."""
     scale_residual: bool = False
     """The network also changes the Gaussians' scales (official code); ours changes their logarithm."""
+    shading: bool = True
+    """A Gaussian's brightness follows the turn of its surface (ours): what light and normal do, to first order."""
     mask: bool = False
     """A learned share of the motion per Gaussian (an option of the official code); hyper-coordinates do it better."""
     time_noise: float = 0.0
@@ -120,6 +122,7 @@ class OptimConfig:
     scales: float = 5e-3
     quats: float = 1e-3
     hyper: float = 2.5e-3
+    shading: float = 2.5e-3
     network: float = 8e-4
     network_end: float = 1.6e-6
     network_until: int = milestone(40_000)

@@ -7,6 +7,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from .environment import one_piece
+from .ops.shading import COLUMNS as SHADING_COLUMNS
 from .types import Gaussians
 
 SH_C0 = 0.28209479177387814
@@ -23,10 +24,10 @@ class GaussianParameters(nn.Module):
     """Raw parameters of N Gaussians in the normalised scene; :meth:`activate` gives what renders.
 
     Attributes: ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``log_scales`` [N, 3], ``opacity_logits`` [N],
-    ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0).
+    ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0), ``shading`` [N, 9] or [N, 0].
     """
 
-    NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper")
+    NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper", "shading")
 
     def __init__(
         self,
@@ -37,6 +38,7 @@ class GaussianParameters(nn.Module):
         opacity: float = 0.1,
         sh_degree: int = 3,
         hyper_dim: int = 0,
+        shaded: bool = False,
     ) -> None:
         super().__init__()
         count, device = means.shape[0], means.device
@@ -50,12 +52,15 @@ class GaussianParameters(nn.Module):
         self.sh_rest = nn.Parameter(torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device=device))
         # Apart from the control points' initial +1e-2, as in the official code, so that the distance has a gradient.
         self.hyper = nn.Parameter(torch.full((count, hyper_dim), -1e-2, device=device))
+        self.shading = nn.Parameter(torch.zeros(count, SHADING_COLUMNS if shaded else 0, device=device))
 
     @staticmethod
-    def empty(count: int, sh_count: int, hyper_dim: int, device: torch.device | str) -> GaussianParameters:
+    def empty(
+        count: int, sh_count: int, hyper_dim: int, shaded: bool, device: torch.device | str
+    ) -> GaussianParameters:
         """Room for ``count`` Gaussians, to be filled from a checkpoint."""
         zeros = torch.zeros(count, 3, device=device)
-        made = GaussianParameters(zeros, zeros, zeros, sh_degree=0, hyper_dim=hyper_dim)
+        made = GaussianParameters(zeros, zeros, zeros, sh_degree=0, hyper_dim=hyper_dim, shaded=shaded)
         made.sh_rest = nn.Parameter(torch.zeros(count, sh_count, 3, device=device))
         return made
 
@@ -94,11 +99,17 @@ def neighbor_distance(points: Tensor, count: int = 3) -> Tensor:
 
 
 def gaussians_from_points(
-    points: Tensor, colors: Tensor | None, *, sh_degree: int, hyper_dim: int, scale: float = 1.0
+    points: Tensor,
+    colors: Tensor | None,
+    *,
+    sh_degree: int,
+    hyper_dim: int,
+    scale: float = 1.0,
+    shaded: bool = False,
 ) -> GaussianParameters:
     """Round Gaussians at ``points`` [N, 3], as large as the distance to their neighbours times ``scale``; ``colors``
     [N, 3] in [0, 1], grey where there are none."""
     with one_piece():
         log_scales = (neighbor_distance(points) * scale).log()[:, None].repeat(1, 3)
     sh_dc = torch.zeros_like(points) if colors is None else (colors - 0.5) / SH_C0
-    return GaussianParameters(points, log_scales, sh_dc, sh_degree=sh_degree, hyper_dim=hyper_dim)
+    return GaussianParameters(points, log_scales, sh_dc, sh_degree=sh_degree, hyper_dim=hyper_dim, shaded=shaded)

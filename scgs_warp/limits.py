@@ -20,7 +20,7 @@ NOT_NEGATIVE = (
     "seed freeze coarse half_size checkpoint_seconds "
     "pretrain.steps pretrain.warm_up pretrain.clone_share pretrain.arap_weight "
     "densify.start densify.until densify.grad_threshold densify.min_opacity loss.ssim loss.arap loss.arap_end "
-    "optim.cameras motion.time_noise motion.hyper_dim motion.hyper_dim_filled "
+    "optim.cameras optim.shading motion.time_noise motion.hyper_dim motion.hyper_dim_filled "
     "loss.hexplane_tv loss.hexplane_smooth loss.hexplane_rest"
 ).split()
 

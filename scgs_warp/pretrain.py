@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -120,7 +122,11 @@ def begin_gaussians(
     config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None = None
 ) -> GaussianParameters:
     """The Gaussians of stage 2: at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
-    options = {"sh_degree": config.sh_degree, "hyper_dim": config.motion.hyper_dim + config.motion.mask}
+    options: dict[str, Any] = {
+        "sh_degree": config.sh_degree,
+        "hyper_dim": config.motion.hyper_dim + config.motion.mask,
+        "shaded": config.motion.shading and config.motion.model == "control-points",
+    }
     count = min(config.init_points, config.densify.max_gaussians)
     if spheres is None or config.init_from == "points":
         return gaussians_from_points(points[:count], colors[:count], **options)

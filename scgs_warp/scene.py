@@ -177,8 +177,10 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
     try:
         config = from_dict(metadata["config"], source)
         rows = checkpoint.strip(tensors, "gaussians.")
+        rows.setdefault("shading", torch.zeros(len(rows["means"]), 0))  # runs from before there was any
+        shaded = rows["shading"].shape[1] > 0
         gaussians = GaussianParameters.empty(
-            len(rows["means"]), rows["sh_rest"].shape[1], rows["hyper"].shape[1], "cpu"
+            len(rows["means"]), rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, "cpu"
         )
         gaussians.load_state_dict(rows)
         state = checkpoint.strip(tensors, "motion.")

@@ -122,6 +122,7 @@ class TrainState:
             "sh_dc": self.config.pretrain.color_rate if spheres else rates.sh_dc,
             "sh_rest": rates.sh_rest,
             "hyper": rates.hyper,
+            "shading": rates.shading,
         }
 
     def scene(self) -> Scene:

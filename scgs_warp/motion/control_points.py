@@ -10,6 +10,7 @@ from ..config import LossConfig, MotionConfig, TrainConfig
 from ..environment import one_piece
 from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.neighbors import NeighborSearch, rbf_weights
+from ..ops.shading import shade
 from ..ops.skinning import skin, skin_rbf
 from ..optim import generator, log_linear
 from ..types import Gaussians, Pose
@@ -61,7 +62,10 @@ def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | 
         quats = rest + share * (quats - rest)
         log_scales = None if log_scales is None else share * log_scales
     scales = gaussians.scales() if log_scales is None else fixed_exp(gaussians.log_scales + log_scales)
-    return Gaussians(means, quats, scales, gaussians.opacities(), gaussians.sh_dc, gaussians.sh_rest)
+    sh_dc = gaussians.sh_dc
+    if gaussians.shading.shape[1]:
+        sh_dc = shade(sh_dc, gaussians.shading, gaussians.quats, quats)
+    return Gaussians(means, quats, scales, gaussians.opacities(), sh_dc, gaussians.sh_rest)
 
 
 class ControlPoints(Motion):
