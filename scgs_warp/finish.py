@@ -1,26 +1,72 @@
-"""What a run leaves behind when training is over: scores, contact sheet, curves, a turntable."""
+"""A whole run, and what it leaves behind when training is over: scores, contact sheet, curves, a turntable."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
 from . import cameras, film
+from .config import TrainConfig, to_dict
+from .data import load
 from .data.dataset import Dataset
-from .evaluate import metrics_of, write_metrics
+from .evaluate import Lpips, metrics_of, write_metrics
 from .overlay import Painter
 from .progress import progress
 from .report import curves
 from .run_folder import read_seconds
 from .scene import Scene
+from .train import fit
 
 FILM_FRAMES = 120
 FILM_SIZE = 400
 FPS = 30.0
 
 
-def finish(scene: Scene, test: Dataset, folder: Path, *, frames: int = FILM_FRAMES) -> dict[str, Any]:
+def settings_of(config: TrainConfig, folder: Path) -> dict[str, Any]:
+    """What ``config.json`` of a run on the data in ``folder`` says."""
+    settings = to_dict(config)
+    settings["data"]["folder"] = str(folder.resolve())
+    return settings
+
+
+def train_and_finish(
+    config: TrainConfig,
+    data: Path,
+    output: Path,
+    *,
+    device: str = "cpu",
+    resume: bool = False,
+    frames: int = FILM_FRAMES,
+    lpips: Lpips | None = None,
+) -> dict[str, Any]:
+    """Load, train, evaluate: what ``apps/train.py`` does.
+
+    Args:
+        data: folder of the data set; its train split is learnt, its test split measured.
+        output: run directory.
+        resume: continue the run in ``output``.
+        frames, lpips: as for :func:`finish`.
+
+    Returns:
+        what ``metrics.json`` holds.
+
+    Raises:
+        UserError: of the data, the configuration, the run directory or the training.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
+    """
+    look = dataclasses.asdict(config.data)
+    train, test = load(data, "train", **look), load(data, "test", **look)
+    scene = fit(
+        config, train, output=output, device=device, test=test, resume=resume, settings=settings_of(config, data)
+    )
+    return finish(scene, test, output, frames=frames, lpips=lpips)
+
+
+def finish(
+    scene: Scene, test: Dataset, folder: Path, *, frames: int = FILM_FRAMES, lpips: Lpips | None = None
+) -> dict[str, Any]:
     """Evaluate the last step on the test split and write every picture.
 
     Args:
@@ -28,7 +74,8 @@ def finish(scene: Scene, test: Dataset, folder: Path, *, frames: int = FILM_FRAM
         test: held-out frames.
         folder: the run directory; ``metrics.json``, ``contact_sheet.png``, ``curves.png``, ``turntable.mp4``,
             ``evaluation/`` go there.
-        frames: length of the turntable.
+        frames: length of the turntable; 0: none.
+        lpips: the perceptual distance, if it is to be measured.
 
     Returns:
         what ``metrics.json`` holds.
@@ -37,14 +84,20 @@ def finish(scene: Scene, test: Dataset, folder: Path, *, frames: int = FILM_FRAM
     renders = folder / "evaluation" / test.split
     with progress(len(test), "evaluating") as bar:
         metrics = metrics_of(
-            scene, test, seconds=read_seconds(folder), render_dir=renders, progress=lambda done, total: bar.advance()
+            scene,
+            test,
+            seconds=read_seconds(folder),
+            lpips=lpips,
+            render_dir=renders,
+            progress=lambda done, total: bar.advance(),
         )
     write_metrics(metrics, folder / "metrics.json")
     sheet = renders / "contact_sheet.png"
     if sheet.is_file():
         (folder / "contact_sheet.png").write_bytes(sheet.read_bytes())
     curves(folder / "log.jsonl", folder / "curves.png")
-    turntable(scene, folder / "turntable.mp4", frames)
+    if frames > 0:
+        turntable(scene, folder / "turntable.mp4", frames)
     return metrics
 
 
