@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 
-APPS = ("train", "evaluate", "view", "bench")
+APPS = ("train", "evaluate", "view", "bench", "ablate")
 
 
 def main() -> int:

@@ -10,13 +10,11 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image as Picture
-from tiny import tiny_dataset
+from tiny import write_dnerf
 
 ROOT = Path(__file__).parent.parent
-APPS = ["train", "evaluate", "view", "bench"]
+APPS = ["train", "evaluate", "view", "bench", "ablate"]
 SMALL = ["--preset", "cpu", "--set", "motion.layers=3", "--set", "motion.width=32", "--set", "motion.skip=2",
          "--set", "init_points=300", "--nodes", "16", "--device", "cpu"]  # fmt: skip
 
@@ -30,25 +28,7 @@ def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess
 @pytest.fixture(scope="module")
 def dnerf(tmp_path_factory) -> Path:
     """A tiny D-NeRF folder on disk."""
-    folder = tmp_path_factory.mktemp("data") / "blobs"
-    for split, count in (("train", 8), ("test", 3)):
-        data = tiny_dataset(count, 48, split)
-        (folder / split).mkdir(parents=True)
-        frames = []
-        for frame in data:
-            alpha = frame.alpha.numpy()[:, :, None]
-            color = frame.image.numpy() / np.maximum(alpha, 1e-3)
-            pixels = (np.concatenate([color, alpha], 2).clip(0, 1) * 255 + 0.5).astype(np.uint8)
-            Picture.fromarray(pixels, "RGBA").save(folder / split / f"{frame.name}.png")
-            pose = np.linalg.inv(frame.camera.viewmat.double().numpy()) @ np.diag([1.0, -1, -1, 1])
-            frames.append(
-                {"file_path": f"./{split}/{frame.name}", "time": frame.time, "transform_matrix": pose.tolist()}
-            )
-        focal = float(data[0].camera.K[0, 0])
-        angle = 2 * np.arctan(0.5 * 48 / focal)
-        text = json.dumps({"camera_angle_x": angle, "frames": frames})
-        (folder / f"transforms_{split}.json").write_text(text)
-    return folder
+    return write_dnerf(tmp_path_factory.mktemp("data") / "blobs")
 
 
 @pytest.fixture(scope="module")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
+import numpy as np
 import torch
+from PIL import Image as Picture
 from scenes import look_at
 
 from scgs_warp.config import TrainConfig, from_dict, preset, with_steps
@@ -66,3 +69,25 @@ def tiny_config(steps: int = 60, **changes) -> TrainConfig:
         "pretrain": {"densify_every": 3},
     }
     return from_dict(changes, "test", from_dict(small, "test", base))
+
+
+def write_dnerf(folder: Path, size: int = 48) -> Path:
+    """The tiny scene as a D-NeRF folder: 8 frames to train, 3 to test."""
+    for split, count in (("train", 8), ("test", 3)):
+        data = tiny_dataset(count, size, split)
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for frame in data:
+            alpha = frame.alpha.numpy()[:, :, None]
+            color = frame.image.numpy() / np.maximum(alpha, 1e-3)
+            pixels = (np.concatenate([color, alpha], 2).clip(0, 1) * 255 + 0.5).astype(np.uint8)
+            Picture.fromarray(pixels, "RGBA").save(folder / split / f"{frame.name}.png")
+            pose = np.linalg.inv(frame.camera.viewmat.double().numpy()) @ np.diag([1.0, -1, -1, 1])
+            frames.append(
+                {"file_path": f"./{split}/{frame.name}", "time": frame.time, "transform_matrix": pose.tolist()}
+            )
+        focal = float(data[0].camera.K[0, 0])
+        angle = 2 * np.arctan(0.5 * size / focal)
+        text = json.dumps({"camera_angle_x": angle, "frames": frames})
+        (folder / f"transforms_{split}.json").write_text(text)
+    return folder

@@ -1,0 +1,162 @@
+"""Ablations, a training run a cell: the number of control points, the model of motion, ARAP on and off."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from scgs_warp.apps.cli import prepare, run
+from scgs_warp.apps.settings import Settings, builtin_scene, configuration
+from scgs_warp.config import PresetName
+
+if TYPE_CHECKING:
+    from scgs_warp.ablate import Cell
+
+
+@dataclass(frozen=True)
+class Place:
+    """Listed before the settings."""
+
+    ablation: tyro.conf.Positional[Literal["nodes", "motion", "arap"]]
+    """nodes: 64 to 4096 control points; motion: static, hexplane, per-gaussian and control-points; arap: on, off, and
+    the per-gaussian baseline where the data's true motion is known."""
+    output: Path
+    """Folder of the table and the plot (ABLATION.json, .md, .png), and of a run directory for each cell,
+    SCENE/VALUE[-seedN]. Cells that are there already are taken as they are; begun ones are continued."""
+    data: tuple[Path, ...] = ()
+    """Folders of data sets; without any the built-in scene, made on first use."""
+    values: tuple[str, ...] = ()
+    """The rows, with commas or spaces between; all by default. The table also has what was trained before."""
+    seeds: tuple[str, ...] = ()
+    """Train every cell once for each; with commas or spaces between. The table then has standard deviations."""
+    jobs: int = 1
+    """Cells at a time, each in a process of its own with its share of the threads."""
+    lpips_weights: Path | None = None
+    """VGG16 and LPIPS weights; without them LPIPS is not measured."""
+    table_only: bool = False
+    """Only make table and plot, of the cells that are there."""
+
+
+@dataclass(frozen=True)
+class Options(Settings, Place):
+    """Train what differs in one thing alone, and put the results beside the published ones."""
+
+    preset: PresetName | None = None
+    """cpu by default: some 15 minutes a cell; quick: a few minutes; paper: the full schedule. All cells are trained for
+    equally many steps."""
+
+
+def words(texts: tuple[str, ...]) -> list[str]:
+    """Texts with commas or spaces between, one by one."""
+    return [word for text in texts for word in text.replace(",", " ").split()]
+
+
+def check(options: Options) -> None:
+    """Refuse what the ablation itself decides.
+
+    Raises:
+        UserError: naming the option.
+    """
+    from scgs_warp.ablate import VARIED
+    from scgs_warp.errors import UserError
+
+    if options.jobs < 1:
+        raise UserError(f"--jobs {options.jobs}: must be at least 1")
+    if options.ablation == "nodes" and options.nodes is not None:
+        raise UserError(f"--nodes {options.nodes}: that is what is varied; choose rows with --values")
+    for text in options.set:
+        name = text.partition("=")[0].strip()
+        if name in VARIED[options.ablation] and name.startswith("motion."):
+            raise UserError(f"--set {text}: that is what is varied; choose rows with --values")
+        if name == "seed":
+            raise UserError(f"--set {text}: give --seeds")
+
+
+def find_scenes(folders: tuple[Path, ...], named: str | None, device: str) -> dict[str, Path]:
+    """Data folders by their names, which the table and the run directories have.
+
+    Raises:
+        UserError: one is missing, or two have one name.
+    """
+    from scgs_warp.errors import UserError
+
+    if not folders:
+        folders = (Path(named) if named else builtin_scene(device),)
+    scenes: dict[str, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise UserError(f"--data {folder}: no such folder; give folders of data sets")
+        name = folder.resolve().name
+        if name in scenes:
+            raise UserError(f"--data {folder}: there is another {name!r}; rename one, cells are kept by that name")
+        scenes[name] = folder
+    return scenes
+
+
+def make_cells(options: Options, device: str) -> list[Cell]:
+    """All cells that were asked for, checked before the first is trained."""
+    from scgs_warp.ablate import parse_seeds, parse_values, plan
+
+    check(options)
+    config, named = configuration(options, options.config, {}, "cpu")
+    values = parse_values(options.ablation, words(options.values))
+    seeds = parse_seeds(words(options.seeds))
+    if options.lpips_weights is not None:
+        from scgs_warp.metrics import LPIPS
+
+        LPIPS(options.lpips_weights, device)  # says at once what is wrong with them
+    scenes = find_scenes(options.data, named, device)
+    return plan(
+        options.ablation,
+        config,
+        scenes,
+        options.output,
+        values=values,
+        seeds=seeds,
+        device=device,
+        lpips_weights=options.lpips_weights,
+    )
+
+
+def main(args: list[str] | None) -> None:
+    options = tyro.cli(Options, args=args, prog="ablate.py", description=__doc__)
+
+    from scgs_warp.ablate_jobs import run_cells
+    from scgs_warp.ablate_markdown import markdown
+    from scgs_warp.ablate_table import build, write
+    from scgs_warp.errors import UserError
+
+    cells = [] if options.table_only else make_cells(options, prepare(options.device, options.threads))
+    failures: dict[str, str] = {}
+    report = build(options.ablation, options.output, cells)
+    paths = write(report, options.output)
+    if cells:
+
+        def renew() -> None:
+            write(build(options.ablation, options.output, cells), options.output)
+
+        failures = run_cells(
+            cells,
+            jobs=options.jobs,
+            threads=options.threads,
+            report=lambda text: print(text, flush=True),
+            finished=renew,
+        )
+        report = build(options.ablation, options.output, cells)
+    print(markdown(report))
+    print(f"{', '.join(map(str, paths))}")
+    if failures:
+        texts = [f"{name} ({message})" for name, message in failures.items()]
+        raise UserError(f"{len(failures)} of {len(cells)} cells failed: {'; '.join(texts)}")
+
+
+def cli(args: list[str] | None = None) -> int:
+    return run(main, args)
+
+
+if __name__ == "__main__":
+    sys.exit(cli())
