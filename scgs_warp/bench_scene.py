@@ -54,13 +54,15 @@ HEAD_WEIGHT = 2e-3
 """Standard deviation of the last layer's weights: control points move by some hundredths of the figure's height."""
 PLANE_HEAD_WEIGHT = 5e-2
 """The same where the network is small and its features are."""
+HYPER_SPREAD = 0.02
 FRAMES = 4
 RATES = 1e-6
 """Learning rates are multiplied by this: Adam does all its work, and the scene stays the same from step to step."""
 
 
-def figure(count: int, seed: int = SEED) -> GaussianParameters:
-    """``count`` Gaussians in the shape of a standing figure, 2.5 units high; the same for the same arguments."""
+def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> GaussianParameters:
+    """``count`` Gaussians in the shape of a standing figure, 2.5 units high; the same for the same arguments. With the
+    hyper-coordinates and the shading that ``motion`` asks for."""
     random = generator(seed, 1)
     centres, axes, shares = (torch.tensor(column) for column in zip(*PARTS))
     part = torch.multinomial(shares, count, replacement=True, generator=random)
@@ -69,13 +71,18 @@ def figure(count: int, seed: int = SEED) -> GaussianParameters:
     means = centres[part] + axes[part] * direction * depth
     log_scales = math.log(SIZE / math.sqrt(count)) + SIZE_SPREAD * torch.randn(count, 3, generator=random)
     colors = (0.5 + 0.4 * torch.sin(5.0 * means + torch.tensor([0.0, 2.0, 4.0]))).clamp(0.0, 1.0)
-    made = GaussianParameters(means, log_scales, (colors - 0.5) / SH_C0)
+    own = motion or MotionConfig(shading=False)
+    made = GaussianParameters(
+        means, log_scales, (colors - 0.5) / SH_C0, hyper_dim=own.hyper_dim, shaded=own.has_shading
+    )
     low, high = OPACITIES
     opacities = low + (high - low) * torch.rand(count, generator=random) ** OPACITY_POWER
     with torch.no_grad():
         made.quats.copy_(torch.randn(count, 4, generator=random))
         made.opacity_logits.copy_(opacities.logit())
         made.sh_rest.copy_(0.05 * torch.randn(made.sh_rest.shape, generator=random))
+        made.hyper.add_(HYPER_SPREAD * torch.randn(made.hyper.shape, generator=random))
+        made.shading.copy_(0.1 * torch.randn(made.shading.shape, generator=random))
     return made
 
 
@@ -98,13 +105,15 @@ def _loosen(motion: Motion, seed: int) -> None:
 def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int = SEED) -> Scene:
     """A moving figure as a trained scene: ``count`` Gaussians, ``nodes`` control points (control-points only), networks
     of the paper's size."""
-    gaussians = figure(count, seed)
-    config = TrainConfig(seed=seed, motion=MotionConfig(model=motion, nodes=nodes))  # type: ignore[arg-type]
+    config = TrainConfig(seed=seed)
+    config = dataclasses.replace(config, motion=dataclasses.replace(config.motion, model=motion, nodes=nodes))
+    gaussians = figure(count, seed, config.motion)
     model = build_motion(motion, config)
     if isinstance(model, ControlPoints):
         positions = gaussians.means.detach()[farthest_points(gaussians.means.detach(), nodes)]
         with torch.no_grad():
             model.positions.copy_(positions)
+            model.hyper.add_(HYPER_SPREAD * torch.randn(model.hyper.shape, generator=generator(seed, 3)))
             model.log_radii.fill_(math.log(float(neighbor_distance(positions).median())))
     _loosen(model, seed)
     scene = Scene(gaussians.to(device), model.to(device), Normalisation.identity(), config, OVERVIEW)

@@ -125,7 +125,7 @@ def begin_gaussians(
     options: dict[str, Any] = {
         "sh_degree": config.sh_degree,
         "hyper_dim": config.motion.hyper_dim + config.motion.mask,
-        "shaded": config.motion.shading and config.motion.model == "control-points",
+        "shaded": config.motion.has_shading,
     }
     count = min(config.init_points, config.densify.max_gaussians)
     if spheres is None or config.init_from == "points":

@@ -7,6 +7,7 @@ import torch
 
 from scgs_warp import bench_scene
 from scgs_warp.motion import ControlPoints
+from scgs_warp.scene import scene_from
 from scgs_warp.types import Gaussians
 
 
@@ -90,3 +91,36 @@ def test_training_sees_the_neighbours_of_the_step(scene):
                 tensor += (0.004 * step * torch.randn(tensor.shape, generator=generator)).to(tensor)
             if step == 6:
                 scene.gaussians.means.data = scene.gaussians.means.data.flip(0).clone()
+
+
+def test_shading_turns_with_the_surface_and_nothing_else_changes(scene):
+    gaussians, motion = scene.gaussians, scene.motion
+    assert isinstance(motion, ControlPoints) and gaussians.shading.shape[1] == 9
+    shaded = fresh(scene, 0.6)
+    with torch.no_grad():
+        gaussians.shading.zero_()
+    plain = fresh(scene, 0.6)
+    assert not torch.allclose(shaded.sh_dc, plain.sh_dc, atol=1e-3)
+    torch.testing.assert_close(plain.sh_dc, gaussians.sh_dc, rtol=1e-5, atol=1e-5)
+    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
+        assert torch.equal(getattr(shaded, name), getattr(plain, name)), name
+
+
+def test_shading_learns_and_the_motion_does_not_follow_brightness(scene):
+    gaussians, motion = scene.gaussians, scene.motion
+    motion.cache_binding(None)
+    posed = motion.gaussians_at(gaussians, 0.6)
+    posed.sh_dc.sum().backward()
+    assert gaussians.shading.grad is not None and (gaussians.shading.grad != 0).any()
+    found = [parameter.grad for parameter in motion.parameters() if parameter.grad is not None]
+    assert all(not gradient.any() for gradient in found)
+    assert gaussians.quats.grad is None or not gaussians.quats.grad.any()
+
+
+def test_a_scene_from_before_shading_still_opens(scene):
+    tensors = {name: value.detach().clone() for name, value in scene.tensors().items() if name != "gaussians.shading"}
+    metadata = scene.metadata()
+    del metadata["config"]["motion"]["shading"]
+    opened = scene_from(tensors, metadata, str(scene.device), "old run")
+    assert opened.gaussians.shading.shape == (len(scene.gaussians), 0)
+    torch.testing.assert_close(opened.gaussians_at(0.3).sh_dc, scene.gaussians.sh_dc)
