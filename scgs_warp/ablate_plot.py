@@ -173,7 +173,7 @@ def _arap(figure: Any, report: dict[str, Any]) -> None:
     rows = [row for table in report["tables"] for row in table["rows"]]
     panels = [panel for panel in panels if panel[0] == "psnr" or any(row[panel[0]] for row in rows)]
     groups = len(report["tables"]) * len(report["values"])
-    figure.set_size_inches(len(panels) * max(3.2, 0.8 + 0.5 * groups), HEIGHT)
+    figure.set_size_inches(max(5.5, len(panels) * max(3.2, 0.8 + 0.5 * groups)), HEIGHT)
     for index, (key, title, digits) in enumerate(panels):
         axes = figure.add_subplot(1, len(panels), index + 1)
         heights = _bars(axes, report, key, digits)

@@ -1,0 +1,390 @@
+"""Ablations: cells are resumed and never mixed, tables say what the cells say, mistakes get one line and status 2."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as Picture
+from tiny import write_dnerf
+
+from scgs_warp import ablate, ablate_jobs, ablate_table, config
+from scgs_warp.ablate_markdown import markdown
+from scgs_warp.apps import ablate as app
+from scgs_warp.errors import UserError
+
+ROOT = Path(__file__).parent.parent
+SMALL = ["--set", "motion.layers=3", "--set", "motion.width=32", "--set", "motion.skip=2", "--set", "init_points=300",
+         "--device", "cpu"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def blobs(tmp_path_factory) -> Path:
+    return write_dnerf(tmp_path_factory.mktemp("data") / "blobs", 32)
+
+
+def options(blobs: Path, output: Path, *more: str, steps: int = 30) -> list[str]:
+    return ["--data", str(blobs), "--output", str(output), "--steps", str(steps), *SMALL, *more]
+
+
+@pytest.fixture(scope="module")
+def trained(blobs, tmp_path_factory) -> Path:
+    """Two cells of nodes."""
+    output = tmp_path_factory.mktemp("ablations") / "nodes"
+    assert app.cli(["nodes", *options(blobs, output, "--values", "16,8")]) == 0
+    return output
+
+
+@pytest.fixture
+def copied(trained, tmp_path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "nodes"))
+
+
+def craft(output: Path, name: str, value: str, seed: int = 0, scene: str = "hook", steps: int = 12_000, **metrics):
+    """A cell's folder as training leaves it."""
+    folder = output / scene / ablate.cell_folder(value, seed)
+    folder.mkdir(parents=True)
+    made = ablate.settings_of_cell(config.with_steps(config.preset("cpu"), steps), name, value, seed)
+    settings = config.to_dict(made)
+    settings["data"]["folder"] = f"/data/{scene}"
+    (folder / "config.json").write_text(json.dumps(settings))
+    usual = {"ssim": 0.99, "lpips": None, "seconds": 60.0, "gaussians": 1000, "control_points": 10, "device": "cpu"}
+    (folder / "metrics.json").write_text(json.dumps({**usual, **metrics, "per_image": [{"psnr": 1.0}]}))
+
+
+# What the cells are.
+
+
+def test_values_are_sorted_and_unique():
+    assert ablate.parse_values("nodes", ["512", "64", "512"]) == ("64", "512")
+    assert ablate.parse_values("motion", ["control-points", "static"]) == ("static", "control-points")
+
+
+def test_cells_differ_in_what_is_varied_alone(blobs, tmp_path):
+    base = config.with_steps(config.preset("cpu"), 1_000)
+    for name in ablate.ABLATIONS:
+        cells = ablate.plan(name, base, {"blobs": blobs}, tmp_path, seeds=(0, 3))
+        expected = [value for value in ablate.VALUES[name] if (name, value) != ("arap", "per-gaussian")]
+        assert [cell.value for cell in cells] == 2 * expected, "without true motion there is no baseline to compare"
+        for cell in cells:
+            assert cell.settings["steps"] == 1_000
+            differs = ablate.difference(cell.settings, cells[0].settings, ("seed", *ablate.VARIED[name]))
+            assert differs is None
+        assert len({json.dumps(cell.settings) for cell in cells}) == len(cells), "but in that they do"
+        assert len({cell.folder for cell in cells}) == len(cells)
+
+
+def test_arap_off_is_off_in_both_stages(blobs, tmp_path):
+    base = config.preset("cpu")
+    on, off = ablate.plan("arap", base, {"blobs": blobs}, tmp_path)
+    assert on.settings["loss"]["arap"] == base.loss.arap > 0 and on.settings["pretrain"]["arap_weight"] > 0
+    assert off.settings["loss"]["arap"] == 0 == off.settings["pretrain"]["arap_weight"]
+    assert on.settings["motion"] == off.settings["motion"]
+
+
+def test_known_motion_asks_for_the_baseline(blobs, tmp_path):
+    known = Path(shutil.copytree(blobs, tmp_path / "known"))
+    (known / "ground_truth.npz").write_bytes(b"")
+    cells = ablate.plan("arap", config.preset("cpu"), {"known": known}, tmp_path / "out")
+    assert [cell.value for cell in cells] == ["on", "off", "per-gaussian"]
+    assert cells[2].settings["motion"]["model"] == "per-gaussian"
+
+
+def test_a_cell_is_plain_data(blobs, tmp_path):
+    cell = ablate.plan("nodes", config.preset("cpu"), {"blobs": blobs}, tmp_path)[0]
+    assert ablate_jobs._read_cell(json.dumps(dataclasses.asdict(cell))) == cell
+    assert Path(cell.folder).is_absolute() and Path(cell.settings["data"]["folder"]).is_absolute()
+
+
+# Running them.
+
+
+def test_cells_are_run_directories(trained):
+    for value, count in (("8", 8), ("16", 16)):
+        folder = trained / "blobs" / value
+        metrics = json.loads((folder / "metrics.json").read_text())
+        assert metrics["step"] == 30 and metrics["motion"] == "control-points" and metrics["images"] == 3
+        assert json.loads((folder / "config.json").read_text())["motion"]["nodes"] == count
+        assert (folder / "checkpoint.safetensors").is_file()
+    report = json.loads((trained / "nodes.json").read_text())
+    assert report["values"] == ["8", "16"] and report["settings"]["steps"] == 30
+    assert [row["control_points"]["mean"] for row in report["tables"][0]["rows"]] == [8, 16]
+
+
+def test_finished_cells_are_taken_as_they_are(blobs, copied, capsys):
+    before = {path: path.stat().st_mtime_ns for path in copied.glob("blobs/*/*.*")}
+    assert app.cli(["nodes", *options(blobs, copied, "--values", "8")]) == 0
+    assert {path: path.stat().st_mtime_ns for path in copied.glob("blobs/*/*.*")} == before
+    out = capsys.readouterr().out
+    assert "[1/1] blobs/8: done before" in out and "| 16 " in out, "the table has all cells that are there"
+
+
+def test_a_cell_without_metrics_is_resumed(blobs, copied, capsys):
+    path = copied / "blobs/8/metrics.json"
+    before = json.loads(path.read_text())
+    path.unlink()
+    assert app.cli(["nodes", *options(blobs, copied, "--values", "8,16")]) == 0
+    after = json.loads(path.read_text())
+    assert {key: after[key] for key in ("psnr", "ssim", "step", "seconds")} == {
+        key: before[key] for key in ("psnr", "ssim", "step", "seconds")
+    }
+    assert "[2/2] blobs/16: done before" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [(["--downscale", "2"], "data.downscale"), (["--set", "loss.ssim=0.3"], "loss.ssim"), (["--steps", "40"], "steps")],
+)
+def test_changed_settings_are_refused(change, field, blobs, copied, capsys):
+    assert app.cli(["nodes", *options(blobs, copied, "--values", "8", *change)]) == 2
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line and "blobs/8: made with " in line
+    assert field in line
+
+
+def test_other_data_of_the_same_name_are_refused(blobs, copied, tmp_path, capsys):
+    other = Path(shutil.copytree(blobs, tmp_path / "elsewhere" / "blobs"))
+    assert app.cli(["nodes", *options(other, copied, "--values", "8")]) == 2
+    assert "data.folder" in capsys.readouterr().err
+
+
+def test_what_changes_no_bit_may_change(blobs, copied):
+    assert app.cli(["nodes", *options(blobs, copied, "--values", "8", "--set", "evaluate_every=7")]) == 0
+
+
+def test_a_field_that_is_younger_than_the_cell_has_its_usual_value(blobs, copied):
+    path = copied / "blobs/8/config.json"
+    settings = json.loads(path.read_text())
+    del settings["loss"]["arap_neighbors"]
+    path.write_text(json.dumps(settings))
+    assert app.cli(["nodes", *options(blobs, copied, "--values", "8")]) == 0
+
+
+def test_lpips_is_measured_afterwards(blobs, copied, tmp_path, monkeypatch):
+    class Distance:
+        def __init__(self, weights: Path, device: str) -> None:
+            assert Path(weights) == tmp_path / "vgg"
+
+        def __call__(self, image, truth) -> float:
+            return 0.25
+
+    monkeypatch.setattr("scgs_warp.metrics.LPIPS", Distance)
+    path = copied / "blobs/8/metrics.json"
+    before = json.loads(path.read_text())
+    weights = ["--lpips-weights", str(tmp_path / "vgg")]
+    assert app.cli(["nodes", *options(blobs, copied, "--values", "8", *weights)]) == 0
+    after = json.loads(path.read_text())
+    assert after["lpips"] == 0.25 and after["psnr"] == before["psnr"] and after["seconds"] == before["seconds"]
+
+
+def test_ctrl_c_keeps_what_is_done(blobs, tmp_path, monkeypatch, capsys):
+    real = ablate_jobs.attempt
+
+    def attempt(cell):
+        if cell.value == "16":
+            raise KeyboardInterrupt
+        return real(cell)
+
+    monkeypatch.setattr(ablate_jobs, "attempt", attempt)
+    output = tmp_path / "out"
+    assert app.cli(["nodes", *options(blobs, output, "--values", "8,16")]) == 130
+    text = (output / "nodes.md").read_text()
+    assert "1 of 2 cells are missing" in text
+    assert [line.split("|")[4].strip() == "-" for line in text.splitlines() if line.startswith(("| 8", "| 16"))] == [
+        False,
+        True,
+    ]
+
+
+def test_whatever_goes_wrong_comes_back_as_one_line(tmp_path):
+    cell = ablate.Cell("nodes", "hook", "64", 0, str(tmp_path / "cell"), {})
+
+    def run(cell):
+        raise RuntimeError("out of memory\nin a kernel")
+
+    assert ablate.attempt(cell, run) == "RuntimeError: out of memory"
+    assert "Traceback" in (tmp_path / "cell" / "error.txt").read_text()
+    assert ablate.attempt(cell, lambda cell: tmp_path) is None
+    assert not (tmp_path / "cell" / "error.txt").exists()
+
+
+def test_a_failing_cell_stops_no_other(blobs, tmp_path, capsys):
+    """In processes of their own: the reason comes back from there, too."""
+    broken = Path(shutil.copytree(blobs, tmp_path / "broken"))
+    (broken / "train/train_002.png").write_bytes(b"not a picture")
+    output = tmp_path / "out"
+    data = ["--data", str(broken), str(blobs), "--jobs", "2"]
+    assert app.cli(["nodes", *options(blobs, output, "--values", "8"), *data]) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1 and "1 of 2 cells failed: broken/8 (" in lines[0] and "train_002.png" in lines[0]
+    report = json.loads((output / "nodes.json").read_text())
+    assert [cell["metrics"] is None for cell in report["cells"]] == [True, False]
+    assert "training 30/30" in (output / "blobs/8/train.log").read_text()
+
+
+def test_stopped_from_outside_and_resumed(blobs, tmp_path):
+    """Two processes are told, and save; the same command goes on from there."""
+    output = tmp_path / "out"
+    arguments = ["nodes", *options(blobs, output, "--values", "8,16", "--jobs", "2", steps=1_000)]
+    command = [sys.executable, str(ROOT / "apps/ablate.py"), *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    logs = {value: output / "blobs" / value / "log.jsonl" for value in ("8", "16")}
+    begun: list[str] = []
+    while not begun:
+        assert process.poll() is None
+        time.sleep(0.05)
+        begun = [value for value, log in logs.items() if log.is_file() and log.stat().st_size > 300]
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    folder, log = output / "blobs" / begun[0], logs[begun[0]]
+    assert (folder / "checkpoint.safetensors").is_file() and not (folder / "metrics.json").is_file()
+    before = log.read_text().splitlines()
+    assert app.cli(["nodes", *options(blobs, output, "--values", begun[0], steps=1_000)]) == 0
+    assert log.read_text().splitlines()[: len(before)] == before, "continued, not begun again"
+    assert json.loads((folder / "metrics.json").read_text())["step"] == 1_000
+
+
+# Tables.
+
+
+def test_means_spreads_and_gaps(tmp_path):
+    for scene, base in (("hook", 30.0), ("figure", 40.0)):
+        for seed in (0, 1):
+            craft(tmp_path, "nodes", "64", seed, scene, psnr=base + seed, control_points=66)
+    craft(tmp_path, "nodes", "128", 0, "hook", psnr=33.0)
+    report = ablate_table.build("nodes", tmp_path)
+    mean, figure, hook = report["tables"]
+    assert mean["rows"][0]["psnr"] == {"mean": 35.5, "std": pytest.approx(0.5**0.5), "count": 4}
+    assert mean["rows"][1]["psnr"] is None, "a mean over fewer scenes would be another figure"
+    assert hook["name"] == "hook" and hook["rows"][1]["psnr"] == {"mean": 33.0, "std": None, "count": 1}
+    assert hook["rows"][0]["to_best"] == pytest.approx(-2.5) and hook["rows"][1]["to_best"] == 0
+    assert figure["rows"][1]["psnr"] is None
+    assert mean["rows"][0]["published"]["psnr"] == 42.65 and mean["rows"][0]["published"]["control_points"] == 67
+    text = markdown(report)
+    assert "12,000 steps in every cell" in text and "35.50 ± 0.71" in text and "LPIPS" in text
+    assert "per_image" not in json.dumps(report)
+
+
+def test_missing_cells_are_dashes(blobs, tmp_path):
+    cells = ablate.plan("motion", config.preset("cpu"), {"blobs": blobs}, tmp_path)
+    text = markdown(ablate_table.build("motion", tmp_path, cells))
+    rows = [line for line in text.splitlines() if line.startswith("| control-points")]
+    assert len(rows) == 1 and rows[0].split("|")[4].strip() == "-"
+    assert "4 of 4 cells are missing" in text
+
+
+def test_leads_beside_the_published(tmp_path):
+    for value, psnr in (("static", 20.0), ("hexplane", 30.0), ("control-points", 38.0)):
+        craft(tmp_path, "motion", value, psnr=psnr)
+    rows = {row["value"]: row for row in ablate_table.build("motion", tmp_path)["tables"][0]["rows"]}
+    assert rows["static"]["lead"] == 18.0 and rows["hexplane"]["lead"] == 8.0
+    assert rows["control-points"]["lead"] is None
+    assert rows["hexplane"]["published"]["lead"] == pytest.approx(39.87 - 30.99)
+    assert rows["hexplane"]["published_mean"]["lead"] == pytest.approx(43.31 - 34.01)
+
+
+@pytest.mark.parametrize("model", list(ablate_table.PUBLISHED_PSNR))
+def test_published_means_are_those_of_the_published_scenes(model):
+    known = dict(ablate_table.PUBLISHED_PSNR[model])
+    mean = known.pop("mean")
+    assert len(known) == 7
+    assert sum(known.values()) / 7 == pytest.approx(mean, abs=0.01)
+
+
+def test_motion_error_beside_the_baseline(tmp_path):
+    for value, epe, jitter in (("on", 1.0, 0.1), ("off", 1.5, 0.3), ("per-gaussian", 4.0, 0.5)):
+        craft(tmp_path, "arap", value, scene="figure", psnr=33.0, epe=epe, jitter=jitter)
+    report = ablate_table.build("arap", tmp_path)
+    rows = {row["value"]: row for row in report["tables"][0]["rows"]}
+    assert rows["on"]["epe_share"] == 0.25 and rows["on"]["jitter_share"] == pytest.approx(0.2)
+    assert rows["off"]["epe_share"] == 0.375 and rows["per-gaussian"]["epe_share"] is None
+    assert "EPE [%]" in markdown(report) and "per-gaussian (baseline)" in markdown(report)
+
+
+def test_unequal_cells_make_no_table(tmp_path):
+    craft(tmp_path, "nodes", "64", psnr=30.0)
+    craft(tmp_path, "nodes", "128", psnr=31.0, steps=6_000)
+    with pytest.raises(UserError, match=r"hook/(64|128): made with steps = "):
+        ablate_table.build("nodes", tmp_path)
+
+
+def test_ablations_share_a_folder(tmp_path):
+    craft(tmp_path, "nodes", "64", psnr=30.0)
+    craft(tmp_path, "motion", "static", psnr=20.0)
+    craft(tmp_path, "arap", "off", psnr=29.0)
+    assert [ablate_table.build(name, tmp_path)["values"] for name in ablate.ABLATIONS] == [
+        ("64",),
+        ("static",),
+        ("off",),
+    ]
+
+
+@pytest.mark.parametrize("name", ablate.ABLATIONS)
+@pytest.mark.parametrize("there", ["all", "one", "none"])
+def test_pictures(name, there, tmp_path, blobs):
+    """Drawn whatever is there; more cells, more ink."""
+    values = ablate.VALUES[name]
+    for value in {"all": values, "one": values[-1:], "none": ()}[there]:
+        for scene in ("hook", "jumpingjacks"):
+            craft(tmp_path, name, value, scene=scene, psnr=30.0 + len(value), epe=1.0, jitter=0.1, control_points=64)
+    cells = []
+    if there == "none":
+        cells = ablate.plan(name, config.with_steps(config.preset("cpu"), 12_000), {"blobs": blobs}, tmp_path)
+    paths = ablate_table.write(ablate_table.build(name, tmp_path, cells), tmp_path)
+    assert [path.name for path in paths] == [f"{name}.json", f"{name}.md", f"{name}.png"]
+    pixels = np.asarray(Picture.open(io.BytesIO(paths[2].read_bytes())).convert("RGB"))
+    ink = (pixels.astype(int).max(2) - pixels.min(2) > 60).mean()
+    assert 300 < pixels.shape[0] < 700 and 400 < pixels.shape[1] < 2500
+    assert ink > {"all": 0.004, "one": 0.0005, "none": 0.0}[there], "coloured curves or bars"
+
+
+# Mistakes.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["nodes", "--values", "64,many"], "--values 'many'"),
+        (["nodes", "--values", "2"], "2"),
+        (["motion", "--values", "fluid"], "--values 'fluid'"),
+        (["arap", "--values", "half"], "on, off, per-gaussian"),
+        (["nodes", "--nodes", "64"], "--nodes 64"),
+        (["motion", "--set", "motion.model=static"], "--set motion.model"),
+        (["arap", "--set", "loss.arap=0", "--set", "pretrain.arap_weight=0"], "arap"),
+        (["nodes", "--set", "motion.speed=1"], "motion.speed"),
+        (["nodes", "--seeds", "1,x"], "--seeds 'x'"),
+        (["nodes", "--jobs", "0"], "--jobs 0"),
+        (["nodes", "--table-only"], "--table-only"),
+        (["nodes", "--data", "nowhere"], "nowhere"),
+        (["nodes", "--lpips-weights", "nowhere.pth"], "nowhere.pth"),
+    ],
+)
+def test_mistakes_get_one_line_and_status_2(arguments, named, blobs, tmp_path, capsys):
+    name, *more = arguments
+    assert app.cli([name, *options(blobs, tmp_path / "out", *more)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and named in lines[0]
+    assert not (tmp_path / "out").exists(), "nothing is begun"
+
+
+def test_two_data_sets_of_one_name(blobs, tmp_path, capsys):
+    assert app.cli(["nodes", "--data", str(blobs), str(blobs), "--output", str(tmp_path), "--device", "cpu"]) == 2
+    assert "another 'blobs'" in capsys.readouterr().err
+
+
+def test_damaged_metrics_are_named(blobs, copied, capsys):
+    (copied / "blobs/8/metrics.json").write_text("{")
+    assert app.cli(["nodes", *options(blobs, copied, "--values", "8")]) == 2
+    assert "blobs/8/metrics.json: damaged" in capsys.readouterr().err
