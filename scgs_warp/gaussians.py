@@ -24,7 +24,7 @@ class GaussianParameters(nn.Module):
     """Raw parameters of N Gaussians in the normalised scene; :meth:`activate` gives what renders.
 
     Attributes: ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``log_scales`` [N, 3], ``opacity_logits`` [N],
-    ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0), ``shading`` [N, 9] or [N, 0].
+    ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0), ``shading`` [N, 10] or [N, 0].
     """
 
     NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper", "shading")

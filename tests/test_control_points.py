@@ -95,7 +95,7 @@ def test_training_sees_the_neighbours_of_the_step(scene):
 
 def test_shading_turns_with_the_surface_and_nothing_else_changes(scene):
     gaussians, motion = scene.gaussians, scene.motion
-    assert isinstance(motion, ControlPoints) and gaussians.shading.shape[1] == 9
+    assert isinstance(motion, ControlPoints) and gaussians.shading.shape[1] == 10
     shaded = fresh(scene, 0.6)
     with torch.no_grad():
         gaussians.shading.zero_()

@@ -15,7 +15,7 @@ from scgs_warp.ops.shading import shade
 
 def draw(seed, n, device="cpu", spread=0.8):
     g = torch.Generator().manual_seed(seed)
-    values = torch.randn(n, 3, generator=g), spread * torch.randn(n, 9, generator=g)
+    values = torch.randn(n, 3, generator=g), spread * torch.randn(n, 10, generator=g)
     turns = torch.randn(n, 4, generator=g), torch.randn(n, 4, generator=g)
     return [x.to(device) for x in (*values, *turns)]
 
@@ -57,7 +57,7 @@ def test_a_lambertian_surface_under_one_lamp(device):
         [0.0, 0.6 * math.cos(angle) - 0.8 * math.sin(angle), 0.6 * math.sin(angle) + 0.8 * math.cos(angle)]
     )
     before, after = ambient + lamp @ normal, ambient + lamp @ turned
-    matrix = (torch.outer(lamp, normal) / before).reshape(1, 9)
+    matrix = torch.nn.functional.pad((torch.outer(lamp, normal) / before).reshape(1, 9), (0, 1))
     rest = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     albedo = torch.tensor([[0.2, 0.5, 0.1]])
     sh_dc = (albedo * before - 0.5) / 0.28209479177387814
@@ -76,8 +76,10 @@ def test_a_common_turn_of_both_changes_nothing_but_the_frame(values, matrix):
     G = torch.tensor(matrix).double().view(1, 3, 3) / 40
     Q = to_matrix(q)
     moved = (Q @ G @ Q.transpose(1, 2)).reshape(1, 9)
-    plain = shade(sh_dc.float(), G.reshape(1, 9).float(), quats.float(), quats_t.float())
-    both = shade(sh_dc.float(), moved.float(), multiply(q, quats).float(), multiply(q, quats_t).float())
+    bend = torch.full((1, 1), 0.1)
+    still, moved = (torch.cat([x.reshape(1, 9).float(), bend], 1) for x in (G, moved))
+    plain = shade(sh_dc.float(), still, quats.float(), quats_t.float())
+    both = shade(sh_dc.float(), moved, multiply(q, quats).float(), multiply(q, quats_t).float())
     torch.testing.assert_close(both, plain, rtol=1e-4, atol=1e-4)
 
 

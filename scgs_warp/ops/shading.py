@@ -10,7 +10,7 @@ from torch import Tensor
 from ..kernels import shading as kernels
 from ..warp_interop import launch
 
-COLUMNS = 9
+COLUMNS = 10
 
 
 class _Shade(torch.autograd.Function):
@@ -32,14 +32,15 @@ class _Shade(torch.autograd.Function):
 
 
 def shade(sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor) -> Tensor:
-    """Base colours times ``1 + <G, R - I>``, R being the rotation from ``quats`` to ``quats_t``, within [0, 4].
+    """Base colours times ``1 + x + 5 b x^2`` within [0, 4]; ``x = <G, R - I>``, R turning ``quats`` to ``quats_t``.
 
-    What a diffuse surface sends back is, to first order, linear in its normal; the rest of G is what light and normal
-    there are, learnt for each Gaussian. At rest nothing changes.
+    What a diffuse surface sends back is, to first order, linear in its normal, and G holds the light and the normal
+    there are; b is for lamps, whose light is cut off at grazing angles. Both are learnt for each Gaussian. At rest
+    nothing changes.
 
     Args:
         sh_dc: [N, 3] spherical harmonics coefficients of degree 0 (colour less one half, over C0).
-        shading: [N, 9] the matrices G, by rows.
+        shading: [N, 10] the matrices G, by rows, and b.
         quats: [N, 4] wxyz at rest, any norm.
         quats_t: [N, 4] wxyz at the instant, any norm.
 
