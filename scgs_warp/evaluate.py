@@ -57,6 +57,7 @@ class _Renders:
         self._chosen = {round(index * (count - 1) / max(rows - 1, 1)) for index in range(rows)}
         self._rows: list[tuple[Any, Any]] = []
         self._titles: list[str] = []
+        self._scores: list[float] = []
         self._names: set[str] = set()
         try:
             for name in ("renders", "truth"):
@@ -64,19 +65,22 @@ class _Renders:
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror}); make the folder writable") from None
 
-    def add(self, index: int, frame: Frame, image: Tensor, truth: Tensor) -> None:
+    def add(self, index: int, frame: Frame, image: Tensor, truth: Tensor, score: float) -> None:
         name = frame.name if frame.name and frame.name not in self._names else f"{index:05d}"
         self._names.add(name)
         pair = to_bytes(truth), to_bytes(image)
         self._write(self.folder / "truth" / f"{name}.png", pair[0])
         self._write(self.folder / "renders" / f"{name}.png", pair[1])
         if index in self._chosen:
+            if frame.mask is not None:  # outside it nothing is known: the sheet shows no error there
+                pair = pair[0], to_bytes(torch.where(frame.mask.to(image.device)[..., None], image, truth))
             self._rows.append(pair)
+            self._scores.append(score)
             self._titles.append(f"{name}   t = {frame.time:.3f}")
 
     def finish(self) -> None:
         if self._rows:
-            self._write(self.folder / "contact_sheet.png", contact_sheet(self._rows, self._titles))
+            self._write(self.folder / "contact_sheet.png", contact_sheet(self._rows, self._titles, scores=self._scores))
 
     @staticmethod
     def _write(path: Path, image: Any) -> None:
@@ -119,7 +123,7 @@ def evaluate(
         truth = frame.image.to(image.device).clamp(0.0, 1.0)
         rows.append(_measure(frame, image, truth, lpips))
         if renders is not None:
-            renders.add(index, frame, image, truth)
+            renders.add(index, frame, image, truth, rows[-1]["psnr"])
         if progress is not None:
             progress(index + 1, len(dataset))
     if renders is not None:

@@ -77,13 +77,18 @@ def _fit(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def contact_sheet(
-    rows: Sequence[tuple[Picture, Picture]], titles: Sequence[str] = (), *, cell: int = 400
+    rows: Sequence[tuple[Picture, Picture]],
+    titles: Sequence[str] = (),
+    *,
+    scores: Sequence[float] = (),
+    cell: int = 400,
 ) -> np.ndarray:
     """Truth, render and error side by side, one row a pair.
 
     Args:
         rows: (truth, render), each [H, W, 3]: floats in [0, 1] or uint8; the two of a row have one size.
         titles: a caption for each row; may be shorter than ``rows``.
+        scores: PSNR of each row, dB, where it is not that of the two pictures (masked pixels do not count).
         cell: longest side of a picture on the sheet, pixels. Errors are computed before pictures are made smaller.
 
     Returns:
@@ -108,7 +113,8 @@ def contact_sheet(
         pictures = (to_bytes(_floats(truth)), to_bytes(_floats(render)), error_map(truth, render))
         for x, picture in zip(columns, pictures):
             sheet[y : y + height, x : x + width] = _fit(picture, width, height)
-        captions = (titles[index] if index < len(titles) else "", "", f"PSNR {psnr_of(truth, render):.2f} dB")
+        score = scores[index] if index < len(scores) else psnr_of(truth, render)
+        captions = (titles[index] if index < len(titles) else "", "", f"PSNR {score:.2f} dB")
         for x, text in zip(columns, captions):
             _write(sheet, text, x, y + height, width)
     return sheet

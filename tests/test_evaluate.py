@@ -65,6 +65,24 @@ def test_masked_pixels_do_not_count() -> None:
     assert found["psnr"] == pytest.approx(20.0, abs=1e-3)
 
 
+def test_the_sheet_shows_no_error_where_nothing_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, seen = FakeScene(), []
+    frame = fake_dataset(scene, 1, error=0.1)[0]
+    mask = torch.zeros(40, 40, dtype=torch.bool)
+    mask[:, :20] = True
+    spoilt = frame.image.clone()
+    spoilt[:, 20:] = 0.7
+    masked = type(frame)(frame.camera, frame.time, spoilt, frame.alpha, mask, "a")
+    monkeypatch.setattr(
+        "scgs_warp.evaluate.contact_sheet",
+        lambda rows, titles, scores: seen.append((rows, scores)) or report.contact_sheet(rows, titles, scores=scores),
+    )
+    found = evaluate(scene, Dataset([masked], folder=Path("x"), split="test"), render_dir=tmp_path)
+    (((truth, shown),), scores) = seen[0]
+    assert (truth[:, 20:] == shown[:, 20:]).all() and (truth[:, :20] != shown[:, :20]).any()
+    assert scores == [found["psnr"]] == [pytest.approx(20.0, abs=0.01)]
+
+
 def test_renders_lie_beside_the_truth(tmp_path: Path) -> None:
     scene = FakeScene()
     first = fake_dataset(scene, 3, error=0.1)
