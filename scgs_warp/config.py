@@ -60,6 +60,7 @@ def preset(name: PresetName) -> TrainConfig:
         motion=MotionConfig(nodes=256),
         optim=OptimConfig(means_until=21_000, network_until=21_000),
         densify=DensifyConfig(
+            grad_threshold=1e-4,
             start=400,
             until=12_000,
             opacity_reset_every=3_000,
@@ -67,7 +68,7 @@ def preset(name: PresetName) -> TrainConfig:
             nodes_every=2_000,
             nodes_until=9_000,
         ),
-        loss=LossConfig(arap_until=5_000, arap_every=5),
+        loss=LossConfig(arap_until=24_000),
     )
     if name == "cpu":
         return cpu

@@ -125,6 +125,8 @@ class OptimConfig:
     nodes: float = 8e-4
     """Radii, weights and hyper-coordinates of the control points."""
     node_positions: float = 8e-5
+    settle: float = 0.15
+    """Last share of the main stage in which the constant rates of the Gaussians fall, too: to a twentieth."""
     cameras: float = 0.0
     """Corrections of the training cameras' poses (radians, normalised units), from the end of ``freeze``; 0: none."""
     planes: float = 8e-3
@@ -138,8 +140,9 @@ class DensifyConfig:
     start: int = milestone(500)
     until: int = milestone(50_000)
     every: int = 100
-    grad_threshold: float = 2e-4
-    """Gradient of the loss to the 2D mean in normalised device coordinates, at 800 pixels."""
+    grad_threshold: float = 1.4e-4
+    """Gradient of the loss to the 2D mean in normalised device coordinates, at 800 pixels (official code: 2e-4 at any
+    size)."""
     resolution_exponent: float = 0.66
     """The threshold grows by (800 / image size) to this power: small images have larger gradients per Gaussian."""
     absolute_grad: bool = False
@@ -167,11 +170,12 @@ class LossConfig:
     """L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10; seed S4)."""
 
     ssim: float = 0.2
-    arap: float = 1e-4
-    arap_end: float = 1e-7
-    arap_until: int = milestone(10_000)
-    """The ARAP weight decays exponentially until this main step, then the term is off."""
-    arap_every: int = 1
+    arap: float = 1e-2
+    arap_end: float = 1e-2
+    arap_until: int = milestone(80_000)
+    """The ARAP weight goes exponentially from the first value to the second until this main step, then the term is
+    off (paper: from 1e-4 to 1e-7 over 10,000 steps)."""
+    arap_every: int = 5
     """Apply it every so many steps with as many times the weight."""
     arap_pair: Literal["frame", "random"] = "frame"
     """The two instants that are compared. frame: the step's own and a random one, of which the network has to be asked

@@ -20,7 +20,7 @@ NOT_NEGATIVE = (
     "seed freeze coarse half_size checkpoint_seconds "
     "pretrain.steps pretrain.warm_up pretrain.clone_share pretrain.arap_weight "
     "densify.start densify.until densify.grad_threshold densify.min_opacity loss.ssim loss.arap loss.arap_end "
-    "optim.cameras optim.shading motion.time_noise motion.hyper_dim motion.hyper_dim_filled "
+    "optim.cameras optim.shading optim.settle motion.time_noise motion.hyper_dim motion.hyper_dim_filled "
     "loss.hexplane_tv loss.hexplane_smooth loss.hexplane_rest"
 ).split()
 
@@ -53,6 +53,8 @@ def check(config: TrainConfig) -> TrainConfig:
         raise UserError(f"motion.plane_times is {motion.plane_times}; choose 2 to 4096, or 0 for half of the times")
     if motion.nodes < motion.neighbors + 1:
         raise UserError(f"--nodes {motion.nodes}: needs at least {motion.neighbors + 1}")
+    if config.optim.settle > 1:
+        raise UserError(f"optim.settle is {config.optim.settle}; it is a share of the run, choose 0 to 1")
     if config.densify.max_gaussians < 100:
         raise UserError(f"--max-gaussians {config.densify.max_gaussians}: needs at least 100")
     return config

@@ -35,6 +35,8 @@ from .run_folder import RunFolder
 from .scene import Scene
 from .train_state import TrainState
 
+SETTLED = 0.05
+"""What remains of the constant rates at the last step."""
 MOST_FAILURES = 20
 """Non-finite steps in a row after which training stops at the last good state."""
 
@@ -103,12 +105,23 @@ def set_rates(state: TrainState) -> None:
     """Every learning rate is a function of the step."""
     config, step = state.config, state.stage_step
     means = log_linear(config.optim.means, config.optim.means_end, step, config.optim.means_until)
-    state.gaussian_optimizer.groups["means"].rate = means
+    settled = settling(step, config)
+    base = state.gaussian_rates()
+    for name, group in state.gaussian_optimizer.groups.items():
+        group.rate = means if name == "means" else base[name] * (settled if state.stage == "main" else 1.0)
     if state.motion_optimizer is not None:
         rates = state.motion.rates(step, config)
         for name, group in state.motion_optimizer.groups.items():
             group.rate = rates[name]
     state.camera_optimizer.groups["twists"].rate = camera_rate(step, config.optim, config.rest_steps)
+
+
+def settling(step: int, config: TrainConfig) -> float:
+    """Factor of the constant rates: 1, then log-linearly to ``SETTLED`` over the last share of the main stage. Steps
+    that stay large shake every colour about its best value."""
+    length = round(config.optim.settle * config.main_steps)
+    passed = step - (config.main_steps - length)
+    return log_linear(1.0, SETTLED, passed, length) if length > 0 and passed > 0 else 1.0
 
 
 def noisy_time(time: float, state: TrainState, frames: int) -> float:
