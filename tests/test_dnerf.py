@@ -73,6 +73,18 @@ def test_composited_once(tmp_path, background):
     assert data.background == background and data.background_color.tolist() == [color] * 3
 
 
+def test_alpha_that_says_nothing_is_none(tmp_path):
+    """A file that an object fills keeps its alpha as long as others have something to say."""
+    folder = tmp_path / "s"
+    images = write_scene(folder, frames=2)
+    for index, image in enumerate(images):
+        image[..., 3] = 255
+        PillowImage.fromarray(image).save(folder / f"train/r_{index:03d}.png")
+        alphas = [frame.alpha for frame in load(folder, "train")]
+        assert all(alpha is not None for alpha in alphas) == (index == 0), "all or none"
+    assert alphas == [None, None]
+
+
 def test_area_averages_premultiplied(tmp_path):
     images = write_scene(tmp_path / "s", frames=1)
     frame = load(tmp_path / "s", "train", downscale=2, background="white")[0]

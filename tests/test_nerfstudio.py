@@ -159,6 +159,61 @@ def test_a_black_border_is_masked_but_nothing_dark_inside(tmp_path):
     assert not small[0, 4:11].any() and small[1:].all()
 
 
+def rewrite(folder: Path, change, count: int = 20) -> None:
+    """Every image of the folder becomes ``change(index, image)``."""
+    for index in range(count):
+        path = str(folder / f"f_{index}.png")
+        cv2.imwrite(path, change(index, cv2.imread(path)))
+
+
+def with_alpha(image: np.ndarray, bits: int) -> np.ndarray:
+    """RGBA that is opaque everywhere, of 8 or 16 bits."""
+    most = 2**bits - 1
+    image = image.astype(np.uint8 if bits == 8 else np.uint16) * (most // 255)
+    return np.dstack([image, np.full_like(image[..., :1], most)])
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("background", ["black", "white", "random"])
+def test_opaque_rgba_is_rgb(tmp_path, bits, background):
+    """Filled images stay filled: a border is masked, bare walls get points, large Gaussians are kept."""
+    write(tmp_path)
+
+    def bordered(index: int, image: np.ndarray) -> np.ndarray:
+        image[0] = 0
+        return image
+
+    rewrite(tmp_path, bordered)
+    expected = load(tmp_path, background=background)
+    # Some with alpha, some without, as a tool leaves them that saves what it has touched.
+    rewrite(tmp_path, lambda index, image: with_alpha(image, bits) if bits == 16 or index % 2 else image)
+    data = load(tmp_path, background=background)
+    for plain, frame in zip(expected, data):
+        assert frame.alpha is None and torch.allclose(frame.image, plain.image, rtol=0, atol=1e-6)
+        assert frame.mask is not None and torch.equal(frame.mask, plain.mask)
+    config = tiny_config(20, data={"background": background})
+    state = TrainState.begin(config, data, "cpu")
+    assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 4)
+    assert len(state.gaussians) == config.init_points > len(data.points)
+
+
+def test_one_image_that_an_object_fills_keeps_its_alpha(tmp_path):
+    write(tmp_path)
+
+    def cut_out(index: int, image: np.ndarray) -> np.ndarray:
+        image = with_alpha(image, 8)
+        if index != 1:
+            image[:4, :, 3] = 200
+        return image
+
+    rewrite(tmp_path, cut_out)
+    data = load(tmp_path)
+    assert all(frame.alpha is not None and frame.mask is None for frame in data)
+    assert (data[1].alpha == 1).all() and (data[0].alpha[:4] < 0.8).all()
+    kept = TrainState.begin(tiny_config(20), data, "cpu").config
+    assert (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 0)
+
+
 def test_a_black_ground_is_no_border():
     images = [np.zeros((30, 40, 3), np.uint8) for _ in range(6)]
     for image in images:

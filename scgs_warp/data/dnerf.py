@@ -13,7 +13,7 @@ from pathlib import Path
 from ..errors import UserError
 from ..types import Frame
 from .dataset import Dataset
-from .images import Decoded, parallel_map, read_image
+from .images import Decoded, parallel_map, read_image, without_idle_alpha
 from .transforms import (
     check_distortion,
     find_image,
@@ -63,7 +63,7 @@ def read(
     def decode(file: Path) -> Decoded:
         return read_image(file, downscale, resample, background)
 
-    images = parallel_map(decode, files, progress)
+    images = without_idle_alpha(parallel_map(decode, files, progress))
     source = images[0].source_size
     for file, image in zip(files, images):
         if image.source_size != source:

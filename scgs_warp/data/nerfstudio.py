@@ -20,7 +20,7 @@ from ..errors import UserError
 from ..types import Camera, Frame
 from .borders import border_mask, reduce_mask
 from .dataset import Dataset
-from .images import Decoded, decode, parallel_map, read_image
+from .images import Decoded, decode, is_transparent, parallel_map, read_image, without_idle_alpha
 from .transforms import (
     check_distortion,
     find_image,
@@ -81,9 +81,10 @@ def read(
         return read_image(files[index], downscale, resample, background), _mask(path, folder, index, entries[index])
 
     loaded = parallel_map(load, chosen, progress)
+    images = without_idle_alpha([decoded for decoded, _ in loaded])
+    first = images[0].source_size
     frames = []
-    for index, (decoded, own) in zip(chosen, loaded):
-        first = loaded[0][0].source_size
+    for index, decoded, (_, own) in zip(chosen, images, loaded):
         if decoded.source_size != first:
             raise UserError(
                 f"{files[index]}: is {size_text(decoded.source_size)}, but {files[chosen[0]].name} is "
@@ -145,9 +146,9 @@ def _border(files: list[Path], times: list[float]) -> np.ndarray | None:
     order = sorted(range(len(files)), key=lambda index: times[index])
     spread = order[:: max(1, len(order) // BORDER_FRAMES)]
     images = parallel_map(decode, [files[index] for index in spread if files[index].is_file()])
-    if any(image.shape[2] == 4 for image in images):
+    if any(is_transparent(image) for image in images):
         return None  # alpha says it better
-    return border_mask(images)
+    return border_mask([image[..., :3] for image in images])
 
 
 def _mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> np.ndarray | None:
