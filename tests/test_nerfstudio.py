@@ -13,10 +13,11 @@ import torch
 from scenes import look_at
 from tiny import tiny_config, tiny_dataset
 
-from scgs_warp.data import load
+from scgs_warp.data import images, load, nerfstudio
 from scgs_warp.data.borders import border_mask, reduce_mask
 from scgs_warp.data.nerfstudio import read_ply
 from scgs_warp.errors import UserError
+from scgs_warp.gaussians import SH_C0
 from scgs_warp.train_state import TrainState
 
 WIDTH, HEIGHT, FOCAL = 40, 30, 50.0
@@ -214,6 +215,16 @@ def test_one_image_that_an_object_fills_keeps_its_alpha(tmp_path):
     assert (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 0)
 
 
+@pytest.mark.parametrize("count", [47, 49])
+def test_a_border_takes_few_images_to_find(tmp_path, monkeypatch, count):
+    write(tmp_path, count)
+    seen = []
+    monkeypatch.setattr(nerfstudio, "decode", lambda file: seen.append(file.stem) or images.decode(file))
+    load(tmp_path)
+    assert len(seen) == nerfstudio.BORDER_FRAMES
+    assert {"f_0", f"f_{count - 1}"} <= set(seen), "from the whole video"
+
+
 def test_a_black_ground_is_no_border():
     images = [np.zeros((30, 40, 3), np.uint8) for _ in range(6)]
     for image in images:
@@ -277,6 +288,27 @@ def test_faults_are_named(name, tmp_path):
     save(tmp_path, content)
     text = message(tmp_path)
     assert expected in text and str(tmp_path) in text
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"pretrain": {"start_ratio": 80.0}}, {"densify": {"max_gaussians": 100}}, {"motion": {"model": "static"}}],
+    ids=["spheres", "cap", "neither"],
+)
+def test_the_backdrop_is_seen_by_all_frames(tmp_path, changes):
+    """Also where more points are drawn than Gaussians begin with."""
+    write(tmp_path)
+    rewrite(tmp_path, lambda index, image: np.full_like(image, 10 + 10 * index))
+    data = load(tmp_path)
+    config = tiny_config(20, **changes)
+    count = min(config.init_points, config.densify.max_gaussians)
+    gaussians = TrainState.begin(config, data, "cpu").gaussians
+    assert len(gaussians) == count
+    greys = (gaussians.sh_dc.detach()[len(data.points) :, 0] * SH_C0 + 0.5) * 255
+    frames, own = greys.round().unique(return_counts=True)
+    expected = {int(10 + 10 * int(frame.name[2:])) for frame in data}
+    assert len(set(frames.int().tolist()) & expected) > 0.8 * len(expected)
+    assert int(own.max()) < 5 * (count - len(data.points)) / len(data)
 
 
 def test_what_the_data_offers_decides(tmp_path):

@@ -16,6 +16,13 @@ BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random
 """What RGBA images are composited on when they are read. With ``random`` the trainer composites, once per step."""
 
 
+def spread(count: int, most: int) -> list[int]:
+    """At most ``most`` of the indices below ``count``, evenly from the first to the last."""
+    if count <= most:
+        return list(range(count))
+    return [round(index * (count - 1) / max(most - 1, 1)) for index in range(most)]
+
+
 class Dataset(Sequence[Frame]):
     """Frames of one split, in the order of the file that lists them.
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..errors import UserError
 from ..types import Camera, Frame
 from .borders import border_mask, reduce_mask
-from .dataset import Dataset
+from .dataset import Dataset, spread
 from .images import Decoded, decode, is_transparent, parallel_map, read_image, without_idle_alpha
 from .transforms import (
     check_distortion,
@@ -37,7 +37,7 @@ HELD_OUT_EVERY = 8
 HELD_OUT_FIRST = 4
 """Without lists, frames 4, 12, 20, ... are held out: never the first, so that nothing has to be extrapolated."""
 BORDER_FRAMES = 24
-"""Frames, spread over the video, in which a border is looked for."""
+"""At most so many frames, spread over the video, are looked at for a border: all of them are in memory at once."""
 
 
 def recognises(folder: Path) -> bool:
@@ -144,8 +144,8 @@ def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) 
 def _border(files: list[Path], times: list[float]) -> np.ndarray | None:
     """[H, W] bool, False on the black border of the video, if it has one; the same whichever split is read."""
     order = sorted(range(len(files)), key=lambda index: times[index])
-    spread = order[:: max(1, len(order) // BORDER_FRAMES)]
-    images = parallel_map(decode, [files[index] for index in spread if files[index].is_file()])
+    looked_at = [files[order[place]] for place in spread(len(order), BORDER_FRAMES)]
+    images = parallel_map(decode, [file for file in looked_at if file.is_file()])
     if any(is_transparent(image) for image in images):
         return None  # alpha says it better
     return border_mask([image[..., :3] for image in images])
