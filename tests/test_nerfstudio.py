@@ -249,6 +249,25 @@ def test_masks_of_frames(tmp_path):
     assert "all black" in message(tmp_path)
 
 
+@pytest.mark.parametrize("what", ["reduction", "border"])
+def test_a_mask_that_leaves_nothing_is_told(tmp_path, what):
+    content = write(tmp_path)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    if what == "border":
+        rewrite(tmp_path, lambda index, image: cv2.rectangle(image, (0, 0), (WIDTH, 1), (0, 0, 0), -1))
+        mask[0] = 255
+    else:
+        mask[::2, ::2] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    content["frames"][3]["mask_path"] = "mask.png"
+    save(tmp_path, content)
+    if what == "reduction":
+        assert load(tmp_path)[3].mask.sum() == HEIGHT * WIDTH / 4
+    with pytest.raises(UserError, match=r"f_3\.png: no pixel is left") as caught:
+        load(tmp_path, downscale=2 if what == "reduction" else 1)
+    assert "mask_path" in str(caught.value)
+
+
 def test_a_reduced_pixel_is_valid_only_if_all_beneath_are():
     mask = np.ones((4, 4), bool)
     mask[0, 3] = False

@@ -166,7 +166,11 @@ def _mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> np.nda
 
 
 def _combined(file: Path, border: np.ndarray | None, own: np.ndarray | None, decoded: Decoded) -> Tensor | None:
-    """[h, w] bool at the reduced size, True where both masks are; None where there is none."""
+    """[h, w] bool at the reduced size, True where both masks are; None where there is none.
+
+    Raises:
+        UserError: the mask has another size than the image, or no pixel is left.
+    """
     width, height = decoded.source_size
     if own is not None and own.shape != (height, width):
         raise UserError(
@@ -177,7 +181,13 @@ def _combined(file: Path, border: np.ndarray | None, own: np.ndarray | None, dec
     if not masks:
         return None
     size = (decoded.image.shape[1], decoded.image.shape[0])
-    return torch.from_numpy(reduce_mask(np.logical_and.reduce(masks), size))
+    mask = reduce_mask(np.logical_and.reduce(masks), size)
+    if not mask.any():  # neither a step nor a score could say anything of such a frame
+        raise UserError(
+            f"{file}: no pixel is left by its mask, the video's border and the reduction to {size_text(size)}; "
+            "correct mask_path, give a smaller downscale or drop the frame"
+        )
+    return torch.from_numpy(mask)
 
 
 def _points(
