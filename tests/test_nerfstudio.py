@@ -17,7 +17,9 @@ from scgs_warp.data import images, load, nerfstudio
 from scgs_warp.data.borders import border_mask, reduce_mask
 from scgs_warp.data.nerfstudio import read_ply
 from scgs_warp.errors import UserError
+from scgs_warp.frames import Frames
 from scgs_warp.gaussians import SH_C0
+from scgs_warp.train import training_step
 from scgs_warp.train_state import TrainState
 
 WIDTH, HEIGHT, FOCAL = 40, 30, 50.0
@@ -307,6 +309,23 @@ def test_faults_are_named(name, tmp_path):
     save(tmp_path, content)
     text = message(tmp_path)
     assert expected in text and str(tmp_path) in text
+
+
+@pytest.mark.parametrize(("count", "neighbors"), [(0, 4), (1, 4), (3, 4), (9, 4), (10, 4), (12, 12), (13, 12)])
+def test_a_handful_of_points_is_none(tmp_path, count, neighbors):
+    """A Gaussian needs as many control points as move it, and those begin as a sample of the points."""
+    write(tmp_path)
+    write_ply(tmp_path / "points.ply", POINTS[:count], COLORS[:count])
+    data = load(tmp_path)
+    config = tiny_config(20, motion={"neighbors": neighbors})
+    state = TrainState.begin(config, data, "cpu")
+    assert state.stage == ("main" if count in (10, 13) else "pretrain")
+    frames = Frames(data, state.normalisation, state.config, "cpu")
+    assert training_step(state, frames).failed is None
+    if state.stage == "pretrain":
+        state.begin_main()
+        state.step = state.config.pretrain_steps
+        assert training_step(state, frames).failed is None
 
 
 @pytest.mark.parametrize(

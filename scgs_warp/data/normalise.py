@@ -18,6 +18,7 @@ COMMON_RADIUS = 1.3654
 BULK = 0.95
 """Fraction of the initial points that shall lie within COMMON_RADIUS; the rest may be far background."""
 FEWEST_POINTS = 10
+"""Fewer say nothing of where the scene is."""
 PARALLEL = 1e-4
 """Smallest eigenvalue of the mean of (I - d d^T) at which optical axes still define a nearest point: some 1 degree."""
 
