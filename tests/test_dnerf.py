@@ -36,11 +36,15 @@ def write_scene(folder: Path, frames: int = 3, mode: str = "RGBA", seed: int = 0
     return images
 
 
+HUGE = "a number of 5,000 digits"
+"""Python refuses to read such a number, and to write it."""
+
+
 def edit(folder: Path, change) -> None:
     path = folder / "transforms_train.json"
     content = json.loads(path.read_text())
     change(content)
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(content).replace(f'"{HUGE}"', "9" * 5_000))
 
 
 def test_camera_and_times(tmp_path):
@@ -167,7 +171,10 @@ BAD_CONTENT = {
     "no angle": (lambda content: content.pop("camera_angle_x"), "camera_angle_x"),
     "focal": (lambda content: content.__setitem__("fl_x", "long"), "fl_x"),
     "width": (lambda content: content.__setitem__("w", 99), "w is 99"),
-    "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1"),
+    "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1 is 0.1"),
+    "a frame's distortion": (frame_field("p1", 0.1), "p1 is 0.1"),
+    "a frame's fisheye": (frame_field("camera_model", "OPENCV_FISHEYE"), "camera_model is 'OPENCV_FISHEYE'"),
+    "long number": (lambda content: content.__setitem__("w", HUGE), "transforms_train.json: holds a number of more"),
 }
 
 

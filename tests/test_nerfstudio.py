@@ -288,6 +288,15 @@ def test_points_without_colours_and_bad_ones(tmp_path):
 FAULTS = {
     "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1 is 0.1, lens distortion, which is not supp"),
     "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", 0.1), "p2 is 0.1"),
+    "k5": (lambda content: content.__setitem__("k5", 0.1), "k5 is 0.1"),
+    "parameters": (lambda content: content.__setitem__("distortion_params", [0, 0.1, 0, 0]), "distortion_params is [0"),
+    "parameter": (lambda content: content["frames"][1].__setitem__("distortion_params", 0.1), "distortion_params is 0"),
+    "fisheye": (lambda content: content.__setitem__("camera_model", "OPENCV_FISHEYE"), "camera_model is 'OPENCV_FISH"),
+    "sphere": (
+        lambda content: content["frames"][3].__setitem__("camera_model", "EQUIRECTANGULAR"),
+        "'EQUIRECTANGULAR'",
+    ),
+    "no text": (lambda content: content.__setitem__("camera_model", 3), "camera_model is '3'"),
     "no points": (lambda content: content.__setitem__("ply_file_path", "none.ply"), "none.ply: no such file"),
     "points": (lambda content: content.__setitem__("ply_file_path", 3), "ply_file_path is no text"),
     "mask": (lambda content: content["frames"][0].__setitem__("mask_path", 3), "frames[0].mask_path"),
@@ -299,6 +308,14 @@ FAULTS = {
     "split": (lambda content: content.__setitem__("train_filenames", []), "train_filenames is empty"),
     "pose": (lambda content: content["frames"][0].__setitem__("transform_matrix", [[1]]), "frames[0].transform_matrix"),
 }
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective", "SIMPLE_RADIAL", None])
+def test_models_of_a_pinhole_are_read(tmp_path, model):
+    content = write(tmp_path, camera_model=model, distortion_params=[0.0] * 6, k5=0, k6=0.0)
+    content["frames"][0]["camera_model"] = model
+    save(tmp_path, content)
+    assert len(load(tmp_path)) == 18
 
 
 @pytest.mark.parametrize("name", FAULTS)

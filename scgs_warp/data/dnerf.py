@@ -58,7 +58,8 @@ def read(
     poses = [read_pose(path, index, entry) for index, entry in enumerate(entries)]
     times = read_times(path, entries)
     files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
-    check_distortion(path, content)
+    for described in (content, *entries):
+        check_distortion(path, described)
 
     def decode(file: Path) -> Decoded:
         return read_image(file, downscale, resample, background)

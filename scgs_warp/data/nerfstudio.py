@@ -71,9 +71,8 @@ def read(
     entries = content["frames"]
     files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
     times = _times(path, entries, files)
-    check_distortion(path, content)
-    for entry in entries:
-        check_distortion(path, entry)
+    for described in (content, *entries):
+        check_distortion(path, described)
     chosen = _chosen(path, content, files, split)
     border = _border(files, times)
 
