@@ -107,6 +107,13 @@ def test_splits_by_list_and_by_every_eighth(tmp_path):
     save(tmp_path, {**content, "train_filenames": ["f_3.png", "f_1.png"], "test_filenames": ["f_0.png"]})
     assert [frame.name for frame in load(tmp_path, "train")] == ["f_1", "f_3"]
     assert [frame.name for frame in load(tmp_path, "val")] == ["f_0"]
+    lists = {"train_filenames": ["f_3.png"], "val_filenames": ["f_0.png"], "test_filenames": []}
+    save(tmp_path, {**content, **lists})
+    assert [frame.name for frame in load(tmp_path, "test")] == ["f_0"]
+    save(tmp_path, {**content, **lists, "val_filenames": [], "test_filenames": ["f_5.png"]})
+    assert [frame.name for frame in load(tmp_path, "val")] == ["f_5"]
+    save(tmp_path, {**content, **lists, "val_filenames": []})
+    assert "test_filenames is missing" in message(tmp_path, "test")
     save(tmp_path, {**content, "train_filenames": ["f_3.png"]})
     assert "test_filenames is missing" in message(tmp_path, "test")
     save(tmp_path, {**content, "train_filenames": ["f_99.png"]})

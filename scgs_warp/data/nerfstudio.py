@@ -57,8 +57,9 @@ def read(
     """Read one split.
 
     Frames without a time are taken to be evenly spaced in the order of their names (9 before 10). Without lists of
-    files every eighth frame is held out, for ``test`` and ``val`` alike; with lists that leave out one of these two,
-    it is the other. A frame's mask is False where ``mask_path`` is black, and on borders that undistortion left.
+    files every eighth frame is held out, for ``test`` and ``val`` alike; with lists that leave out one of these two, or
+    leave it empty, it is the other. A frame's mask is False where ``mask_path`` is black, and on borders that
+    undistortion left.
 
     Args:
         progress: called with (done, total) after each decoded image.
@@ -117,6 +118,9 @@ def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list
 def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) -> list[int]:
     """Indices of the frames of this split, in the order of the file."""
     lists = {name: content[f"{name}_filenames"] for name in ("train", "val", "test") if f"{name}_filenames" in content}
+    for name in ("val", "test"):  # exporters write all three lists, whether or not they hold frames out twice
+        if lists.get(name) == []:
+            del lists[name]
     if not lists:
         order = sorted(range(len(files)), key=lambda index: _natural(files[index].as_posix()))
         held_out = set(order[min(HELD_OUT_FIRST, len(order) - 1) :: HELD_OUT_EVERY])
