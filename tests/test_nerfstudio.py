@@ -283,6 +283,54 @@ def test_a_reduced_pixel_is_valid_only_if_all_beneath_are():
     assert reduce_mask(mask, (2, 2)).tolist() == [[True, False], [True, True]]
 
 
+def raw_ply(path: Path, rows: list[str], kinds: str, count: str | None = None, form: str = "ascii") -> Path:
+    """``kinds``: the types of x, y, z and red, green, blue, as many as there are in a row."""
+    names = ("x", "y", "z", "red", "green", "blue")
+    lines = [f"property {kind} {name}" for kind, name in zip(kinds.split(), names)]
+    head = ["ply", f"format {form} 1.0", f"element vertex {len(rows) if count is None else count}", *lines]
+    path.write_text("\n".join([*head, "end_header", *rows]) + "\n")
+    return path
+
+
+def test_points_beyond_float32_are_left_out(tmp_path):
+    path = raw_ply(tmp_path / "a.ply", ["1e300 0 0", "0 -1e39 0", "1 2 3", "inf 0 0"], "double double double")
+    assert read_ply(path)[0].tolist() == [[1.0, 2.0, 3.0]]
+    folder = tmp_path / "scene"
+    content = write(folder)
+    rows = [*(" ".join(map(str, [*point, *color])) for point, color in zip(POINTS, COLORS)), "3e38 0 0 9 9 9"]
+    raw_ply(folder / "points.ply", rows, "double double double uchar uchar uchar")
+    shift = np.array([[1.0, 0.0, 0.0, 3.0], [0.0, 1.0, 0.0, -5.0], [0.0, 0.0, 1.0, 2.0]])
+    for entry in content["frames"]:
+        pose = np.array(entry["transform_matrix"])
+        pose[:3, 3] = 10.0 * (pose[:3, 3] + shift[:, 3])
+        entry["transform_matrix"] = pose.tolist()
+    save(folder, {**content, "applied_transform": shift.tolist(), "applied_scale": 10.0})
+    data = load(folder)
+    assert data.points.shape == data.colors.shape == (60, 3) and data.points.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows", "expected"),
+    [
+        ("float", ["0 0 0 0.5 nan 1", "0 0 0 inf 0 0.25"], [[0.5, 0.5, 1.0], [0.5, 0.0, 0.25]]),
+        ("float", ["0 0 0 51 nan 255", "0 0 0 0 -3 0.255"], [[0.2, 0.5, 1.0], [0.0, 0.0, 0.001]]),
+        ("double", ["0 0 0 nan nan nan"], [[0.5, 0.5, 0.5]]),
+        ("ushort", ["0 0 0 0 13107 65535"], [[0.0, 0.2, 1.0]]),
+    ],
+)
+def test_colours_of_points_are_shares(tmp_path, kind, rows, expected):
+    path = raw_ply(tmp_path / "a.ply", rows, f"float float float {kind} {kind} {kind}")
+    np.testing.assert_allclose(read_ply(path)[1], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("count", ["1000000000000000", "1" + "0" * 30, "-3", "many", "9" * 5000])
+def test_absurd_counts_of_points_are_told(tmp_path, count, form):
+    path = raw_ply(tmp_path / "a.ply", ["1 2 3"], "float float float", count, form)
+    with pytest.raises(UserError, match=r"a\.ply: .*; export the points again"):
+        read_ply(path)
+
+
 def test_points_without_colours_and_bad_ones(tmp_path):
     write_ply(tmp_path / "a.ply", np.array([[0.0, 1.0, 2.0], [np.nan, 0.0, 0.0]]), None)
     points, colors = read_ply(tmp_path / "a.ply")

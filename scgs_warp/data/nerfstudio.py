@@ -207,7 +207,8 @@ def _points(
     # Writers disagree whether the transform that was applied to the poses was applied to the points, too.
     if moved is not None and _seen(moved, cameras) > _seen(points, cameras):
         points = moved
-    return torch.from_numpy(points).float(), None if colors is None else torch.from_numpy(colors).float()
+    kept = _finite(points)  # once more: the transform may have led beyond what float32 holds
+    return torch.from_numpy(points[kept]).float(), None if colors is None else torch.from_numpy(colors[kept]).float()
 
 
 def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndarray | None:
@@ -240,13 +241,36 @@ def _seen(points: np.ndarray, cameras: list[Camera]) -> int:
     return total
 
 
+def _finite(points: np.ndarray) -> np.ndarray:
+    """[P] bool: which points [P, 3] float64 are finite in float32, as training takes them."""
+    with np.errstate(over="ignore"):
+        return np.all(np.isfinite(points.astype(np.float32)), axis=1)
+
+
+def _unit_colors(vertices: np.ndarray) -> np.ndarray | None:
+    """[P, 3] in [0, 1], grey where the file says nothing finite; None where it has no colours.
+
+    Whole numbers are shares of their type's largest; others of 1, or of 255 where any is above 1.
+    """
+    names = ("red", "green", "blue")
+    if not all(name in (vertices.dtype.names or ()) for name in names):
+        return None
+    raw = np.stack([np.asarray(vertices[name]) for name in names], axis=1)
+    if np.issubdtype(raw.dtype, np.integer):
+        return (raw / np.iinfo(raw.dtype).max).clip(0.0, 1.0)
+    colors = raw.astype(np.float64)
+    finite = np.isfinite(colors)
+    most = 255.0 if (colors[finite] > 1.0).any() else 1.0
+    return np.where(finite, colors / most, 0.5).clip(0.0, 1.0)
+
+
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Vertices [P, 3] float64 of a PLY file, and their colours [P, 3] in [0, 1] where it has some.
 
-    Points that are not finite are left out.
+    Points that are not finite in float32 are left out.
 
     Raises:
-        UserError: the file is missing, no PLY, or has no vertices with x, y, z.
+        UserError: the file is missing, no PLY, has no vertices with x, y, z, or claims more than fit into memory.
     """
     from plyfile import PlyData, PlyParseError
 
@@ -254,16 +278,14 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         elements = PlyData.read(path)
         vertices = elements["vertex"].data
         points = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
+        colors = _unit_colors(vertices)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file, though ply_file_path names it; restore it or drop the field") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError):
+    except (PlyParseError, KeyError, ValueError, TypeError):
         raise UserError(f"{path}: no PLY file of vertices with x, y, z; export the points again") from None
-    colors = None
-    if all(name in (vertices.dtype.names or ()) for name in ("red", "green", "blue")):
-        raw = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1)
-        whole = np.issubdtype(raw.dtype, np.integer)
-        colors = (raw / (np.iinfo(raw.dtype).max if whole else 1.0)).clip(0.0, 1.0)
-    finite = np.isfinite(points).all(axis=1)
-    return points[finite], None if colors is None else colors[finite]
+    except (MemoryError, OverflowError):
+        raise UserError(f"{path}: says it has more points than fit into memory; export the points again") from None
+    kept = _finite(points)
+    return points[kept], None if colors is None else colors[kept]
