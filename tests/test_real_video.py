@@ -37,14 +37,22 @@ def posed(mask: bool, logit: float, seed: int):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_mask_is_a_share_of_the_motion(seed):
     gaussians, whole = posed(False, 0.0, seed)
-    full, half, none = (posed(True, logit, seed)[1] for logit in (30.0, 0.0, -30.0))
+    full, none = (posed(True, logit, seed)[1] for logit in (30.0, -30.0))
+    halfway, half = posed(True, 0.0, seed)
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
     torch.testing.assert_close(full.means, whole.means)
     torch.testing.assert_close((full.quats * whole.quats).sum(1).abs(), torch.ones(30))
     torch.testing.assert_close(none.means, gaussians.means)
     torch.testing.assert_close((none.quats * unit).sum(1).abs(), torch.ones(30))
     torch.testing.assert_close(half.means, 0.5 * (gaussians.means + whole.means))
-    half.means.sum().backward()
+    # Of a share s = sigmoid(l): d(rest + s (moved - rest)) / dl = s (1 - s) (moved - rest); quats, too, on one side.
+    weights = [torch.randn(30, width, generator=torch.Generator().manual_seed(seed)) for width in (3, 4)]
+    sum((x * weight).sum() for x, weight in zip((half.means, half.quats), weights)).backward()
+    unit = unit * (unit * whole.quats).sum(1, keepdim=True).sign()
+    moved = (whole.means - gaussians.means, whole.quats - unit)
+    expected = 0.25 * sum((x * weight).sum(1, keepdim=True) for x, weight in zip(moved, weights))
+    assert expected.abs().min() > 1e-4
+    torch.testing.assert_close(halfway.hyper.grad, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_noisy_times_fade_and_repeat():
