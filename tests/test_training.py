@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,6 +22,7 @@ from scgs_warp.errors import UserError
 from scgs_warp.evaluate import evaluate
 from scgs_warp.frames import Frames
 from scgs_warp.metrics import psnr
+from scgs_warp.run_folder import RunFolder
 from scgs_warp.scene import Scene
 from scgs_warp.train import fit, training_step
 from scgs_warp.train_state import TrainState
@@ -235,8 +237,6 @@ def test_the_background_is_one(tmp_path):
 
 
 def test_two_trainers_cannot_share_a_directory(tmp_path):
-    from scgs_warp.run_folder import RunFolder
-
     config = tiny_config(20)
     with (
         RunFolder(tmp_path / "run", config, None, resume=False),
@@ -250,6 +250,26 @@ def test_max_gaussians_bounds_the_model(tmp_path):
     config = tiny_config(150, densify={"max_gaussians": 320, "grad_threshold": 1e-9})
     scene = fit(config, tiny_dataset(6), output=tmp_path / "run")
     assert 100 < scene.gaussian_count <= 320
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_the_psnr_of_training_is_that_of_valid_pixels(masked, tmp_path, device):
+    config = tiny_config(50)
+    mask = torch.zeros(48, 48, dtype=torch.bool)
+    mask[5:40, :20] = True
+    data = tiny_dataset(3)
+    frames = [dataclasses.replace(frame, mask=mask if masked else None) for frame in data]
+    data = type(data)(frames, folder=Path("masked"), split="train")
+    state = TrainState.begin(config, data, device)
+    result = training_step(state, Frames(data, state.normalisation, state.config, device))
+    state.step = 50
+    bar = SimpleNamespace(advance=lambda steps, **shown: None)
+    with RunFolder(tmp_path / "run", config, None, resume=False) as folder:
+        folder.record(state, result, bar)
+    logged = json.loads((tmp_path / "run/log.jsonl").read_text())["psnr"]
+    scores = [float(psnr(result.render[:, seen], result.truth[:, seen])) for seen in (mask.to(device), slice(None))]
+    assert abs(scores[0] - scores[1]) > 0.1
+    assert logged == pytest.approx(scores[0 if masked else 1], abs=1e-3)
 
 
 def test_fit_runs_in_a_thread(tmp_path):
