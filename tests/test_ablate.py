@@ -17,7 +17,7 @@ import pytest
 from PIL import Image as Picture
 from tiny import write_dnerf
 
-from scgs_warp import ablate, ablate_jobs, ablate_table, config
+from scgs_warp import ablate, ablate_jobs, ablate_table, config, finish
 from scgs_warp.ablate_markdown import markdown
 from scgs_warp.apps import ablate as app
 from scgs_warp.errors import UserError
@@ -138,6 +138,22 @@ def test_a_cell_without_metrics_is_resumed(blobs, copied, capsys):
         key: before[key] for key in ("psnr", "ssim", "step", "seconds")
     }
     assert "[2/2] blobs/16: done before" in capsys.readouterr().out
+
+
+def test_a_cell_stopped_before_its_pictures_gets_them(blobs, copied, monkeypatch):
+    folder = copied / "blobs/8"
+    for name in ("metrics.json", "contact_sheet.png", "curves.png"):
+        (folder / name).unlink()
+
+    def stopped(log: Path, output: Path) -> None:
+        raise KeyboardInterrupt
+
+    arguments = ["nodes", *options(blobs, copied, "--values", "8")]
+    monkeypatch.setattr(finish, "curves", stopped)
+    assert app.cli(arguments) == 130
+    monkeypatch.undo()
+    assert app.cli(arguments) == 0
+    assert all((folder / name).is_file() for name in ("metrics.json", "contact_sheet.png", "curves.png"))
 
 
 @pytest.mark.parametrize(
