@@ -244,10 +244,16 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
 
 def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
     for name, value in wanted.items():
+        if name in FREE_TO_CHANGE:
+            continue
         if isinstance(value, dict):
             _same_configuration(saved.get(name, {}), value, source, f"{prefix}{name}.")
-        elif saved.get(name) != value and name not in FREE_TO_CHANGE:
+        elif name not in saved:  # what that version did instead cannot be asked for
             raise UserError(
-                f"{source}: made with {prefix}{name} = {saved.get(name)!r}, now {value!r}; "
+                f"{source}: made by another version, which had no {prefix}{name}; train again with another --output"
+            )
+        elif saved[name] != value:
+            raise UserError(
+                f"{source}: made with {prefix}{name} = {saved[name]!r}, now {value!r}; "
                 "give the same options to --resume, or another --output"
             )

@@ -177,10 +177,26 @@ def test_what_changes_no_bit_may_change(blobs, copied):
     assert app.cli(["nodes", *options(blobs, copied, "--values", "8", "--set", "evaluate_every=7")]) == 0
 
 
-def test_a_field_that_is_younger_than_the_cell_has_its_usual_value(blobs, copied):
+@pytest.mark.parametrize("more", [["--values", "8"], ["--table-only"]])
+@pytest.mark.parametrize(("section", "field"), [("loss", "arap_neighbors"), (None, "half_size"), (None, "motion")])
+def test_a_cell_of_another_version_is_refused(section, field, more, blobs, copied, capsys):
+    """Today's default is not what that version did; nor may the cell stand in a table beside others."""
     path = copied / "blobs/8/config.json"
     settings = json.loads(path.read_text())
-    del settings["loss"]["arap_neighbors"]
+    del (settings[section] if section else settings)[field]
+    path.write_text(json.dumps(settings))
+    assert app.cli(["nodes", *options(blobs, copied, *more)]) == 2
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line and "blobs/8: made by another version, which had no " in line
+    assert field in line and "remove the folder" in line
+    shutil.rmtree(copied / "blobs/8")
+    assert app.cli(["nodes", *options(blobs, copied, *more)]) == 0
+
+
+def test_a_field_that_changes_no_bit_may_be_missing(blobs, copied):
+    path = copied / "blobs/8/config.json"
+    settings = json.loads(path.read_text())
+    del settings["evaluate_every"]
     path.write_text(json.dumps(settings))
     assert app.cli(["nodes", *options(blobs, copied, "--values", "8")]) == 0
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 from tiny import tiny_config, tiny_dataset
 
-from scgs_warp import environment
+from scgs_warp import checkpoint, environment
 from scgs_warp.config import with_steps
 from scgs_warp.errors import UserError
 from scgs_warp.evaluate import evaluate
@@ -203,6 +203,19 @@ def test_resume_refuses_other_frames(tmp_path):
     fit(config, tiny_dataset(3), output=tmp_path / "run")
     with pytest.raises(UserError, match="other frames"):
         fit(config, tiny_dataset(4), output=tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize(("section", "field"), [("motion", "shading"), (None, "half_size")])
+def test_resume_refuses_a_run_of_another_version(section, field, tmp_path):
+    """What it did without the field is no value that could be given."""
+    config, data = tiny_config(20), tiny_dataset(3)
+    fit(config, data, output=tmp_path / "run")
+    tensors, metadata = checkpoint.read(tmp_path / "run")
+    del (metadata["config"][section] if section else metadata["config"])[field]
+    checkpoint.write(tmp_path / "run", tensors, metadata)
+    name = f"{section}.{field}" if section else field
+    with pytest.raises(UserError, match=f"made by another version, which had no {name}; train again with another --"):
+        fit(config, data, output=tmp_path / "run", resume=True)
 
 
 def test_what_changes_no_bit_may_differ_on_resume(tmp_path):
