@@ -265,6 +265,7 @@ def test_normalisation_of_points_and_round_trip():
     before = points @ cameras[0].viewmat[:3, :3].T + cameras[0].viewmat[:3, 3]
     after = normal @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     assert torch.allclose(after, before * transform.scale, atol=1e-4)
+    assert torch.allclose(transform.undo_camera(camera).viewmat, cameras[0].viewmat, atol=1e-4)
 
 
 def test_normalisation_of_parallel_cameras_is_finite():

@@ -50,6 +50,17 @@ class Dataset(Sequence[Frame]):
         self.colors = colors
         """[P, 3] their colours in [0, 1], where the data has those, too."""
 
+    def with_frames(self, frames: Sequence[Frame]) -> Dataset:
+        """The same data set of other frames."""
+        return Dataset(
+            frames,
+            folder=self.folder,
+            split=self.split,
+            background=self.background,
+            points=self.points,
+            colors=self.colors,
+        )
+
     @overload
     def __getitem__(self, index: int) -> Frame: ...
     @overload

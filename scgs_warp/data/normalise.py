@@ -82,6 +82,14 @@ class Normalisation:
         moved[:3, 3] = (viewmat[:3, 3] + viewmat[:3, :3] @ centre) * self.scale
         return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
 
+    def undo_camera(self, camera: Camera) -> Camera:
+        """Inverse of :meth:`apply_camera`."""
+        viewmat = camera.viewmat.double()
+        centre = torch.as_tensor(self.centre, device=viewmat.device)
+        moved = viewmat.clone()
+        moved[:3, 3] = viewmat[:3, 3] / self.scale - viewmat[:3, :3] @ centre
+        return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
+
 
 def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Camera centres [V, 3], viewing directions [V, 3], and sines [V] of half the narrower field of view."""
