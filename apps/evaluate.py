@@ -22,7 +22,7 @@ class Options:
     run: Path
     """Folder of a run, as apps/train.py writes it."""
     split: Literal["train", "test", "val"] = "test"
-    """Which frames."""
+    """Which frames; those of training are seen from the poses that training refined, if it did."""
     data: Path | None = None
     """The data set, if it is no longer where it was for training."""
     lpips_weights: Path | None = None
@@ -97,6 +97,12 @@ def main(args: list[str] | None) -> None:
 
         lpips = LPIPS(options.lpips_weights, device)
     dataset = load_data(scene, options)
+    poses = "given"
+    if options.split == "train":
+        from scgs_warp.camera_refinement import refined
+
+        found = refined(dataset, options.run, scene.normalisation)
+        dataset, poses = (dataset, poses) if found is None else (found, "refined")
     folder = options.run / "evaluation" / options.split
     with progress(len(dataset), "evaluate") as shown:
         metrics = metrics_of(
@@ -107,9 +113,11 @@ def main(args: list[str] | None) -> None:
             render_dir=folder,
             progress=lambda done, total: shown.advance(),
         )
+    metrics["poses"] = poses
     target = options.json or folder / "metrics.json"
     write_metrics(metrics, target)
     show(metrics)
+    print("poses: as training refined them" if poses == "refined" else "poses: as the data give them")
     print(f"renders and ground truth: {folder}; metrics: {target}")
 
 

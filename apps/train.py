@@ -20,7 +20,8 @@ class Place:
     """Listed before the settings."""
 
     data: Path | None = None
-    """Folder of a data set in D-NeRF layout (transforms_train.json ...). Without it the built-in scene is made."""
+    """Folder of a data set in D-NeRF layout (transforms_train.json ...) or nerfstudio's (transforms.json). Without it
+    the built-in scene is made."""
     output: Path | None = None
     """Run directory; runs/NAME by default."""
 

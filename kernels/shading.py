@@ -38,11 +38,16 @@ def response(i: int, shading: wp.array2d[float], turn: wp.mat33) -> float:
 
 @wp.func
 def gain(x: float, bend: float) -> float:
-    """1 + x + 5 b x^2, not limited; 1 where it is not finite."""
-    total = 1.0 + x + BEND * bend * x * x
-    if not wp.isfinite(total):
-        total = 1.0
-    return total
+    """1 + x + 5 b x^2, not limited, finite or not."""
+    return 1.0 + x + BEND * bend * x * x
+
+
+@wp.func
+def limited(free: float) -> float:
+    """The gain within its limits; 1 where it is not finite."""
+    if not wp.isfinite(free):
+        return 1.0
+    return wp.clamp(free, 0.0, MOST)
 
 
 @wp.kernel
@@ -58,7 +63,7 @@ def shade(
 ):
     i = first + wp.tid()
     x = response(i, shading_in, turned(quats_in[i], quats_t_in[i]))
-    factor = wp.clamp(gain(x, shading_in[i, 9]), 0.0, MOST)
+    factor = limited(gain(x, shading_in[i, 9]))
     grey = wp.vec3(GREY, GREY, GREY)
     sh_dc_out[i] = factor * (sh_dc_in[i] + grey) - grey
 
@@ -76,16 +81,16 @@ def shade_adjoint(
     v_sh_dc_out: wp.array[wp.vec3],  # [N]
     v_shading_out: wp.array2d[float],  # [N, 10]
 ):
-    """A limited gain passes nothing to G and b."""
+    """A gain that is limited, or replaced as it is not finite, passes nothing to G and b."""
     i = first + wp.tid()
     turn = turned(quats_in[i], quats_t_in[i])
     x = response(i, shading_in, turn)
     bend = shading_in[i, 9]
     free = gain(x, bend)
-    factor = wp.clamp(free, 0.0, MOST)
+    factor = limited(free)
     v_sh_dc_out[i] = factor * v_sh_dc_t_in[i]
     v_factor = float(0.0)
-    if free == factor:
+    if wp.isfinite(free) and free == factor:
         v_factor = wp.dot(v_sh_dc_t_in[i], sh_dc_in[i] + wp.vec3(GREY, GREY, GREY))
     v_x = v_factor * (1.0 + 2.0 * BEND * bend * x)
     v_bend = v_factor * BEND * x * x

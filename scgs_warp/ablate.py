@@ -120,11 +120,11 @@ def flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
 
 
 def recorded(folder: Path) -> dict[str, Any] | None:
-    """The complete settings that ``config.json`` in ``folder`` holds; None without one. A field that is younger than
-    the file has the preset's value.
+    """The complete settings that ``config.json`` in ``folder`` holds; None without one.
 
     Raises:
-        UserError: the file is not a configuration.
+        UserError: the file is not a configuration, or was written by a version that did not have all fields: what that
+            version did instead is not known here, and today's default may be another.
     """
     path = folder / "config.json"
     if not path.is_file():
@@ -133,6 +133,13 @@ def recorded(folder: Path) -> dict[str, Any] | None:
     data = values.get("data")
     place = data.pop("folder", None) if isinstance(data, dict) else None
     settings = to_dict(from_dict(values, str(path)))
+    there = dict(flat(values))
+    for name, _ in flat(settings):
+        if name not in there and name not in FREE_TO_CHANGE:
+            raise UserError(
+                f"{folder}: made by another version, which had no {name}; remove the folder, and the cell is trained "
+                "again, or give another --output"
+            )
     settings["data"]["folder"] = place
     return settings
 

@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from .data.dataset import spread
 from .data.normalise import Normalisation
 from .optim import generator
 from .types import Camera, Frame
@@ -30,17 +31,31 @@ def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     return pixels[inside], local[inside, 2]
 
 
+def _valid_cells(count: int, frame: Frame, random: torch.Generator) -> Tensor:
+    """[count] pixels inside the mask, row times width plus column, with repetition; [0] where there are none."""
+    # Drawn as integers: torch.multinomial takes no more than 2^24 pixels.
+    if frame.mask is None:
+        return torch.randint(frame.camera.width * frame.camera.height, (count,), generator=random)
+    valid = frame.mask.flatten().nonzero()[:, 0]
+    return valid[torch.randint(len(valid), (count,), generator=random)] if len(valid) else valid
+
+
 def backdrop(
     count: int, points: Tensor, data: Sequence[Frame], normalisation: Normalisation, seed: int, key: int
 ) -> tuple[Tensor, Tensor]:
-    """Points [count, 3] on random rays through the images, with the colours [count, 3] of their pixels.
+    """Points on random rays through the images, and the colours of their pixels.
 
     The depth is that of the nearest sparse points in the image, times a factor between 1 and ``FARTHEST``.
 
     Args:
+        count: how many, at most: a frame that sees no sparse point, or has no valid pixel, leaves out its share.
         points: [P, 3] the data's own, normalised.
+
+    Returns:
+        points [B, 3], normalised, and their colours [B, 3], B <= ``count``. Their order is random: however many of the
+        first are taken, they lie in the sight of all frames.
     """
-    frames = list(data)[:: max(1, len(data) // MOST_VIEWS)]
+    frames = [data[index] for index in spread(len(data), MOST_VIEWS)]
     found, colors = [], []
     for place, frame in enumerate(frames):
         share = count * (place + 1) // len(frames) - count * place // len(frames)
@@ -49,8 +64,9 @@ def backdrop(
         if share == 0 or len(known) == 0:
             continue
         random = generator(seed, key, place)
-        valid = torch.ones(camera.height, camera.width) if frame.mask is None else frame.mask.float()
-        cells = torch.multinomial(valid.flatten(), share, replacement=True, generator=random)
+        cells = _valid_cells(share, frame, random)
+        if len(cells) == 0:
+            continue
         rows, columns = cells // camera.width, cells % camera.width
         pixels = torch.stack([columns, rows], 1) + torch.rand(share, 2, generator=random)
         _, nearest = KDTree(known.double().numpy()).query(pixels.double().numpy(), k=min(NEAREST, len(known)))
@@ -61,4 +77,5 @@ def backdrop(
         colors.append(frame.image[rows, columns])
     if not found:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    return torch.cat(found), torch.cat(colors)
+    order = torch.randperm(sum(map(len, found)), generator=generator(seed, key, len(frames)))
+    return torch.cat(found)[order], torch.cat(colors)[order]

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from . import checkpoint
 from .config import OptimConfig
+from .data.dataset import Dataset
+from .data.normalise import Normalisation
 from .optim import Adam, log_linear
 from .types import Camera
 
@@ -45,6 +50,33 @@ class CameraRefinement(nn.Module):
         with torch.no_grad():
             ones = torch.ones(1, len(self.twists), device=self.twists.device)
             self.twists.data -= ones @ self.twists / len(self.twists)
+
+
+def refined(data: Dataset, folder: Path, normalisation: Normalisation) -> Dataset | None:
+    """Training frames with the poses that the run in ``folder`` found for them, which are those its scene fits.
+
+    Args:
+        data: the split that was trained on, with the poses it was given.
+        normalisation: of the run's scene.
+
+    Returns:
+        None where the run refined no poses, or those of other frames than these.
+
+    Raises:
+        UserError: there is no checkpoint, or it is damaged.
+    """
+    tensors, metadata = checkpoint.read(folder, ("cameras.",))
+    twists = tensors.get("cameras.twists")
+    if twists is None or metadata.get("frames") != data.fingerprint or twists.shape != (len(data), 6):
+        return None
+    found = CameraRefinement(len(data))
+    found.twists.data[:] = twists
+    frames = []
+    for index, frame in enumerate(data):
+        with torch.no_grad():
+            camera = found.apply(normalisation.apply_camera(frame.camera), index)
+        frames.append(dataclasses.replace(frame, camera=normalisation.undo_camera(camera)))
+    return data.with_frames(frames)
 
 
 def camera_rate(step: int, optim: OptimConfig, start: int) -> float:

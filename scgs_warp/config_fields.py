@@ -201,7 +201,8 @@ class TrainConfig:
     coarse: int = milestone(6_000)
     """The same for models without stage 1: a static scene comes first."""
     init_points: int = 100_000
-    """Gaussians to start with where the data brings no points."""
+    """Gaussians to start with, and no more where the data brings more points; filled images get points behind theirs up
+    to this total."""
     init_from: Literal["points", "spheres"] = "points"
     """points: at the data's points, else at random where the images' alpha allows something to be; spheres: around the
     control points that stage 1 found."""

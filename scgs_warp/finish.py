@@ -91,13 +91,13 @@ def finish(
             render_dir=renders,
             progress=lambda done, total: bar.advance(),
         )
-    write_metrics(metrics, folder / "metrics.json")
     sheet = renders / "contact_sheet.png"
     if sheet.is_file():
         (folder / "contact_sheet.png").write_bytes(sheet.read_bytes())
     curves(folder / "log.jsonl", folder / "curves.png")
     if frames > 0:
         turntable(scene, folder / "turntable.mp4", frames)
+    write_metrics(metrics, folder / "metrics.json")  # last: a folder that has it is taken to have everything
     return metrics
 
 

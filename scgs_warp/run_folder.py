@@ -133,7 +133,8 @@ class RunFolder:
         """Progress, a log line every 50 steps, a preview every 15 seconds. ``state.step`` counts the step as done."""
         due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
         if due and result.failed is None:
-            now = float(psnr(result.render, result.truth))
+            seen = slice(None) if result.mask is None else result.mask  # as the loss and the test's score do
+            now = float(psnr(result.render[:, seen], result.truth[:, seen]))
             if math.isfinite(now):  # equal images, both empty, have none
                 self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
             self.log(

@@ -50,6 +50,8 @@ class StepResult(NamedTuple):
     regulariser: float
     render: Tensor
     truth: Tensor
+    mask: Tensor | None
+    """[H, W] bool, the pixels that count; None: all."""
     failed: str | None
     """The name of the term that was not finite, if any; the step was dropped."""
 
@@ -93,7 +95,7 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
     for optimizer in state.optimizers():
         optimizer.zero_grad()
     weighted = 0.0 if regulariser is None else float(regulariser.detach())
-    return StepResult(loss.detach(), l1.detach(), ssim.detach(), weighted, picture.detach(), truth, failed)
+    return StepResult(loss.detach(), l1.detach(), ssim.detach(), weighted, picture.detach(), truth, mask, failed)
 
 
 def frozen(state: TrainState) -> bool:

@@ -15,7 +15,7 @@ from .camera_refinement import CameraRefinement
 from .cameras import Overview, overview
 from .config import FREE_TO_CHANGE, TrainConfig, to_dict
 from .data.dataset import Dataset
-from .data.normalise import COMMON_RADIUS, Normalisation
+from .data.normalise import COMMON_RADIUS, FEWEST_POINTS, Normalisation
 from .errors import UserError
 from .frames import first_frames
 from .gaussians import GaussianParameters
@@ -78,7 +78,7 @@ class TrainState:
             spheres = begin_spheres(config, points, colors, device)
             return TrainState(config, *spheres, *rest, stage="pretrain", **seen)
         gaussians = begin_gaussians(config, points, colors)
-        rest_points = points if data.points is None or not given(data) else points[: len(data.points)]
+        rest_points = points if data.points is None or not given(data, config) else points[: len(data.points)]
         motion = begin_motion(config, rest_points, len(data.times.unique())).to(device)  # none on bare walls
         return TrainState(config, gaussians, motion, *rest, stage="main", **seen)
 
@@ -197,9 +197,11 @@ class TrainState:
         return state
 
 
-def given(data: Dataset) -> bool:
-    """Whether the data brings points of its own."""
-    return data.points is not None and len(data.points) > 0
+def given(data: Dataset, config: TrainConfig) -> bool:
+    """Whether the data brings points to begin with: enough to tell where the scene is, and for every Gaussian to have
+    its control points among them. Fewer are no more than noise of a failed reconstruction."""
+    fewest = max(FEWEST_POINTS, config.motion.neighbors + 1)
+    return data.points is not None and len(data.points) >= fewest
 
 
 def suited(config: TrainConfig, data: Dataset) -> TrainConfig:
@@ -217,7 +219,7 @@ def suited(config: TrainConfig, data: Dataset) -> TrainConfig:
         config = replace(config, motion=replace(motion, hyper_dim=hyper_dim))
     if growth.prune_large == "auto":
         config = replace(config, densify=replace(growth, prune_large="never" if filled else "always"))
-    if given(data) and not config.pretrain.with_points:
+    if given(data, config) and not config.pretrain.with_points:
         config = replace(config, init_from="points", pretrain=replace(config.pretrain, steps=0))
     return config
 
@@ -226,7 +228,7 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     """Points [P, 3], normalised, and colours [P, 3]: the data's own points in a random order, and some for what has no
     texture; else likely ones."""
     count = max(config.init_points, round(config.motion.nodes * config.pretrain.start_ratio))
-    if data.points is None or not given(data):
+    if data.points is None or not given(data, config):
         # Progressive pre-training starts from the pose of the first frames; what others cover is not there yet.
         frames = first_frames(data) if config.pretrain.progressive and config.pretrain_steps else list(data)
         points, colors = likely_points(count, frames, normalisation, config.seed, 31)
@@ -242,10 +244,16 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
 
 def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
     for name, value in wanted.items():
+        if name in FREE_TO_CHANGE:
+            continue
         if isinstance(value, dict):
             _same_configuration(saved.get(name, {}), value, source, f"{prefix}{name}.")
-        elif saved.get(name) != value and name not in FREE_TO_CHANGE:
+        elif name not in saved:  # what that version did instead cannot be asked for
             raise UserError(
-                f"{source}: made with {prefix}{name} = {saved.get(name)!r}, now {value!r}; "
+                f"{source}: made by another version, which had no {prefix}{name}; train again with another --output"
+            )
+        elif saved[name] != value:
+            raise UserError(
+                f"{source}: made with {prefix}{name} = {saved[name]!r}, now {value!r}; "
                 "give the same options to --resume, or another --output"
             )

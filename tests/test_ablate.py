@@ -17,7 +17,7 @@ import pytest
 from PIL import Image as Picture
 from tiny import write_dnerf
 
-from scgs_warp import ablate, ablate_jobs, ablate_table, config
+from scgs_warp import ablate, ablate_jobs, ablate_table, config, finish
 from scgs_warp.ablate_markdown import markdown
 from scgs_warp.apps import ablate as app
 from scgs_warp.errors import UserError
@@ -140,6 +140,22 @@ def test_a_cell_without_metrics_is_resumed(blobs, copied, capsys):
     assert "[2/2] blobs/16: done before" in capsys.readouterr().out
 
 
+def test_a_cell_stopped_before_its_pictures_gets_them(blobs, copied, monkeypatch):
+    folder = copied / "blobs/8"
+    for name in ("metrics.json", "contact_sheet.png", "curves.png"):
+        (folder / name).unlink()
+
+    def stopped(log: Path, output: Path) -> None:
+        raise KeyboardInterrupt
+
+    arguments = ["nodes", *options(blobs, copied, "--values", "8")]
+    monkeypatch.setattr(finish, "curves", stopped)
+    assert app.cli(arguments) == 130
+    monkeypatch.undo()
+    assert app.cli(arguments) == 0
+    assert all((folder / name).is_file() for name in ("metrics.json", "contact_sheet.png", "curves.png"))
+
+
 @pytest.mark.parametrize(
     ("change", "field"),
     [(["--downscale", "2"], "data.downscale"), (["--set", "loss.ssim=0.3"], "loss.ssim"), (["--steps", "40"], "steps")],
@@ -161,10 +177,26 @@ def test_what_changes_no_bit_may_change(blobs, copied):
     assert app.cli(["nodes", *options(blobs, copied, "--values", "8", "--set", "evaluate_every=7")]) == 0
 
 
-def test_a_field_that_is_younger_than_the_cell_has_its_usual_value(blobs, copied):
+@pytest.mark.parametrize("more", [["--values", "8"], ["--table-only"]])
+@pytest.mark.parametrize(("section", "field"), [("loss", "arap_neighbors"), (None, "half_size"), (None, "motion")])
+def test_a_cell_of_another_version_is_refused(section, field, more, blobs, copied, capsys):
+    """Today's default is not what that version did; nor may the cell stand in a table beside others."""
     path = copied / "blobs/8/config.json"
     settings = json.loads(path.read_text())
-    del settings["loss"]["arap_neighbors"]
+    del (settings[section] if section else settings)[field]
+    path.write_text(json.dumps(settings))
+    assert app.cli(["nodes", *options(blobs, copied, *more)]) == 2
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line and "blobs/8: made by another version, which had no " in line
+    assert field in line and "remove the folder" in line
+    shutil.rmtree(copied / "blobs/8")
+    assert app.cli(["nodes", *options(blobs, copied, *more)]) == 0
+
+
+def test_a_field_that_changes_no_bit_may_be_missing(blobs, copied):
+    path = copied / "blobs/8/config.json"
+    settings = json.loads(path.read_text())
+    del settings["evaluate_every"]
     path.write_text(json.dumps(settings))
     assert app.cli(["nodes", *options(blobs, copied, "--values", "8")]) == 0
 

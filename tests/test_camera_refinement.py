@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
-from tiny import blobs, tiny_camera, tiny_config, tiny_dataset
+from tiny import blobs, tiny_camera, tiny_config, tiny_dataset, write_dnerf
 
-from scgs_warp.camera_refinement import CameraRefinement, camera_rate
+from scgs_warp.apps import evaluate as app
+from scgs_warp.camera_refinement import CameraRefinement, camera_rate, refined
 from scgs_warp.checkpoint import read
 from scgs_warp.config import OptimConfig
+from scgs_warp.data import load
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.data.normalise import Normalisation
 from scgs_warp.evaluate import evaluate
+from scgs_warp.finish import train_and_finish
 from scgs_warp.render import render
+from scgs_warp.scene import Scene
 from scgs_warp.train import fit
 from scgs_warp.types import Camera, Frame
 
@@ -110,6 +116,56 @@ def corrected(data: Dataset, run: Path, normalisation: Normalisation) -> Dataset
         moved = Camera(viewmat.float(), camera.K, camera.width, camera.height)
         frames.append(dataclasses.replace(frame, camera=moved))
     return Dataset(frames, folder=data.folder, split=data.split)
+
+
+@pytest.fixture(scope="module")
+def refined_run(tmp_path_factory) -> tuple[Path, Path]:
+    """A data set on disk, and a run that refined its poses."""
+    data = write_dnerf(tmp_path_factory.mktemp("data") / "blobs")
+    run = tmp_path_factory.mktemp("runs") / "refined"
+    config = tiny_config(120, motion={"model": "static"}, optim={"cameras": 2e-2}, coarse=0)
+    train_and_finish(config, data, run, frames=0)
+    return data, run
+
+
+def test_training_frames_are_scored_from_the_poses_that_were_found(refined_run, tmp_path, capsys):
+    folder, run = refined_run
+    scene, given = Scene.load(run), load(folder)
+    found = corrected(given, run, scene.normalisation)
+    ours = refined(given, run, scene.normalisation)
+    assert ours is not None and ours.fingerprint == given.fingerprint
+    for one, other in zip(ours, found):
+        torch.testing.assert_close(one.camera.viewmat, other.camera.viewmat)
+        assert torch.equal(one.image, other.image)
+    expected, without = (evaluate(scene, frames)["psnr"] for frames in (found, given))
+    assert abs(expected - without) > 0.05
+    arguments = ["--run", str(run), "--device", "cpu", "--json", str(tmp_path / "metrics.json")]
+    assert app.cli([*arguments, "--split", "train"]) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["psnr"] == pytest.approx(expected, abs=1e-3) and metrics["poses"] == "refined"
+    assert "poses: as training refined them" in capsys.readouterr().out
+    assert app.cli(arguments) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["poses"] == "given" and metrics["psnr"] == json.loads((run / "metrics.json").read_text())["psnr"]
+
+
+def test_other_frames_are_scored_from_the_poses_they_were_given(refined_run, tmp_path, capsys):
+    folder, run = refined_run
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    path = other / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"][0]["time"] = 0.01
+    path.write_text(json.dumps(content))
+    target = tmp_path / "metrics.json"
+    assert app.cli(["--run", str(run), "--split", "train", "--data", str(other), "--json", str(target)]) == 0
+    assert json.loads(target.read_text())["poses"] == "given"
+    assert "poses: as the data give them" in capsys.readouterr().out
+
+
+def test_a_run_that_refined_none_has_none(tmp_path):
+    data = tiny_dataset(4)
+    scene = fit(tiny_config(12), data, output=tmp_path / "run")
+    assert refined(data, tmp_path / "run", scene.normalisation) is None
 
 
 def test_resumed_to_the_same_bits(tmp_path, device, monkeypatch):

@@ -36,11 +36,15 @@ def write_scene(folder: Path, frames: int = 3, mode: str = "RGBA", seed: int = 0
     return images
 
 
+HUGE = "a number of 5,000 digits"
+"""Python refuses to read such a number, and to write it."""
+
+
 def edit(folder: Path, change) -> None:
     path = folder / "transforms_train.json"
     content = json.loads(path.read_text())
     change(content)
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(content).replace(f'"{HUGE}"', "9" * 5_000))
 
 
 def test_camera_and_times(tmp_path):
@@ -71,6 +75,18 @@ def test_composited_once(tmp_path, background):
     assert (frame.image - expected).abs().max() < 1e-6
     assert frame.alpha is not None and (frame.alpha - rgba[..., 3]).abs().max() < 1e-6
     assert data.background == background and data.background_color.tolist() == [color] * 3
+
+
+def test_alpha_that_says_nothing_is_none(tmp_path):
+    """A file that an object fills keeps its alpha as long as others have something to say."""
+    folder = tmp_path / "s"
+    images = write_scene(folder, frames=2)
+    for index, image in enumerate(images):
+        image[..., 3] = 255
+        PillowImage.fromarray(image).save(folder / f"train/r_{index:03d}.png")
+        alphas = [frame.alpha for frame in load(folder, "train")]
+        assert all(alpha is not None for alpha in alphas) == (index == 0), "all or none"
+    assert alphas == [None, None]
 
 
 def test_area_averages_premultiplied(tmp_path):
@@ -155,7 +171,10 @@ BAD_CONTENT = {
     "no angle": (lambda content: content.pop("camera_angle_x"), "camera_angle_x"),
     "focal": (lambda content: content.__setitem__("fl_x", "long"), "fl_x"),
     "width": (lambda content: content.__setitem__("w", 99), "w is 99"),
-    "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1"),
+    "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1 is 0.1"),
+    "a frame's distortion": (frame_field("p1", 0.1), "p1 is 0.1"),
+    "a frame's fisheye": (frame_field("camera_model", "OPENCV_FISHEYE"), "camera_model is 'OPENCV_FISHEYE'"),
+    "long number": (lambda content: content.__setitem__("w", HUGE), "transforms_train.json: holds a number of more"),
 }
 
 
@@ -246,6 +265,7 @@ def test_normalisation_of_points_and_round_trip():
     before = points @ cameras[0].viewmat[:3, :3].T + cameras[0].viewmat[:3, 3]
     after = normal @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     assert torch.allclose(after, before * transform.scale, atol=1e-4)
+    assert torch.allclose(transform.undo_camera(camera).viewmat, cameras[0].viewmat, atol=1e-4)
 
 
 def test_normalisation_of_parallel_cameras_is_finite():

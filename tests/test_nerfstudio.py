@@ -13,10 +13,13 @@ import torch
 from scenes import look_at
 from tiny import tiny_config, tiny_dataset
 
-from scgs_warp.data import load
+from scgs_warp.data import images, load, nerfstudio
 from scgs_warp.data.borders import border_mask, reduce_mask
 from scgs_warp.data.nerfstudio import read_ply
 from scgs_warp.errors import UserError
+from scgs_warp.frames import Frames
+from scgs_warp.gaussians import SH_C0
+from scgs_warp.train import training_step
 from scgs_warp.train_state import TrainState
 
 WIDTH, HEIGHT, FOCAL = 40, 30, 50.0
@@ -104,6 +107,13 @@ def test_splits_by_list_and_by_every_eighth(tmp_path):
     save(tmp_path, {**content, "train_filenames": ["f_3.png", "f_1.png"], "test_filenames": ["f_0.png"]})
     assert [frame.name for frame in load(tmp_path, "train")] == ["f_1", "f_3"]
     assert [frame.name for frame in load(tmp_path, "val")] == ["f_0"]
+    lists = {"train_filenames": ["f_3.png"], "val_filenames": ["f_0.png"], "test_filenames": []}
+    save(tmp_path, {**content, **lists})
+    assert [frame.name for frame in load(tmp_path, "test")] == ["f_0"]
+    save(tmp_path, {**content, **lists, "val_filenames": [], "test_filenames": ["f_5.png"]})
+    assert [frame.name for frame in load(tmp_path, "val")] == ["f_5"]
+    save(tmp_path, {**content, **lists, "val_filenames": []})
+    assert "test_filenames is missing" in message(tmp_path, "test")
     save(tmp_path, {**content, "train_filenames": ["f_3.png"]})
     assert "test_filenames is missing" in message(tmp_path, "test")
     save(tmp_path, {**content, "train_filenames": ["f_99.png"]})
@@ -159,6 +169,71 @@ def test_a_black_border_is_masked_but_nothing_dark_inside(tmp_path):
     assert not small[0, 4:11].any() and small[1:].all()
 
 
+def rewrite(folder: Path, change, count: int = 20) -> None:
+    """Every image of the folder becomes ``change(index, image)``."""
+    for index in range(count):
+        path = str(folder / f"f_{index}.png")
+        cv2.imwrite(path, change(index, cv2.imread(path)))
+
+
+def with_alpha(image: np.ndarray, bits: int) -> np.ndarray:
+    """RGBA that is opaque everywhere, of 8 or 16 bits."""
+    most = 2**bits - 1
+    image = image.astype(np.uint8 if bits == 8 else np.uint16) * (most // 255)
+    return np.dstack([image, np.full_like(image[..., :1], most)])
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("background", ["black", "white", "random"])
+def test_opaque_rgba_is_rgb(tmp_path, bits, background):
+    """Filled images stay filled: a border is masked, bare walls get points, large Gaussians are kept."""
+    write(tmp_path)
+
+    def bordered(index: int, image: np.ndarray) -> np.ndarray:
+        image[0] = 0
+        return image
+
+    rewrite(tmp_path, bordered)
+    expected = load(tmp_path, background=background)
+    # Some with alpha, some without, as a tool leaves them that saves what it has touched.
+    rewrite(tmp_path, lambda index, image: with_alpha(image, bits) if bits == 16 or index % 2 else image)
+    data = load(tmp_path, background=background)
+    for plain, frame in zip(expected, data):
+        assert frame.alpha is None and torch.allclose(frame.image, plain.image, rtol=0, atol=1e-6)
+        assert frame.mask is not None and torch.equal(frame.mask, plain.mask)
+    config = tiny_config(20, data={"background": background})
+    state = TrainState.begin(config, data, "cpu")
+    assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 4)
+    assert len(state.gaussians) == config.init_points > len(data.points)
+
+
+def test_one_image_that_an_object_fills_keeps_its_alpha(tmp_path):
+    write(tmp_path)
+
+    def cut_out(index: int, image: np.ndarray) -> np.ndarray:
+        image = with_alpha(image, 8)
+        if index != 1:
+            image[:4, :, 3] = 200
+        return image
+
+    rewrite(tmp_path, cut_out)
+    data = load(tmp_path)
+    assert all(frame.alpha is not None and frame.mask is None for frame in data)
+    assert (data[1].alpha == 1).all() and (data[0].alpha[:4] < 0.8).all()
+    kept = TrainState.begin(tiny_config(20), data, "cpu").config
+    assert (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 0)
+
+
+@pytest.mark.parametrize("count", [47, 49])
+def test_a_border_takes_few_images_to_find(tmp_path, monkeypatch, count):
+    write(tmp_path, count)
+    seen = []
+    monkeypatch.setattr(nerfstudio, "decode", lambda file: seen.append(file.stem) or images.decode(file))
+    load(tmp_path)
+    assert len(seen) == nerfstudio.BORDER_FRAMES
+    assert {"f_0", f"f_{count - 1}"} <= set(seen), "from the whole video"
+
+
 def test_a_black_ground_is_no_border():
     images = [np.zeros((30, 40, 3), np.uint8) for _ in range(6)]
     for image in images:
@@ -183,10 +258,77 @@ def test_masks_of_frames(tmp_path):
     assert "all black" in message(tmp_path)
 
 
+@pytest.mark.parametrize("what", ["reduction", "border"])
+def test_a_mask_that_leaves_nothing_is_told(tmp_path, what):
+    content = write(tmp_path)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    if what == "border":
+        rewrite(tmp_path, lambda index, image: cv2.rectangle(image, (0, 0), (WIDTH, 1), (0, 0, 0), -1))
+        mask[0] = 255
+    else:
+        mask[::2, ::2] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    content["frames"][3]["mask_path"] = "mask.png"
+    save(tmp_path, content)
+    if what == "reduction":
+        assert load(tmp_path)[3].mask.sum() == HEIGHT * WIDTH / 4
+    with pytest.raises(UserError, match=r"f_3\.png: no pixel is left") as caught:
+        load(tmp_path, downscale=2 if what == "reduction" else 1)
+    assert "mask_path" in str(caught.value)
+
+
 def test_a_reduced_pixel_is_valid_only_if_all_beneath_are():
     mask = np.ones((4, 4), bool)
     mask[0, 3] = False
     assert reduce_mask(mask, (2, 2)).tolist() == [[True, False], [True, True]]
+
+
+def raw_ply(path: Path, rows: list[str], kinds: str, count: str | None = None, form: str = "ascii") -> Path:
+    """``kinds``: the types of x, y, z and red, green, blue, as many as there are in a row."""
+    names = ("x", "y", "z", "red", "green", "blue")
+    lines = [f"property {kind} {name}" for kind, name in zip(kinds.split(), names)]
+    head = ["ply", f"format {form} 1.0", f"element vertex {len(rows) if count is None else count}", *lines]
+    path.write_text("\n".join([*head, "end_header", *rows]) + "\n")
+    return path
+
+
+def test_points_beyond_float32_are_left_out(tmp_path):
+    path = raw_ply(tmp_path / "a.ply", ["1e300 0 0", "0 -1e39 0", "1 2 3", "inf 0 0"], "double double double")
+    assert read_ply(path)[0].tolist() == [[1.0, 2.0, 3.0]]
+    folder = tmp_path / "scene"
+    content = write(folder)
+    rows = [*(" ".join(map(str, [*point, *color])) for point, color in zip(POINTS, COLORS)), "3e38 0 0 9 9 9"]
+    raw_ply(folder / "points.ply", rows, "double double double uchar uchar uchar")
+    shift = np.array([[1.0, 0.0, 0.0, 3.0], [0.0, 1.0, 0.0, -5.0], [0.0, 0.0, 1.0, 2.0]])
+    for entry in content["frames"]:
+        pose = np.array(entry["transform_matrix"])
+        pose[:3, 3] = 10.0 * (pose[:3, 3] + shift[:, 3])
+        entry["transform_matrix"] = pose.tolist()
+    save(folder, {**content, "applied_transform": shift.tolist(), "applied_scale": 10.0})
+    data = load(folder)
+    assert data.points.shape == data.colors.shape == (60, 3) and data.points.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows", "expected"),
+    [
+        ("float", ["0 0 0 0.5 nan 1", "0 0 0 inf 0 0.25"], [[0.5, 0.5, 1.0], [0.5, 0.0, 0.25]]),
+        ("float", ["0 0 0 51 nan 255", "0 0 0 0 -3 0.255"], [[0.2, 0.5, 1.0], [0.0, 0.0, 0.001]]),
+        ("double", ["0 0 0 nan nan nan"], [[0.5, 0.5, 0.5]]),
+        ("ushort", ["0 0 0 0 13107 65535"], [[0.0, 0.2, 1.0]]),
+    ],
+)
+def test_colours_of_points_are_shares(tmp_path, kind, rows, expected):
+    path = raw_ply(tmp_path / "a.ply", rows, f"float float float {kind} {kind} {kind}")
+    np.testing.assert_allclose(read_ply(path)[1], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("count", ["1000000000000000", "1" + "0" * 30, "-3", "many", "9" * 5000])
+def test_absurd_counts_of_points_are_told(tmp_path, count, form):
+    path = raw_ply(tmp_path / "a.ply", ["1 2 3"], "float float float", count, form)
+    with pytest.raises(UserError, match=r"a\.ply: .*; export the points again"):
+        read_ply(path)
 
 
 def test_points_without_colours_and_bad_ones(tmp_path):
@@ -201,6 +343,15 @@ def test_points_without_colours_and_bad_ones(tmp_path):
 FAULTS = {
     "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1 is 0.1, lens distortion, which is not supp"),
     "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", 0.1), "p2 is 0.1"),
+    "k5": (lambda content: content.__setitem__("k5", 0.1), "k5 is 0.1"),
+    "parameters": (lambda content: content.__setitem__("distortion_params", [0, 0.1, 0, 0]), "distortion_params is [0"),
+    "parameter": (lambda content: content["frames"][1].__setitem__("distortion_params", 0.1), "distortion_params is 0"),
+    "fisheye": (lambda content: content.__setitem__("camera_model", "OPENCV_FISHEYE"), "camera_model is 'OPENCV_FISH"),
+    "sphere": (
+        lambda content: content["frames"][3].__setitem__("camera_model", "EQUIRECTANGULAR"),
+        "'EQUIRECTANGULAR'",
+    ),
+    "no text": (lambda content: content.__setitem__("camera_model", 3), "camera_model is '3'"),
     "no points": (lambda content: content.__setitem__("ply_file_path", "none.ply"), "none.ply: no such file"),
     "points": (lambda content: content.__setitem__("ply_file_path", 3), "ply_file_path is no text"),
     "mask": (lambda content: content["frames"][0].__setitem__("mask_path", 3), "frames[0].mask_path"),
@@ -214,6 +365,14 @@ FAULTS = {
 }
 
 
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective", "SIMPLE_RADIAL", None])
+def test_models_of_a_pinhole_are_read(tmp_path, model):
+    content = write(tmp_path, camera_model=model, distortion_params=[0.0] * 6, k5=0, k6=0.0)
+    content["frames"][0]["camera_model"] = model
+    save(tmp_path, content)
+    assert len(load(tmp_path)) == 18
+
+
 @pytest.mark.parametrize("name", FAULTS)
 def test_faults_are_named(name, tmp_path):
     content = write(tmp_path, 6)
@@ -222,6 +381,44 @@ def test_faults_are_named(name, tmp_path):
     save(tmp_path, content)
     text = message(tmp_path)
     assert expected in text and str(tmp_path) in text
+
+
+@pytest.mark.parametrize(("count", "neighbors"), [(0, 4), (1, 4), (3, 4), (9, 4), (10, 4), (12, 12), (13, 12)])
+def test_a_handful_of_points_is_none(tmp_path, count, neighbors):
+    """A Gaussian needs as many control points as move it, and those begin as a sample of the points."""
+    write(tmp_path)
+    write_ply(tmp_path / "points.ply", POINTS[:count], COLORS[:count])
+    data = load(tmp_path)
+    config = tiny_config(20, motion={"neighbors": neighbors})
+    state = TrainState.begin(config, data, "cpu")
+    assert state.stage == ("main" if count in (10, 13) else "pretrain")
+    frames = Frames(data, state.normalisation, state.config, "cpu")
+    assert training_step(state, frames).failed is None
+    if state.stage == "pretrain":
+        state.begin_main()
+        state.step = state.config.pretrain_steps
+        assert training_step(state, frames).failed is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"pretrain": {"start_ratio": 80.0}}, {"densify": {"max_gaussians": 100}}, {"motion": {"model": "static"}}],
+    ids=["spheres", "cap", "neither"],
+)
+def test_the_backdrop_is_seen_by_all_frames(tmp_path, changes):
+    """Also where more points are drawn than Gaussians begin with."""
+    write(tmp_path)
+    rewrite(tmp_path, lambda index, image: np.full_like(image, 10 + 10 * index))
+    data = load(tmp_path)
+    config = tiny_config(20, **changes)
+    count = min(config.init_points, config.densify.max_gaussians)
+    gaussians = TrainState.begin(config, data, "cpu").gaussians
+    assert len(gaussians) == count
+    greys = (gaussians.sh_dc.detach()[len(data.points) :, 0] * SH_C0 + 0.5) * 255
+    frames, own = greys.round().unique(return_counts=True)
+    expected = {int(10 + 10 * int(frame.name[2:])) for frame in data}
+    assert len(set(frames.int().tolist()) & expected) > 0.8 * len(expected)
+    assert int(own.max()) < 5 * (count - len(data.points)) / len(data)
 
 
 def test_what_the_data_offers_decides(tmp_path):

@@ -96,6 +96,20 @@ def test_what_is_not_finite_shades_nothing_and_passes_no_gradient_to_the_matrix(
     assert torch.isfinite(shading.grad).all()
 
 
+@pytest.mark.parametrize("bend", [1e10, -1e10, 3e38])
+def test_a_gain_beyond_float32_is_one_and_learns_nothing(bend, device):
+    """x and x^2 are finite; only their product with b is not."""
+    sh_dc, shading, quats, quats_t = draw(4, 3, device, spread=0.05)
+    shading[1, :9] = 1e15
+    shading[1, 9] = bend
+    sh_dc, shading = sh_dc.requires_grad_(), shading.requires_grad_()
+    out = shade(sh_dc, shading, quats, quats_t)
+    torch.testing.assert_close(out[1], sh_dc[1], rtol=1e-6, atol=1e-6)
+    out.sum().backward()
+    assert not shading.grad[1].any() and shading.grad[0].any() and shading.grad[2].any()
+    assert (sh_dc.grad[1] == 1).all()
+
+
 @pytest.mark.parametrize("which", range(4))
 def test_wrong_shapes_are_named(which):
     inputs = draw(0, 3)

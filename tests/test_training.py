@@ -10,17 +10,19 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from tiny import tiny_config, tiny_dataset
 
-from scgs_warp import environment
+from scgs_warp import checkpoint, environment
 from scgs_warp.config import with_steps
 from scgs_warp.errors import UserError
 from scgs_warp.evaluate import evaluate
 from scgs_warp.frames import Frames
 from scgs_warp.metrics import psnr
+from scgs_warp.run_folder import RunFolder
 from scgs_warp.scene import Scene
 from scgs_warp.train import fit, training_step
 from scgs_warp.train_state import TrainState
@@ -203,6 +205,19 @@ def test_resume_refuses_other_frames(tmp_path):
         fit(config, tiny_dataset(4), output=tmp_path / "run", resume=True)
 
 
+@pytest.mark.parametrize(("section", "field"), [("motion", "shading"), (None, "half_size")])
+def test_resume_refuses_a_run_of_another_version(section, field, tmp_path):
+    """What it did without the field is no value that could be given."""
+    config, data = tiny_config(20), tiny_dataset(3)
+    fit(config, data, output=tmp_path / "run")
+    tensors, metadata = checkpoint.read(tmp_path / "run")
+    del (metadata["config"][section] if section else metadata["config"])[field]
+    checkpoint.write(tmp_path / "run", tensors, metadata)
+    name = f"{section}.{field}" if section else field
+    with pytest.raises(UserError, match=f"made by another version, which had no {name}; train again with another --"):
+        fit(config, data, output=tmp_path / "run", resume=True)
+
+
 def test_what_changes_no_bit_may_differ_on_resume(tmp_path):
     fit(tiny_config(20), tiny_dataset(3), output=tmp_path / "run")
     before = checkpoint_bytes(tmp_path / "run")
@@ -235,8 +250,6 @@ def test_the_background_is_one(tmp_path):
 
 
 def test_two_trainers_cannot_share_a_directory(tmp_path):
-    from scgs_warp.run_folder import RunFolder
-
     config = tiny_config(20)
     with (
         RunFolder(tmp_path / "run", config, None, resume=False),
@@ -250,6 +263,26 @@ def test_max_gaussians_bounds_the_model(tmp_path):
     config = tiny_config(150, densify={"max_gaussians": 320, "grad_threshold": 1e-9})
     scene = fit(config, tiny_dataset(6), output=tmp_path / "run")
     assert 100 < scene.gaussian_count <= 320
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_the_psnr_of_training_is_that_of_valid_pixels(masked, tmp_path, device):
+    config = tiny_config(50)
+    mask = torch.zeros(48, 48, dtype=torch.bool)
+    mask[5:40, :20] = True
+    data = tiny_dataset(3)
+    frames = [dataclasses.replace(frame, mask=mask if masked else None) for frame in data]
+    data = type(data)(frames, folder=Path("masked"), split="train")
+    state = TrainState.begin(config, data, device)
+    result = training_step(state, Frames(data, state.normalisation, state.config, device))
+    state.step = 50
+    bar = SimpleNamespace(advance=lambda steps, **shown: None)
+    with RunFolder(tmp_path / "run", config, None, resume=False) as folder:
+        folder.record(state, result, bar)
+    logged = json.loads((tmp_path / "run/log.jsonl").read_text())["psnr"]
+    scores = [float(psnr(result.render[:, seen], result.truth[:, seen])) for seen in (mask.to(device), slice(None))]
+    assert abs(scores[0] - scores[1]) > 0.1
+    assert logged == pytest.approx(scores[0 if masked else 1], abs=1e-3)
 
 
 def test_fit_runs_in_a_thread(tmp_path):

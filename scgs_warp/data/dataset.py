@@ -16,6 +16,13 @@ BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random
 """What RGBA images are composited on when they are read. With ``random`` the trainer composites, once per step."""
 
 
+def spread(count: int, most: int) -> list[int]:
+    """At most ``most`` of the indices below ``count``, evenly from the first to the last."""
+    if count <= most:
+        return list(range(count))
+    return [round(index * (count - 1) / max(most - 1, 1)) for index in range(most)]
+
+
 class Dataset(Sequence[Frame]):
     """Frames of one split, in the order of the file that lists them.
 
@@ -42,6 +49,17 @@ class Dataset(Sequence[Frame]):
         """[P, 3] initial points, world units, where the data has some."""
         self.colors = colors
         """[P, 3] their colours in [0, 1], where the data has those, too."""
+
+    def with_frames(self, frames: Sequence[Frame]) -> Dataset:
+        """The same data set of other frames."""
+        return Dataset(
+            frames,
+            folder=self.folder,
+            split=self.split,
+            background=self.background,
+            points=self.points,
+            colors=self.colors,
+        )
 
     @overload
     def __getitem__(self, index: int) -> Frame: ...

@@ -13,7 +13,7 @@ from pathlib import Path
 from ..errors import UserError
 from ..types import Frame
 from .dataset import Dataset
-from .images import Decoded, parallel_map, read_image
+from .images import Decoded, parallel_map, read_image, without_idle_alpha
 from .transforms import (
     check_distortion,
     find_image,
@@ -58,12 +58,13 @@ def read(
     poses = [read_pose(path, index, entry) for index, entry in enumerate(entries)]
     times = read_times(path, entries)
     files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
-    check_distortion(path, content)
+    for described in (content, *entries):
+        check_distortion(path, described)
 
     def decode(file: Path) -> Decoded:
         return read_image(file, downscale, resample, background)
 
-    images = parallel_map(decode, files, progress)
+    images = without_idle_alpha(parallel_map(decode, files, progress))
     source = images[0].source_size
     for file, image in zip(files, images):
         if image.source_size != source:

@@ -32,6 +32,8 @@ class Decoded(NamedTuple):
     """[H, W] float32, None for a file without alpha."""
     source_size: tuple[int, int]
     """(width, height) of the file, before the reduction."""
+    transparent: bool
+    """Whether any pixel of the file is less than opaque."""
 
 
 def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[[int, int], None] | None = None):
@@ -95,7 +97,23 @@ def read_image(path: Path, downscale: float, resample: str, background: str) -> 
         rgb, alpha = _area(pixels, size, color)
     planar = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
     alpha_tensor = None if alpha is None else torch.from_numpy(np.ascontiguousarray(alpha))
-    return Decoded(planar.permute(1, 2, 0), alpha_tensor, (width, height))
+    return Decoded(planar.permute(1, 2, 0), alpha_tensor, (width, height), is_transparent(pixels))
+
+
+def is_transparent(pixels: np.ndarray) -> bool:
+    """Whether any pixel of a file [H, W, 3 or 4] is less than opaque."""
+    return pixels.shape[2] == 4 and bool((pixels[..., 3] < np.iinfo(pixels.dtype).max).any())
+
+
+def without_idle_alpha(images: Sequence[Decoded]) -> list[Decoded]:
+    """The images of a split, without alpha if it says nothing in any of them.
+
+    Many tools write RGBA whatever they are given; taken for cut-out objects, filled images would get neither a border
+    mask nor points on bare walls. One image that an object fills is another matter: it keeps its alpha.
+    """
+    if any(image.transparent for image in images):
+        return list(images)
+    return [image._replace(alpha=None) for image in images]
 
 
 def decode(path: Path) -> np.ndarray:

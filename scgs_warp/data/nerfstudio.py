@@ -19,8 +19,8 @@ from torch import Tensor
 from ..errors import UserError
 from ..types import Camera, Frame
 from .borders import border_mask, reduce_mask
-from .dataset import Dataset
-from .images import Decoded, decode, parallel_map, read_image
+from .dataset import Dataset, spread
+from .images import Decoded, decode, is_transparent, parallel_map, read_image, without_idle_alpha
 from .transforms import (
     check_distortion,
     find_image,
@@ -37,7 +37,7 @@ HELD_OUT_EVERY = 8
 HELD_OUT_FIRST = 4
 """Without lists, frames 4, 12, 20, ... are held out: never the first, so that nothing has to be extrapolated."""
 BORDER_FRAMES = 24
-"""Frames, spread over the video, in which a border is looked for."""
+"""At most so many frames, spread over the video, are looked at for a border: all of them are in memory at once."""
 
 
 def recognises(folder: Path) -> bool:
@@ -57,8 +57,9 @@ def read(
     """Read one split.
 
     Frames without a time are taken to be evenly spaced in the order of their names (9 before 10). Without lists of
-    files every eighth frame is held out, for ``test`` and ``val`` alike; with lists that leave out one of these two,
-    it is the other. A frame's mask is False where ``mask_path`` is black, and on borders that undistortion left.
+    files every eighth frame is held out, for ``test`` and ``val`` alike; with lists that leave out one of these two, or
+    leave it empty, it is the other. A frame's mask is False where ``mask_path`` is black, and on borders that
+    undistortion left.
 
     Args:
         progress: called with (done, total) after each decoded image.
@@ -71,9 +72,8 @@ def read(
     entries = content["frames"]
     files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
     times = _times(path, entries, files)
-    check_distortion(path, content)
-    for entry in entries:
-        check_distortion(path, entry)
+    for described in (content, *entries):
+        check_distortion(path, described)
     chosen = _chosen(path, content, files, split)
     border = _border(files, times)
 
@@ -81,9 +81,10 @@ def read(
         return read_image(files[index], downscale, resample, background), _mask(path, folder, index, entries[index])
 
     loaded = parallel_map(load, chosen, progress)
+    images = without_idle_alpha([decoded for decoded, _ in loaded])
+    first = images[0].source_size
     frames = []
-    for index, (decoded, own) in zip(chosen, loaded):
-        first = loaded[0][0].source_size
+    for index, decoded, (_, own) in zip(chosen, images, loaded):
         if decoded.source_size != first:
             raise UserError(
                 f"{files[index]}: is {size_text(decoded.source_size)}, but {files[chosen[0]].name} is "
@@ -117,6 +118,9 @@ def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list
 def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) -> list[int]:
     """Indices of the frames of this split, in the order of the file."""
     lists = {name: content[f"{name}_filenames"] for name in ("train", "val", "test") if f"{name}_filenames" in content}
+    for name in ("val", "test"):  # exporters write all three lists, whether or not they hold frames out twice
+        if lists.get(name) == []:
+            del lists[name]
     if not lists:
         order = sorted(range(len(files)), key=lambda index: _natural(files[index].as_posix()))
         held_out = set(order[min(HELD_OUT_FIRST, len(order) - 1) :: HELD_OUT_EVERY])
@@ -143,11 +147,11 @@ def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) 
 def _border(files: list[Path], times: list[float]) -> np.ndarray | None:
     """[H, W] bool, False on the black border of the video, if it has one; the same whichever split is read."""
     order = sorted(range(len(files)), key=lambda index: times[index])
-    spread = order[:: max(1, len(order) // BORDER_FRAMES)]
-    images = parallel_map(decode, [files[index] for index in spread if files[index].is_file()])
-    if any(image.shape[2] == 4 for image in images):
+    looked_at = [files[order[place]] for place in spread(len(order), BORDER_FRAMES)]
+    images = parallel_map(decode, [file for file in looked_at if file.is_file()])
+    if any(is_transparent(image) for image in images):
         return None  # alpha says it better
-    return border_mask(images)
+    return border_mask([image[..., :3] for image in images])
 
 
 def _mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> np.ndarray | None:
@@ -165,7 +169,11 @@ def _mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> np.nda
 
 
 def _combined(file: Path, border: np.ndarray | None, own: np.ndarray | None, decoded: Decoded) -> Tensor | None:
-    """[h, w] bool at the reduced size, True where both masks are; None where there is none."""
+    """[h, w] bool at the reduced size, True where both masks are; None where there is none.
+
+    Raises:
+        UserError: the mask has another size than the image, or no pixel is left.
+    """
     width, height = decoded.source_size
     if own is not None and own.shape != (height, width):
         raise UserError(
@@ -176,7 +184,13 @@ def _combined(file: Path, border: np.ndarray | None, own: np.ndarray | None, dec
     if not masks:
         return None
     size = (decoded.image.shape[1], decoded.image.shape[0])
-    return torch.from_numpy(reduce_mask(np.logical_and.reduce(masks), size))
+    mask = reduce_mask(np.logical_and.reduce(masks), size)
+    if not mask.any():  # neither a step nor a score could say anything of such a frame
+        raise UserError(
+            f"{file}: no pixel is left by its mask, the video's border and the reduction to {size_text(size)}; "
+            "correct mask_path, give a smaller downscale or drop the frame"
+        )
+    return torch.from_numpy(mask)
 
 
 def _points(
@@ -193,7 +207,8 @@ def _points(
     # Writers disagree whether the transform that was applied to the poses was applied to the points, too.
     if moved is not None and _seen(moved, cameras) > _seen(points, cameras):
         points = moved
-    return torch.from_numpy(points).float(), None if colors is None else torch.from_numpy(colors).float()
+    kept = _finite(points)  # once more: the transform may have led beyond what float32 holds
+    return torch.from_numpy(points[kept]).float(), None if colors is None else torch.from_numpy(colors[kept]).float()
 
 
 def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndarray | None:
@@ -226,13 +241,36 @@ def _seen(points: np.ndarray, cameras: list[Camera]) -> int:
     return total
 
 
+def _finite(points: np.ndarray) -> np.ndarray:
+    """[P] bool: which points [P, 3] float64 are finite in float32, as training takes them."""
+    with np.errstate(over="ignore"):
+        return np.all(np.isfinite(points.astype(np.float32)), axis=1)
+
+
+def _unit_colors(vertices: np.ndarray) -> np.ndarray | None:
+    """[P, 3] in [0, 1], grey where the file says nothing finite; None where it has no colours.
+
+    Whole numbers are shares of their type's largest; others of 1, or of 255 where any is above 1.
+    """
+    names = ("red", "green", "blue")
+    if not all(name in (vertices.dtype.names or ()) for name in names):
+        return None
+    raw = np.stack([np.asarray(vertices[name]) for name in names], axis=1)
+    if np.issubdtype(raw.dtype, np.integer):
+        return (raw / np.iinfo(raw.dtype).max).clip(0.0, 1.0)
+    colors = raw.astype(np.float64)
+    finite = np.isfinite(colors)
+    most = 255.0 if (colors[finite] > 1.0).any() else 1.0
+    return np.where(finite, colors / most, 0.5).clip(0.0, 1.0)
+
+
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Vertices [P, 3] float64 of a PLY file, and their colours [P, 3] in [0, 1] where it has some.
 
-    Points that are not finite are left out.
+    Points that are not finite in float32 are left out.
 
     Raises:
-        UserError: the file is missing, no PLY, or has no vertices with x, y, z.
+        UserError: the file is missing, no PLY, has no vertices with x, y, z, or claims more than fit into memory.
     """
     from plyfile import PlyData, PlyParseError
 
@@ -240,16 +278,14 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         elements = PlyData.read(path)
         vertices = elements["vertex"].data
         points = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
+        colors = _unit_colors(vertices)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file, though ply_file_path names it; restore it or drop the field") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError):
+    except (PlyParseError, KeyError, ValueError, TypeError):
         raise UserError(f"{path}: no PLY file of vertices with x, y, z; export the points again") from None
-    colors = None
-    if all(name in (vertices.dtype.names or ()) for name in ("red", "green", "blue")):
-        raw = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1)
-        whole = np.issubdtype(raw.dtype, np.integer)
-        colors = (raw / (np.iinfo(raw.dtype).max if whole else 1.0)).clip(0.0, 1.0)
-    finite = np.isfinite(points).all(axis=1)
-    return points[finite], None if colors is None else colors[finite]
+    except (MemoryError, OverflowError):
+        raise UserError(f"{path}: says it has more points than fit into memory; export the points again") from None
+    kept = _finite(points)
+    return points[kept], None if colors is None else colors[kept]

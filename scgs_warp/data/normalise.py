@@ -18,6 +18,7 @@ COMMON_RADIUS = 1.3654
 BULK = 0.95
 """Fraction of the initial points that shall lie within COMMON_RADIUS; the rest may be far background."""
 FEWEST_POINTS = 10
+"""Fewer say nothing of where the scene is."""
 PARALLEL = 1e-4
 """Smallest eigenvalue of the mean of (I - d d^T) at which optical axes still define a nearest point: some 1 degree."""
 
@@ -79,6 +80,14 @@ class Normalisation:
         centre = torch.as_tensor(self.centre, device=viewmat.device)
         moved = viewmat.clone()
         moved[:3, 3] = (viewmat[:3, 3] + viewmat[:3, :3] @ centre) * self.scale
+        return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
+
+    def undo_camera(self, camera: Camera) -> Camera:
+        """Inverse of :meth:`apply_camera`."""
+        viewmat = camera.viewmat.double()
+        centre = torch.as_tensor(self.centre, device=viewmat.device)
+        moved = viewmat.clone()
+        moved[:3, 3] = viewmat[:3, 3] / self.scale - viewmat[:3, :3] @ centre
         return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
 
 

@@ -20,7 +20,9 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 RIGID_TOLERANCE = 1e-3
 """Largest entry of R^T R - I that passes as rounding."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Camera models (COLMAP's and nerfstudio's names) that are a pinhole where all distortion is 0; a fisheye is not."""
 
 
 def size_text(size: tuple[int, int]) -> str:
@@ -41,6 +43,8 @@ def read_transforms(path: Path) -> dict[str, Any]:
         raise UserError(
             f"{path}: not valid JSON, line {error.lineno} column {error.colno}: {error.msg}; restore or correct it"
         ) from None
+    except ValueError:  # of Python, not of JSON: it converts no more than 4,300 digits
+        raise UserError(f"{path}: holds a number of more than 4,300 digits; restore or correct the file") from None
     except RecursionError:
         raise UserError(f"{path}: JSON nested too deeply; restore the file") from None
     frames = content.get("frames") if isinstance(content, dict) else None
@@ -121,7 +125,25 @@ def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> P
 
 
 def check_distortion(path: Path, content: dict[str, Any]) -> None:
-    """Raise UserError for lens distortion: images are taken as those of a pinhole camera."""
+    """Images are taken as those of a pinhole camera. ``content``: the file's object, or one of its frames.
+
+    Raises:
+        UserError: another camera model, or lens distortion.
+    """
+    model = content.get("camera_model")
+    if model is not None and (not isinstance(model, str) or model.upper() not in PINHOLES):
+        raise UserError(
+            f"{path}: camera_model is {str(model)[:40]!r}, which is not supported; "
+            f"undistort the images to one of {', '.join(PINHOLES)}"
+        )
+    parameters = content.get("distortion_params")
+    if parameters is not None and (
+        not isinstance(parameters, list) or any(as_number(value) != 0.0 for value in parameters)
+    ):
+        raise UserError(
+            f"{path}: distortion_params is {repr(parameters)[:60]}, lens distortion, which is not supported yet; "
+            "undistort the images and leave it out"
+        )
     for key in DISTORTION:
         value = content.get(key, 0)
         if as_number(value) != 0.0:
