@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from .data.dataset import Dataset
 from .data.normalise import Normalisation
 from .optim import generator
-from .types import Frame
 
 HALF_SIZE = 1.3
 """Half the edge of the cube in which a scene without initial points starts (normalised units)."""
@@ -35,13 +34,14 @@ class Coverage(NamedTuple):
     """[P, 3] mean colour in those views; grey where there is none."""
 
 
-def coverage(points: Tensor, data: Sequence[Frame], normalisation: Normalisation) -> Coverage | None:
+def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Coverage | None:
     """Look every point up in up to 100 frames; None where no frame has alpha. ``points`` [P, 3] normalised."""
-    frames = [frame for frame in data if frame.alpha is not None]
-    if not frames:
+    chosen = data.with_alpha
+    if not chosen:
         return None
     covered, seen, colors = torch.zeros(len(points)), torch.zeros(len(points)), torch.zeros(len(points), 3)
-    for frame in frames[:: max(1, len(frames) // MOST_VIEWS)]:
+    for index in chosen[:: max(1, len(chosen) // MOST_VIEWS)]:
+        frame = data[index]
         camera = normalisation.apply_camera(frame.camera).to("cpu")
         local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
         pixels = local @ camera.K.T
@@ -59,7 +59,7 @@ def coverage(points: Tensor, data: Sequence[Frame], normalisation: Normalisation
 
 
 def likely_points(
-    count: int, data: Sequence[Frame], normalisation: Normalisation, seed: int, key: int
+    count: int, data: Dataset, normalisation: Normalisation, seed: int, key: int
 ) -> tuple[Tensor, Tensor | None]:
     """Random points [count, 3] in the cube and their colours [count, 3], drawn where the images are covered; uniform,
     without colours, where no frame has alpha."""
