@@ -6,14 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import UserError
-from . import dnerf, nerfstudio
+from . import colmap, dnerf, nerfies, nerfstudio, panoptic, poses_bounds
 from .cache import CACHE_MIB, ImageCache
 from .dataset import Dataset
 from .images import Look, check_options
 
 __all__ = ["Dataset", "ImageCache", "load"]
 
-READERS = (dnerf, nerfstudio)
+READERS = (dnerf, nerfstudio, nerfies, panoptic, poses_bounds, colmap)
 """Asked in this order: ``recognises(folder)``, then ``read(folder, split, look)``."""
 
 
@@ -58,6 +58,7 @@ def load(
         if reader.recognises(folder):
             return reader.read(folder, split, look)
     raise UserError(
-        f"{folder}: no transforms_{split}.json and no transforms.json here; give the folder of a D-NeRF / Blender or "
-        "nerfstudio data set"
+        f"{folder}: nothing known lies here: no transforms_{split}.json (D-NeRF, Blender), transforms.json "
+        "(nerfstudio), dataset.json (HyperNeRF, NeRF-DS), train_meta.json (Panoptic), poses_bounds.npy "
+        "(Neural 3D Video) or sparse/0 (COLMAP); give the folder that holds one of these"
     )

@@ -139,8 +139,8 @@ def _facts(shot: Shot, decoded: Decoded, border: np.ndarray | None) -> _Facts:
     height, width = image.shape[:2]
     lens, source = decoded.lens, decoded.source_size
     sx, sy = width / source[0], height / source[1]
-    K = torch.tensor([[lens.fx * sx, 0.0, lens.cx * sx], [0.0, lens.fy * sy, lens.cy * sy], [0.0, 0.0, 1.0]])
-    camera = Camera(torch.from_numpy(shot.viewmat).float(), K, width, height)
+    K = np.array([[lens.fx * sx, 0.0, lens.cx * sx], [0.0, lens.fy * sy, lens.cy * sy], [0.0, 0.0, 1.0]])
+    camera = Camera(torch.from_numpy(shot.viewmat).float(), torch.from_numpy(K).float(), width, height)
     valid = mask is None or bool(mask.any())
     within = valid
     if border is not None and border.shape == (source[1], source[0]):

@@ -171,6 +171,17 @@ def decode(path: Path) -> np.ndarray:
     return cv2.cvtColor(pixels, code)
 
 
+def header_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) as the file's first bytes say; None where they say nothing, or there is no such file."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+
+
 def _area(
     pixels: np.ndarray, size: tuple[int, int], color: np.ndarray, lens: Lens | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
