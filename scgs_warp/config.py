@@ -114,7 +114,7 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds")
+FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds", "cache_mib")
 """Settings that change no bit of the result: not part of a checkpoint, and free when a run is resumed."""
 
 

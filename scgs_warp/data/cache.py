@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-CACHE_MIB = 2048
-"""Decoded images that are kept, by default: 200 of 800 x 800 pixels with alpha."""
+from ..config_fields import CACHE_MIB
+
 AHEAD = 2
 """Images that are decoded before they are asked for."""
 

@@ -177,7 +177,7 @@ def _believed(count: int, left: int, least: int) -> int:
 
 
 def _lines(data: bytes) -> Iterator[str]:
-    return (line for line in data.decode("utf-8").split("\n") if not line.startswith("#"))
+    return (line for line in data.decode("utf-8").removesuffix("\n").split("\n") if not line.startswith("#"))
 
 
 def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
