@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,7 @@ def train_and_finish(
     resume: bool = False,
     frames: int = FILM_FRAMES,
     lpips: Lpips | None = None,
+    look: Callable[[Dataset], None] | None = None,
 ) -> dict[str, Any]:
     """Load, train, evaluate: what ``apps/train.py`` does.
 
@@ -71,6 +73,7 @@ def train_and_finish(
         output: run directory.
         resume: continue the run in ``output``.
         frames, lpips: as for :func:`finish`.
+        look: called with the training frames before training begins.
 
     Returns:
         what ``metrics.json`` holds.
@@ -80,6 +83,8 @@ def train_and_finish(
         KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
     """
     train, test = load_splits(config, data)
+    if look is not None:
+        look(train)
     scene = fit(
         config, train, output=output, device=device, test=test, resume=resume, settings=settings_of(config, data)
     )
