@@ -263,3 +263,38 @@ def test_a_model_of_other_images(data_root):
         pytest.skip("no such model here")
     with pytest.raises(UserError, match=r"camera \d+, of \d+\.jpg, is of 269\d x 20\d\d pixels, but the image is 2704"):
         load(folder)
+
+
+def test_a_video_is_the_same_from_transforms_and_from_colmap(data_root, tmp_path):
+    """The handheld video, and a model that pycolmap writes of its poses and points: the same frames to train on."""
+    import pycolmap
+
+    folder = data_root / "handheld"
+    if not folder.is_dir():
+        pytest.skip("no such video here")
+    reconstruction = pycolmap.Reconstruction()
+    splits = {split: load(folder, split, downscale=4, cache_mib=0) for split in ("train", "test")}
+    content = json.loads((folder / "transforms.json").read_text())
+    params = [content[key] for key in ("fl_x", "fl_y", "cx", "cy")]
+    camera = pycolmap.Camera(model="PINHOLE", width=content["w"], height=content["h"], params=params, camera_id=1)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for point, color in zip(splits["train"].points.tolist(), (splits["train"].colors * 255).round().byte().numpy()):
+        reconstruction.add_point3D(np.array(point), pycolmap.Track(), color)
+    entries = sorted((e for data in splits.values() for e in data.entries), key=lambda entry: entry.name)
+    for index, entry in enumerate(entries):
+        view = entry.camera.viewmat.double().numpy()
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3])
+        image = pycolmap.Image(name=f"{entry.name}.png", camera_id=1, image_id=index + 1)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    reconstruction.write_binary(str(tmp_path / "sparse/0"))
+    (tmp_path / "images").symlink_to((folder / "images").resolve())
+    for split, expected in splits.items():
+        data = load(tmp_path, split, downscale=4, cache_mib=0)
+        assert [frame.name for frame in data.entries] == [frame.name for frame in expected.entries]
+        torch.testing.assert_close(data.times, expected.times, atol=1e-6, rtol=0)
+        torch.testing.assert_close(data.points, expected.points)
+        for ours, theirs in zip(data, expected):
+            torch.testing.assert_close(ours.camera.viewmat, theirs.camera.viewmat, atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(ours.camera.K, theirs.camera.K)
+            assert torch.equal(ours.image, theirs.image) and torch.equal(ours.mask, theirs.mask)

@@ -350,6 +350,8 @@ FAULTS = {
     ),
     "parameters": (lambda content: content.__setitem__("distortion_params", [0] * 7), "distortion_params is [0, 0, 0"),
     "parameter": (lambda content: content["frames"][1].__setitem__("distortion_params", 0.1), "distortion_params is 0"),
+    "huge": (lambda content: content.__setitem__("k1", 1e10), "frames[0]: camera parameters are not finite"),
+    "huge focal": (lambda content: content.__setitem__("fl_x", 1e300), "its camera has numbers beyond 1e+30"),
     "listed": (lambda content: content.__setitem__("distortion_params", [0, "a"]), "distortion_params (k2) is 'a'"),
     "sphere": (
         lambda content: content["frames"][3].__setitem__("camera_model", "EQUIRECTANGULAR"),

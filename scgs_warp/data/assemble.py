@@ -26,6 +26,9 @@ from .points import finite
 BORDER_FRAMES = 24
 """At most so many frames, spread over the video, are looked at for a border: all of them are in memory at once."""
 
+LARGEST = 1e30
+"""Of a camera's numbers: float32 holds them, and what is made of them."""
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -139,6 +142,9 @@ def _facts(shot: Shot, decoded: Decoded, border: np.ndarray | None) -> _Facts:
     height, width = image.shape[:2]
     lens, source = decoded.lens, decoded.source_size
     sx, sy = width / source[0], height / source[1]
+    numbers = np.abs([lens.fx, lens.fy, lens.cx, lens.cy, *shot.viewmat.ravel()])
+    if not (numbers < LARGEST).all():
+        raise UserError(f"{shot.file}: its camera has numbers beyond {LARGEST:g}; correct its pose and intrinsics")
     K = np.array([[lens.fx * sx, 0.0, lens.cx * sx], [0.0, lens.fy * sy, lens.cy * sy], [0.0, 0.0, 1.0]])
     camera = Camera(torch.from_numpy(shot.viewmat).float(), torch.from_numpy(K).float(), width, height)
     valid = mask is None or bool(mask.any())

@@ -66,7 +66,7 @@ def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
     if model == "EQUIRECTANGULAR":
         raise ValueError("camera model EQUIRECTANGULAR sees all around, which no pinhole does")
     if not all(math.isfinite(value) and abs(value) < 1e9 for value in (*params, skew)):
-        raise ValueError("camera parameters are not finite")
+        raise ValueError("camera parameters are not finite, or absurd")
     camera = pycolmap.Camera(model=model, width=1, height=1)
     camera.params = list(params)
     if not camera.verify_params():

@@ -146,7 +146,12 @@ def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int,
     """
     fx, fy, cx, cy = read_intrinsics(path, fields, index, source)
     model, further = read_distortion(path, fields)
-    return Lens(fx, fy, cx, cy) if model == "PINHOLE" else make_lens(model, (fx, fy, cx, cy, *further))
+    if model == "PINHOLE":
+        return Lens(fx, fy, cx, cy)
+    try:
+        return make_lens(model, (fx, fy, cx, cy, *further))
+    except ValueError as error:
+        raise UserError(f"{path}: frames[{index}]: {error}; correct the lens, or undistort the images") from None
 
 
 def read_intrinsics(
