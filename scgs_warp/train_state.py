@@ -244,7 +244,7 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
 
 def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
     for name, value in wanted.items():
-        if name in FREE_TO_CHANGE:
+        if f"{prefix}{name}" in FREE_TO_CHANGE:
             continue
         if isinstance(value, dict):
             _same_configuration(saved.get(name, {}), value, source, f"{prefix}{name}.")
