@@ -138,6 +138,36 @@ def test_memory_is_bounded_by_the_cache(tmp_path, monkeypatch):
     assert peak < 8 * 2**20 + 12 * size, "numpy's part of it: torch shares its memory"
 
 
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+def test_truncated_images_are_told(tmp_path, suffix):
+    image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    data = cv2.imencode(suffix, image)[1].tobytes()
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(data)
+    assert images.decode(path).shape == (40, 60, 3)
+    assert images._whole(np.frombuffer(data + b"appended", np.uint8))
+    for share in (0.0, 0.1, 0.5, 0.99):
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(UserError, match=rf"a\{suffix}: not an image"):
+            images.decode(path)
+        if suffix == ".jpg":
+            assert not images._whole(np.fromfile(path, np.uint8))
+
+
+def test_long_reading_shows_how_far_it_is(tmp_path, monkeypatch, capsys):
+    from scgs_warp import finish
+
+    write(tmp_path)
+    config = tiny_config(20, data={"cache_mib": 3})
+    train, test = finish.load_splits(config, tmp_path)
+    assert train.cache is test.cache and train.cache.budget == 3 * 2**20
+    assert "reading" not in capsys.readouterr().err, "it was quick"
+    monkeypatch.setattr(finish, "QUIET_SECONDS", -1.0)
+    finish.load_splits(config, tmp_path)
+    said = capsys.readouterr()
+    assert "reading train images" in said.out + said.err and "reading test images 2/2" in said.out + said.err
+
+
 def test_a_file_that_goes_away_is_told_when_it_is_needed(tmp_path):
     write(tmp_path)
     data = load(tmp_path, cache_mib=0)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layouts import HEIGHT, WIDTH, save_image, write_colmap, write_nerfies, write_panoptic, write_poses_bounds
+from test_nerfstudio import write as write_nerfstudio
 
 from scgs_warp.data import load
 from scgs_warp.data.colmap_model import read_model
@@ -218,12 +219,12 @@ def test_nothing_known(tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("layout", ALL)
+@pytest.mark.parametrize("layout", [*ALL, "nerfstudio"])
 def test_mutated_files_are_read_or_refused(tmp_path, layout, seed):
     """Whatever bytes change: a data set, or one line; soon, and without the memory that a damaged count asks for."""
     random = np.random.default_rng(seed)
     folder = tmp_path / "scene"
-    (ALL[layout][0] if layout != "colmap" else write_colmap)(folder)
+    {"colmap": write_colmap, "nerfstudio": write_nerfstudio}.get(layout, ALL.get(layout, (None,))[0])(folder)
     files = sorted(f for f in folder.rglob("*") if f.is_file() and f.suffix not in (".png", ".jpg"))
     original = {file: file.read_bytes() for file in files}
     for _ in range(12):

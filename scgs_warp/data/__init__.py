@@ -53,7 +53,7 @@ def load(
         raise UserError(f"split is {split!r}; give train, test or val")
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; give one with transforms_train.json or transforms.json")
+        raise UserError(f"{folder}: no such folder; give that of a data set, as docs/data.md describes them")
     look = Look(downscale, resample, background, progress, cache if cache is not None else ImageCache(cache_mib))
     for reader in READERS:
         if reader.recognises(folder):

@@ -159,7 +159,7 @@ def decode(path: Path) -> np.ndarray:
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if _whole(data) else None
     except cv2.error:
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
@@ -169,6 +169,14 @@ def decode(path: Path) -> np.ndarray:
     if code is None:
         raise UserError(f"{path}: has {channels} channels; save it as grey, RGB or RGBA")
     return cv2.cvtColor(pixels, code)
+
+
+def _whole(data: np.ndarray) -> bool:
+    """False where a file ends too soon. Older versions of OpenCV fill up what is missing of a JPEG with grey."""
+    if data[:2].tobytes() != b"\xff\xd8":
+        return data.size > 0
+    content = data.tobytes()
+    return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # the end of the image, after its last scan
 
 
 def header_size(path: Path) -> tuple[int, int] | None:
