@@ -75,9 +75,7 @@ def rotate_harmonics(
                 for v in range(size):
                     value = band_value(degree, k + row, quat_rotate(back, directions_in[direction + v]), sh_rest_in)
                     for m in range(size):
-                        sh_rest_out[k + row + m] = (
-                            sh_rest_out[k + row + m] + inverses_in[matrix + m * size + v] * value
-                        )
+                        sh_rest_out[k + row + m] = sh_rest_out[k + row + m] + inverses_in[matrix + m * size + v] * value
             direction += size
             matrix += size * size
             row += size
