@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ..ops.arap import trajectory_graph
 
-NEIGHBORS = 6
-"""Control points each one asks for; the union of both sides' wishes has some 7 an edge more."""
+NEIGHBORS = 7
+"""Control points each one asks for; the union of both sides wishes makes it some nine."""
 LONGEST = 3.0
 """An edge longer than so many times the median one ties nothing together."""
 SMALLEST = 4

@@ -91,6 +91,7 @@ class EditSession:
     def node_positions(self, time: float, at: float | None = None, *, live: bool = False) -> np.ndarray:
         """[M, 3] edited control points, world."""
         bent = self._bend(time, at, live)
+        time = min(max(float(time), 0.0), 1.0)
         positions = self.engine.motion_at(time).positions if bent is None else bent.positions
         return self.engine.to_world(positions)
 
@@ -247,11 +248,18 @@ class EditSession:
 
     # Results
 
+    def resize_film(self, size: int) -> None:
+        """Longer side of the film in pixels."""
+        self._change(film=dataclasses.replace(self.edit.film, size=size))
+
     def scene_time(self, at: float) -> float:
         """The moment of the motion that a moment of the film shows."""
         return self.edit.playback.time_at(at, self.edit.film.seconds)
 
     def _bend(self, time: float, at: float | None, live: bool, frame: float = ONE_FRAME) -> NodePose | None:
+        if not (math.isfinite(time) and (at is None or math.isfinite(at))):
+            raise UserError(f"time {time}, at {at}: give finite numbers")
+        time = min(max(float(time), 0.0), 1.0)
         if live and at is None:
             return self.engine.bend_live(self.edit, time, frame=frame)
         return self.engine.bend(self.edit, time, at, frame=frame)
@@ -260,7 +268,8 @@ class EditSession:
         self, time: float, at: float | None = None, *, live: bool = False, frame: float = ONE_FRAME
     ) -> Gaussians:
         """Activated Gaussians under the edit, world units; the scene's own bits where the edit changes nothing."""
-        return self.engine.gaussians(time, self._bend(time, at, live, frame))
+        bent = self._bend(time, at, live, frame)
+        return self.engine.gaussians(min(max(float(time), 0.0), 1.0), bent)
 
     @torch.no_grad()
     def render(
@@ -274,8 +283,8 @@ class EditSession:
         frame: float = ONE_FRAME,
     ) -> Image:
         """The edited scene, as ``Scene.render`` shows the scene; its very bits where the edit changes nothing."""
-        time = min(max(float(time), 0.0), 1.0)
         bent = self._bend(time, at, live, frame)
+        time = min(max(float(time), 0.0), 1.0)
         scene = self.scene
         if bent is None:
             return scene.render(camera, time, background)  # type: ignore[arg-type]

@@ -25,7 +25,7 @@ from .graph import ControlGraph
 
 SMOOTHNESS = 0.3
 """Weight of neighbours' rotations, in squared edge lengths."""
-STRETCH = 5.0
+STRETCH = 2.0
 """Weight of an edge's length, relative to its shape."""
 STEP_ANGLE = math.radians(15.0)
 """A handle turns at most so far between two solutions: beyond some 90 degrees the energy has other minima."""
