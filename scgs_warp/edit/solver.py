@@ -22,6 +22,7 @@ from scipy.sparse.linalg import splu
 from ..kernels import editing as kernels
 from ..warp_interop import launch
 from .graph import ControlGraph
+from .rotations import exponential, from_matrix, logarithm, to_matrix
 
 SMOOTHNESS = 0.3
 """Weight of neighbours' rotations, in squared edge lengths."""
@@ -137,6 +138,9 @@ class ArapSolver:
     def relax(self, rest: np.ndarray, anchors: Anchors, shape: Shape, iterations: int) -> Shape:
         """At most ``iterations`` local and global steps from ``shape`` towards the minimum.
 
+        They begin with a guess: what turns with the handles spreads evenly between them, and positions follow. A piece
+        that hangs on one handle alone is there at once.
+
         Args:
             rest: [M, 3] float64, normalised units: the shape that costs nothing.
             anchors: what is held.
@@ -145,8 +149,7 @@ class ArapSolver:
         system = self._system(anchors)
         start = torch.from_numpy(np.ascontiguousarray(rest))
         positions = np.where(anchors.hard[:, None], anchors.positions, shape.positions)
-        turns = np.where(anchors.turned[:, None, None], anchors.rotations, shape.rotations)
-        posed, rotations = torch.from_numpy(positions), torch.from_numpy(turns)
+        posed, rotations = torch.from_numpy(positions), torch.from_numpy(self._guess(system, anchors, shape))
         targets = torch.from_numpy(np.ascontiguousarray(anchors.positions))
         spare = rotations.clone()
         edges = self._begin, self._neighbors, self._weights
@@ -154,20 +157,41 @@ class ArapSolver:
         sums = torch.empty(len(free), 3, dtype=torch.float64)
         smooth = self.smoothness * self.graph.edge_length**2
         tolerance = TOLERANCE * self.graph.edge_length
-        for _ in range(iterations):
-            inputs = system.turning, start, posed, *edges
-            launch(kernels.turn_nodes, len(system.turning), *inputs, smooth, rotations, spare, grain=64)
-            rotations, spare = spare, rotations
+        for step in range(iterations + 1):
+            if step:
+                inputs = system.turning, start, posed, *edges
+                launch(kernels.turn_nodes, len(system.turning), *inputs, smooth, rotations, spare, grain=64)
+                rotations, spare = spare, rotations
             if system.factor is None:
                 break
-            inputs = system.free, system.fixed, start, posed, *edges, self.stretch, rotations
+            stretch = self.stretch if step else 0.0  # the edges of what was moved have no direction yet
+            inputs = system.free, system.fixed, start, posed, *edges, stretch, rotations
             launch(kernels.edge_sums, len(free), *inputs, system.pulls, targets, sums, grain=128)
             solved = system.factor.solve(sums.numpy())
             moved = float(np.abs(solved - positions[free]).max(initial=0.0))
             positions[free] = solved
-            if not moved > tolerance:
+            if step and not moved > tolerance:
                 break
         return Shape(positions, rotations.numpy())
+
+    def _guess(self, system: _System, anchors: Anchors, shape: Shape) -> np.ndarray:
+        """[M, 3, 3] rotations: given where they are, else those of ``shape`` turned by a harmonic mean of what the
+        given ones have turned since."""
+        turns = np.where(anchors.turned[:, None, None], anchors.rotations, shape.rotations)
+        further = np.zeros((len(turns), 3))
+        given = np.flatnonzero(anchors.turned)
+        change = turns[given] @ shape.rotations[given].transpose(0, 2, 1)
+        further[given] = logarithm(from_matrix(change))
+        if system.factor is None or not further.any():
+            return turns
+        free = system.free.long().numpy()
+        pulls = system.pulls.numpy()[:, None]
+        held = np.where(anchors.hard[:, None], further, 0.0)
+        sums = (self.graph.matrix @ held) + pulls * further
+        further[free] = system.factor.solve(np.ascontiguousarray(sums[free]))
+        turning = np.setdiff1d(free, given)
+        turns[turning] = to_matrix(exponential(further[turning])) @ turns[turning]
+        return turns
 
     def solve(self, rest: np.ndarray, path: Callable[[float], Anchors], steps: int) -> Shape:
         """The deformation at the end of a path of handles, which begins at rest: a function of its arguments alone.
