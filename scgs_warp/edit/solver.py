@@ -66,13 +66,12 @@ class Shape:
     """[M, 3]"""
     rotations: np.ndarray
     """[M, 3, 3]"""
+    anchors: Anchors | None = None
+    """What held it."""
 
     @staticmethod
     def at_rest(rest: np.ndarray) -> Shape:
         return Shape(rest.copy(), np.tile(np.eye(3), (len(rest), 1, 1)))
-
-    def copy(self) -> Shape:
-        return Shape(self.positions.copy(), self.rotations.copy())
 
 
 class _System(NamedTuple):
@@ -138,8 +137,8 @@ class ArapSolver:
     def relax(self, rest: np.ndarray, anchors: Anchors, shape: Shape, iterations: int) -> Shape:
         """At most ``iterations`` local and global steps from ``shape`` towards the minimum.
 
-        They begin with a guess: what turns with the handles spreads evenly between them, and positions follow. A piece
-        that hangs on one handle alone is there at once.
+        Where anchors have moved, they begin with a guess: what turns with the handles spreads evenly between them, and
+        positions follow. A piece that hangs on one handle alone is there at once.
 
         Args:
             rest: [M, 3] float64, normalised units: the shape that costs nothing.
@@ -157,7 +156,9 @@ class ArapSolver:
         sums = torch.empty(len(free), 3, dtype=torch.float64)
         smooth = self.smoothness * self.graph.edge_length**2
         tolerance = TOLERANCE * self.graph.edge_length
-        for step in range(iterations + 1):
+        old = shape.anchors
+        same = old is not None and all(np.array_equal(a, b) for a, b in zip(old, anchors))
+        for step in range(1 if same else 0, iterations + 1):
             if step:
                 inputs = system.turning, start, posed, *edges
                 launch(kernels.turn_nodes, len(system.turning), *inputs, smooth, rotations, spare, grain=64)
@@ -172,7 +173,7 @@ class ArapSolver:
             positions[free] = solved
             if step and not moved > tolerance:
                 break
-        return Shape(positions, rotations.numpy())
+        return Shape(positions, rotations.numpy(), anchors)
 
     def _guess(self, system: _System, anchors: Anchors, shape: Shape) -> np.ndarray:
         """[M, 3, 3] rotations: given where they are, else those of ``shape`` turned by a harmonic mean of what the
