@@ -12,34 +12,75 @@ from .quaternion import quat_conjugate, quat_normalise, quat_rotate
 wp.set_module_options({"enable_backward": False})
 
 
+mat33 = wp.types.matrix(shape=(3, 3), dtype=float)
+mat53 = wp.types.matrix(shape=(5, 3), dtype=float)
+mat73 = wp.types.matrix(shape=(7, 3), dtype=float)
+
+
 @wp.func
-def band_value(degree: int, k: int, d: wp.vec3, sh_rest: wp.array[wp.vec3]) -> wp.vec3:
-    """What one band adds to the colour in direction ``d``; ``k``: row of its first coefficient."""
-    x = d[0]
-    y = d[1]
-    z = d[2]
-    if degree == 1:
-        return C1 * (z * sh_rest[k + 1] - y * sh_rest[k] - x * sh_rest[k + 2])
-    xx = x * x
-    yy = y * y
-    zz = z * z
-    if degree == 2:
-        return (
-            (C2 * x * y) * sh_rest[k]
-            - (C2 * y * z) * sh_rest[k + 1]
-            + (C20 * (3.0 * zz - 1.0)) * sh_rest[k + 2]
-            - (C2 * x * z) * sh_rest[k + 3]
-            + (C22 * (xx - yy)) * sh_rest[k + 4]
+def turn_first(k: int, back: wp.vec4, directions: wp.array[wp.vec3], inverses: wp.array[float],
+               sh_in: wp.array[wp.vec3], sh_out: wp.array[wp.vec3]):  # fmt: skip
+    """One band; ``k``: row of its first coefficient. Loops over constants are unrolled, so values stay in registers."""
+    values = mat33()
+    for v in range(3):
+        d = quat_rotate(back, directions[v])
+        values[v] = C1 * (d[2] * sh_in[k + 1] - d[1] * sh_in[k] - d[0] * sh_in[k + 2])
+    for m in range(3):
+        total = wp.vec3(0.0)
+        for v in range(3):
+            total += inverses[m * 3 + v] * values[v]
+        sh_out[k + m] = total
+
+
+@wp.func
+def turn_second(k: int, back: wp.vec4, directions: wp.array[wp.vec3], inverses: wp.array[float],
+                sh_in: wp.array[wp.vec3], sh_out: wp.array[wp.vec3]):  # fmt: skip
+    values = mat53()
+    for v in range(5):
+        d = quat_rotate(back, directions[3 + v])
+        x = d[0]
+        y = d[1]
+        z = d[2]
+        values[v] = (
+            (C2 * x * y) * sh_in[k]
+            - (C2 * y * z) * sh_in[k + 1]
+            + (C20 * (3.0 * z * z - 1.0)) * sh_in[k + 2]
+            - (C2 * x * z) * sh_in[k + 3]
+            + (C22 * (x * x - y * y)) * sh_in[k + 4]
         )
-    return (
-        (C33 * y * (yy - 3.0 * xx)) * sh_rest[k]
-        + (C32 * x * y * z) * sh_rest[k + 1]
-        + (C31 * y * (1.0 - 5.0 * zz)) * sh_rest[k + 2]
-        + (C30 * z * (5.0 * zz - 3.0)) * sh_rest[k + 3]
-        + (C31 * x * (1.0 - 5.0 * zz)) * sh_rest[k + 4]
-        + (C3Z * z * (xx - yy)) * sh_rest[k + 5]
-        + (C33 * x * (3.0 * yy - xx)) * sh_rest[k + 6]
-    )
+    for m in range(5):
+        total = wp.vec3(0.0)
+        for v in range(5):
+            total += inverses[9 + m * 5 + v] * values[v]
+        sh_out[k + m] = total
+
+
+@wp.func
+def turn_third(k: int, back: wp.vec4, directions: wp.array[wp.vec3], inverses: wp.array[float],
+               sh_in: wp.array[wp.vec3], sh_out: wp.array[wp.vec3]):  # fmt: skip
+    values = mat73()
+    for v in range(7):
+        d = quat_rotate(back, directions[8 + v])
+        x = d[0]
+        y = d[1]
+        z = d[2]
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        values[v] = (
+            (C33 * y * (yy - 3.0 * xx)) * sh_in[k]
+            + (C32 * x * y * z) * sh_in[k + 1]
+            + (C31 * y * (1.0 - 5.0 * zz)) * sh_in[k + 2]
+            + (C30 * z * (5.0 * zz - 3.0)) * sh_in[k + 3]
+            + (C31 * x * (1.0 - 5.0 * zz)) * sh_in[k + 4]
+            + (C3Z * z * (xx - yy)) * sh_in[k + 5]
+            + (C33 * x * (3.0 * yy - xx)) * sh_in[k + 6]
+        )
+    for m in range(7):
+        total = wp.vec3(0.0)
+        for v in range(7):
+            total += inverses[34 + m * 7 + v] * values[v]
+        sh_out[k + m] = total
 
 
 @wp.kernel
@@ -64,18 +105,9 @@ def rotate_harmonics(
             sh_rest_out[k + row] = sh_rest_in[k + row]
     else:
         back = quat_conjugate(quat_normalise(q))
-        direction = int(0)
-        matrix = int(0)
-        row = int(0)
-        for degree in range(1, 4):
-            size = 2 * degree + 1
-            if row < rest:
-                for m in range(size):
-                    sh_rest_out[k + row + m] = wp.vec3(0.0)
-                for v in range(size):
-                    value = band_value(degree, k + row, quat_rotate(back, directions_in[direction + v]), sh_rest_in)
-                    for m in range(size):
-                        sh_rest_out[k + row + m] = sh_rest_out[k + row + m] + inverses_in[matrix + m * size + v] * value
-            direction += size
-            matrix += size * size
-            row += size
+        if rest > 0:
+            turn_first(k, back, directions_in, inverses_in, sh_rest_in, sh_rest_out)
+        if rest > 3:
+            turn_second(k + 3, back, directions_in, inverses_in, sh_rest_in, sh_rest_out)
+        if rest > 8:
+            turn_third(k + 8, back, directions_in, inverses_in, sh_rest_in, sh_rest_out)
