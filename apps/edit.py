@@ -24,7 +24,7 @@ class Options:
     ply: Path | None = None
     """Instead of a run: a .ply of 3D Gaussian splatting, as a scene that stands still."""
     script: Path | None = None
-    """An edit, as JSON (docs/editing.md)."""
+    """An edit, as JSON (docs/editing.md). Without an output, the editor begins with it."""
     output: Path | None = None
     """Where the script's film goes: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     export: Path | None = None
@@ -35,6 +35,12 @@ class Options:
     """Control points of a scene that stands still."""
     size: int | None = None
     """Longer side of the film in pixels, instead of the script's."""
+    port: int = 8080
+    """Of the editor's page, on 127.0.0.1; the next free one is taken. With --share: where others reach it."""
+    share: bool = False
+    """Let other machines in: the page is served on all interfaces, behind a proxy that asks for a token."""
+    folder: Path | None = None
+    """Where the editor keeps edits, films and exports; by default edits/ in the run, or beside the .ply."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
@@ -60,10 +66,10 @@ def check(options: Options) -> None:
         if options.script is None:
             raise UserError(f"--output {options.output}: a film needs --script")
         film.check_path(options.output)
-    if options.script is not None and options.output is None and options.export is None:
-        raise UserError(f"--script {options.script}: say where the result goes with --output or --export")
     if options.export is not None and options.export.suffix.lower() != ".ply":
         raise UserError(f"--export {options.export}: end the name in .ply")
+    if not 0 <= options.port <= 65535:
+        raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
     if not 0 <= options.at <= 3600:
         raise UserError(f"--at {options.at:g}: give a second of the film, from 0 to 3600")
 
@@ -91,14 +97,39 @@ def open_session(options: Options, device: str) -> EditSession:
 
 
 def open_browser(session: EditSession, options: Options) -> None:
-    """The editor's page; returns when the user is done.
+    """The editor's page; returns when the user is done (Ctrl-C).
 
     Raises:
         UserError: it cannot be shown here.
     """
-    from scgs_warp.errors import UserError
+    import secrets
+    import threading
 
-    raise UserError("edit.py: the editor in the browser is not there yet; give --script FILE.json --output FILE.mp4")
+    from scgs_warp.editor import Editor, Proxy
+
+    source = options.run if options.ply is None else options.ply.parent
+    assert source is not None
+    folder = options.folder or source / "edits"
+    key = secrets.token_urlsafe(24) if options.share else None
+    editor = Editor(session, folder, 0 if options.share else options.port, key=key)
+    proxy = None
+    try:
+        if key is None:
+            print(f"open {editor.url} in a browser; Ctrl-C ends", flush=True)
+        else:
+            proxy = Proxy(editor.port, key, public=options.port)
+            print(f"open {proxy.url} in a browser; Ctrl-C ends", flush=True)
+            print("from other machines: the same with this machine's name; whoever has the token may edit", flush=True)
+            print(
+                "what is sent is not encrypted: outside a network that you trust, forward the port over SSH", flush=True
+            )
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("the editor has ended", flush=True)
+    finally:
+        if proxy is not None:
+            proxy.stop()
+        editor.stop()
 
 
 def main(args: list[str] | None) -> None:
@@ -106,9 +137,14 @@ def main(args: list[str] | None) -> None:
 
     options = tyro.cli(Options, args=args, prog="edit.py")
     check(options)
+    browser = options.output is None and options.export is None
+    if browser:
+        from scgs_warp.editor.app import import_viser
+
+        import_viser()  # before the scene: loading may take a while
     device = prepare(options.device, options.threads)
     session = open_session(options, device)
-    if options.output is None and options.export is None:
+    if browser:
         open_browser(session, options)
         return
 

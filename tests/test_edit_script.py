@@ -215,7 +215,7 @@ def test_the_app_films_and_exports(tmp_path, ply, capsys):
         (["--ply", "missing.ply", "--script", "x", "--output", "film.mp4"], "missing.ply"),
         (["--run", "missing", "--script", "x", "--output", "film.mp4"], "missing"),
         (["--run", "a", "--output", "film.mp4"], "--script"),
-        (["--run", "a", "--script", "x"], "--output"),
+        (["--run", "a", "--port", "-1"], "--port -1"),
         (["--run", "a", "--script", "x", "--output", "film.avi"], "film.avi"),
         (["--run", "a", "--script", "x", "--export", "out.obj"], "out.obj"),
         (["--run", "a", "--nodes", "0"], "--nodes 0"),

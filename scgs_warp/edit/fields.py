@@ -28,6 +28,15 @@ def read_object(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: no such file; give an edit's JSON") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: cannot be read as UTF-8 text ({type(error).__name__}); give an edit's JSON") from None
+    return parse_object(text, str(path))
+
+
+def parse_object(text: str, path: str) -> dict[str, Any]:
+    """The JSON object in a text; ``path`` is what errors name.
+
+    Raises:
+        UserError: it is no JSON, or no object.
+    """
     try:
         content = json.loads(text, parse_constant=_no_constant, object_pairs_hook=_unique)
     except json.JSONDecodeError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -72,12 +73,30 @@ def frame_reach(session: EditSession) -> float:
     return float(np.median(moving)) / 2 * (1 + 1e-9) if len(moving) else ONE_FRAME
 
 
-def render_film(session: EditSession, output: str | Path, advance: Callable[[], None] | None = None) -> int:
+def film_frame(session: EditSession, at: float, reach: float, size: int | None = None) -> np.ndarray:
+    """[H, W, 3] uint8, the film's picture at a moment in seconds; ``reach`` is ``frame_reach``'s."""
+    camera = film_camera(session, at, size).to(session.scene.device)
+    background = session.edit.film.background
+    return to_bytes(session.render(camera, session.scene_time(at), at, background, frame=reach).rgb)
+
+
+def _at_once(draw: Callable[[], np.ndarray]) -> np.ndarray:
+    return draw()
+
+
+def render_film(
+    session: EditSession,
+    output: str | Path,
+    advance: Callable[[], None] | None = None,
+    compute: Callable[[Callable[[], np.ndarray]], np.ndarray] = _at_once,
+) -> int:
     """Write the session's film; the same edit gives the same frames as the editor shows.
 
     Args:
         output: ends in .mp4 or .gif, or a folder for numbered PNGs.
-        advance: called after each frame.
+        advance: called after each frame; what it raises ends the film, and nothing is left behind.
+        compute: calls the function that draws a frame and returns what it returned; for those who draw on another
+            thread.
 
     Returns:
         Number of frames.
@@ -89,9 +108,7 @@ def render_film(session: EditSession, output: str | Path, advance: Callable[[], 
     reach = frame_reach(session)
     with film(output, settings.fps) as writer:
         for at in moments(settings):
-            camera = film_camera(session, at).to(session.scene.device)
-            image = session.render(camera, session.scene_time(at), at, settings.background, frame=reach)
-            writer.write(to_bytes(image.rgb))
+            writer.write(compute(functools.partial(film_frame, session, at, reach)))
             if advance is not None:
                 advance()
     return settings.frames

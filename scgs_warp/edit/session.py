@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
@@ -51,6 +52,13 @@ class EditSession:
     def __len__(self) -> int:
         """Number of control points."""
         return len(self.graph)
+
+    def fork(self) -> EditSession:
+        """Another session on the same scene that begins with this one's edit and without its history. Scene, graph and
+        solutions are shared, not copied: the two may not compute at the same time."""
+        other = copy.copy(self)
+        other._past, other._future, other._before_drag = [], [], None
+        return other
 
     # The edit and its history
 
@@ -204,10 +212,14 @@ class EditSession:
         target = Target.of(
             old.translation if translation is None else translation, old.rotation if rotation is None else rotation
         )
+        self.preview(dataclasses.replace(self.edit, targets={**self.edit.targets, name: target}))
+        return target
+
+    def preview(self, edit: Edit) -> None:
+        """Make ``edit`` the present one as part of a drag: ``release`` makes one step of it all."""
         if self._before_drag is None:
             self._before_drag = self.edit
-        self.edit = dataclasses.replace(self.edit, targets={**self.edit.targets, name: target})
-        return target
+        self.edit = edit
 
     def release(self) -> None:
         """The drag is over: one step for undo."""
