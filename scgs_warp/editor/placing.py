@@ -14,6 +14,8 @@ from .model import Moment, Region
 from .views import ClientCamera
 
 PICK_SIZE = 512
+NOISE = 1e-7
+"""Half the angle in radians, below which a browser that was asked to shift has not turned."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class Place:
         shift = rotate(conjugate(self.frame), np.asarray(position, np.float64) - self.pivot)
         turn = multiply(multiply(conjugate(self.frame), np.asarray(wxyz, np.float64)), self.frame)
         checked = Target.of(shift.tolist(), turn.tolist())
+        if all(abs(part) < NOISE for part in checked.rotation[1:]):
+            return Target(checked.translation)
         return Target(checked.translation, tuple(unit(np.array(checked.rotation)).tolist()))
 
 

@@ -1,0 +1,174 @@
+"""The editor in a real browser: what a user does with mouse and buttons, seen on the screen."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from chromium import chromium
+from edit_scenes import figure_scene
+from PIL import Image
+
+from scgs_warp.edit import EditSession, render_film
+from scgs_warp.edit.script import read
+
+pytest.importorskip("viser", reason="the package viser is not installed")
+
+from scgs_warp.editor import Editor
+
+SIZE = {"width": 1000, "height": 640}
+PATIENCE = 60.0
+
+
+def until(condition: Callable[[], Any], seconds: float = PATIENCE) -> None:
+    """Wait until something is true; browsers on busy machines take their time."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+def still(editor: Editor) -> None:
+    """Wait until the picture on the screen is the last and full one."""
+    until(lambda: editor.worker.idle)
+    time.sleep(1.5)  # until the page has drawn it
+
+
+class Window:
+    """One browser window with the editor in it."""
+
+    def __init__(self, browser: Any, editor: Editor, url: str) -> None:
+        self.editor, self.problems = editor, []
+        self.page = browser.new_page(viewport=SIZE, accept_downloads=True)
+        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self.page.on("console", lambda m: self.problems.append(m.text) if m.type == "error" else None)
+        self.page.goto(url)
+        self.page.get_by_text("Undo", exact=True).wait_for(timeout=1e3 * PATIENCE)
+        until(lambda: len(editor.views))
+        still(editor)
+
+    def picture(self) -> np.ndarray:
+        """[H, W, 3] what is on the screen, left of the panel."""
+        still(self.editor)
+        image = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"), np.int32)
+        return image[160:, :590]
+
+    def press(self, name: str) -> None:
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def tab(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name, exact=True).click()
+
+    def camera(self) -> Any:
+        return self.editor.camera(next(iter(self.editor.server.get_clients().values()))).at_size(SIZE["width"])
+
+    def pixel(self, point: np.ndarray) -> tuple[float, float]:
+        """Where a point of the world is on the screen."""
+        camera = self.camera()
+        seen = camera.K @ (camera.viewmat[:3, :3] @ torch.from_numpy(point).float() + camera.viewmat[:3, 3])
+        return float(seen[0] / seen[2]), float(seen[1] / seen[2])
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        mouse = self.page.mouse
+        mouse.move(*start)
+        time.sleep(0.3)  # the gizmo notices who hovers
+        mouse.down()
+        for share in np.linspace(0, 1, 8)[1:]:
+            mouse.move(*(np.array(start) + share * (np.array(end) - start)))
+            time.sleep(0.1)
+        self.latest = len(self.editor.latency)
+        mouse.up()
+
+
+@pytest.fixture
+def editor(tmp_path) -> Iterator[Editor]:
+    made = Editor(EditSession(figure_scene(nodes=200, points=5000)[0]), tmp_path / "edits", port=0, size=512)
+    yield made
+    made.stop()
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> float:
+    """Share of the pixels that are clearly different."""
+    return float((np.abs(before - after).max(-1) > 40).mean())
+
+
+def take_arm(window: Window) -> None:
+    """Click on the end of an arm that is in sight, left of the panel."""
+    editor = window.editor
+    points = editor.session.node_positions(0.0)
+    seen = np.array([window.pixel(point) for point in points])
+    free = (seen[:, 0] < 560) & (seen[:, 1] > 300) & (seen[:, 1] < 480)
+    left = int(np.where(free, seen[:, 0], np.inf).argmin())
+    window.page.mouse.click(seen[left, 0] + 4, seen[left, 1])
+    until(lambda: editor.model.selection)
+    until(lambda: editor.overlays.gizmo.visible)
+    still(editor)
+
+
+def pull(window: Window, away: float = 90.0) -> None:
+    """Drag the gizmo by its upward arrow."""
+    gizmo, reach = window.editor.overlays.gizmo, window.editor.overlays.reach
+    window.page.mouse.move(10, 630)
+    start = window.pixel(np.array(gizmo.position) + np.array([0, 0, 0.9 * reach]))
+    base = np.array(window.pixel(np.array(gizmo.position)))
+    step = (np.array(start) - base) / np.linalg.norm(np.array(start) - base)
+    window.drag(start, tuple(np.array(start) + away * step))
+    until(lambda: not window.editor.model.dragging)
+
+
+def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
+    with chromium() as browser:
+        window = Window(browser, editor, editor.url)
+        session, model = editor.session, editor.model
+        begin = window.picture()
+        assert changed(begin, np.zeros_like(begin)) > 0.1, "the scene is on the screen"
+
+        take_arm(window)
+        chosen = window.picture()
+        pull(window)
+        assert len(session.edit.handles) == 1 and session.edit.pins
+        lifted = session.edit.targets["handle 1"].translation
+        assert lifted[2] > 0.05 and editor.latency, "the gizmo's arrow lifts the handle"
+        moved = window.picture()
+        assert changed(chosen, moved) > 0.005
+
+        window.press("Undo")
+        until(lambda: not session.edit.handles)
+        assert changed(chosen, window.picture()) < 0.25 * changed(chosen, moved)
+        window.press("Redo")
+        until(lambda: session.edit.handles)
+
+        window.tab("Film")
+        window.press("Add keyframe here")
+        until(lambda: len(session.edit.keyframes) == 1)
+        window.page.get_by_label("Seconds").fill("0.5")
+        window.page.get_by_label("Frames a second").fill("8")
+        until(lambda: session.edit.film.seconds == 0.5 and session.edit.film.fps == 8)
+        window.page.get_by_label("Longer side").fill("64")
+        until(lambda: session.edit.film.size == 64)
+        model.seek(0.5)
+        pull(window, -60.0)
+        window.press("Add keyframe here")
+        until(lambda: len(session.edit.keyframes) == 2)
+
+        window.tab("Files")
+        window.press("Export film")
+        until(lambda: (editor.folder / "edit.mp4").is_file())
+        window.press("Save edit")
+        until(lambda: (editor.folder / "edit.json").is_file())
+        window.press("Screenshot")
+        until(lambda: (editor.folder / "edit.png").is_file())
+        assert window.problems == []
+
+    assert read(editor.folder / "edit.json", session) == session.edit
+    script = EditSession(figure_scene(nodes=200, points=5000)[0])
+    script.load(editor.folder / "edit.json")
+    assert render_film(script, tmp_path / "script.mp4") == 4
+    assert (tmp_path / "script.mp4").read_bytes() == (editor.folder / "edit.mp4").read_bytes()
+    shown = np.asarray(Image.open(editor.folder / "edit.png"))
+    assert shown.shape == (640, 1000, 3)
