@@ -16,10 +16,10 @@ from PIL import Image
 
 from scgs_warp.edit import EditSession, render_film
 from scgs_warp.edit.script import read
+from scgs_warp.editor import Editor, Proxy
+from scgs_warp.errors import UserError
 
 pytest.importorskip("viser", reason="the package viser is not installed")
-
-from scgs_warp.editor import Editor
 
 SIZE = {"width": 1000, "height": 640}
 PATIENCE = 60.0
@@ -63,6 +63,10 @@ class Window:
 
     def tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name, exact=True).click()
+
+    def field(self, label: str) -> Any:
+        """The input beside a label."""
+        return self.page.locator(f"xpath=//*[text()='{label}']/following::input[1]")
 
     def camera(self) -> Any:
         return self.editor.camera(next(iter(self.editor.server.get_clients().values()))).at_size(SIZE["width"])
@@ -146,10 +150,10 @@ def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
         window.tab("Film")
         window.press("Add keyframe here")
         until(lambda: len(session.edit.keyframes) == 1)
-        window.page.get_by_label("Seconds").fill("0.5")
-        window.page.get_by_label("Frames a second").fill("8")
+        window.field("Seconds").fill("0.5")
+        window.field("Frames a second").fill("8")
         until(lambda: session.edit.film.seconds == 0.5 and session.edit.film.fps == 8)
-        window.page.get_by_label("Longer side").fill("64")
+        window.field("Longer side").fill("64")
         until(lambda: session.edit.film.size == 64)
         model.seek(0.5)
         pull(window, -60.0)
@@ -172,3 +176,53 @@ def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
     assert (tmp_path / "script.mp4").read_bytes() == (editor.folder / "edit.mp4").read_bytes()
     shown = np.asarray(Image.open(editor.folder / "edit.png"))
     assert shown.shape == (640, 1000, 3)
+
+
+def test_mistakes_are_said_and_the_shared_editor_survives(tmp_path):
+    key = "between the two"
+    editor = Editor(EditSession(figure_scene(nodes=100, points=2000)[0]), tmp_path, port=0, size=256, key=key)
+    proxy = Proxy(editor.port, key, "127.0.0.1")
+    session, model = editor.session, editor.model
+
+    def says(window: Window, words: str) -> None:
+        window.page.get_by_text(words).first.wait_for(timeout=1e3 * PATIENCE)
+
+    try:
+        with chromium() as browser:
+            window = Window(browser, editor, proxy.url)
+            assert proxy.token not in window.page.url
+            window.press("Undo")
+            says(window, "nothing to undo")
+            window.press("Grow")
+            says(window, "click on the picture first")
+            window.tab("Film")
+            window.press("Add keyframe here")
+            says(window, "a keyframe needs a handle")
+            window.tab("Files")
+            window.field("Name").fill("../../outside")
+            until(lambda: editor.panel.files.name.value == "../../outside")
+            window.press("Save edit")
+            says(window, "take letters, digits")
+            assert list(tmp_path.rglob("*.json")) == []
+
+            take_arm(window)
+            place = editor._place[0]
+            with pytest.raises(UserError, match="finite"):
+                editor._gizmo("start", np.zeros(3), np.array([1.0, 0, 0, 0]))
+                editor._gizmo("update", np.array([np.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
+            editor._gizmo("update", place.pivot + np.array([0, 0, 1000.0]), np.array([1.0, 0, 0, 0]))
+            editor._gizmo("end", place.pivot, np.array([1.0, 0, 0, 0]))
+            still(editor)
+            assert session.edit.targets["handle 1"].translation == pytest.approx((0, 0, 1000))
+            model.undo()
+            assert not session.edit.handles
+            window.tab("View")
+            window.field("Show").click()
+            window.page.get_by_role("option", name="side by side").click()
+            until(lambda: model.show == "side by side")
+            halves = window.picture()
+            assert (halves[:, 495:506].max(axis=(1, 2)) > 60).all(), "a line between the halves"
+            assert window.problems == []
+    finally:
+        proxy.stop()
+        editor.stop()

@@ -70,7 +70,6 @@ class Model:
         """Overlays are seen through the surface."""
         self.show: Show = "edited"
         self.at = 0.0
-        self.speed = 1.0
         self.dragging = False
         self._following = False
         self._played_from: tuple[float, float] | None = None
@@ -120,7 +119,7 @@ class Model:
             now = time.monotonic() if now is None else now
             fps = self.session.edit.film.fps
             length = max(self.seconds, 1.0 / fps)
-            self.at = int((begin + self.speed * (now - start)) % length * fps) / fps
+            self.at = int((begin + now - start) % length * fps + 1e-6) / fps
 
     def moment(self) -> Moment:
         with self.lock:

@@ -38,6 +38,7 @@ class Place:
         Raises:
             UserError: a number is not finite.
         """
+        Target.of(position.tolist(), wxyz.tolist())  # broken numbers are named as the browser sent them
         shift = rotate(conjugate(self.frame), np.asarray(position, np.float64) - self.pivot)
         turn = multiply(multiply(conjugate(self.frame), np.asarray(wxyz, np.float64)), self.frame)
         checked = Target.of(shift.tolist(), turn.tolist())
