@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,10 @@ from PIL import Image
 from scgs_warp.edit import EditSession, render_film
 from scgs_warp.edit.script import read
 from scgs_warp.editor import Editor, Proxy
+from scgs_warp.editor.placing import surface_point
+from scgs_warp.editor.views import ClientCamera
 from scgs_warp.errors import UserError
+from scgs_warp.types import Camera
 
 pytest.importorskip("viser", reason="the package viser is not installed")
 
@@ -53,10 +57,10 @@ class Window:
         still(editor)
 
     def picture(self) -> np.ndarray:
-        """[H, W, 3] what is on the screen, left of the panel."""
+        """[H, W, 3] what is on the screen beside the panel."""
         still(self.editor)
         image = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"), np.int32)
-        return image[160:, :590]
+        return image[160:, : self.client().width]  # below what it says of WebGL in software
 
     def press(self, name: str) -> None:
         self.page.get_by_role("button", name=name, exact=True).click()
@@ -64,12 +68,23 @@ class Window:
     def tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name, exact=True).click()
 
+    def hush(self) -> None:
+        """Close what lies over the picture."""
+        buttons = self.page.locator(".mantine-Notification-closeButton")
+        while buttons.count():
+            with suppress(Exception):  # it may have closed by itself
+                buttons.first.click(timeout=1000)
+
     def field(self, label: str) -> Any:
         """The input beside a label."""
         return self.page.locator(f"xpath=//*[text()='{label}']/following::input[1]")
 
-    def camera(self) -> Any:
-        return self.editor.camera(next(iter(self.editor.server.get_clients().values()))).at_size(SIZE["width"])
+    def client(self) -> ClientCamera:
+        return self.editor.camera(next(iter(self.editor.server.get_clients().values())))
+
+    def camera(self) -> Camera:
+        client = self.client()
+        return client.at_size(max(client.width, client.height))
 
     def pixel(self, point: np.ndarray) -> tuple[float, float]:
         """Where a point of the world is on the screen."""
@@ -102,13 +117,20 @@ def changed(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def take_arm(window: Window) -> None:
-    """Click on the end of an arm that is in sight, left of the panel."""
+    """Click on what sticks out to the left, at half the figure's height."""
     editor = window.editor
-    points = editor.session.node_positions(0.0)
-    seen = np.array([window.pixel(point) for point in points])
-    free = (seen[:, 0] < 560) & (seen[:, 1] > 300) & (seen[:, 1] < 480)
-    left = int(np.where(free, seen[:, 0], np.inf).argmin())
-    window.page.mouse.click(seen[left, 0] + 4, seen[left, 1])
+    window.hush()
+    camera, moment = window.client(), editor.model.moment()
+    seen = np.array([window.pixel(point) for point in editor.session.node_positions(0.0)])
+    seen = seen[(seen[:, 1] > 300) & (seen[:, 1] < 480)]
+
+    def hit() -> np.ndarray:
+        ordered = seen[seen[:, 0].argsort()] + [5, 0]
+        screens = ordered / [camera.width, camera.height]
+        met = (surface_point(editor.session, camera, tuple(screen), moment) is not None for screen in screens)
+        return next(pixel for pixel, good in zip(ordered, met) if good)
+
+    window.page.mouse.click(*editor.worker.call(hit))
     until(lambda: editor.model.selection)
     until(lambda: editor.overlays.gizmo.visible)
     still(editor)
@@ -165,6 +187,7 @@ def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
         until(lambda: (editor.folder / "edit.mp4").is_file())
         window.press("Save edit")
         until(lambda: (editor.folder / "edit.json").is_file())
+        window_size = window.client().width, window.client().height
         window.press("Screenshot")
         until(lambda: (editor.folder / "edit.png").is_file())
         assert window.problems == []
@@ -175,7 +198,7 @@ def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
     assert render_film(script, tmp_path / "script.mp4") == 4
     assert (tmp_path / "script.mp4").read_bytes() == (editor.folder / "edit.mp4").read_bytes()
     shown = np.asarray(Image.open(editor.folder / "edit.png"))
-    assert shown.shape == (640, 1000, 3)
+    assert shown.shape == (window_size[1], window_size[0], 3)
 
 
 def test_mistakes_are_said_and_the_shared_editor_survives(tmp_path):
@@ -221,7 +244,8 @@ def test_mistakes_are_said_and_the_shared_editor_survives(tmp_path):
             window.page.get_by_role("option", name="side by side").click()
             until(lambda: model.show == "side by side")
             halves = window.picture()
-            assert (halves[:, 495:506].max(axis=(1, 2)) > 60).all(), "a line between the halves"
+            middle = halves.shape[1] // 2
+            assert (halves[:, middle - 5 : middle + 6].max(axis=(1, 2)) > 60).all(), "a line between the halves"
             assert window.problems == []
     finally:
         proxy.stop()

@@ -104,6 +104,7 @@ class Editor:
         """The scene's own up, camera and overlays."""
         server, overview = self.server, self.session.scene.overview
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
+        server.gui.main_panel.dock_right()  # beside the picture, not over it
         server.scene.world_axes.visible = False
         server.scene.set_up_direction(overview.up)
         start = orbit_camera(overview, overview.azimuth, 256)

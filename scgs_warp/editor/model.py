@@ -147,8 +147,8 @@ class Model:
     def _check(self) -> None:
         """Forget what is no longer there."""
         edit = self.session.edit
-        if self.active is not None and edit.handle(self.active) is None:
-            self.active = None
+        if edit.handle(self.active or "") is None:
+            self.active = self._holder()
         self.at = min(self.at, self.seconds)
         self._following = self._following and bool(edit.keyframes)
 
@@ -196,7 +196,6 @@ class Model:
             if self.active is None:
                 raise UserError("no handle is chosen; click on what it holds first")
             session.remove_handle(self.active)
-            self.active = None
 
     # Selecting
 
@@ -205,8 +204,13 @@ class Model:
             old, new = set(self.selection), set(nodes)
             chosen = {"replace": new, "add": old | new, "subtract": old - new}[how]
             self.selection = tuple(sorted(chosen))
-            self.active = None
+            self.active = self._holder()
         self.changed()
+
+    def _holder(self) -> str | None:
+        """The handle that holds just what is selected: nobody wants a second one there."""
+        handles = self.session.edit.handles
+        return next((handle.name for handle in handles if handle.nodes == self.selection), None)
 
     def activate(self, name: str | None) -> None:
         """Take an existing handle in hand."""

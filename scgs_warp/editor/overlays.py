@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 PLAIN, CHOSEN, HELD, PINNED = (235, 235, 235), (255, 190, 0), (60, 170, 255), (150, 70, 70)
 EDGE = (120, 120, 130)
-GIZMO = 0.22
+GIZMO = 0.16
 """Length of the gizmo's arrows, in distances of the cameras from the scene."""
 
 

@@ -89,8 +89,9 @@ class Panel:
     def _said(self) -> str:
         model = self.editor.model
         edit = model.session.edit
-        chosen = f"handle **{model.active}**" if model.active else f"{len(model.selection)} control points chosen"
-        return f"{chosen}; {len(edit.handles)} handles, {len(edit.pins)} pinned, {len(edit.keyframes)} keyframes"
+        chosen = f"**{model.active}**" if model.active else f"{len(model.selection)} control points chosen"
+        counts = f"handles: {len(edit.handles)}, pinned: {len(edit.pins)}, keyframes: {len(edit.keyframes)}"
+        return f"{chosen}; {counts}"
 
     # Jobs
 
