@@ -23,7 +23,7 @@ from . import placing
 from .model import Combine, Model, Moment
 from .overlays import GIZMO, Overlays
 from .panel import Panel
-from .picture import Picture, take
+from .picture import FINE_QUALITY, QUALITY, Picture, take
 from .proxy import guarded
 from .views import FULL, ClientCamera, Pace, Views
 from .worker import Worker
@@ -209,7 +209,7 @@ class Editor:
             step = 2 if quality == FULL else 1
             depth = picture.depth[::step, ::step] + 0.5 * self.edge_length  # control points lie inside what they move
         client.scene.set_background_image(
-            picture.rgb, format="jpeg", jpeg_quality=90 if quality == FULL else 75, depth=depth
+            picture.rgb, format="jpeg", jpeg_quality=FINE_QUALITY if quality == FULL else QUALITY, depth=depth
         )
         client.flush()
         took = time.perf_counter() - begin

@@ -13,8 +13,8 @@ from ..types import Image
 from .model import Moment
 from .views import ClientCamera
 
-BEYOND = 100.0
-"""Depth of the background, in the browser's range: 0 to 167."""
+QUALITY, FINE_QUALITY = 75, 90
+"""Of the JPEG while something moves, and when all is still."""
 
 
 class Picture(NamedTuple):
