@@ -140,8 +140,9 @@ def pull(window: Window, away: float = 90.0) -> None:
     """Drag the gizmo by its upward arrow."""
     gizmo, reach = window.editor.overlays.gizmo, window.editor.overlays.reach
     window.page.mouse.move(10, 630)
-    start = window.pixel(np.array(gizmo.position) + np.array([0, 0, 0.9 * reach]))
-    base = np.array(window.pixel(np.array(gizmo.position)))
+    world = window.editor.display.world
+    start = window.pixel(world(gizmo.position + np.array([0, 0, 0.9 * reach])))
+    base = np.array(window.pixel(world(gizmo.position)))
     step = (np.array(start) - base) / np.linalg.norm(np.array(start) - base)
     window.drag(start, tuple(np.array(start) + away * step))
     until(lambda: not window.editor.model.dragging)

@@ -20,6 +20,7 @@ from ..edit import EditSession, Target
 from ..edit.handles import STAY
 from ..errors import UserError
 from . import placing
+from .display import RADIUS, Display
 from .model import Combine, Model, Moment
 from .overlays import GIZMO, Overlays
 from .panel import Panel
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 HOST = "127.0.0.1"
 QUICK, PATIENT = 0.11, 0.8
 """Seconds that a picture may take while something moves, and when all is still."""
-DEEPEST = 150.0
-"""The browser knows depths up to 167; scenes larger than this are drawn without, and overlays lie on top."""
 
 
 def import_viser() -> Any:
@@ -80,7 +79,7 @@ class Editor:
         self.latency: list[float] = []
         self._dragged_at: float | None = None
         self._place: tuple[placing.Place, Target] | None = None
-        self._depth = session.scene.overview.radius * 4 < DEEPEST
+        self.display = Display.of(session.scene.overview)
         with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # its banner names the wrong door
             self.server: viser.ViserServer = viser.ViserServer(HOST, port, label="scgs_warp", verbose=False)
         self.port: int = self.server.get_port()
@@ -108,18 +107,15 @@ class Editor:
         server.scene.world_axes.visible = False
         server.scene.set_up_direction(overview.up)
         start = orbit_camera(overview, overview.azimuth, 256)
-        server.initial_camera.position = tuple(start.position.tolist())  # type: ignore[assignment]
-        server.initial_camera.look_at = overview.centre
-        server.initial_camera.up = overview.up
-        server.initial_camera.fov = 2 * float(np.arctan(start.height / (2 * float(start.K[1, 1]))))
-        server.initial_camera.near = 0.01 * overview.radius
-        server.initial_camera.far = 100.0 * overview.radius
-        points = self.session.node_positions(0.0)
-        unit = self.session.graph.edge_length / self.session.engine.units[1]
-        self.node_size = 0.16 * unit
-        self.edge_length = unit
-        reach = GIZMO * overview.radius
-        self.overlays = Overlays(server, self.session.graph.edges, points, self.node_size, reach)
+        camera = server.initial_camera
+        camera.position = tuple(self.display.show(start.position.numpy()).tolist())  # type: ignore[assignment]
+        camera.look_at, camera.up = (0.0, 0.0, 0.0), overview.up
+        camera.fov = 2 * float(np.arctan(start.height / (2 * float(start.K[1, 1]))))
+        camera.near, camera.far = 0.01 * RADIUS, 100.0 * RADIUS
+        self.edge_length = self.session.graph.edge_length / self.session.engine.units[1]
+        self.node_size = 0.16 * self.edge_length * self.display.scale
+        points = self.display.show(self.session.node_positions(0.0))
+        self.overlays = Overlays(server, self.session.graph.edges, points, self.node_size, GIZMO * RADIUS)
         self.overlays.gizmo.on_update(self._gizmo_moved)
         scene = server.scene
         for modifier, how in ((None, None), ("shift", "add"), ("cmd/ctrl", "subtract")):
@@ -139,7 +135,7 @@ class Editor:
         if client.client_id not in self.server.get_clients():
             return
         with self.worker.changing() as views:
-            views.move(client.client_id, camera_of(client), time.monotonic())
+            views.move(client.client_id, self.camera(client), time.monotonic())
 
     def refresh(self) -> None:
         """Something changed: new pictures for everybody."""
@@ -185,8 +181,15 @@ class Editor:
     # Pictures
 
     def camera(self, client: viser.ClientHandle) -> ClientCamera:
-        """A client's view as it is now."""
-        return camera_of(client)
+        """A client's view as it is now, in world units."""
+        camera = client.camera
+        try:
+            width, height = int(camera.image_width), int(camera.image_height)
+        except (TypeError, ValueError, OverflowError):
+            width = height = 0
+        position = self.display.world(np.asarray(camera.position, np.float64))
+        wxyz = np.asarray(camera.wxyz, np.float64)
+        return ClientCamera(tuple(wxyz.tolist()), tuple(position.tolist()), float(camera.fov), width, height)
 
     def take(self, moment: Moment, camera: ClientCamera) -> Picture:
         """A picture in full; on the worker's thread."""
@@ -204,10 +207,10 @@ class Editor:
         pace = self.full if quality == FULL else self.quick
         begin = time.perf_counter()
         picture = take(self.session, moment, camera, min(pace.size, max(camera.width, camera.height)))
-        depth = None
-        if self._depth and not self.model.through:
-            step = 2 if quality == FULL else 1
-            depth = picture.depth[::step, ::step] + 0.5 * self.edge_length  # control points lie inside what they move
+        depth = self.display.nothing
+        if not self.model.through:
+            behind = 0.5 * self.edge_length * self.display.scale  # control points lie inside what they move
+            depth = self.display.depth(picture.depth, behind, 2 if quality == FULL else 1)
         client.scene.set_background_image(
             picture.rgb, format="jpeg", jpeg_quality=FINE_QUALITY if quality == FULL else QUALITY, depth=depth
         )
@@ -222,7 +225,8 @@ class Editor:
 
     def _follow(self, moment: Moment) -> None:
         """Overlays and panel, after the picture."""
-        self.overlays.move(self.session.node_positions(moment.time, moment.at, live=moment.live))
+        points = self.session.node_positions(moment.time, moment.at, live=moment.live)
+        self.overlays.move(self.display.show(points))
         self._place_gizmo(moment)
         self.panel.show_time()
         again = self.model.playing or (moment.live and not self.session.engine.settled(self.session.edit))
@@ -244,7 +248,8 @@ class Editor:
             target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
             self._place = placing.place_of(self.session, handle, moment.time), target
         place, target = self._place
-        self.overlays.place(place.pose(target))
+        position, wxyz = place.pose(target)
+        self.overlays.place((self.display.show(position), wxyz))
 
     # What users do in the picture
 
@@ -257,7 +262,7 @@ class Editor:
         how = how or model.combine
 
         def find() -> tuple[int, ...]:
-            point = placing.surface_point(self.session, camera_of(client), screen, moment)
+            point = placing.surface_point(self.session, self.camera(client), screen, moment)
             return () if point is None else placing.region_at(self.session, point, model.region, moment)
 
         nodes = self.worker.call(find)
@@ -270,7 +275,7 @@ class Editor:
     async def _gizmo_moved(self, event: Any) -> None:
         """On the server's loop, in order; nothing here waits for a solution."""
         try:
-            self._gizmo(event.phase, np.array(event.target.position), np.array(event.target.wxyz))
+            self._gizmo(event.phase, self.display.world(event.target.position), np.array(event.target.wxyz))
         except UserError as error:
             self.say(event.client, "That does not work", str(error))
 
@@ -298,13 +303,3 @@ class Editor:
             self.model.drag(target)
         finally:
             self.model.release()
-
-
-def camera_of(client: viser.ClientHandle) -> ClientCamera:
-    camera = client.camera
-    try:
-        width, height = int(camera.image_width), int(camera.image_height)
-    except (TypeError, ValueError, OverflowError):
-        width = height = 0
-    position, wxyz = (tuple(np.asarray(x, np.float64).tolist()) for x in (camera.position, camera.wxyz))
-    return ClientCamera(wxyz, position, float(camera.fov), width, height)

@@ -24,11 +24,13 @@ def node_colors(count: int, chosen: Any, held: Any, pins: Any) -> np.ndarray:
 
 
 class Overlays:
-    """What is drawn over the picture, the same for all clients.
+    """What is drawn over the picture, the same for all clients. All in the browser's units.
 
     Args:
-        size: of a control point, world units.
-        reach: length of the gizmo, world units.
+        edges: [E, 2] of the graph.
+        points: [M, 3] control points.
+        size: of a control point.
+        reach: length of the gizmo.
     """
 
     def __init__(self, server: viser.ViserServer, edges: np.ndarray, points: np.ndarray, size: float, reach: float):
@@ -48,7 +50,7 @@ class Overlays:
         )  # fmt: skip
 
     def move(self, points: np.ndarray) -> None:
-        """[M, 3] where control points are now, world; broken ones stay."""
+        """[M, 3] where control points are now; broken ones stay."""
         points = np.where(np.isfinite(points), points, self._points)
         if not np.array_equal(points, self._points):
             self._points = points
