@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 HOST = "127.0.0.1"
 QUICK, PATIENT = 0.11, 0.8
 """Seconds that a picture may take while something moves, and when all is still."""
+REPEAT = 1.5
+"""Seconds in which the same message is not shown again."""
 
 
 def import_viser() -> Any:
@@ -77,6 +79,8 @@ class Editor:
         self.worker = Worker(self.views, self._draw, lambda: self.model.busy)
         self.model = Model(session, self.refresh)
         self.latency: list[float] = []
+        self._said: dict[str, float] = {}
+        self._dragger: int | None = None
         self._dragged_at: float | None = None
         self._place: tuple[placing.Place, Target] | None = None
         self.display = Display.of(session.scene.overview)
@@ -128,6 +132,9 @@ class Editor:
         self._moved(client)
 
     def _leave(self, client: viser.ClientHandle) -> None:
+        if client.client_id == self._dragger:  # a window that was closed in the middle of a drag
+            self._dragger = None
+            self.model.release()
         with self.worker.changing() as views:
             views.drop(client.client_id)
 
@@ -143,7 +150,11 @@ class Editor:
             views.change(time.monotonic())
 
     def say(self, client: viser.ClientHandle | None, title: str, text: str, color: str = "red") -> None:
-        """A notification, to one client or to all."""
+        """A notification, to one client or to all; the same again only after a while, as drags repeat mistakes."""
+        now = time.monotonic()
+        if now - self._said.get(text, -np.inf) < REPEAT:
+            return
+        self._said = {said: at for said, at in self._said.items() if now - at < REPEAT} | {text: now}
         everybody = self.server.get_clients().values()
         for one in [client] if client is not None else list(everybody):
             one.add_notification(title, text, auto_close_seconds=8.0, color=color)  # type: ignore[arg-type]
@@ -162,11 +173,15 @@ class Editor:
             except CancelledError:
                 pass
             except Exception as error:
-                traceback.print_exc(file=sys.stderr)
-                self.say(event.client, "Internal error", f"{type(error).__name__}: {error}; the edit is as it was")
+                self._failed(event.client, error)
             self.panel.show()
 
         return callback
+
+    def _failed(self, client: viser.ClientHandle | None, error: Exception) -> None:
+        """Our mistake, while it is being handled."""
+        traceback.print_exc(file=sys.stderr)
+        self.say(client, "Internal error", f"{type(error).__name__}: {error}")
 
     def on_value(self, handle: Any, action: Callable[[Any], Any]) -> Any:
         """The handle of a control; whenever a user changes its value, ``action`` is called with it."""
@@ -273,11 +288,16 @@ class Editor:
             model.select(nodes, how)
 
     async def _gizmo_moved(self, event: Any) -> None:
-        """On the server's loop, in order; nothing here waits for a solution."""
+        """On the server's loop, in order; nothing here waits for a solution. One client drags at a time."""
+        if self._dragger not in (None, event.client_id):
+            return
+        self._dragger = None if event.phase == "end" else event.client_id
         try:
             self._gizmo(event.phase, self.display.world(event.target.position), np.array(event.target.wxyz))
         except UserError as error:
             self.say(event.client, "That does not work", str(error))
+        except Exception as error:
+            self._failed(event.client, error)
 
     def _gizmo(self, phase: str, position: np.ndarray, wxyz: np.ndarray) -> None:
         if self._place is None:

@@ -65,7 +65,9 @@ class ShapeSection:
             self.handle = on(
                 gui.add_dropdown("Handle", (NEW,)), lambda name: model.activate(None if name == NEW else name)
             )
-            self.move = on(gui.add_vector3("Move", (0.0, 0.0, 0.0), step=0.01), self._moved)
+            self.move = on(
+                gui.add_vector3("Move", (0.0, 0.0, 0.0), step=_round(0.1 * self.editor.edge_length)), self._moved
+            )
             self.turn = on(
                 gui.add_vector3(
                     "Turn, degrees", (0.0, 0.0, 0.0), step=1.0, hint="About x, y and z at once: an axis times an angle"
@@ -162,3 +164,8 @@ class ShapeSection:
         self.move.value = target.translation
         self.turn.value = tuple(np.degrees(logarithm(np.array(target.rotation))).tolist())
         self.rest.value = model.pin_rings is not None
+
+
+def _round(length: float) -> float:
+    """The power of ten below it: a step that suits the scene."""
+    return 10.0 ** math.floor(math.log10(length)) if length > 0 else 0.01
