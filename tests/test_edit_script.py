@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import sys
 from pathlib import Path
 
 import cv2
@@ -237,3 +238,9 @@ def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
     assert app.cli(arguments) == 2
     assert "film.fps" in capsys.readouterr().err and not (tmp_path / "film.mp4").exists()
     assert open_ply(ply).gaussian_count == 300
+
+
+def test_without_viser_the_editor_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert app.cli(["--run", str(tmp_path)]) == 2
+    assert "pip install 'scgs_warp[edit]'" in capsys.readouterr().err

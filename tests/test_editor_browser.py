@@ -116,8 +116,8 @@ def changed(before: np.ndarray, after: np.ndarray) -> float:
     return float((np.abs(before - after).max(-1) > 40).mean())
 
 
-def take_arm(window: Window) -> None:
-    """Click on what sticks out to the left, at half the figure's height."""
+def take_arm(window: Window, key: str = "") -> None:
+    """Click on what sticks out to the left, at half the figure's height, while a key is held."""
     editor = window.editor
     window.hush()
     camera, moment = window.client(), editor.model.moment()
@@ -130,7 +130,12 @@ def take_arm(window: Window) -> None:
         met = (surface_point(editor.session, camera, tuple(screen), moment) is not None for screen in screens)
         return next(pixel for pixel, good in zip(ordered, met) if good)
 
-    window.page.mouse.click(*editor.worker.call(hit))
+    where = editor.worker.call(hit)
+    if key:
+        window.page.keyboard.down(key)
+    window.page.mouse.click(*where)
+    if key:
+        window.page.keyboard.up(key)
     until(lambda: editor.model.selection)
     until(lambda: editor.overlays.gizmo.visible)
     still(editor)
@@ -191,6 +196,18 @@ def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
         window_size = window.client().width, window.client().height
         window.press("Screenshot")
         until(lambda: (editor.folder / "edit.png").is_file())
+        window.press("Export PLY")
+        until(lambda: (editor.folder / "edit.ply").is_file())
+        edit = session.edit
+        window.press("Reset")
+        until(lambda: not session.edit.handles)
+        window.press("Load edit")
+        until(lambda: session.edit == edit)
+        model.seek(0.0)
+        window.press("Play")
+        until(lambda: model.at > 0.2)
+        window.press("Pause")
+        until(lambda: not model.playing)
         assert window.problems == []
 
     assert read(editor.folder / "edit.json", session) == session.edit
@@ -238,8 +255,11 @@ def test_mistakes_are_said_and_the_shared_editor_survives(tmp_path):
             editor._gizmo("end", place.pivot, np.array([1.0, 0, 0, 0]))
             still(editor)
             assert session.edit.targets["handle 1"].translation == pytest.approx((0, 0, 1000))
-            model.undo()
-            assert not session.edit.handles
+            window.page.mouse.click(5, 600)
+            until(lambda: not model.selection)
+            window.page.keyboard.press("Control+z")
+            until(lambda: not session.edit.handles)
+            take_arm(window, "Shift")
             window.tab("View")
             window.field("Show").click()
             window.page.get_by_role("option", name="side by side").click()

@@ -74,7 +74,7 @@ def test_a_drag_is_one_step(model):
 
 
 def test_without_a_selection_nothing_is_held(model):
-    with pytest.raises(UserError, match="choose some first"):
+    with pytest.raises(UserError, match="nothing is chosen"):
         model.grab(STAY)
     assert not model.dragging and not model.session.edit.handles and not model.undo()
 
@@ -214,6 +214,28 @@ def test_handles_are_changed_reset_and_removed(model):
     model.undo()
     model.reset()
     assert not model.session.edit.handles and not model.session.edit.pins
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"film": Film(seconds=math.nan)}, "film"),
+        ({"film": Film(fps=0.0)}, "film.fps"),
+        ({"film": Film(size=10**9)}, "film.size"),
+        ({"playback": Playback(speed=math.inf)}, "playback"),
+        ({"playback": Playback(repeat="never")}, "playback.repeat"),
+    ],
+)
+def test_what_a_page_sends_is_checked(model, fields, words):
+    before = model.session.edit
+    with pytest.raises(UserError, match=words):
+        model.replace(**fields)
+    model.select(chosen(model))
+    model.grab(STAY)
+    model.release()
+    with pytest.raises(UserError, match="lasts"):
+        model.change_handle(lasts="for ever")
+    assert model.undo() and model.session.edit == before
 
 
 def test_clicks_meet_the_surface(model):

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import http.client
+import re
+import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
 from edit_scenes import bar_scene
 
+from scgs_warp.data.gaussian_ply import write_gaussian_ply
 from scgs_warp.edit import EditSession
 from scgs_warp.editor import Editor, Proxy
 from scgs_warp.editor.proxy import COOKIE, KEY, guarded, is_local, parse_head, same_origin
@@ -187,3 +192,24 @@ def test_a_server_that_cannot_be_guarded_is_refused():
 def test_a_port_that_is_taken(shared):
     with pytest.raises(UserError, match=f"--port {shared.public}"):
         Proxy(1, "key", "127.0.0.1", shared.public)
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_the_app_serves_until_it_is_interrupted(tmp_path, share):
+    ply = tmp_path / "scene.ply"
+    write_gaussian_ply(ply, bar_scene().gaussians_at(0.0))
+    command = [sys.executable, "-m", "scgs_warp.apps.edit", "--ply", str(ply), "--nodes", "40", "--port", "0"]
+    process = subprocess.Popen(
+        [*command, *(["--share"] if share else [])], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        said = re.search(r"http://127\.0\.0\.1:(\d+)/?(\S*)", process.stdout.readline())
+        assert said is not None and ("token=" in said[2]) == share
+        port = int(said[1])
+        assert get(port, "/").status == (403 if share else 200)
+        assert get(port, f"/{said[2]}").status == (303 if share else 200)
+        process.send_signal(signal.SIGINT)
+        assert "has ended" in process.communicate(timeout=60)[0] and process.returncode == 0
+    finally:
+        process.kill()
+        process.wait()

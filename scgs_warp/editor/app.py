@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 HOST = "127.0.0.1"
 QUICK, PATIENT = 0.11, 0.8
 """Seconds that a picture may take while something moves, and when all is still."""
+LARGEST = 4096
+"""Pixels of a screenshot's longer side, whatever a page says of its window."""
 REPEAT = 1.5
 """Seconds in which the same message is not shown again."""
 
@@ -80,6 +82,9 @@ class Editor:
         self.model = Model(session, self.refresh)
         self.latency: list[float] = []
         self._said: dict[str, float] = {}
+        self._first = True
+        """No picture was drawn yet."""
+        self._waiting: dict[int, Any] = {}
         self._dragger: int | None = None
         self._dragged_at: float | None = None
         self._place: tuple[placing.Place, Target] | None = None
@@ -128,6 +133,9 @@ class Editor:
     # Clients
 
     def _arrive(self, client: viser.ClientHandle) -> None:
+        if self._first:
+            text = "Kernels are compiled when they are needed first; that may take a minute."
+            self._waiting[client.client_id] = client.add_notification("Drawing the scene", text, loading=True)
         client.camera.on_update(lambda camera: self._moved(client))
         self._moved(client)
 
@@ -135,6 +143,7 @@ class Editor:
         if client.client_id == self._dragger:  # a window that was closed in the middle of a drag
             self._dragger = None
             self.model.release()
+        self._waiting.pop(client.client_id, None)
         with self.worker.changing() as views:
             views.drop(client.client_id)
 
@@ -208,7 +217,7 @@ class Editor:
 
     def take(self, moment: Moment, camera: ClientCamera) -> Picture:
         """A picture in full; on the worker's thread."""
-        return take(self.session, moment, camera, max(camera.width, camera.height))
+        return take(self.session, moment, camera, min(max(camera.width, camera.height), LARGEST))
 
     def _draw(self, number: int, quality: str) -> None:
         """On the worker's thread."""
@@ -230,6 +239,10 @@ class Editor:
             picture.rgb, format="jpeg", jpeg_quality=FINE_QUALITY if quality == FULL else QUALITY, depth=depth
         )
         client.flush()
+        self._first = False
+        waiting = self._waiting.pop(number, None)
+        if waiting is not None:
+            waiting.remove()
         took = time.perf_counter() - begin
         pace.took(took)
         if asked is not None and asked == self._dragged_at:
@@ -253,7 +266,7 @@ class Editor:
         if model.dragging:
             return
         handle = self.session.edit.handle(model.active or "")
-        if moment.show == "side by side" or (handle is None and not model.selection):
+        if moment.show in ("original", "side by side") or (handle is None and not model.selection):
             self._place = None
             self.overlays.place(None)
             return

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..edit import EditSession, Target
+from ..edit import Edit, EditSession, Target, script
 from ..edit.filming import frame_reach
 from ..errors import UserError
 
@@ -176,9 +177,17 @@ class Model:
         self.changed()
 
     def replace(self, **fields: Any) -> None:
-        """Change fields of the edit."""
+        """Change fields of the edit.
+
+        Raises:
+            UserError: a script could not say that either; the edit is as before.
+        """
         with self.changing() as session:
-            session.apply(dataclasses.replace(session.edit, **fields))
+            session.apply(self._checked(dataclasses.replace(session.edit, **fields)))
+
+    def _checked(self, edit: Edit) -> Edit:
+        """What controls send is trusted no more than a file is: pages may send anything."""
+        return script.parse(json.loads(script.to_json(edit, self.session)), "the edit", self.session)
 
     def change_handle(self, **fields: Any) -> None:
         """Change fields of the active handle."""
@@ -188,7 +197,7 @@ class Model:
                 raise UserError("no handle is chosen; click on the picture, then drag")
             changed = dataclasses.replace(handle, **fields)
             handles = tuple(changed if other is handle else other for other in session.edit.handles)
-            session.apply(dataclasses.replace(session.edit, handles=handles))
+            session.apply(self._checked(dataclasses.replace(session.edit, handles=handles)))
 
     def remove_handle(self) -> None:
         """The active handle, with its part in every keyframe."""
@@ -231,6 +240,8 @@ class Model:
         """
         with self.lock:
             self.session.release()
+            if self.active is None and not self.selection:
+                raise UserError("nothing is chosen; click on the picture first")
             self._take_over()
             if self.active is None:
                 draft = self.session.fork()
