@@ -74,7 +74,7 @@ class Raycaster:
     def render(self, posed: Posed, camera: Camera, samples: int = 4) -> Tensor:
         """[H, W, 4] premultiplied colour and coverage, ``samples`` x ``samples`` rays a pixel."""
         image = torch.zeros(camera.height, camera.width, 4, device=self.device)
-        left, top, columns, rows = self._window(posed, camera)
+        left, top, columns, rows = window(posed.vertices, camera)
         camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
         launch(
             kernels.raycast, columns * rows, posed.mesh.id, self.faces, self.rest, posed.light, self.face_part,
@@ -92,15 +92,16 @@ class Raycaster:
         )  # fmt: skip
         return seen.bool()
 
-    def _window(self, posed: Posed, camera: Camera) -> tuple[int, int, int, int]:
-        """(left, top, columns, rows) of the pixels that the figure may touch."""
-        view = camera.to(self.device)
-        points = posed.vertices @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        if bool((points[:, 2] < 1e-3).any()):
-            return 0, 0, camera.width, camera.height
-        pixels = points @ view.K.T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        low = (pixels.amin(0) - 1).floor().long().tolist()
-        high = (pixels.amax(0) + 2).ceil().long().tolist()
-        left, top = max(low[0], 0), max(low[1], 0)
-        return left, top, max(min(high[0], camera.width) - left, 0), max(min(high[1], camera.height) - top, 0)
+
+def window(vertices: Tensor, camera: Camera) -> tuple[int, int, int, int]:
+    """(left, top, columns, rows) of the pixels that a mesh of vertices [P, 3] may touch."""
+    view = camera.to(vertices.device)
+    points = vertices @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    if bool((points[:, 2] < 1e-3).any()):
+        return 0, 0, camera.width, camera.height
+    pixels = points @ view.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    low = (pixels.amin(0) - 1).floor().long().tolist()
+    high = (pixels.amax(0) + 2).ceil().long().tolist()
+    left, top = max(low[0], 0), max(low[1], 0)
+    return left, top, max(min(high[0], camera.width) - left, 0), max(min(high[1], camera.height) - top, 0)
