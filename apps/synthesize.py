@@ -50,7 +50,7 @@ class Options:
     """Direction to the light; z is up and the figure faces -y."""
     ambient: float = 0.5
     """Light from all around."""
-    diffuse: float = 0.6
+    diffuse: float = 0.5
     """Light from the direction of --light, times the cosine with the surface."""
     unlit: bool = False
     """Show textures and colours as they are, without light."""

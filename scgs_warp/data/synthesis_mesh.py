@@ -32,7 +32,7 @@ class Look:
     light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
     """Direction to the light, world (z up, the subject faces -y)."""
     ambient: float = 0.5
-    diffuse: float = 0.6
+    diffuse: float = 0.5
     """Light of a surface = ambient x (0.75 .. 1, more from above) + diffuse x cosine, in linear light."""
     unlit: bool = False
     """Show bare base colours."""
