@@ -162,6 +162,8 @@ def test_morph_targets(tmp_path):
     glb.document["nodes"] = [{"mesh": 0}]
     still = read(glb, tmp_path).posed(0.0).positions
     assert np.abs(still - upright(BOX + 0.25 * targets[0] + 0.5 * targets[1])).max() < 1e-6
+    glb.document["nodes"][0]["weights"] = [1.0, 0.0]
+    assert np.abs(read(glb, tmp_path).posed(0.0).positions - upright(BOX + targets[0])).max() < 1e-6
     clip = glb.clip("Smile")
     glb.animate(clip, 0, "weights", [0.0, 2.0], np.array([0.0, 1.0, 1.0, 0.0])[:, None])
     moved = read(glb, tmp_path).posed(0.5).positions

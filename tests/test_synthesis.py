@@ -323,6 +323,15 @@ def test_time_range_rig_background_and_still_scenes(tmp_path):
     assert json.loads((still / "synthesis.json").read_text())["clip"] is None
 
 
+def test_a_surface_that_grows_from_nothing_is_explained(tmp_path):
+    glb = box()
+    glb.animate(0, 1, "scale", [0.0, 1.0], [[0, 0, 0], [1, 1, 1]])
+    mesh = glb.save(tmp_path / "box.glb")
+    with pytest.raises(UserError, match="no area at second 0; give a later --start"):
+        plan(tmp_path / "scene", request(mesh))
+    assert plan(tmp_path / "scene", request(mesh, start=0.5)).counts["train"] == 4
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

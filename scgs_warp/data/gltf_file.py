@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import base64
 import binascii
+import json
 import logging
+import struct
 import warnings
 from pathlib import Path
 from typing import Any
@@ -24,15 +26,15 @@ UNDERSTOOD = {
     "KHR_texture_transform",
     "KHR_materials_unlit",
     "KHR_materials_pbrSpecularGlossiness",
+    "EXT_texture_webp",
 }
 """Extensions whose data are read; others matter only where a file requires them."""
-HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation_pointer", "EXT_lights")
+HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights")
 """They change how light is reflected, not what moves where: left out even where required."""
 REMEDIES = {
     "KHR_draco_mesh_compression": "export it again without Draco compression",
     "EXT_meshopt_compression": "export it again without meshopt compression",
     "KHR_texture_basisu": "export it again with PNG or JPEG textures",
-    "EXT_texture_webp": "export it again with PNG or JPEG textures",
 }
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -50,6 +52,7 @@ class GltfFile:
         self.path = Path(path)
         self.document = _parse(self.path)
         self._buffers: dict[int, bytes] = {}
+        self._json: list[dict[str, Any]] | None = None
         version = str(getattr(self.document.asset, "version", "") or "")
         if not version.startswith("2."):
             raise self.error("asset.version", f"is {version or 'missing'}; export it again as glTF 2.0")
@@ -68,6 +71,15 @@ class GltfFile:
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
             raise self.error(field, f"is {index!r}, but there are {len(items)} {kind}; export the file again")
         return items[index]
+
+    def node_weights(self, index: int) -> list[float] | None:
+        """``nodes[index].weights`` of morph targets, which the parser leaves out; None where there are none."""
+        if self._json is None:
+            data = self.path.read_bytes()
+            if data[:4] == b"glTF":
+                data = data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
+            self._json = json.loads(data)["nodes"]
+        return self._json[index].get("weights") if self._json else None
 
     def array(self, index: Any, field: str, components: int | None = None) -> np.ndarray:
         """[count, components] of an accessor; matrices [count, 4, 4] row-major, as mathematicians write them.

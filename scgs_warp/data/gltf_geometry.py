@@ -105,7 +105,7 @@ def read_geometry(file: GltfFile, nodes: Nodes, materials: list[Material]) -> Ge
                 joints = len(file.document.skins[skin].joints)
             part = _part(file, primitive, mode, materials, first, joints, where)
             if part.targets is not None:
-                rest = getattr(node, "weights", None) or mesh.weights or []
+                rest = file.node_weights(index) or mesh.weights or []
                 weights = np.zeros(len(part.targets[0]))
                 weights[: len(rest)] = rest[: len(weights)]
                 morphs.append(Morph(index, count, *part.targets, weights))

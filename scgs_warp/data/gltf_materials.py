@@ -130,4 +130,8 @@ def _texture(file: GltfFile, texture: Any, where: str) -> Texture:
         sampler = file.item("samplers", texture.sampler, f"{where}.sampler")
         wrap = (WRAPS.get(sampler.wrapS, REPEAT), WRAPS.get(sampler.wrapT, REPEAT))
         nearest = sampler.magFilter == NEAREST
-    return Texture(file.image(texture.source, f"{where}.source"), wrap, nearest)
+    source = texture.source
+    for extension in (texture.extensions or {}).values():  # WebP and others keep a fallback beside them, or none
+        if source is None and isinstance(extension, dict):
+            source = extension.get("source")
+    return Texture(file.image(source, f"{where}.source"), wrap, nearest)

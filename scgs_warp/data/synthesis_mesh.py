@@ -13,10 +13,10 @@ from torch import Tensor
 from ..errors import UserError
 from ..kernels import mesh_raycast as kernels
 from ..types import Camera
-from ..warp_interop import launch, warp_view
+from ..warp_interop import launch
 from .gltf_scene import GltfScene
 from .synthesis import ROOM, SurfacePoints, points_on_triangles
-from .synthetic_raycast import TOLERANCE, window
+from .synthetic_raycast import TOLERANCE, mesh_over, window
 
 FIT_TIMES = 101
 """Instants of the clip that are looked at to find out how much room it takes."""
@@ -132,8 +132,7 @@ class MeshSubject:
         """The scene at ``time`` in [0, 1]."""
         vertices = self.scene.posed(self.seconds(time))
         points, normals = self._tensor(vertices.positions), self._tensor(vertices.normals)
-        mesh = wp.Mesh(points=warp_view(points, wp.vec3), indices=warp_view(self.faces))
-        return Posed(mesh, points, normals)
+        return Posed(mesh_over(points, self.faces), points, normals)
 
     def render(self, posed: Posed, camera: Camera, samples: int) -> Tensor:
         """[H, W, 4] premultiplied colour and coverage, ``samples`` x ``samples`` rays a pixel."""
@@ -158,8 +157,16 @@ class MeshSubject:
         return seen.bool()
 
     def sample(self, count: int, rng: np.random.Generator) -> SurfacePoints:
-        """Points spread evenly by area over the surface at time 0."""
+        """Points spread evenly by area over the surface at time 0.
+
+        Raises:
+            UserError: it has no area then.
+        """
         positions = self.scene.posed(self.seconds(0.0)).positions
+        a, b, c = positions[self.scene.triangles.faces].transpose(1, 0, 2)
+        if not np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() > 0:
+            second = f"{self.seconds(0.0):g}"
+            raise UserError(f"{self.scene.path}: the surface has no area at second {second}; give a later --start")
         return points_on_triangles(positions, self.scene.triangles.faces, count, rng)
 
     def track(self, points: SurfacePoints, times) -> np.ndarray:

@@ -9,6 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..cuda_graph import warp_stream
 from ..kernels import raycast as kernels
 from ..types import Camera
 from ..warp_interop import launch, warp_view
@@ -63,7 +64,7 @@ class Raycaster:
         vertices = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.local) + transforms[:, :3, 3]
         normals = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.normals)
         points, directions = self._tensor(vertices), self._tensor(normals)
-        mesh = wp.Mesh(points=warp_view(points, wp.vec3), indices=warp_view(self.faces))
+        mesh = mesh_over(points, self.faces)
         light = torch.empty_like(points)
         launch(
             kernels.light_vertices, len(points), mesh.id, points, directions, self.light_direction, LIGHT_SPREAD,
@@ -91,6 +92,14 @@ class Raycaster:
             camera.K.to(self.device), camera.width, camera.height, TOLERANCE, seen,
         )  # fmt: skip
         return seen.bool()
+
+
+def mesh_over(vertices: Tensor, faces: Tensor) -> wp.Mesh:
+    """Warp's mesh over the memory of vertices [P, 3] and faces [3 F], built on torch's stream like all else."""
+    if not vertices.is_cuda:
+        return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
+    with wp.ScopedStream(warp_stream(vertices.device)):
+        return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
 
 
 def window(vertices: Tensor, camera: Camera) -> tuple[int, int, int, int]:
