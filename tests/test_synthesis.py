@@ -117,6 +117,17 @@ def test_one_light_and_lambert(tmp_path, device):
     assert behind[20, 20, 0] == pytest.approx(srgb(0.5 * 0.4 * 0.75), abs=1e-5)
 
 
+@pytest.mark.parametrize("given", [True, False])
+def test_both_sides_are_lit_from_where_they_look(tmp_path, device, given):
+    glb = quad(doubleSided=True)
+    if given:
+        attributes = glb.document["meshes"][0]["primitives"][0]["attributes"]
+        attributes["NORMAL"] = glb.array([[0, 0, 1]] * 4)
+    subject = subject_of(glb, tmp_path, Look((0, 1, 0), ambient=0.4, diffuse=0.3), device)
+    lit, dark = picture(subject, front(azimuth=90.0))[20, 20, 0], picture(subject, front())[20, 20, 0]
+    assert lit == pytest.approx(srgb(0.6), abs=1e-5) and dark == pytest.approx(srgb(0.3), abs=1e-5)
+
+
 def test_backs_alpha_cutoff_and_translucency(tmp_path, device):
     pixels = np.zeros((1, 2, 4), np.uint8)
     pixels[0, 0], pixels[0, 1] = [255, 0, 0, 100], [0, 255, 0, 200]
