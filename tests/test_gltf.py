@@ -182,6 +182,16 @@ def test_strips_fans_and_no_indices(tmp_path):
         assert np.allclose(normals, [[0, 0, 1], [0, 0, 1]])
 
 
+def test_vertices_that_no_triangle_uses_are_left_out(tmp_path):
+    glb = Glb()
+    stray = np.concatenate([[[99.0, 0, 0]], BOX, [[0, 99.0, 0]]])
+    glb.add("meshes", primitives=[glb.primitive(stray, BOX_FACES + 1)])
+    glb.document["nodes"] = [{"mesh": 0}]
+    scene = read(glb, tmp_path)
+    assert np.abs(scene.posed(0.0).positions - upright(BOX)).max() < 1e-6
+    assert np.array_equal(scene.triangles.faces, BOX_FACES)
+
+
 def test_sparse_strided_and_quantised_accessors(tmp_path):
     glb = Glb()
     values = np.arange(24, dtype=np.float32).reshape(8, 3)
@@ -218,6 +228,9 @@ def test_separate_and_embedded_buffers(tmp_path):
         document = {**glb.document, "buffers": [{"byteLength": len(data), "uri": uri}]}
         (tmp_path / f"{name}.gltf").write_text(json.dumps(document))
         assert len(read_scene(tmp_path / f"{name}.gltf").triangles.faces) == 12
+    before = read_scene(tmp_path / "beside.gltf").digest
+    (tmp_path / "a b.bin").write_bytes(data + b"\0")
+    assert read_scene(tmp_path / "beside.gltf").digest != before
 
 
 def test_clips_by_name(tmp_path):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import json
 import logging
 import struct
@@ -52,6 +53,7 @@ class GltfFile:
         self.path = Path(path)
         self.document = _parse(self.path)
         self._buffers: dict[int, bytes] = {}
+        self._digest = hashlib.sha256(self.path.read_bytes())
         self._json: list[dict[str, Any]] | None = None
         version = str(getattr(self.document.asset, "version", "") or "")
         if not version.startswith("2."):
@@ -64,6 +66,11 @@ class GltfFile:
     def error(self, field: str, text: str) -> UserError:
         """The error to raise: file, field, and what is wrong with it and how to put it right."""
         return UserError(f"{self.path}: {field} {text}")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the file and of the files beside it that were read so far."""
+        return self._digest.hexdigest()
 
     def item(self, kind: str, index: Any, field: str) -> Any:
         """Element ``index`` of the document's list ``kind``; ``field`` is what refers to it."""
@@ -169,7 +176,9 @@ class GltfFile:
                 raise self.error(field, "is no valid base64; export the file again") from None
         path = self.path.parent / unquote(uri)
         try:
-            return path.read_bytes()
+            data = path.read_bytes()
+            self._digest.update(data)
+            return data
         except OSError as error:
             reason = error.strerror or type(error).__name__
             raise self.error(

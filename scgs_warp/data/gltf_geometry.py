@@ -168,16 +168,20 @@ def _part(
         colors = np.concatenate([colors, np.ones((count, 1))], axis=1)
     uv = numbers(f"TEXCOORD_{material.coordinates}", 2, np.zeros((count, 2)))
     bones, weights = _carriers(numbers, count, first, joints, file, where)
+    normals = _unit_rows(numbers("NORMAL", 3, np.zeros((count, 3))))
+    faces = _faces(file, primitive, mode, count, where)
+    targets = _targets(file, primitive, count, where)
+    used, faces = np.unique(faces, return_inverse=True)  # primitives often share one long list of vertices
     return Part(
-        positions=positions,
-        normals=_unit_rows(numbers("NORMAL", 3, np.zeros((count, 3)))),
-        uv=transformed(uv, material),
-        colors=colors.astype(np.float64),
-        faces=_faces(file, primitive, mode, count, where),
+        positions=positions[used],
+        normals=normals[used],
+        uv=transformed(uv, material)[used],
+        colors=colors[used].astype(np.float64),
+        faces=faces.reshape(-1, 3),
         material=index,
-        bones=bones,
-        weights=weights,
-        targets=_targets(file, primitive, count, where),
+        bones=bones[used],
+        weights=weights[used],
+        targets=None if targets is None else (targets[0][:, used], targets[1][:, used]),
     )
 
 

@@ -58,6 +58,8 @@ class GltfScene:
     triangles: Triangles
     skipped: int
     """Primitives that are points or lines and are not drawn."""
+    digest: str
+    """SHA-256 of everything that was read."""
     world_from_gltf: np.ndarray
     """[4, 4] applied to everything; ``UPRIGHT`` until somebody fits the scene into a room."""
 
@@ -141,6 +143,7 @@ def read_scene(path: str | Path, clip: str | None = None) -> GltfScene:
         textures=textures,
         triangles=_triangles(geometry.parts),
         skipped=geometry.skipped,
+        digest=file.digest,
         world_from_gltf=UPRIGHT,
     )
     _face_outward(scene)

@@ -88,16 +88,15 @@ class MeshSubject:
 
     def _fit(self) -> None:
         """Move and scale the scene so that it stays in a ball of radius ``ROOM`` around the origin at all times."""
-        used = np.unique(self.scene.triangles.faces)
         times = np.linspace(0.0, 1.0, FIT_TIMES if self.scene.clip else 1)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for time in times:
-            positions = self.scene.posed(self.seconds(float(time))).positions[used]
+            positions = self.scene.posed(self.seconds(float(time))).positions
             low, high = np.minimum(low, positions.min(0)), np.maximum(high, positions.max(0))
         centre = (low + high) / 2
         radius = 0.0
         for time in times:
-            positions = self.scene.posed(self.seconds(float(time))).positions[used]
+            positions = self.scene.posed(self.seconds(float(time))).positions
             radius = max(radius, float(np.linalg.norm(positions - centre, axis=1).max()))
         if not np.isfinite(radius) or radius <= 0.0:
             raise UserError(f"{self.scene.path}: meshes have no extent (radius {radius:g}); export a surface")

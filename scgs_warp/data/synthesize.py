@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -139,7 +138,7 @@ def load_subject(request: Request, device: str) -> tuple[Subject, dict[str, Any]
     clip = scene.clip
     found = {
         "subject": scene.path.name,
-        "sha256": hashlib.sha256(scene.path.read_bytes()).hexdigest(),
+        "sha256": scene.digest,
         "clip": clip.name if clip else None,
         "seconds": list(span),
         "world_from_gltf": scene.world_from_gltf.tolist(),
