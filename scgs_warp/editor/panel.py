@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from .jobs import Jobs, Progress
 from .panel_files import FilesSection
 from .panel_film import FilmSection, TimeSection
+from .panel_motion import MotionSection
 from .panel_shape import ShapeSection
 from .panel_view import ViewSection
 
@@ -24,8 +25,8 @@ HELP = (
 class Panel:
     """Everything beside the picture.
 
-    Attributes: ``jobs`` (films and exports in the making) and the sections ``time``, ``shape``, ``film``, ``view``,
-    ``files``.
+    Attributes: ``jobs`` (films and exports in the making) and the sections ``time``, ``shape``, ``motion``, ``film``,
+    ``view``, ``files``.
     """
 
     def __init__(self, editor: Editor) -> None:
@@ -45,6 +46,8 @@ class Panel:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Shape"):
             self.shape = ShapeSection(editor)
+        with tabs.add_tab("Motion"):
+            self.motion = MotionSection(editor)
         with tabs.add_tab("Film"):
             self.film = FilmSection(editor)
         with tabs.add_tab("View"):
@@ -77,7 +80,7 @@ class Panel:
     def show(self) -> None:
         """Make every control say what the model says."""
         with self._lock:
-            for section in (self.time, self.shape, self.film, self.view, self.files):
+            for section in (self.time, self.shape, self.motion, self.film, self.view, self.files):
                 section.show()
             self.status.content = f"{HELP}\n\n{self._said()}"
             self.editor.color_overlays()
