@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 
-APPS = ("train", "evaluate", "view", "bench", "ablate")
+APPS = ("train", "evaluate", "view", "edit", "bench", "ablate", "synthesize")
 
 
 def main() -> int:

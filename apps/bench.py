@@ -1,4 +1,4 @@
-"""Measure what a frame, a rasterisation or a training step costs, which stage takes how much, and how it grows."""
+"""Measure what a frame, a rasterisation, a training step or a drag in the editor costs, by stages, and how it grows."""
 
 from __future__ import annotations
 
@@ -63,6 +63,14 @@ class Step(Options):
 
 
 @dataclass(frozen=True)
+class Edit(Options):
+    """From a drag of a handle in the editor to the new picture: solve, skin, render, encode."""
+
+    size: str = "512"
+    """Longer side of the picture in pixels, or WIDTHxHEIGHT; the editor shows at most 512 while something moves."""
+
+
+@dataclass(frozen=True)
 class Scaling(Common):
     """Frames and rasterisations as Gaussians, pixels, control points and threads grow, beside the machine's limits."""
 
@@ -73,7 +81,7 @@ class Scaling(Common):
     """Folder for one figure a sweep: scaling-NAME.png."""
 
 
-COMMANDS = {"frame": Frame, "raster": Raster, "step": Step, "scaling": Scaling}
+COMMANDS = {"frame": Frame, "raster": Raster, "step": Step, "edit": Edit, "scaling": Scaling}
 
 
 def check(options: Common) -> None:

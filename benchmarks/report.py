@@ -184,6 +184,7 @@ TABLES: dict[str, tuple[Callable[[Report], str], str]] = {
     "frame-cpu": (stages, "apps/bench.py frame --motion control-points,static"),
     "raster-cpu": (stages, "apps/bench.py raster"),
     "step-cpu": (stages, "apps/bench.py step --gaussians 40000 --size 400"),
+    "edit-cpu": (stages, "apps/bench.py edit"),
     "table-s2-cpu": (table_s2, "apps/bench.py frame --table-s2"),
     "million-cpu": (stages, "apps/bench.py frame --gaussians 1000000 --size 1920x1080"),
     "opensplat": (opensplat, "benchmarks/opensplat.py CHECKOUT"),

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from . import environment
 from .bench_clock import machine, now
+from .bench_edit import edit_rows
 from .bench_memory import resident_mib
 from .bench_peers import Peers
 from .bench_place import MIDDLE, Place, Plan, posed
@@ -19,7 +20,7 @@ from .config import MOTIONS
 from .errors import UserError
 from .scene import Scene
 
-What = Literal["frame", "raster", "step"]
+What = Literal["frame", "raster", "step", "edit"]
 
 
 def thread_counts(threads: int | None, device: str) -> tuple[int, ...]:
@@ -39,7 +40,7 @@ def bench(what: What, plan: Plan) -> dict[str, Any]:
     Raises:
         UserError: the run cannot be read, gsplat is asked for and not usable, or the renderers disagree.
     """
-    measure = {"frame": frame_rows, "raster": raster_rows, "step": step_rows}[what]
+    measure = {"frame": frame_rows, "raster": raster_rows, "step": step_rows, "edit": edit_rows}[what]
     peers = Peers.find(plan) if plan.against else None
     rows: list[dict[str, Any]] = []
     compared: list[dict[str, Any]] = []

@@ -231,6 +231,13 @@ def orbit_camera(overview: Overview, azimuth: float, size: int, elevation: float
     return Camera(look_at(eye, centre, up), K, width, height)
 
 
+def azimuth_of(overview: Overview, eye: Vector) -> float:
+    """The azimuth, 0 to 360 degrees, from which ``orbit_camera`` looks the way that a camera at ``eye`` [3] does."""
+    zero, ninety = _horizon(np.array(overview.up))
+    offset = np.asarray(eye, np.float64) - np.array(overview.centre)
+    return math.degrees(math.atan2(float(offset @ ninety), float(offset @ zero))) % 360.0
+
+
 def turntable(overview: Overview, frames: int, size: int, azimuths: tuple[float, float] | None = None) -> list[Camera]:
     """Cameras of a film that goes round the scene and loops.
 

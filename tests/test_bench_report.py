@@ -47,6 +47,7 @@ def test_every_table_from_tiny_results(tmp_path, monkeypatch, capsys):
         "frame-cpu": ["frame", *TINY, "--motion", "control-points,static", "--threads", "1"],
         "raster-cpu": ["raster", *TINY],
         "step-cpu": ["step", *TINY, "--threads", "1"],
+        "edit-cpu": ["edit", *TINY, "--threads", "1"],
         "table-s2-cpu": ["frame", *TINY, "--table-s2", "--threads", "1"],
         "scaling-cpu": ["scaling", *TINY, "--sweeps", "nodes:6/12", "--figures", str(tmp_path / "figures")],
     }
@@ -64,7 +65,14 @@ def test_every_table_from_tiny_results(tmp_path, monkeypatch, capsys):
     assert text.count("Not measured yet") == 2 and "1000000 --size 1920x1080" in text
     first = json.loads((tmp_path / "frame-cpu.json").read_text(encoding="utf-8"))["rows"][0]
     assert f"| **frame** | {first['ms_median']:,.1f} | {first['ms_min']:,.1f} |" in text
-    for said in ("frame/skin", "**raster/both**", "**step/arap**", "(network and skinning)", "| hexplane | 1 |"):
+    for said in (
+        "frame/skin",
+        "**raster/both**",
+        "**step/arap**",
+        "edit/drag/solve",
+        "(network and skinning)",
+        "| hexplane | 1 |",
+    ):
         assert said in text
     for said in ("GFLOP/s", "MiB more", "| nodes | pairs |", "of the frames/s of `static`"):
         assert said in text

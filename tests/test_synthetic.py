@@ -13,7 +13,8 @@ import torch
 from reference.raycast import first_hit
 from scgs_warp import environment
 from scgs_warp.data import load
-from scgs_warp.data.synthetic import _camera, make_synthetic, random_camera, sample_surface, write_rgba
+from scgs_warp.data.synthesis import write_rgba
+from scgs_warp.data.synthetic import _camera, make_synthetic, random_camera, sample_surface
 from scgs_warp.data.synthetic_figure import PARTS, build_figure, rounded_box, torus, vertex_normals
 from scgs_warp.data.synthetic_motion import BONES, bone_transforms
 from scgs_warp.data.synthetic_raycast import Raycaster

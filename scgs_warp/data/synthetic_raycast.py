@@ -9,6 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..cuda_graph import warp_stream
 from ..kernels import raycast as kernels
 from ..types import Camera
 from ..warp_interop import launch, warp_view
@@ -63,7 +64,7 @@ class Raycaster:
         vertices = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.local) + transforms[:, :3, 3]
         normals = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.normals)
         points, directions = self._tensor(vertices), self._tensor(normals)
-        mesh = wp.Mesh(points=warp_view(points, wp.vec3), indices=warp_view(self.faces))
+        mesh = mesh_over(points, self.faces)
         light = torch.empty_like(points)
         launch(
             kernels.light_vertices, len(points), mesh.id, points, directions, self.light_direction, LIGHT_SPREAD,
@@ -74,7 +75,7 @@ class Raycaster:
     def render(self, posed: Posed, camera: Camera, samples: int = 4) -> Tensor:
         """[H, W, 4] premultiplied colour and coverage, ``samples`` x ``samples`` rays a pixel."""
         image = torch.zeros(camera.height, camera.width, 4, device=self.device)
-        left, top, columns, rows = self._window(posed, camera)
+        left, top, columns, rows = window(posed.vertices, camera)
         camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
         launch(
             kernels.raycast, columns * rows, posed.mesh.id, self.faces, self.rest, posed.light, self.face_part,
@@ -92,15 +93,24 @@ class Raycaster:
         )  # fmt: skip
         return seen.bool()
 
-    def _window(self, posed: Posed, camera: Camera) -> tuple[int, int, int, int]:
-        """(left, top, columns, rows) of the pixels that the figure may touch."""
-        view = camera.to(self.device)
-        points = posed.vertices @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        if bool((points[:, 2] < 1e-3).any()):
-            return 0, 0, camera.width, camera.height
-        pixels = points @ view.K.T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        low = (pixels.amin(0) - 1).floor().long().tolist()
-        high = (pixels.amax(0) + 2).ceil().long().tolist()
-        left, top = max(low[0], 0), max(low[1], 0)
-        return left, top, max(min(high[0], camera.width) - left, 0), max(min(high[1], camera.height) - top, 0)
+
+def mesh_over(vertices: Tensor, faces: Tensor) -> wp.Mesh:
+    """Warp's mesh over the memory of vertices [P, 3] and faces [3 F], built on torch's stream like all else."""
+    if not vertices.is_cuda:
+        return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
+    with wp.ScopedStream(warp_stream(vertices.device)):
+        return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
+
+
+def window(vertices: Tensor, camera: Camera) -> tuple[int, int, int, int]:
+    """(left, top, columns, rows) of the pixels that a mesh of vertices [P, 3] may touch."""
+    view = camera.to(vertices.device)
+    points = vertices @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    if bool((points[:, 2] < 1e-3).any()):
+        return 0, 0, camera.width, camera.height
+    pixels = points @ view.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    low = (pixels.amin(0) - 1).floor().long().tolist()
+    high = (pixels.amax(0) + 2).ceil().long().tolist()
+    left, top = max(low[0], 0), max(low[1], 0)
+    return left, top, max(min(high[0], camera.width) - left, 0), max(min(high[1], camera.height) - top, 0)

@@ -1,0 +1,169 @@
+"""Edit a scene: take hold of control points and move them, in the browser, or by script into a film."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from scgs_warp.apps.cli import Device, prepare, run
+
+if TYPE_CHECKING:
+    from scgs_warp.edit import EditSession
+
+MOST_NODES = 20_000
+
+
+@dataclass(frozen=True)
+class Options:
+    """Edit a trained scene or a 3D-GS file: with a script and an output, as a film; otherwise in the browser."""
+
+    run: Path | None = None
+    """Folder of a run, as apps/train.py writes it."""
+    ply: Path | None = None
+    """Instead of a run: a .ply of 3D Gaussian splatting, as a scene that stands still."""
+    script: Path | None = None
+    """An edit, as JSON (docs/editing.md). Without an output, the editor begins with it."""
+    output: Path | None = None
+    """Where the script's film goes: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
+    export: Path | None = None
+    """A .ply to write the edited scene to, as it is at the time --at."""
+    at: float = 0.0
+    """Second of the film that --export shows."""
+    nodes: int = 512
+    """Control points of a scene that stands still."""
+    size: int | None = None
+    """Longer side of the film in pixels, instead of the script's."""
+    port: int = 8080
+    """Of the editor's page, on 127.0.0.1; the next free one is taken. With --share: where others reach it."""
+    share: bool = False
+    """Let other machines in: the page is served on all interfaces, behind a proxy that asks for a token."""
+    folder: Path | None = None
+    """Where the editor keeps edits, films and exports; by default edits/ in the run, or beside the .ply."""
+    device: Device = "auto"
+    """Where to render; auto takes a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all cores by default."""
+
+
+def check(options: Options) -> None:
+    """Refuse what cannot work before anything is loaded.
+
+    Raises:
+        UserError: naming the option and the remedy.
+    """
+    from scgs_warp import film
+    from scgs_warp.errors import UserError
+
+    if (options.run is None) == (options.ply is None):
+        raise UserError("edit.py: give one of --run and --ply")
+    if not 1 <= options.nodes <= MOST_NODES:
+        raise UserError(f"--nodes {options.nodes}: give 1 to {MOST_NODES}")
+    if options.size is not None and not 16 <= options.size <= 8192:
+        raise UserError(f"--size {options.size}: give 16 to 8192 pixels")
+    if options.output is not None:
+        if options.script is None:
+            raise UserError(f"--output {options.output}: a film needs --script")
+        film.check_path(options.output)
+    if options.export is not None and options.export.suffix.lower() != ".ply":
+        raise UserError(f"--export {options.export}: end the name in .ply")
+    if not 0 <= options.port <= 65535:
+        raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
+    if not 0 <= options.at <= 3600:
+        raise UserError(f"--at {options.at:g}: give a second of the film, from 0 to 3600")
+
+
+def open_session(options: Options, device: str) -> EditSession:
+    """The scene, ready to be edited, with the script's edit if there is one."""
+    from scgs_warp.data.gaussian_ply import open_ply, rig_static
+    from scgs_warp.edit import EditSession
+    from scgs_warp.motion import Static
+    from scgs_warp.scene import Scene
+
+    if options.ply is not None:
+        scene = open_ply(options.ply, device, options.nodes)
+    else:
+        assert options.run is not None
+        scene = Scene.load(options.run, device=device)
+        if isinstance(scene.motion, Static):
+            scene = rig_static(scene, options.nodes)
+    session = EditSession(scene)
+    if options.script is not None:
+        session.load(options.script)
+    if options.size is not None:
+        session.resize_film(options.size)
+    return session
+
+
+def open_browser(session: EditSession, options: Options) -> None:
+    """The editor's page; returns when the user is done (Ctrl-C).
+
+    Raises:
+        UserError: it cannot be shown here.
+    """
+    import secrets
+    import threading
+
+    from scgs_warp.editor import Editor, Proxy
+
+    source = options.run if options.ply is None else options.ply.parent
+    assert source is not None
+    folder = options.folder or source / "edits"
+    key = secrets.token_urlsafe(24) if options.share else None
+    editor = Editor(session, folder, 0 if options.share else options.port, key=key)
+    proxy = None
+    try:
+        if key is None:
+            print(f"open {editor.url} in a browser; Ctrl-C ends", flush=True)
+        else:
+            proxy = Proxy(editor.port, key, public=options.port)
+            print(f"open {proxy.url} in a browser; Ctrl-C ends", flush=True)
+            print("from other machines: the same with this machine's name; whoever has the token may edit", flush=True)
+            print(
+                "what is sent is not encrypted: outside a network that you trust, forward the port over SSH", flush=True
+            )
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("the editor has ended", flush=True)
+    finally:
+        if proxy is not None:
+            proxy.stop()
+        editor.stop()
+
+
+def main(args: list[str] | None) -> None:
+    import tyro
+
+    options = tyro.cli(Options, args=args, prog="edit.py")
+    check(options)
+    browser = options.output is None and options.export is None
+    if browser:
+        from scgs_warp.editor.app import import_viser
+
+        import_viser()  # before the scene: loading may take a while
+    device = prepare(options.device, options.threads)
+    session = open_session(options, device)
+    if browser:
+        open_browser(session, options)
+        return
+
+    from scgs_warp.edit import film_camera, render_film
+    from scgs_warp.progress import progress
+
+    if options.output is not None:
+        with progress(session.edit.film.frames, "edit") as shown:
+            frames = render_film(session, options.output, shown.advance)
+        camera = film_camera(session, 0.0)
+        print(f"{options.output}: {frames} frames of {camera.width} x {camera.height}")
+    if options.export is not None:
+        session.export_ply(options.export, session.scene_time(options.at), options.at)
+        print(f"{options.export}: {session.scene.gaussian_count} Gaussians, {options.at:g} s into the film")
+
+
+def cli(args: list[str] | None = None) -> int:
+    return run(main, args)
+
+
+if __name__ == "__main__":
+    sys.exit(cli())

@@ -1,0 +1,98 @@
+"""Make a data set with known motion: ``python apps/synthesize.py --mesh figure.glb --output data/figure``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from scgs_warp.apps.cli import Device, prepare, run
+
+
+@dataclass(frozen=True)
+class Options:
+    """Film a moving mesh: pictures in D-NeRF layout and the true motion of its surface, for train.py --data."""
+
+    output: Path
+    """Folder to make; transforms_train.json, train/ and so on, ground_truth.npz, contact_sheet.png."""
+    mesh: Path | None = None
+    """A .glb or .gltf; skins, moving nodes and morph targets play. Without it, the built-in figure."""
+    clip: str | None = None
+    """Name of the animation; the first one by default. A wrong name gets the list."""
+    start: float | None = None
+    """Second of the clip at which time is 0; its first keyframe by default."""
+    end: float | None = None
+    """Second of the clip at which time is 1; its last keyframe by default."""
+    size: tuple[int, ...] = (400,)
+    """Of the pictures in pixels: one number, or width and height."""
+    train: int = 150
+    """Instants that training sees, spread over the time; each is one picture of every camera."""
+    test: int = 20
+    """Held-out pictures, spread over the time, each from a place of its own."""
+    val: int = 10
+    """The same again, for tuning; 0 leaves them out."""
+    cameras: Literal["sphere", "path"] = "sphere"
+    """sphere: anywhere on a dome, a new place for every picture (a rig: places that stay); path: moving round."""
+    views: int = 1
+    """Cameras that film together: 1 is monocular, more are a synchronised rig."""
+    turns: float = 1.0
+    """How often a path goes round; less than 1 is an arc."""
+    elevation: tuple[float, float] = (2.866, 58.212)
+    """Lowest and highest camera, degrees."""
+    fov: float = 39.597752
+    """Horizontal field of view, degrees; cameras stand where the whole motion just fits."""
+    samples: int = 4
+    """Rays per pixel and axis: 4 makes 16 rays a pixel, 1 is without anti-aliasing."""
+    background: Literal["transparent", "black", "white"] = "transparent"
+    """transparent: RGBA pictures; else RGB on that ground."""
+    light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
+    """Direction to the light; z is up and the figure faces -y."""
+    ambient: float = 0.5
+    """Light from all around."""
+    diffuse: float = 0.5
+    """Light from the direction of --light, times the cosine with the surface."""
+    unlit: bool = False
+    """Show textures and colours as they are, without light."""
+    seed: int = 0
+    """Of cameras and surface points; the same seed gives the same bytes."""
+    device: Device = "auto"
+    """Where rays are cast; auto takes a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all cores by default."""
+
+
+def main(args: list[str] | None) -> None:
+    import tyro
+
+    options = tyro.cli(Options, args=args, prog="synthesize.py")
+    device = prepare(options.device, options.threads)
+
+    from scgs_warp.data.synthesis_cameras import Filming
+    from scgs_warp.data.synthesis_mesh import Look
+    from scgs_warp.data.synthesize import SHEET, Request, film, plan
+    from scgs_warp.errors import UserError
+    from scgs_warp.progress import progress
+
+    if len(options.size) not in (1, 2):
+        raise UserError(f"--size {' '.join(map(str, options.size))}: give one number, or width and height")
+    o = options
+    filming = Filming(o.size[0], o.size[-1], o.train, o.test, o.val, o.cameras, o.views, o.fov, o.elevation, o.turns)
+    look = Look(o.light, o.ambient, o.diffuse, o.unlit)
+    request = Request(o.mesh, o.clip, o.start, o.end, filming, look, o.samples, o.background, o.seed)
+    planned = plan(o.output, request, device)
+    print("\n".join(planned.lines), flush=True)
+    if not planned.made:
+        with progress(sum(planned.counts.values()), "filming") as bar:
+            film(planned, lambda done, total: bar.advance())
+    pictures = ", ".join(f"{count} {split}" for split, count in planned.counts.items())
+    print(f"{o.output}: {pictures}; ground_truth.npz, {SHEET}{' (made before)' if planned.made else ''}")
+    print(f"next: python apps/train.py --data {o.output}")
+
+
+def cli(args: list[str] | None = None) -> int:
+    return run(main, args)
+
+
+if __name__ == "__main__":
+    sys.exit(cli())

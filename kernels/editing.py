@@ -1,0 +1,89 @@
+"""As-rigid-as-possible editing of the control points: the two steps that a sparse solve alternates with.
+
+In float64 throughout: a few hundred points, bent by hand, whose result is compared bit by bit. Edges lie in rows
+(``begin``), both directions listed.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def turn_nodes(
+    first: int,
+    # In:
+    nodes_in: wp.array[wp.int32],  # [F] whose rotation is unknown
+    rest_in: wp.array[wp.vec3d],  # [M]
+    posed_in: wp.array[wp.vec3d],  # [M]
+    begin_in: wp.array[wp.int32],  # [M + 1]
+    neighbors_in: wp.array[wp.int32],  # [E]
+    weights_in: wp.array[wp.float64],  # [E]
+    smoothness: wp.float64,  # weight of a neighbour's rotation, squared units of the positions
+    rotations_in: wp.array[wp.mat33d],  # [M] of the step before
+    # Out:
+    rotations_out: wp.array[wp.mat33d],  # [M], rows of nodes_in only
+):
+    """R = argmin sum w (|e' - R e|^2 + smoothness |R - R_j|^2), determinant +1 always (SR-ARAP, Levi & Gotsman)."""
+    i = nodes_in[first + wp.tid()]
+    S = wp.mat33d(wp.float64(0.0))
+    for at in range(begin_in[i], begin_in[i + 1]):
+        j = neighbors_in[at]
+        edge = rest_in[j] - rest_in[i]
+        posed = posed_in[j] - posed_in[i]
+        S += weights_in[at] * (wp.outer(posed, edge) + smoothness * rotations_in[j])
+    largest = wp.float64(0.0)
+    bad = int(0)
+    for a in range(3):
+        for b in range(3):
+            largest = wp.max(largest, wp.abs(S[a, b]))
+            if not wp.isfinite(S[a, b]):
+                bad = 1
+    R = rotations_in[i]
+    if bad == 0 and largest > wp.float64(1.0e-60):
+        U, _sigma, V = wp.svd3(S / largest)
+        # singular values come in descending order: a reflection is undone along the least of them
+        if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):
+            for a in range(3):
+                U[a, 2] = -U[a, 2]
+        R = U * wp.transpose(V)
+    rotations_out[i] = R
+
+
+@wp.kernel
+def edge_sums(
+    first: int,
+    # In:
+    nodes_in: wp.array[wp.int32],  # [F] whose position is unknown
+    fixed_in: wp.array[wp.int32],  # [M] 1: position known
+    rest_in: wp.array[wp.vec3d],  # [M]
+    posed_in: wp.array[wp.vec3d],  # [M]
+    begin_in: wp.array[wp.int32],  # [M + 1]
+    neighbors_in: wp.array[wp.int32],  # [E]
+    weights_in: wp.array[wp.float64],  # [E]
+    stretch: wp.float64,  # weight of keeping an edge's length, relative to that of keeping its shape
+    rotations_in: wp.array[wp.mat33d],  # [M]
+    pulls_in: wp.array[wp.float64],  # [M] weight of a soft target
+    targets_in: wp.array[wp.vec3d],  # [M]
+    # Out:
+    sums_out: wp.array[wp.vec3d],  # [F]
+):
+    """The right-hand side of the linear system: where each edge wants to point, what known neighbours add, soft
+    targets."""
+    at_row = first + wp.tid()
+    i = nodes_in[at_row]
+    total = pulls_in[i] * targets_in[i]
+    for at in range(begin_in[i], begin_in[i + 1]):
+        j = neighbors_in[at]
+        edge = rest_in[i] - rest_in[j]
+        wanted = wp.float64(0.5) * ((rotations_in[i] + rotations_in[j]) * edge)
+        posed = posed_in[i] - posed_in[j]
+        length = wp.length(posed)
+        if length > wp.float64(0.0):
+            wanted += (stretch * wp.length(edge) / length) * posed
+        else:
+            wanted += stretch * wanted
+        total += (weights_in[at] / (wp.float64(1.0) + stretch)) * wanted
+        if fixed_in[j] != 0:
+            total += weights_in[at] * posed_in[j]
+    sums_out[at_row] = total

@@ -1,0 +1,114 @@
+"""The film of an edit: a camera's way, frame by frame."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import cameras
+from ..film import film
+from ..report import to_bytes
+from ..types import Camera
+from .document import Film, View
+from .handles import ONE_FRAME
+from .keyframes import cubic
+from .session import EditSession
+
+FIELDS = ("azimuth", "elevation", "distance")
+
+
+def film_camera(session: EditSession, at: float, size: int | None = None) -> Camera:
+    """The camera at a moment of the session's film, on the CPU."""
+    settings = session.edit.film
+    shot, overview = settings.shot, session.scene.overview
+    changes: dict[str, Any] = {}
+    if shot.up is not None:
+        length = math.sqrt(math.fsum(x * x for x in shot.up))
+        changes["up"] = tuple(x / length for x in shot.up)
+    if shot.fov is not None:
+        changes["fov_x"] = shot.fov
+    view = _view_at(shot.views, at if shot.kind == "orbit" else -math.inf, overview)
+    azimuth = view["azimuth"][0]
+    if shot.kind == "turntable":
+        azimuth += 360.0 * shot.turns * at / settings.seconds
+    x, y, z = view["target"].tolist()
+    moved = dataclasses.replace(overview, centre=(x, y, z), radius=float(view["distance"][0]), **changes)
+    return cameras.orbit_camera(moved, azimuth, size or settings.size, float(view["elevation"][0]))
+
+
+def _view_at(views: tuple[View, ...], at: float, overview: cameras.Overview) -> dict[str, np.ndarray]:
+    """Every quantity by itself, smooth and without overshooting; what a view leaves open is the overview's."""
+    usual = {"azimuth": overview.azimuth, "elevation": overview.elevation, "distance": overview.radius}
+    rows = {
+        name: np.array([[usual[name] if getattr(view, name) is None else getattr(view, name)] for view in views])
+        for name in FIELDS
+    }
+    rows["target"] = np.array([overview.centre if view.target is None else view.target for view in views])
+    times = np.array([view.at for view in views])
+    if len(views) == 1 or at <= times[0]:
+        return {name: values[0] for name, values in rows.items()}
+    if at >= times[-1]:
+        return {name: values[-1] for name, values in rows.items()}
+    i = int(np.searchsorted(times, at, side="right")) - 1
+    share = float((at - times[i]) / (times[i + 1] - times[i]))
+    return {name: cubic(times, values, i, share) for name, values in rows.items()}
+
+
+def moments(settings: Film) -> list[float]:
+    """When, in seconds, every frame of a film is."""
+    return [index / settings.fps for index in range(settings.frames)]
+
+
+def frame_reach(session: EditSession) -> float:
+    """How far from its time an edit of one frame shows, so that one frame of the film does: half of its step."""
+    times = [session.scene_time(at) for at in moments(session.edit.film)]
+    steps = np.abs(np.diff(times))
+    moving = steps[steps > 0]
+    return float(np.median(moving)) / 2 * (1 + 1e-9) if len(moving) else ONE_FRAME
+
+
+def film_frame(session: EditSession, at: float, reach: float, size: int | None = None) -> np.ndarray:
+    """[H, W, 3] uint8, the film's picture at a moment in seconds; ``reach`` is ``frame_reach``'s."""
+    camera = film_camera(session, at, size).to(session.scene.device)
+    background = session.edit.film.background
+    return to_bytes(session.render(camera, session.scene_time(at), at, background, frame=reach).rgb)
+
+
+def _at_once(draw: Callable[[], np.ndarray]) -> np.ndarray:
+    return draw()
+
+
+def render_film(
+    session: EditSession,
+    output: str | Path,
+    advance: Callable[[], None] | None = None,
+    compute: Callable[[Callable[[], np.ndarray]], np.ndarray] = _at_once,
+) -> int:
+    """Write the session's film; the same edit gives the same frames as the editor shows.
+
+    Args:
+        output: ends in .mp4 or .gif, or a folder for numbered PNGs.
+        advance: called after each frame; what it raises ends the film, and nothing is left behind.
+        compute: calls the function that draws a frame and returns what it returned; for those who draw on another
+            thread.
+
+    Returns:
+        Number of frames.
+
+    Raises:
+        UserError: it cannot be written there.
+    """
+    settings = session.edit.film
+    reach = frame_reach(session)
+    with film(output, settings.fps) as writer:
+        for at in moments(settings):
+            writer.write(compute(functools.partial(film_frame, session, at, reach)))
+            if advance is not None:
+                advance()
+    return settings.frames

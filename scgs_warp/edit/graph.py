@@ -1,0 +1,120 @@
+"""Who is tied to whom: the graph of control points that an edit bends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from ..ops.arap import trajectory_graph
+
+NEIGHBORS = 7
+"""Control points each one asks for; the union of both sides wishes makes it some nine."""
+LONGEST = 3.0
+"""An edge longer than so many times the median one ties nothing together."""
+SMALLEST = 4
+"""Fewer control points than this, cut off from all others, follow the nearest ones that are not."""
+TIMES = 16
+"""Instants at which trajectories are compared."""
+
+
+@dataclass(frozen=True)
+class ControlGraph:
+    """A symmetric graph: every edge stands in both of its ends' rows."""
+
+    begin: np.ndarray
+    """[M + 1] int32, the rows of the two arrays below."""
+    neighbors: np.ndarray
+    """[E] int32, ascending in every row."""
+    weights: np.ndarray
+    """[E] float64 > 0, the same in both directions."""
+    component: np.ndarray
+    """[M] int32, which connected piece each control point belongs to."""
+    edge_length: float
+    """Median over the edges (root mean square over time), normalised units; 1 where there is none."""
+    stray: np.ndarray
+    """[M] int32: whom a control point that is tied to (almost) nobody follows; -1 for all others, itself if nobody is
+    near."""
+
+    def __len__(self) -> int:
+        return len(self.begin) - 1
+
+    @property
+    def edges(self) -> np.ndarray:
+        """[E / 2, 2] each edge once, first end < second."""
+        first = np.repeat(np.arange(len(self)), np.diff(self.begin))
+        keep = first < self.neighbors
+        return np.stack([first[keep], self.neighbors[keep]], axis=1)
+
+    @property
+    def matrix(self) -> csr_matrix:
+        """[M, M] of weights."""
+        return csr_matrix((self.weights, self.neighbors, self.begin), shape=(len(self), len(self)))
+
+    def ring(self, nodes: Iterable[int], count: int = 1) -> tuple[int, ...]:
+        """The nodes and everything at most ``count`` edges away, ascending."""
+        inside = np.zeros(len(self), bool)
+        inside[list(nodes)] = True
+        matrix = self.matrix
+        for _ in range(max(0, count)):
+            grown = inside | (matrix @ inside > 0)
+            if (grown == inside).all():
+                break
+            inside = grown
+        return tuple(np.flatnonzero(inside).tolist())
+
+
+def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS) -> ControlGraph:
+    """Neighbours by mean squared distance over time (SC-GS, Eq. 10), so that parts which touch once and move apart
+    are not tied; made symmetric by union, overlong edges dropped.
+
+    Weights are 1: on an unstructured graph an edge's length says how finely control points happen to lie there, not
+    how stiff the body is.
+
+    Args:
+        trajectories: [T, M, 3] control points at T times (one is enough for what stands still).
+        neighbors: that each control point asks for, 1 .. 15.
+    """
+    nodes = trajectories.shape[1]
+    found, _ = trajectory_graph(trajectories.float().cpu().contiguous(), neighbors)
+    columns = found.numpy().astype(np.int64)
+    rows = np.repeat(np.arange(nodes), columns.shape[1])
+    columns = columns.reshape(-1)
+    rows, columns = rows[columns >= 0], columns[columns >= 0]
+    pairs = np.unique(np.stack([np.minimum(rows, columns), np.maximum(rows, columns)], 1), axis=0)
+    tracks = trajectories.detach().cpu().double().numpy()
+    offsets = tracks[:, pairs[:, 0]] - tracks[:, pairs[:, 1]]
+    lengths = np.sqrt((offsets**2).sum(-1).mean(0))
+    median = float(np.median(lengths)) if len(lengths) else 1.0
+    pairs = pairs[lengths <= LONGEST * median]
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    matrix = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(nodes, nodes)).tocsr()
+    matrix.sort_indices()
+    component = connected_components(matrix, directed=False)[1].astype(np.int32)
+    begin, columns = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32)
+    stray = _strays(tracks, component, LONGEST * median)
+    return ControlGraph(begin, columns, matrix.data.astype(np.float64), component, median or 1.0, stray)
+
+
+def _strays(tracks: np.ndarray, component: np.ndarray, reach: float) -> np.ndarray:
+    """Whom the members of tiny components follow: the nearest member of a large one, within a few edges' length."""
+    stray = np.full(len(component), -1, np.int32)
+    small = np.bincount(component, minlength=1)[component] < SMALLEST
+    if not small.any() or small.all():
+        return stray
+    held = np.flatnonzero(~small)
+    for node in np.flatnonzero(small):
+        distances = ((tracks[:, held] - tracks[:, node : node + 1]) ** 2).sum(-1).mean(0)
+        nearest = int(distances.argmin())
+        stray[node] = held[nearest] if distances[nearest] <= (4.0 * reach) ** 2 else node
+    return stray
+
+
+def sample_times(moves: bool) -> Tensor:
+    """Instants for ``build_graph``."""
+    return torch.linspace(0.0, 1.0, TIMES) if moves else torch.zeros(1)

@@ -1,0 +1,195 @@
+"""What a user takes hold of: handles, where they were moved to, and what that asks of the solver. All frozen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ..errors import UserError
+from .graph import ControlGraph
+from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
+from .solver import Anchors
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Lasting = Literal["motion", "frame", "fade"]
+
+ONE_FRAME = 5e-3
+"""What lasts one frame shows this far from its time, where nobody says how far frames are apart."""
+FEWEST_FOR_A_FRAME = 4
+"""A region of fewer nodes takes its neighbours along to tell how it turns."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where a handle was moved to: turned about its pivot, then shifted. World units, at the handle's time."""
+
+    translation: Vector3 = (0.0, 0.0, 0.0)
+    rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """wxyz, unit."""
+
+    @staticmethod
+    def of(translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None) -> Target:
+        """Checked and normalised.
+
+        Raises:
+            UserError: a number is not finite, or the rotation has no direction.
+        """
+        moved = tuple(float(x) for x in (translation if translation is not None else (0.0, 0.0, 0.0)))
+        turned = tuple(float(x) for x in (rotation if rotation is not None else IDENTITY))
+        if len(moved) != 3 or not all(map(math.isfinite, moved)):
+            raise UserError(f"translation {list(moved)}: must be three finite numbers; the handle stays where it is")
+        if len(turned) != 4 or not all(map(math.isfinite, turned)) or not any(turned):
+            raise UserError(f"rotation {list(turned)}: must be four finite numbers, not all 0; the handle stays")
+        if abs(math.fsum(x * x for x in turned) - 1.0) > 1e-12:
+            scale = max(map(abs, turned))
+            turned = tuple(unit(np.array(turned) / scale).tolist())
+        return Target(moved, turned)  # type: ignore[arg-type]
+
+    @property
+    def is_identity(self) -> bool:
+        return not any(self.translation) and not any(self.rotation[1:])
+
+
+STAY = Target()
+
+
+@dataclass(frozen=True)
+class Handle:
+    """A set of control points that is moved as one."""
+
+    name: str
+    nodes: tuple[int, ...]
+    """Ascending, at least one."""
+    time: float = 0.0
+    """Scene time at which it was made; pivot and targets are said there."""
+    pivot: Vector3 | None = None
+    """World, what it turns about; None: the mean of its nodes."""
+    stiffness: float | None = None
+    """None: exactly where it is put. A number: pulled there, the weaker the smaller (1: as its edges)."""
+    turns: bool | None = None
+    """Whether its nodes' rotations are given, too. None: if it is more than one node."""
+    lasts: Lasting = "motion"
+    """The whole motion, in the nodes' own frames; one frame; or fading out over ``window`` around its time."""
+    window: float = 0.1
+    """Scene time after which a fading handle has no effect."""
+
+    @property
+    def gives_rotation(self) -> bool:
+        return len(self.nodes) > 1 if self.turns is None else self.turns
+
+    def strength(self, time: float, frame: float = ONE_FRAME) -> float:
+        """How much of its target counts at a scene time: 0 to 1, smooth for a fading one."""
+        away = abs(time - self.time)
+        if self.lasts == "motion" or away == 0.0:
+            return 1.0
+        if self.lasts == "frame":
+            return 1.0 if away <= frame else 0.0
+        share = 1.0 - away / self.window if self.window > 0 else 0.0
+        return 0.0 if share <= 0 else share * share * (3.0 - 2.0 * share)
+
+
+class Goal(NamedTuple):
+    """What a handle asks for at one instant, normalised units. On the way there (share 0 to 1) it turns about its
+    pivot; it does not cut across."""
+
+    nodes: np.ndarray
+    """[n]"""
+    pivot: np.ndarray
+    quat: np.ndarray
+    translation: np.ndarray
+    stiffness: float | None = None
+    gives_rotation: bool = True
+    residual: np.ndarray | None = None
+    """[n, 3] what the rigid motion does not explain."""
+    own_turns: np.ndarray | None = None
+    """[n, 4] rotations of single nodes beyond the rigid motion."""
+
+    @property
+    def is_identity(self) -> bool:
+        return (
+            not self.translation.any()
+            and not self.quat[1:].any()
+            and (self.residual is None or not self.residual.any())
+        )
+
+    def place(self, rest: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [n, 3] and rotations [n, 3, 3] at ``share`` of the way."""
+        quat = power(self.quat, share)
+        positions = rest[self.nodes]
+        if quat[1:].any():
+            positions = rotate(quat, positions - self.pivot) + self.pivot
+        positions = positions + share * self.translation
+        if self.residual is not None:
+            positions = positions + share * self.residual
+        turns = np.broadcast_to(quat, (len(self.nodes), 4))
+        if self.own_turns is not None:
+            turns = multiply(turns, power(self.own_turns, share))
+        return positions, to_matrix(turns)
+
+    def sweep(self, rest: np.ndarray) -> tuple[float, float]:
+        """(angle in radians, distance) it has to go, for the number of sub-steps."""
+        distance = float(np.linalg.norm(self.translation))
+        if self.residual is not None:
+            distance += float(np.linalg.norm(self.residual, axis=1).max(initial=0.0))
+        return float(angle(self.quat)), distance
+
+
+def carried_goal(
+    handle: Handle,
+    target: Target,
+    share: float,
+    graph: ControlGraph,
+    then: np.ndarray,
+    now: np.ndarray,
+    to_units: tuple[np.ndarray, float],
+) -> Goal:
+    """A handle's target, said at the handle's time, at another instant: carried by the rigid motion of its nodes.
+
+    Args:
+        share: how much of the target counts.
+        then, now: [M, 3] control points at the handle's time and at the instant asked for, normalised units; the same
+            object where they are the same.
+        to_units: (centre, scale) of the normalised scene.
+    """
+    centre, scale = to_units
+    nodes = np.array(handle.nodes, np.int64)
+    if handle.pivot is None:
+        pivot = then[nodes].mean(0)
+    else:
+        pivot = (np.array(handle.pivot) - centre) * scale
+    quat = power(np.array(target.rotation), share)
+    translation = share * scale * np.array(target.translation)
+    if now is not then:
+        members = nodes
+        if len(members) < FEWEST_FOR_A_FRAME:
+            members = np.array(graph.ring(handle.nodes, 1))
+        frame, before, after = rigid_fit(then[members], now[members])
+        pivot = rotate(frame, pivot - before) + after
+        quat = multiply(multiply(frame, quat), conjugate(frame)) if quat[1:].any() else quat
+        translation = rotate(frame, translation)
+    return Goal(nodes, pivot, quat, translation, handle.stiffness, handle.gives_rotation)
+
+
+def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share: float) -> Anchors:
+    """What is held at ``share`` of the way. Of two goals for one node the later counts; goals count more than pins.
+
+    Args:
+        pins: nodes that stay, turned by nothing.
+        rest: [M, 3]
+    """
+    count = len(rest)
+    hard, turned, soft = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count)
+    positions, rotations = rest.copy(), np.tile(np.eye(3), (count, 1, 1))
+    hard[pins] = turned[pins] = True
+    for goal in goals:
+        at, turns = goal.place(rest, share)
+        positions[goal.nodes], rotations[goal.nodes] = at, turns
+        hard[goal.nodes] = goal.stiffness is None
+        soft[goal.nodes] = 0.0 if goal.stiffness is None else goal.stiffness
+        turned[goal.nodes] = goal.gives_rotation
+    return Anchors(hard, soft, turned, positions, rotations)

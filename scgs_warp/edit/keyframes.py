@@ -1,0 +1,119 @@
+"""From keyframes to where every handle is at any moment of a film: through the handles' own numbers, not through
+positions, so that what turns between two keyframes turns, and does not shrink."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from .handles import Target
+from .rotations import IDENTITY, conjugate, exponential, logarithm, multiply, power, slerp, unit
+
+Easing = Literal["smooth", "linear", "ease", "step"]
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """Where handles are at one moment of the film."""
+
+    at: float
+    """Seconds of the film."""
+    targets: Mapping[str, Target] = field(default_factory=dict)
+    """By the handle's name; handles not named are led by the other keyframes."""
+    easing: Easing = "smooth"
+    """The way to the next one. smooth: without a stop at keyframes, and never beyond their values; linear: evenly;
+    ease: from rest to rest; step: it stays, then jumps."""
+
+
+def targets_at(keyframes: Sequence[Keyframe], at: float) -> dict[str, Target]:
+    """Every handle's target at a moment of the film; before its first keyframe and after its last it stays."""
+    names = sorted({name for frame in keyframes for name in frame.targets})
+    ordered = sorted(keyframes, key=lambda frame: frame.at)
+    return {name: _track_at([frame for frame in ordered if name in frame.targets], name, at) for name in names}
+
+
+def _track_at(frames: list[Keyframe], name: str, at: float) -> Target:
+    if at <= frames[0].at:
+        return frames[0].targets[name]
+    if at >= frames[-1].at:
+        return frames[-1].targets[name]
+    times = np.array([frame.at for frame in frames])
+    i = int(np.searchsorted(times, at, side="right")) - 1
+    span = times[i + 1] - times[i]
+    share = float((at - times[i]) / span)
+    easing = frames[i].easing
+    first, second = frames[i].targets[name], frames[i + 1].targets[name]
+    if easing == "step" or share == 0.0 or first == second:
+        return first
+    moves = np.array([frame.targets[name].translation for frame in frames])
+    turns = _aligned(np.array([frame.targets[name].rotation for frame in frames]))
+    if easing != "smooth":
+        share = share**3 * (share * (6 * share - 15) + 10) if easing == "ease" else share
+        moved = moves[i] + share * (moves[i + 1] - moves[i])
+        turned = slerp(turns[i], turns[i + 1], share)
+    else:
+        moved = cubic(times, moves, i, share)
+        turned = _squad(times, turns, i, share)
+    return Target.of(moved.tolist(), unit(turned).tolist())
+
+
+def _aligned(quats: np.ndarray) -> np.ndarray:
+    """Each on the side of the one before, so that every turn is the short one."""
+    found = quats.copy()
+    for i in range(1, len(found)):
+        if found[i] @ found[i - 1] < 0:
+            found[i] = -found[i]
+    return found
+
+
+def _slopes(times: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """[K, 3] velocities at the keyframes that overshoot nowhere (Fritsch & Butland): 0 where the direction turns round
+    and at the ends. ``steps`` [K - 1, 3]: the way from one keyframe to the next."""
+    spans = np.diff(times)[:, None]
+    rates = steps / spans
+    slopes = np.zeros((len(times), steps.shape[1]))
+    if len(rates) > 1:
+        before, after = rates[:-1], rates[1:]
+        same = before * after > 0
+        w1, w2 = 2 * spans[1:] + spans[:-1], spans[1:] + 2 * spans[:-1]
+        safe = np.where(same, before, 1.0), np.where(same, after, 1.0)
+        slopes[1:-1] = np.where(same, (w1 + w2) / (w1 / safe[0] + w2 / safe[1]), 0.0)
+    return slopes
+
+
+def cubic(times: np.ndarray, values: np.ndarray, i: int, share: float) -> np.ndarray:
+    """Monotone cubic between keyframes i and i + 1."""
+    slopes = _slopes(times, np.diff(values, axis=0)) * (times[i + 1] - times[i])
+    s2, s3 = share * share, share**3
+    blend = 3 * s2 - 2 * s3
+    return (
+        (1 - blend) * values[i] + blend * values[i + 1] + (s3 - 2 * s2 + share) * slopes[i] + (s3 - s2) * slopes[i + 1]
+    )
+
+
+def _squad(times: np.ndarray, quats: np.ndarray, i: int, share: float) -> np.ndarray:
+    """A cubic Bezier curve of rotations (Shoemake 1985), whose angular velocity at keyframes is that of ``_slopes``."""
+    spans = np.diff(times)
+    ways = logarithm(multiply(conjugate(quats[:-1]), quats[1:]))
+    slopes = _slopes(times, ways) * spans[i] / 3.0
+    points = [
+        quats[i],
+        multiply(quats[i], exponential(slopes[i])),
+        multiply(quats[i + 1], exponential(-slopes[i + 1])),
+        quats[i + 1],
+    ]
+    while len(points) > 1:
+        points = [slerp(a, b, share) for a, b in pairwise(points)]
+    return points[0]
+
+
+def blend(target: Target, share: float) -> Target:
+    """``share`` of a target."""
+    if share == 1.0:
+        return target
+    turned = power(np.array(target.rotation), share) if share else IDENTITY
+    return Target.of((share * np.array(target.translation)).tolist(), turned.tolist())

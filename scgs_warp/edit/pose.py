@@ -1,0 +1,136 @@
+"""From bent control points to Gaussians: the motion's pose and what an edit does to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..gaussians import GaussianParameters
+from ..ops.harmonics_rotation import rotate_harmonics
+from ..ops.skinning import skin
+from ..types import Gaussians, Pose
+from .rotations import IDENTITY, conjugate, multiply
+
+
+class Rig(Protocol):
+    """A motion model that has control points, as far as editing needs it."""
+
+    positions: Tensor
+    moves: bool
+
+    def poses(self, times: Tensor) -> list[Pose]: ...
+    def trajectories(self, times: Tensor) -> Tensor: ...
+    def binding(self, gaussians: GaussianParameters) -> tuple[Tensor, Tensor]: ...
+    def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians: ...
+
+
+class MotionPose(NamedTuple):
+    """The control points as the motion has them at one instant."""
+
+    pose: Pose
+    positions: np.ndarray
+    """[M, 3] float64, normalised units."""
+    rotations: np.ndarray
+    """[M, 4] float64"""
+
+
+@dataclass(frozen=True)
+class NodePose:
+    """Where control points are, and how far an edit has turned them. Normalised units, float64."""
+
+    positions: np.ndarray
+    """[M, 3]"""
+    turns: np.ndarray
+    """[M, 4] wxyz, on top of the motion's rotation: what the Gaussians around turn by."""
+    looks: np.ndarray
+    """[M, 4] wxyz, what their colours turn by: as ``turns``, but for what is held at another instant, whose colours
+    never turned with the trained motion."""
+
+    @staticmethod
+    def of(positions: np.ndarray) -> NodePose:
+        none = np.tile(IDENTITY, (len(positions), 1))
+        return NodePose(positions, none, none)
+
+    def then(self, positions: np.ndarray, turns: np.ndarray, looks: np.ndarray | None = None) -> NodePose:
+        """Moved to ``positions`` and turned further; exact where ``turns`` is the identity."""
+        looks = turns if looks is None else looks
+        return NodePose(positions, _further(turns, self.turns), _further(looks, self.looks))
+
+
+def _further(second: np.ndarray, first: np.ndarray) -> np.ndarray:
+    return np.where(second[:, 1:].any(1, keepdims=True), multiply(second, first), first)
+
+
+@torch.no_grad()
+def motion_pose(rig: Rig, time: float) -> MotionPose:
+    """What the motion says at a time."""
+    pose = rig.poses(torch.tensor([time], dtype=torch.float32))[0]
+    positions = rig.positions.detach() + pose.translations
+    rotations = torch.nn.functional.normalize(pose.rotations.double(), dim=1)
+    return MotionPose(pose, positions.cpu().double().numpy(), rotations.cpu().numpy())
+
+
+def compose(motion: MotionPose, bent: NodePose) -> Pose:
+    """The pose that skinning takes. What an edit leaves alone keeps the motion's bits."""
+    own = motion.pose
+    device = own.translations.device
+    shift = torch.from_numpy(bent.positions - motion.positions).float().to(device)
+    moved = torch.where(shift != 0, own.translations + shift, own.translations)
+    turned = torch.from_numpy(bent.turns[:, 1:].any(1)).to(device)[:, None]
+
+    def turn(rotations: Tensor) -> Tensor:
+        further = multiply(bent.turns, rotations.detach().cpu().double().numpy())
+        return torch.where(turned, torch.from_numpy(further).float().to(device), rotations)
+
+    shape = None if own.shape_rotations is None else turn(own.shape_rotations)
+    return Pose(moved.contiguous(), turn(own.rotations).contiguous(), shape, own.log_scales)
+
+
+@torch.no_grad()
+def pose_gaussians(
+    rig: Rig,
+    gaussians: GaussianParameters,
+    motion: MotionPose,
+    bent: NodePose,
+    binding: tuple[Tensor, Tensor],
+    masked: bool = False,
+) -> Gaussians:
+    """Activated Gaussians under an edit, normalised units: skinned by its pose, harmonics turned with it.
+
+    Learnt shading goes along as well: a Gaussian keeps the brightness that its motion gave it. Asked for turns that it
+    never saw in training, it would invent one: against ray-cast truth of the built-in figure, mean over a leg and the
+    head turned by 45 and 90 degrees, 18.7 dB instead of 17.9.
+
+    Args:
+        binding: what ``rig.binding(gaussians)`` gives; it depends on neither time nor edit.
+        masked: the last hyper-coordinate is the logit of a Gaussian's share in the motion.
+    """
+    posed = rig.apply_pose(gaussians, compose(motion, bent), binding)
+    if not bent.looks[:, 1:].any():
+        return posed
+    sh_dc, sh_rest = posed.sh_dc, posed.sh_rest
+    if gaussians.shading.shape[1]:
+        same = (bent.looks == bent.turns).all(1, keepdims=True)
+        back = np.where(same, IDENTITY, multiply(conjugate(bent.looks), bent.turns))
+        lit = NodePose(motion.positions, back, back)
+        sh_dc = rig.apply_pose(gaussians, compose(motion, lit), binding).sh_dc
+    if sh_rest.shape[1]:
+        looks = _blend(bent.looks, gaussians, binding)
+        if masked:
+            looks[:, 1:] *= gaussians.hyper[:, -1:].sigmoid()
+        sh_rest = rotate_harmonics(sh_rest, looks)
+    return Gaussians(posed.means, posed.quats, posed.scales, posed.opacities, sh_dc, sh_rest)
+
+
+def _blend(turns: np.ndarray, gaussians: GaussianParameters, binding: tuple[Tensor, Tensor]) -> Tensor:
+    """[N, 4] the control points' turns, blended like their rotations."""
+    means = gaussians.means.detach()
+    quats = torch.zeros(len(means), 4, device=means.device)
+    quats[:, 0] = 1.0
+    zeros = torch.zeros(len(turns), 3, device=means.device)
+    pose = Pose(zeros, torch.from_numpy(turns).float().to(means.device))
+    return skin(torch.zeros_like(means), quats, zeros, pose, *binding)[1]

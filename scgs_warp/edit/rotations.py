@@ -1,0 +1,140 @@
+"""Quaternions in float64 NumPy for handles, keyframes and poses. wxyz; every function takes leading dimensions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def unit(quats: ArrayLike) -> np.ndarray:
+    """Unit quaternions; the identity where the norm is 0."""
+    quats = np.asarray(quats, np.float64)
+    norm = np.linalg.norm(quats, axis=-1, keepdims=True)
+    return np.where(norm > 0, quats / np.where(norm > 0, norm, 1.0), IDENTITY)
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product: first ``b``, then ``a``."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a, np.float64), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b, np.float64), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(quats: np.ndarray) -> np.ndarray:
+    return np.asarray(quats, np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def to_matrix(quats: np.ndarray) -> np.ndarray:
+    """[..., 3, 3] of unit quaternions."""
+    w, x, y, z = np.moveaxis(np.asarray(quats, np.float64), -1, 0)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return np.stack(rows, -1).reshape(*w.shape, 3, 3)
+
+
+def from_matrix(matrices: np.ndarray) -> np.ndarray:
+    """[..., 4] unit, w >= 0, of rotation matrices; the identity matrix gives the identity to the bit."""
+    m = np.asarray(matrices, np.float64)
+    flat = m.reshape(-1, 3, 3)
+    a, b, c = flat[:, 0, 0], flat[:, 1, 1], flat[:, 2, 2]
+    # Four times the products of q's largest component with all four; the largest square is at least 1/4
+    squares = np.stack([1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c], axis=1)
+    wx, wy, wz = flat[:, 2, 1] - flat[:, 1, 2], flat[:, 0, 2] - flat[:, 2, 0], flat[:, 1, 0] - flat[:, 0, 1]
+    xy, xz, yz = flat[:, 1, 0] + flat[:, 0, 1], flat[:, 2, 0] + flat[:, 0, 2], flat[:, 2, 1] + flat[:, 1, 2]
+    table = np.stack(
+        [
+            np.stack([squares[:, 0], wx, wy, wz], 1),
+            np.stack([wx, squares[:, 1], xy, xz], 1),
+            np.stack([wy, xy, squares[:, 2], yz], 1),
+            np.stack([wz, xz, yz, squares[:, 3]], 1),
+        ],
+        axis=1,
+    )
+    found = unit(table[np.arange(len(flat)), squares.argmax(1)]) + 0.0
+    return np.where(found[:, :1] < 0, -found, found).reshape(*m.shape[:-2], 4)
+
+
+def from_axis(axis: ArrayLike, degrees: float) -> np.ndarray:
+    """Rotation about an axis of any length; the identity where it has none."""
+    axis = np.asarray(axis, np.float64)
+    norm = float(np.linalg.norm(axis))
+    if not norm > 0:
+        return IDENTITY.copy()
+    half = math.radians(degrees) / 2
+    return np.concatenate([[math.cos(half)], math.sin(half) * axis / norm])
+
+
+def rotate(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Turn vectors [..., 3] by unit quaternions [..., 4]; they broadcast."""
+    quats, vectors = np.asarray(quats, np.float64), np.asarray(vectors, np.float64)
+    axis = quats[..., 1:]
+    twice = 2.0 * np.cross(axis, vectors)
+    return vectors + quats[..., :1] * twice + np.cross(axis, twice)
+
+
+def logarithm(quats: np.ndarray) -> np.ndarray:
+    """[..., 3] rotation vectors (axis times angle, at most pi) of unit quaternions."""
+    quats = np.asarray(quats, np.float64)
+    quats = np.where(quats[..., :1] < 0, -quats, quats)
+    sine = np.linalg.norm(quats[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, quats[..., :1])
+    return quats[..., 1:] * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
+
+
+def exponential(vectors: np.ndarray) -> np.ndarray:
+    """The inverse of ``logarithm``."""
+    vectors = np.asarray(vectors, np.float64)
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    factor = 0.5 * np.sinc(angle / (2.0 * np.pi))
+    return np.concatenate([np.cos(angle / 2.0), factor * vectors], axis=-1)
+
+
+def power(quats: np.ndarray, share: float) -> np.ndarray:
+    """``share`` of the way from the identity, the short way; exactly the identity at 0 and unchanged at 1."""
+    if share == 1.0:
+        return np.asarray(quats, np.float64)
+    return exponential(share * logarithm(quats))
+
+
+def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+    """From ``a`` to ``b``, the short way."""
+    return multiply(a, power(multiply(conjugate(a), b), share))
+
+
+def angle(quats: np.ndarray) -> np.ndarray:
+    """[...] radians, 0 to pi."""
+    return np.linalg.norm(logarithm(quats), axis=-1)
+
+
+def mean(quats: np.ndarray) -> np.ndarray:
+    """[M, 4] of [T, M, 4]: the quaternion nearest to all (largest eigenvector of the sum of q q^T), w >= 0."""
+    outer = np.einsum("tmi,tmj->mij", quats, quats)
+    found = np.linalg.eigh(outer)[1][..., -1]
+    return np.where(found[:, :1] < 0, -found, found)
+
+
+def rigid_fit(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rigid motion that best takes points [P, 3] to points [P, 3] (Kabsch): (quaternion, centre before, centre
+    after), ``x -> R (x - before) + after``. One point, or points on one another, give a pure translation."""
+    from_centre, to_centre = before.mean(0), after.mean(0)
+    S = (after - to_centre).T @ (before - from_centre)
+    if not np.abs(S).max() > 1e-60:
+        return IDENTITY.copy(), from_centre, to_centre
+    U, _, Vt = np.linalg.svd(S / np.abs(S).max())
+    flip = np.diag([1.0, 1.0, 1.0 if np.linalg.det(U) * np.linalg.det(Vt) > 0 else -1.0])
+    return from_matrix(U @ flip @ Vt), from_centre, to_centre

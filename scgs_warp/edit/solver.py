@@ -1,0 +1,249 @@
+"""As-rigid-as-possible deformation of the control points: positions and rotations, from what holds some of them.
+
+Local and global steps alternate (Sorkine & Alexa 2007): every node finds the rotation that best explains its edges,
+drawn a little towards its neighbours' (Levi & Gotsman 2015), then one sparse linear system finds all positions. Edges
+also keep their length (a projective spring on each), because thin limbs hang on few edges and plain ARAP shears those
+at a joint. The matrix depends on which nodes are held, not on where: it is factorised once per set of handles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.sparse import csc_matrix, diags
+from scipy.sparse.linalg import splu
+
+from ..kernels import editing as kernels
+from ..warp_interop import launch
+from .graph import ControlGraph
+from .rotations import exponential, from_matrix, logarithm, to_matrix
+
+SMOOTHNESS = 0.3
+"""Weight of neighbours' rotations, in squared edge lengths."""
+STRETCH = 2.0
+"""Weight of an edge's length, relative to its shape."""
+STEP_ANGLE = math.radians(15.0)
+"""A handle turns at most so far between two solutions: beyond some 90 degrees the energy has other minima."""
+STEP_LENGTH = 2.0
+"""... and moves at most so many edge lengths."""
+MOST_STEPS = 48
+"""A handle dragged to the horizon gets there in so many steps, however long they are."""
+STEP_ITERATIONS = 6
+FINAL_ITERATIONS = 60
+TURN_ITERATIONS = 8
+TOLERANCE = 1e-4
+"""Iterations end when nothing moves by more than so many edge lengths."""
+CACHED = 16
+"""Factorisations kept."""
+
+
+class Anchors(NamedTuple):
+    """What is held, where, and how it is turned."""
+
+    hard: np.ndarray
+    """[M] bool: the position is given."""
+    soft: np.ndarray
+    """[M] >= 0: weight of a position that is asked for, relative to a node's edges; 0 where there is none."""
+    turned: np.ndarray
+    """[M] bool: the rotation is given."""
+    positions: np.ndarray
+    """[M, 3], read where hard or soft."""
+    rotations: np.ndarray
+    """[M, 3, 3], read where turned."""
+
+
+@dataclass
+class Shape:
+    """A state of the solver, from which the next solution starts."""
+
+    positions: np.ndarray
+    """[M, 3]"""
+    rotations: np.ndarray
+    """[M, 3, 3]"""
+    anchors: Anchors | None = None
+    """What held it."""
+
+    @staticmethod
+    def at_rest(rest: np.ndarray) -> Shape:
+        return Shape(rest.copy(), np.tile(np.eye(3), (len(rest), 1, 1)))
+
+
+class _System(NamedTuple):
+    """What depends on which nodes are held, not on where."""
+
+    free: torch.Tensor
+    """[F] int32 nodes whose position is unknown."""
+    turning: torch.Tensor
+    """[T] int32 nodes whose rotation is unknown."""
+    fixed: torch.Tensor
+    """[M] int32"""
+    pulls: torch.Tensor
+    """[M] float64"""
+    factor: Any
+    """SuperLU of the free nodes' Laplacian; None if there are none."""
+
+
+class ArapSolver:
+    """Solves for one graph; keeps the factorisations of the last few sets of anchors. Float64, on the CPU, and the
+    same bits for the same arguments."""
+
+    def __init__(self, graph: ControlGraph, smoothness: float = SMOOTHNESS, stretch: float = STRETCH) -> None:
+        self.graph = graph
+        self.smoothness, self.stretch = smoothness, stretch
+        self._begin = torch.from_numpy(graph.begin)
+        self._neighbors = torch.from_numpy(graph.neighbors)
+        self._weights = torch.from_numpy(graph.weights)
+        self._systems: OrderedDict[bytes, _System] = OrderedDict()
+
+    def _system(self, anchors: Anchors) -> _System:
+        key = anchors.hard.tobytes() + anchors.turned.tobytes() + anchors.soft.tobytes()
+        found = self._systems.get(key)
+        if found is None:
+            found = self._systems[key] = self._factorise(anchors)
+            while len(self._systems) > CACHED:
+                self._systems.popitem(last=False)
+        self._systems.move_to_end(key)
+        return found
+
+    def _factorise(self, anchors: Anchors) -> _System:
+        """A component that nothing holds stays where it is: its nodes are no unknowns."""
+        component = self.graph.component
+        held = anchors.hard | (anchors.soft > 0)
+        alive = np.isin(component, np.unique(component[held]))
+        free = alive & ~anchors.hard
+        degree = np.asarray(self.graph.matrix.sum(1)).reshape(-1)
+        pulls = np.where(free, anchors.soft * degree, 0.0)
+        lone = free & (degree == 0)  # an isolated node goes where its soft target is
+        pulls[lone] = np.maximum(anchors.soft[lone], 1e-12)
+        factor = None
+        if free.any():
+            laplacian = diags(degree + pulls) - self.graph.matrix
+            inner = csc_matrix(laplacian.tocsr()[free][:, free])
+            factor = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        return _System(
+            torch.from_numpy(np.flatnonzero(free).astype(np.int32)),
+            torch.from_numpy(np.flatnonzero(alive & ~anchors.turned).astype(np.int32)),
+            torch.from_numpy((~free).astype(np.int32)),
+            torch.from_numpy(pulls),
+            factor,
+        )
+
+    def relax(self, rest: np.ndarray, anchors: Anchors, shape: Shape, iterations: int) -> Shape:
+        """At most ``iterations`` local and global steps from ``shape`` towards the minimum.
+
+        Where anchors have moved, they begin with a guess: what turns with the handles spreads evenly between them, and
+        positions follow. A piece that hangs on one handle alone is there at once.
+
+        Args:
+            rest: [M, 3] float64, normalised units: the shape that costs nothing.
+            anchors: what is held.
+            shape: where to begin; not changed.
+        """
+        system = self._system(anchors)
+        start = torch.from_numpy(np.ascontiguousarray(rest))
+        positions = np.where(anchors.hard[:, None], anchors.positions, shape.positions)
+        posed, rotations = torch.from_numpy(positions), torch.from_numpy(self._guess(system, anchors, shape))
+        targets = torch.from_numpy(np.ascontiguousarray(anchors.positions))
+        spare = rotations.clone()
+        edges = self._begin, self._neighbors, self._weights
+        free = system.free.long().numpy()
+        sums = torch.empty(len(free), 3, dtype=torch.float64)
+        smooth = self.smoothness * self.graph.edge_length**2
+        tolerance = TOLERANCE * self.graph.edge_length
+        old = shape.anchors
+        same = old is not None and all(np.array_equal(a, b) for a, b in zip(old, anchors))
+        for step in range(1 if same else 0, iterations + 1):
+            if step:
+                inputs = system.turning, start, posed, *edges
+                launch(kernels.turn_nodes, len(system.turning), *inputs, smooth, rotations, spare, grain=64)
+                rotations, spare = spare, rotations
+            if system.factor is None:
+                break
+            stretch = self.stretch if step else 0.0  # the edges of what was moved have no direction yet
+            inputs = system.free, system.fixed, start, posed, *edges, stretch, rotations
+            launch(kernels.edge_sums, len(free), *inputs, system.pulls, targets, sums, grain=128)
+            solved = system.factor.solve(sums.numpy())
+            moved = float(np.abs(solved - positions[free]).max(initial=0.0))
+            positions[free] = solved
+            if step and not moved > tolerance:
+                break
+        return Shape(positions, rotations.numpy(), anchors)
+
+    def _guess(self, system: _System, anchors: Anchors, shape: Shape) -> np.ndarray:
+        """[M, 3, 3] rotations: given where they are, else those of ``shape`` turned by a harmonic mean of what the
+        given ones have turned since."""
+        turns = np.where(anchors.turned[:, None, None], anchors.rotations, shape.rotations)
+        further = np.zeros((len(turns), 3))
+        given = np.flatnonzero(anchors.turned)
+        change = turns[given] @ shape.rotations[given].transpose(0, 2, 1)
+        further[given] = logarithm(from_matrix(change))
+        if system.factor is None or not further.any():
+            return turns
+        free = system.free.long().numpy()
+        pulls = system.pulls.numpy()[:, None]
+        held = np.where(anchors.hard[:, None], further, 0.0)
+        sums = (self.graph.matrix @ held) + pulls * further
+        further[free] = system.factor.solve(np.ascontiguousarray(sums[free]))
+        turning = np.setdiff1d(free, given)
+        turns[turning] = to_matrix(exponential(further[turning])) @ turns[turning]
+        return turns
+
+    def solve(self, rest: np.ndarray, path: Callable[[float], Anchors], steps: int) -> Shape:
+        """The deformation at the end of a path of handles, which begins at rest: a function of its arguments alone.
+
+        Args:
+            rest: [M, 3] float64, normalised units.
+            path: share of the way, 0 to 1, to what is held there; the same nodes everywhere.
+            steps: as ``count_steps`` says.
+        """
+        shape = Shape.at_rest(rest)
+        for step in range(1, steps + 1):
+            last = step == steps
+            shape = self.relax(rest, path(step / steps), shape, FINAL_ITERATIONS if last else STEP_ITERATIONS)
+        return shape
+
+    def turns(self, rest: np.ndarray, posed: np.ndarray) -> np.ndarray:
+        """[M, 3, 3] how every node is turned, told from its edges and, a little, from its neighbours' turns."""
+        nodes = torch.arange(len(rest), dtype=torch.int32)
+        inputs = nodes, *(torch.from_numpy(np.ascontiguousarray(x)) for x in (rest, posed))
+        edges = self._begin, self._neighbors, self._weights
+        rotations = torch.from_numpy(np.tile(np.eye(3), (len(rest), 1, 1)))
+        spare = rotations.clone()
+        for step in range(TURN_ITERATIONS):
+            smooth = self.smoothness * self.graph.edge_length**2 if step else 0.0  # the first ones know nothing yet
+            launch(kernels.turn_nodes, len(rest), *inputs, *edges, smooth, rotations, spare, grain=64)
+            rotations, spare = spare, rotations
+        return rotations.numpy()
+
+    def poisson(self, rest: np.ndarray, rotations: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """Positions [M, 3] whose edges are those of ``rest`` turned by ``rotations`` [M, 3, 3], while nodes ``held``
+        [M] stay. A component of which nothing is held keeps its first node."""
+        graph = self.graph
+        own = np.repeat(np.arange(len(graph)), np.diff(graph.begin))
+        edges = rest[own] - rest[graph.neighbors]
+        wanted = np.einsum("eij,ej->ei", 0.5 * (rotations[own] + rotations[graph.neighbors]), edges)
+        hard = held.copy()
+        free_components = np.setdiff1d(graph.component, graph.component[held])
+        labels, first = np.unique(graph.component, return_index=True)
+        hard[first[np.isin(labels, free_components)]] = True
+        system = self._system(Anchors(hard, np.zeros(len(graph)), ~hard, rest, rotations))
+        positions = rest.copy()
+        free = system.free.long().numpy()
+        if system.factor is not None:
+            sums = np.zeros_like(rest)
+            known = np.where(hard[graph.neighbors, None], rest[graph.neighbors], 0.0)
+            np.add.at(sums, own, graph.weights[:, None] * (wanted + known))
+            positions[free] = system.factor.solve(sums[free])
+        return positions
+
+
+def count_steps(angle: float, distance: float, edge_length: float) -> int:
+    """Sub-steps for a handle that turns by ``angle`` (radians) and moves by ``distance``."""
+    wanted = max(angle / STEP_ANGLE, distance / (STEP_LENGTH * edge_length))
+    return min(MOST_STEPS, max(1, math.ceil(wanted - 1e-9))) if math.isfinite(wanted) else MOST_STEPS

@@ -1,0 +1,338 @@
+"""The editor: a scene in the browser, seen through our own renderer, with control points to take hold of."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..cameras import orbit_camera
+from ..edit import EditSession, Target
+from ..edit.handles import STAY
+from ..errors import UserError
+from . import placing
+from .display import RADIUS, Display
+from .model import Combine, Model, Moment
+from .overlays import GIZMO, Overlays
+from .panel import Panel
+from .picture import FINE_QUALITY, QUALITY, Picture, take
+from .proxy import guarded
+from .views import FULL, ClientCamera, Pace, Views
+from .worker import Worker
+
+if TYPE_CHECKING:
+    import viser
+
+HOST = "127.0.0.1"
+QUICK, PATIENT = 0.11, 0.8
+"""Seconds that a picture may take while something moves, and when all is still."""
+LARGEST = 4096
+"""Pixels of a screenshot's longer side, whatever a page says of its window."""
+REPEAT = 1.5
+"""Seconds in which the same message is not shown again."""
+
+
+def import_viser() -> Any:
+    """The package that serves the page.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        import viser
+    except ImportError:
+        raise UserError("the editor needs the package viser; install it with: pip install 'scgs_warp[edit]'") from None
+    return viser
+
+
+class Editor:
+    """Serves one session to any number of browsers, until ``stop``.
+
+    Args:
+        session: the scene under edit.
+        folder: where edits, films and exports go.
+        port: on 127.0.0.1; the next free one is taken. 0: any.
+        size: longer side of a full picture, at most.
+        key: if a proxy stands before it: what the proxy says.
+
+    Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``latency`` (seconds from a drag to its picture,
+    the latest hundred).
+
+    Raises:
+        UserError: viser is not installed.
+    """
+
+    def __init__(
+        self, session: EditSession, folder: Path, port: int = 8080, size: int = 1024, key: str | None = None
+    ) -> None:
+        viser = import_viser()
+        self.session, self.folder = session, folder
+        self.views = Views()
+        self.quick, self.full = Pace(QUICK, 256, 512), Pace(PATIENT, min(640, size), size)
+        self.worker = Worker(self.views, self._draw, lambda: self.model.busy)
+        self.model = Model(session, self.refresh)
+        self.latency: list[float] = []
+        self._said: dict[str, float] = {}
+        self._first = True
+        """No picture was drawn yet."""
+        self._waiting: dict[int, Any] = {}
+        self._dragger: int | None = None
+        self._dragged_at: float | None = None
+        self._place: tuple[placing.Place, Target] | None = None
+        self.display = Display.of(session.scene.overview)
+        with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # its banner names the wrong door
+            self.server: viser.ViserServer = viser.ViserServer(HOST, port, label="scgs_warp", verbose=False)
+        self.port: int = self.server.get_port()
+        self._dress()
+        self.panel = Panel(self)
+        self.worker.start()
+        self.server.on_client_connect(self._arrive)
+        self.server.on_client_disconnect(self._leave)
+        self.refresh()
+
+    @property
+    def url(self) -> str:
+        return f"http://{HOST}:{self.port}"
+
+    def stop(self) -> None:
+        self.panel.jobs.stop()
+        self.worker.stop()
+        self.server.stop()
+
+    def _dress(self) -> None:
+        """The scene's own up, camera and overlays."""
+        server, overview = self.server, self.session.scene.overview
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
+        server.gui.main_panel.dock_right()  # beside the picture, not over it
+        server.scene.world_axes.visible = False
+        server.scene.set_up_direction(overview.up)
+        start = orbit_camera(overview, overview.azimuth, 256)
+        camera = server.initial_camera
+        camera.position = tuple(self.display.show(start.position.numpy()).tolist())  # type: ignore[assignment]
+        camera.look_at, camera.up = (0.0, 0.0, 0.0), overview.up
+        camera.fov = 2 * float(np.arctan(start.height / (2 * float(start.K[1, 1]))))
+        camera.near, camera.far = 0.01 * RADIUS, 100.0 * RADIUS
+        self.edge_length = self.session.graph.edge_length / self.session.engine.units[1]
+        self.node_size = 0.16 * self.edge_length * self.display.scale
+        points = self.display.show(self.session.node_positions(0.0))
+        self.overlays = Overlays(server, self.session.graph.edges, points, self.node_size, GIZMO * RADIUS)
+        self.overlays.gizmo.on_update(self._gizmo_moved)
+        scene = server.scene
+        for modifier, how in ((None, None), ("shift", "add"), ("cmd/ctrl", "subtract")):
+            scene.on_click(modifier=modifier)(functools.partial(self._clicked, how=how))  # type: ignore[arg-type]
+
+    # Clients
+
+    def _arrive(self, client: viser.ClientHandle) -> None:
+        if self._first:
+            text = "Kernels are compiled when they are needed first; that may take a minute."
+            self._waiting[client.client_id] = client.add_notification("Drawing the scene", text, loading=True)
+        client.camera.on_update(lambda camera: self._moved(client))
+        self._moved(client)
+
+    def _leave(self, client: viser.ClientHandle) -> None:
+        if client.client_id == self._dragger:  # a window that was closed in the middle of a drag
+            self._dragger = None
+            self.model.release()
+        self._waiting.pop(client.client_id, None)
+        with self.worker.changing() as views:
+            views.drop(client.client_id)
+
+    def _moved(self, client: viser.ClientHandle) -> None:
+        if client.client_id not in self.server.get_clients():
+            return
+        with self.worker.changing() as views:
+            views.move(client.client_id, self.camera(client), time.monotonic())
+
+    def refresh(self) -> None:
+        """Something changed: new pictures for everybody."""
+        with self.worker.changing() as views:
+            views.change(time.monotonic())
+
+    def say(self, client: viser.ClientHandle | None, title: str, text: str, color: str = "red") -> None:
+        """A notification, to one client or to all; the same again only after a while, as drags repeat mistakes."""
+        now = time.monotonic()
+        if now - self._said.get(text, -np.inf) < REPEAT:
+            return
+        self._said = {said: at for said, at in self._said.items() if now - at < REPEAT} | {text: now}
+        everybody = self.server.get_clients().values()
+        for one in [client] if client is not None else list(everybody):
+            one.add_notification(title, text, auto_close_seconds=8.0, color=color)  # type: ignore[arg-type]
+
+    def guarded(self, action: Callable[..., Any]) -> Callable[[Any], None]:
+        """A callback that survives: what the user did wrong is said in the page, and so is what we did wrong. Values
+        that the program itself sets in the panel call nothing."""
+
+        def callback(event: Any) -> None:
+            if event.client is None:
+                return
+            try:
+                action(event)
+            except UserError as error:
+                self.say(event.client, "That does not work", str(error))
+            except CancelledError:
+                pass
+            except Exception as error:
+                self._failed(event.client, error)
+            self.panel.show()
+
+        return callback
+
+    def _failed(self, client: viser.ClientHandle | None, error: Exception) -> None:
+        """Our mistake, while it is being handled."""
+        traceback.print_exc(file=sys.stderr)
+        self.say(client, "Internal error", f"{type(error).__name__}: {error}")
+
+    def on_value(self, handle: Any, action: Callable[[Any], Any]) -> Any:
+        """The handle of a control; whenever a user changes its value, ``action`` is called with it."""
+        handle.on_update(self.guarded(lambda event: action(event.target.value)))
+        return handle
+
+    def color_overlays(self) -> None:
+        model, edit = self.model, self.session.edit
+        held = {node for handle in edit.handles for node in handle.nodes}
+        self.overlays.color(model.selection, held, edit.pins)
+
+    # Pictures
+
+    def camera(self, client: viser.ClientHandle) -> ClientCamera:
+        """A client's view as it is now, in world units."""
+        camera = client.camera
+        try:
+            width, height = int(camera.image_width), int(camera.image_height)
+        except (TypeError, ValueError, OverflowError):
+            width = height = 0
+        position = self.display.world(np.asarray(camera.position, np.float64))
+        wxyz = np.asarray(camera.wxyz, np.float64)
+        return ClientCamera(tuple(wxyz.tolist()), tuple(position.tolist()), float(camera.fov), width, height)
+
+    def take(self, moment: Moment, camera: ClientCamera) -> Picture:
+        """A picture in full; on the worker's thread."""
+        return take(self.session, moment, camera, min(max(camera.width, camera.height), LARGEST))
+
+    def _draw(self, number: int, quality: str) -> None:
+        """On the worker's thread."""
+        client = self.server.get_clients().get(number)
+        with self.worker.changing() as views:
+            camera = views.camera(number)
+        if client is None or camera is None:
+            return
+        asked = self._dragged_at
+        moment = self.model.moment()
+        pace = self.full if quality == FULL else self.quick
+        begin = time.perf_counter()
+        picture = take(self.session, moment, camera, min(pace.size, max(camera.width, camera.height)))
+        depth = self.display.nothing
+        if not self.model.through:
+            behind = 0.5 * self.edge_length * self.display.scale  # control points lie inside what they move
+            depth = self.display.depth(picture.depth, behind, 2 if quality == FULL else 1)
+        client.scene.set_background_image(
+            picture.rgb, format="jpeg", jpeg_quality=FINE_QUALITY if quality == FULL else QUALITY, depth=depth
+        )
+        client.flush()
+        self._first = False
+        waiting = self._waiting.pop(number, None)
+        if waiting is not None:
+            waiting.remove()
+        took = time.perf_counter() - begin
+        pace.took(took)
+        if asked is not None and asked == self._dragged_at:
+            self._dragged_at = None
+        if asked is not None and moment.live:
+            self.latency = [*self.latency[-99:], time.monotonic() - asked]
+        self._follow(moment)
+
+    def _follow(self, moment: Moment) -> None:
+        """Overlays and panel, after the picture."""
+        points = self.session.node_positions(moment.time, moment.at, live=moment.live)
+        self.overlays.move(self.display.show(points))
+        self._place_gizmo(moment)
+        self.panel.show_time()
+        again = self.model.playing or (moment.live and not self.session.engine.settled(self.session.edit))
+        if again:
+            self.refresh()
+
+    def _place_gizmo(self, moment: Moment) -> None:
+        model = self.model
+        if model.dragging:
+            return
+        handle = self.session.edit.handle(model.active or "")
+        if moment.show in ("original", "side by side") or (handle is None and not model.selection):
+            self._place = None
+            self.overlays.place(None)
+            return
+        if handle is None:
+            self._place = placing.place_of_selection(self.session, model.selection, moment)
+        else:
+            target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
+            self._place = placing.place_of(self.session, handle, moment.time), target
+        place, target = self._place
+        position, wxyz = place.pose(target)
+        self.overlays.place((self.display.show(position), wxyz))
+
+    # What users do in the picture
+
+    def _clicked(self, event: Any, how: Combine | None) -> None:
+        self.guarded(lambda event: self.pick(event.client, event.screen_pos, how))(event)
+
+    def pick(self, client: viser.ClientHandle, screen: tuple[float, float], how: Combine | None = None) -> None:
+        """A click on the canvas (0 to 1 from the upper left): on the surface it selects, beside it nothing is."""
+        model, moment = self.model, self.model.moment()
+        how = how or model.combine
+
+        def find() -> tuple[int, ...]:
+            point = placing.surface_point(self.session, self.camera(client), screen, moment)
+            return () if point is None else placing.region_at(self.session, point, model.region, moment)
+
+        nodes = self.worker.call(find)
+        held = [h.name for h in self.session.edit.handles if nodes and how == "replace" and set(nodes) <= set(h.nodes)]
+        if held:
+            model.activate(held[-1])
+        elif nodes or how == "replace":
+            model.select(nodes, how)
+
+    async def _gizmo_moved(self, event: Any) -> None:
+        """On the server's loop, in order; nothing here waits for a solution. One client drags at a time."""
+        if self._dragger not in (None, event.client_id):
+            return
+        self._dragger = None if event.phase == "end" else event.client_id
+        try:
+            self._gizmo(event.phase, self.display.world(event.target.position), np.array(event.target.wxyz))
+        except UserError as error:
+            self.say(event.client, "That does not work", str(error))
+        except Exception as error:
+            self._failed(event.client, error)
+
+    def _gizmo(self, phase: str, position: np.ndarray, wxyz: np.ndarray) -> None:
+        if self._place is None:
+            return
+        place, target = self._place
+        if phase == "start":
+            self.model.grab(target)
+        elif phase == "update":
+            if self.model.dragging:
+                self._dragged_at = self._dragged_at or time.monotonic()
+                self.model.drag(place.target(position, wxyz))
+        else:
+            self._dragged_at = None
+            self.model.release()
+            self.panel.show()
+
+    def put(self, target: Target) -> None:
+        """The chosen handle, at once: what the numbers in the panel do."""
+        if self._place is None:
+            raise UserError("nothing is chosen; click on the picture first")
+        self.model.grab(self._place[1])
+        try:
+            self.model.drag(target)
+        finally:
+            self.model.release()

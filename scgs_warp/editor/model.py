@@ -1,0 +1,306 @@
+"""What the editor knows besides the edit: what is selected, which moment is shown, what is being dragged. No browser
+in here: panels call this, and tests do."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ..edit import Edit, EditSession, Target, script
+from ..edit.filming import frame_reach
+from ..errors import UserError
+
+Show = Literal["edited", "original", "side by side", "split"]
+Combine = Literal["replace", "add", "subtract"]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What a picture shows."""
+
+    time: float
+    """Of the scene."""
+    at: float | None
+    """Second of the film whose keyframes lead the handles; None: where handles are now."""
+    live: bool
+    show: Show
+    reach: float
+    """How far from its time an edit of one frame shows."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """What a click takes."""
+
+    kind: Literal["rings", "brush"] = "rings"
+    rings: int = 2
+    radius: float = 0.1
+    """World units."""
+
+
+class Model:
+    """The state of one editor, shared by all its clients. ``lock`` guards it; nothing here solves or draws.
+
+    Args:
+        session: the scene under edit.
+        changed: called after every change, without the lock.
+    """
+
+    def __init__(self, session: EditSession, changed: Callable[[], None] = lambda: None) -> None:
+        self.session = session
+        self.changed = changed
+        self.lock = threading.RLock()
+        self.selection: tuple[int, ...] = ()
+        self.active: str | None = None
+        self.region = Region()
+        self.pin_rings: int | None = 3
+        """Whoever takes hold pins everything further than this; None: nothing."""
+        self.lasts: Any = "motion"
+        self.window = 0.1
+        self.stiffness: float | None = None
+        self.combine: Combine = "replace"
+        self.through = False
+        """Overlays are seen through the surface."""
+        self.show: Show = "edited"
+        self.at = 0.0
+        self.dragging = False
+        self._following = False
+        self._played_from: tuple[float, float] | None = None
+        self._reach: tuple[Any, float] = (None, 0.0)
+
+    # Time
+
+    @property
+    def seconds(self) -> float:
+        return self.session.edit.film.seconds
+
+    @property
+    def playing(self) -> bool:
+        return self._played_from is not None
+
+    @property
+    def busy(self) -> bool:
+        """Pictures had better come soon than large."""
+        return self.dragging or self.playing
+
+    @property
+    def time(self) -> float:
+        """Scene time that is shown."""
+        return self.session.scene_time(self.at)
+
+    def seek(self, at: float) -> None:
+        """Show a second of the film; keyframes lead the handles there."""
+        with self.lock:
+            self.at = min(max(float(at), 0.0), self.seconds) if np.isfinite(at) else self.at
+            self._following = bool(self.session.edit.keyframes)
+            if self._played_from is not None:
+                self._played_from = (time.monotonic(), self.at)
+        self.changed()
+
+    def play(self, on: bool) -> None:
+        with self.lock:
+            self._played_from = (time.monotonic(), self.at) if on else None
+            self._following = self._following or bool(on and self.session.edit.keyframes)
+        self.changed()
+
+    def tick(self, now: float | None = None) -> None:
+        """If it plays, go to the frame of the film that is due."""
+        with self.lock:
+            if self._played_from is None:
+                return
+            start, begin = self._played_from
+            now = time.monotonic() if now is None else now
+            fps = self.session.edit.film.fps
+            length = max(self.seconds, 1.0 / fps)
+            self.at = int((begin + now - start) % length * fps + 1e-6) / fps
+
+    def moment(self) -> Moment:
+        with self.lock:
+            self.tick()
+            edit = self.session.edit
+            key = edit.film, edit.playback
+            if self._reach[0] != key:
+                self._reach = key, frame_reach(self.session)
+            live = self.dragging and not self.playing
+            at = self.at if self._following and not live else None
+            return Moment(self.time, at, live, self.show, self._reach[1])
+
+    # The edit
+
+    @contextlib.contextmanager
+    def changing(self) -> Iterator[EditSession]:
+        """The session, to change its edit; then everything is drawn anew."""
+        with self.lock:
+            try:
+                yield self.session
+            finally:
+                self._check()
+        self.changed()
+
+    def _check(self) -> None:
+        """Forget what is no longer there."""
+        edit = self.session.edit
+        if edit.handle(self.active or "") is None:
+            self.active = self._holder()
+        self.at = min(self.at, self.seconds)
+        self._following = self._following and bool(edit.keyframes)
+
+    def undo(self) -> bool:
+        with self.changing() as session:
+            self.dragging = False
+            return session.undo()
+
+    def redo(self) -> bool:
+        with self.changing() as session:
+            self.dragging = False
+            return session.redo()
+
+    def reset(self) -> None:
+        """No edit; can be undone."""
+        with self.changing() as session:
+            self.dragging = False
+            session.reset()
+
+    def set(self, **fields: Any) -> None:
+        """Change what is no part of the edit: region, pin_rings, show ..."""
+        with self.lock:
+            for name, value in fields.items():
+                setattr(self, name, value)
+        self.changed()
+
+    def replace(self, **fields: Any) -> None:
+        """Change fields of the edit.
+
+        Raises:
+            UserError: a script could not say that either; the edit is as before.
+        """
+        with self.changing() as session:
+            session.apply(self._checked(dataclasses.replace(session.edit, **fields)))
+
+    def _checked(self, edit: Edit) -> Edit:
+        """What controls send is trusted no more than a file is: pages may send anything."""
+        return script.parse(json.loads(script.to_json(edit, self.session)), "the edit", self.session)
+
+    def change_handle(self, **fields: Any) -> None:
+        """Change fields of the active handle."""
+        with self.changing() as session:
+            handle = session.edit.handle(self.active or "")
+            if handle is None:
+                raise UserError("no handle is chosen; click on the picture, then drag")
+            changed = dataclasses.replace(handle, **fields)
+            handles = tuple(changed if other is handle else other for other in session.edit.handles)
+            session.apply(self._checked(dataclasses.replace(session.edit, handles=handles)))
+
+    def remove_handle(self) -> None:
+        """The active handle, with its part in every keyframe."""
+        with self.changing() as session:
+            if self.active is None:
+                raise UserError("no handle is chosen; click on what it holds first")
+            session.remove_handle(self.active)
+
+    # Selecting
+
+    def select(self, nodes: tuple[int, ...], how: Combine = "replace") -> None:
+        with self.lock:
+            old, new = set(self.selection), set(nodes)
+            chosen = {"replace": new, "add": old | new, "subtract": old - new}[how]
+            self.selection = tuple(sorted(chosen))
+            self.active = self._holder()
+        self.changed()
+
+    def _holder(self) -> str | None:
+        """The handle that holds just what is selected: nobody wants a second one there."""
+        handles = self.session.edit.handles
+        return next((handle.name for handle in handles if handle.nodes == self.selection), None)
+
+    def activate(self, name: str | None) -> None:
+        """Take an existing handle in hand."""
+        with self.lock:
+            handle = self.session.edit.handle(name or "")
+            self.active = None if handle is None else handle.name
+            self.selection = self.selection if handle is None else handle.nodes
+        self.changed()
+
+    # Dragging
+
+    def grab(self, target: Target) -> str:
+        """Begin to drag: the active handle, or a new one of the selection, which starts out at ``target`` (where other
+        handles have bent it to), with the rest pinned if so wished. All part of the drag: undo takes it back at once.
+
+        Raises:
+            UserError: nothing is selected; the edit is as before.
+        """
+        with self.lock:
+            self.session.release()
+            if self.active is None and not self.selection:
+                raise UserError("nothing is chosen; click on the picture first")
+            self._take_over()
+            if self.active is None:
+                draft = self.session.fork()
+                self.active = self._take_hold(draft, target)
+                self.session.preview(draft.edit)
+            self.dragging, name = True, self.active
+            self._played_from = None
+        self.changed()
+        return name
+
+    def _take_hold(self, draft: EditSession, target: Target) -> str:
+        """A handle on the selection; its name."""
+        automatic = self.pin_rings is not None and set(draft.edit.pins) == self._rest(self.pin_rings)
+        fields = {"lasts": self.lasts, "window": self.window, "stiffness": self.stiffness}
+        handle = draft.add_handle(self.selection, self.time, **fields)
+        if self.pin_rings is not None and (automatic or not draft.edit.pins):
+            draft.pin_rest(self.pin_rings)
+        draft.unpin(set(handle.nodes) & set(draft.edit.pins))
+        if not target.is_identity:
+            draft.move(handle.name, target.translation, target.rotation)
+        return handle.name
+
+    def _rest(self, rings: int) -> set[int]:
+        """What ``pin_rest`` pins: pins of that kind make way for new handles."""
+        near: set[int] = set()
+        for handle in self.session.edit.handles:
+            near |= set(self.session.graph.ring(handle.nodes, rings))
+        return set(range(len(self.session))) - near
+
+    def _take_over(self) -> None:
+        """Handles go on from where keyframes have them at this moment; part of the drag that begins."""
+        if self._following:
+            for name, target in self.session.engine.targets(self.session.edit, self.at).items():
+                self.session.drag(name, target.translation, target.rotation)
+            self._following = False
+
+    def drag(self, target: Target) -> None:
+        """Put the active handle somewhere; a broken number changes nothing.
+
+        Raises:
+            UserError: a number is not finite.
+        """
+        with self.lock:
+            if self.active is None:
+                return
+            self._take_over()
+            self.session.drag(self.active, target.translation, target.rotation)
+        self.changed()
+
+    def release(self) -> None:
+        with self.lock:
+            self.dragging = False
+            self.session.release()
+        self.changed()
+
+    def add_keyframe(self, easing: Any = "smooth") -> None:
+        """At the moment shown; from then on keyframes lead."""
+        with self.changing() as session:
+            if self._following:
+                session.show_keyframes(self.at)
+            session.add_keyframe(self.at, easing)
+            self._following = True

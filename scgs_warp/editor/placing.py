@@ -1,0 +1,95 @@
+"""Between the picture and the edit: what a click takes, and where the gizmo of a handle stands. Solves: call it on the
+worker's thread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..edit import EditSession, Handle, Target
+from ..edit.handles import STAY, carried_goal
+from ..edit.rotations import conjugate, from_matrix, multiply, rigid_fit, rotate, unit
+from .model import Moment, Region
+from .views import ClientCamera
+
+PICK_SIZE = 512
+NOISE = 1e-7
+"""Half the angle in radians, below which a browser that was asked to shift has not turned."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a handle would be if it were not moved, at the moment shown, world units."""
+
+    pivot: np.ndarray
+    """[3]"""
+    frame: np.ndarray
+    """[4] wxyz: how its surroundings have turned since its own time."""
+
+    def pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:
+        """Position [3] and wxyz [4] of the gizmo."""
+        turned = multiply(multiply(self.frame, np.array(target.rotation)), conjugate(self.frame))
+        return self.pivot + rotate(self.frame, np.array(target.translation)), turned
+
+    def target(self, position: np.ndarray, wxyz: np.ndarray) -> Target:
+        """The inverse of ``pose``.
+
+        Raises:
+            UserError: a number is not finite.
+        """
+        Target.of(position.tolist(), wxyz.tolist())  # broken numbers are named as the browser sent them
+        shift = rotate(conjugate(self.frame), np.asarray(position, np.float64) - self.pivot)
+        turn = multiply(multiply(conjugate(self.frame), np.asarray(wxyz, np.float64)), self.frame)
+        checked = Target.of(shift.tolist(), turn.tolist())
+        if all(abs(part) < NOISE for part in checked.rotation[1:]):
+            return Target(checked.translation)
+        return Target(checked.translation, tuple(unit(np.array(checked.rotation)).tolist()))
+
+
+def place_of(session: EditSession, handle: Handle, time: float) -> Place:
+    engine = session.engine
+    then = engine.base_at(session.edit, handle.time).positions
+    now = then if time == handle.time else engine.base_at(session.edit, time).positions
+    where = [carried_goal(handle, STAY, 1.0, session.graph, then, now, engine.units)]
+    axes = np.eye(3)
+    where += [
+        carried_goal(handle, Target.of(axis), 1.0, session.graph, then, now, engine.units) for axis in axes.tolist()
+    ]
+    frame = np.stack([goal.translation for goal in where[1:]], axis=1) / engine.units[1]
+    return Place(engine.to_world(where[0].pivot), from_matrix(frame))
+
+
+def place_of_selection(session: EditSession, nodes: tuple[int, ...], moment: Moment) -> tuple[Place, Target]:
+    """Where a handle on these nodes would stand, and the target with which it would leave them where they are now."""
+    chosen = list(nodes)
+    base = session.engine.to_world(session.engine.base_at(session.edit, moment.time).positions)[chosen]
+    now = session.node_positions(moment.time, moment.at)[chosen]
+    place = Place(base.mean(0), np.array([1.0, 0.0, 0.0, 0.0]))
+    if np.allclose(base, now, rtol=0, atol=1e-9):
+        return place, STAY
+    turn, before, after = rigid_fit(base, now)
+    if len(chosen) < 3:
+        turn = np.array([1.0, 0.0, 0.0, 0.0])
+    return place, Target.of((after - before).tolist(), turn.tolist())
+
+
+def surface_point(
+    session: EditSession, camera: ClientCamera, screen: tuple[float, float], moment: Moment
+) -> np.ndarray | None:
+    """[3] what is seen at a point of the canvas (0 to 1 from the upper left); None: the background."""
+    x, y = screen
+    share = 1.0
+    if moment.show == "side by side":
+        x, share = 2 * x - (x >= 0.5), 0.5
+    seen = camera.at_size(PICK_SIZE, share)
+    column, row = (min(max(z * n, 0.0), n - 1e-3) for z, n in ((x, seen.width), (y, seen.height)))
+    return session.pick(seen, column, row, moment.time, moment.at)
+
+
+def region_at(session: EditSession, point: np.ndarray, region: Region, moment: Moment) -> tuple[int, ...]:
+    """The control points that a click at a point of the surface takes: never none."""
+    nearest = session.nearest(point.tolist(), moment.time, moment.at)
+    if region.kind == "rings":
+        return session.ring([nearest], region.rings)
+    return tuple(sorted({nearest, *session.within(point.tolist(), region.radius, moment.time, moment.at)}))

@@ -1,0 +1,262 @@
+"""Who may talk to the editor. The package that serves the page checks neither where a request comes from nor who sends
+it, so a page from anywhere could drive an editor on its visitor's machine. Two doors, both of which check:
+
+``guarded`` refuses foreign pages at the editor's own port, which listens on 127.0.0.1 only. ``Proxy`` listens where
+others reach it, asks for a token, checks the origin of pages and WebSockets, and hands everything on; while it stands,
+the editor's own port takes nobody but it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import http
+import secrets
+import threading
+from collections.abc import Iterator
+from http.cookies import CookieError, SimpleCookie
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+from ..errors import UserError
+
+LOCAL = {"127.0.0.1", "localhost", "::1"}
+KEY = "x-editor-key"
+COOKIE = "scgs_editor"
+MOST_HEAD = 32 << 10
+"""Bytes of a request's head."""
+PATIENCE = 10.0
+"""Seconds in which a request's head has to be there."""
+
+
+class Head(NamedTuple):
+    """The beginning of an HTTP request."""
+
+    method: str
+    target: str
+    headers: list[tuple[str, str]]
+    """Names in lower case."""
+
+    def get(self, name: str) -> str | None:
+        """The header's value; None without it, empty (which passes no check) if it is there twice."""
+        found = [value for key, value in self.headers if key == name]
+        return None if not found else found[0] if len(found) == 1 else ""
+
+    @property
+    def upgrades(self) -> bool:
+        return (self.get("upgrade") or "").lower() == "websocket"
+
+
+def parse_head(text: bytes) -> Head | None:
+    """None if it is no request that a browser sends: no bodies, no folded lines, no odd bytes."""
+    try:
+        first, *rest = text.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
+        method, target, version = first.split(" ")
+        headers = [(line.partition(":")[0].lower(), line.partition(":")[2].strip()) for line in rest]
+    except ValueError:
+        return None
+    plain = all(name and ":" in line and name.replace("-", "").isalnum() for (name, _), line in zip(headers, rest))
+    printable = all(" " <= character != "\x7f" for line in (first, *rest) for character in line)
+    head = Head(method, target, headers)
+    body = head.get("content-length") not in (None, "0") or head.get("transfer-encoding") is not None
+    good = method in ("GET", "HEAD") and version == "HTTP/1.1" and target.startswith("/") and not body
+    return head if good and plain and printable else None
+
+
+def same_origin(origin: str | None, host: str | None) -> bool:
+    """Whether a page of this origin came from the host that it now asks."""
+    if not origin or not host:
+        return False
+    parts = urlsplit(origin)
+    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower()
+
+
+def is_local(host: str | None) -> bool:
+    """Whether a Host header names this machine: a foreign name that resolves to 127.0.0.1 does not."""
+    try:
+        return urlsplit(f"//{host}").hostname in LOCAL
+    except ValueError:
+        return False
+
+
+def refusal(headers: Any, key: str | None) -> str | None:
+    """Why a request at the editor's own port is refused; None: it is not.
+
+    Args:
+        headers: with ``get_all(name)``.
+        key: if there is a proxy: what it says. Else only this machine's own pages may ask.
+    """
+    host, origin, given = (
+        found[0] if len(found) == 1 else None for found in map(headers.get_all, ("Host", "Origin", KEY))
+    )
+    if key is not None:
+        known = given is not None and hmac.compare_digest(given.encode(), key.encode())
+        return None if known else "come in through the address that the editor printed"
+    if not is_local(host):
+        return "the editor answers to 127.0.0.1 and localhost only"
+    if (headers.get_all("Upgrade") or headers.get_all("Origin")) and not same_origin(origin, host):
+        return "a page from elsewhere may not use the editor"
+    return None
+
+
+@contextlib.contextmanager
+def guarded(key: str | None) -> Iterator[None]:
+    """Servers started inside answer to nobody whom ``refusal`` refuses. viser leaves no other place to look at a
+    request than the function of ``websockets`` that it starts its server with.
+
+    Raises:
+        UserError: the server was started in another way: better none than an open one.
+    """
+    import websockets.asyncio.server as module
+
+    start, started = module.serve, False
+
+    def serve(*args: Any, process_request: Any = None, **options: Any) -> Any:
+        nonlocal started
+        started = True
+
+        def look(connection: Any, request: Any) -> Any:
+            why = refusal(request.headers, key)
+            if why is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, why)
+            return None if process_request is None else process_request(connection, request)
+
+        return start(*args, process_request=look, **options)
+
+    module.serve = serve  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        module.serve = start
+    if not started:
+        raise UserError("the editor cannot guard this version of viser; install: pip install 'viser>=1.1,<1.2'")
+
+
+class Proxy:
+    """Passes on to ``port`` on 127.0.0.1 who has the token. Runs on a thread of its own until ``stop``.
+
+    Args:
+        port: of the editor.
+        host, public: where to listen; 0 takes any port.
+        key: what the editor's ``guarded`` port knows it by.
+
+    Attributes: ``token``, ``public`` (the port), ``url`` (as seen from this machine, with the token).
+
+    Raises:
+        UserError: it cannot listen there.
+    """
+
+    def __init__(self, port: int, key: str, host: str = "0.0.0.0", public: int = 0) -> None:
+        self.port, self.key, self.host, self.public = port, key, host, public
+        self.token = secrets.token_urlsafe(24)
+        self._loop = asyncio.new_event_loop()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
+        self._thread.start()
+        try:
+            self._server = asyncio.run_coroutine_threadsafe(self._listen(), self._loop).result(10)
+        except OSError as error:
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            raise UserError(f"--port {public}: cannot listen there ({error.strerror}); give another port") from None
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.public}/?token={self.token}"
+
+    def stop(self) -> None:
+        """Every connection ends."""
+
+        async def close() -> None:
+            self._server.close()
+            for task in list(self._tasks):
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+
+        if self._thread.is_alive():
+            asyncio.run_coroutine_threadsafe(close(), self._loop).result(10)
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join(10)
+
+    async def _listen(self) -> asyncio.Server:
+        server = await asyncio.start_server(self._serve, self.host, self.public, limit=MOST_HEAD)
+        self.public = server.sockets[0].getsockname()[1]
+        return server
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        try:
+            await self._answer(reader, writer)
+        except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.TimeoutError):
+            pass  # whoever asked is gone, too slow or sends nonsense
+        finally:
+            self._tasks.discard(task)
+            writer.close()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        text = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
+        head = parse_head(text)
+        if head is None:
+            return await _reply(writer, "400 Bad Request", "not a request of this page")
+        given = self._given(head)
+        if given is None or not hmac.compare_digest(given.encode(), self.token.encode()):
+            return await _reply(writer, "403 Forbidden", "open the address that the editor printed, token and all")
+        origin = head.get("origin")
+        if (head.upgrades or origin is not None) and not same_origin(origin, head.get("host")):
+            return await _reply(writer, "403 Forbidden", "a page from elsewhere may not use the editor")
+        if "token" in parse_qs(urlsplit(head.target).query):
+            # From here on the cookie says it: the token stands in no address, so in no history and no Referer
+            cookie = f"{COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Lax"
+            return await _reply(writer, "303 See Other", "", f"Location: /\r\nSet-Cookie: {cookie}\r\n")
+        await self._pass_on(head, reader, writer)
+
+    def _given(self, head: Head) -> str | None:
+        """The token of a request: in its address, once, then in the cookie."""
+        asked = parse_qs(urlsplit(head.target).query).get("token")
+        if asked is not None:
+            return asked[0] if len(asked) == 1 else None
+        try:
+            found = SimpleCookie(head.get("cookie") or "").get(COOKIE)
+        except CookieError:
+            return None
+        return None if found is None else found.value
+
+    async def _pass_on(self, head: Head, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Head first, then bytes both ways. One request a connection, unless it becomes a WebSocket: what is not
+        looked at is not handed on."""
+        kept = [(name, value) for name, value in head.headers if name not in (KEY, "cookie", "connection")]
+        kept += [(KEY, self.key), ("connection", "Upgrade" if head.upgrades else "close")]
+        lines = [f"{head.method} {head.target} HTTP/1.1", *(f"{name}: {value}" for name, value in kept)]
+        inside_reader, inside_writer = await asyncio.open_connection("127.0.0.1", self.port)
+        try:
+            inside_writer.write(("\r\n".join(lines) + "\r\n\r\n").encode("latin-1"))
+            ways = [asyncio.create_task(_pump(inside_reader, writer))]
+            if head.upgrades:
+                ways.append(asyncio.create_task(_pump(reader, inside_writer)))
+            try:
+                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for way in ways:
+                    way.cancel()
+                await asyncio.gather(*ways, return_exceptions=True)
+        finally:
+            inside_writer.close()
+
+
+async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    with contextlib.suppress(OSError):
+        while chunk := await reader.read(1 << 16):
+            writer.write(chunk)
+            await writer.drain()
+
+
+async def _reply(writer: asyncio.StreamWriter, status: str, text: str, more: str = "") -> None:
+    body = text.encode()
+    head = (
+        f"HTTP/1.1 {status}\r\nContent-Type: text/plain; charset=utf-8\r\nContent-Length: {len(body)}\r\n"
+        f"Connection: close\r\nCache-Control: no-store\r\nReferrer-Policy: no-referrer\r\n{more}\r\n"
+    )
+    writer.write(head.encode("latin-1") + body)
+    await writer.drain()

@@ -1,0 +1,152 @@
+"""Which client needs which picture next, and how large: newest state only, never a queue."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..edit.rotations import to_matrix
+from ..types import Camera
+
+STILL = 0.25
+"""Seconds without a change after which a picture is drawn in full."""
+LOW, FULL = "low", "full"
+SMALLEST = 96
+
+
+@dataclass(frozen=True)
+class ClientCamera:
+    """A browser's view: OpenCV pose, vertical field of view in radians, and its canvas."""
+
+    wxyz: tuple[float, ...]
+    position: tuple[float, ...]
+    fov: float
+    width: int
+    height: int
+
+    @property
+    def usable(self) -> bool:
+        """A hidden window has no size, and a broken page may send anything."""
+        numbers = (*self.wxyz, *self.position, self.fov)
+        return all(map(math.isfinite, numbers)) and any(self.wxyz) and self.width > 0 and self.height > 0
+
+    def at_size(self, size: int, share: float = 1.0) -> Camera:
+        """A camera of the renderer, on the CPU.
+
+        Args:
+            size: longer side in pixels of the whole canvas.
+            share: of the canvas' width that is drawn; the vertical field of view stays.
+        """
+        scale = size / max(self.width, self.height)
+        height = max(1, round(self.height * scale))
+        width = max(1, round(self.width * scale * share))
+        focal = height / (2 * math.tan(min(max(self.fov, 1e-3), 3.1) / 2))
+        K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+        quat = np.array(self.wxyz, np.float64)
+        rotation = to_matrix(quat / np.linalg.norm(quat)).T
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ np.array(self.position, np.float64)
+        return Camera(torch.from_numpy(viewmat).float(), K, width, height)
+
+
+@dataclass
+class _View:
+    camera: ClientCamera
+    changed: float
+    """When it last needed another picture."""
+    drawn: float = -math.inf
+    state: Any = None
+    """(version, camera) of the last picture."""
+    quality: str = ""
+
+
+class Views:
+    """One entry a client. Not thread safe: the worker's lock guards it."""
+
+    def __init__(self) -> None:
+        self._views: dict[int, _View] = {}
+        self._version = 0
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def move(self, client: int, camera: ClientCamera, now: float) -> None:
+        """A client's camera, new or changed."""
+        view = self._views.get(client)
+        if view is None:
+            self._views[client] = _View(camera, now)
+        elif view.camera != camera:
+            view.camera, view.changed = camera, now
+
+    def drop(self, client: int) -> None:
+        self._views.pop(client, None)
+
+    def change(self, now: float) -> None:
+        """The scene looks different to everybody."""
+        self._version += 1
+        for view in self._views.values():
+            view.changed = now
+
+    def camera(self, client: int) -> ClientCamera | None:
+        view = self._views.get(client)
+        return None if view is None else view.camera
+
+    def _wants(self, view: _View, now: float, busy: bool) -> str | None:
+        if not view.camera.usable:
+            return None
+        still = not busy and now - view.changed >= STILL
+        if view.state != (self._version, view.camera):
+            return FULL if still else LOW
+        return FULL if still and view.quality == LOW else None
+
+    def next(self, now: float, busy: bool) -> tuple[int, str] | None:
+        """(client, quality) of the picture that is due, of the client who has waited longest; it counts as drawn from
+        here on, so that what changes meanwhile is drawn again."""
+        due = [(view.drawn, client) for client, view in self._views.items() if self._wants(view, now, busy)]
+        if not due:
+            return None
+        client = min(due)[1]
+        view = self._views[client]
+        quality = self._wants(view, now, busy) or LOW
+        view.drawn, view.state, view.quality = now, (self._version, view.camera), quality
+        return client, quality
+
+    def settled(self, now: float, busy: bool) -> bool:
+        """Whether every client that has a window has its last and full picture."""
+        return all(self._wants(view, now, busy) is None and view.quality == FULL for view in self._seen())
+
+    def _seen(self) -> list[_View]:
+        return [view for view in self._views.values() if view.camera.usable]
+
+    def wait(self, now: float, busy: bool) -> float | None:
+        """Seconds until the next picture is due if nothing happens; None: never."""
+        rough = [view for view in self._seen() if view.quality == LOW]
+        if not rough or busy:
+            return None
+        return max(0.005, min(view.changed + STILL - now for view in rough))
+
+
+class Pace:
+    """The size that a picture may have to be there in time, found by trying.
+
+    Args:
+        seconds: what a picture may take.
+        size, limit: the longer side in pixels to begin with, and at most.
+    """
+
+    def __init__(self, seconds: float, size: int, limit: int) -> None:
+        self.seconds, self.limit = seconds, limit
+        self._size = float(size)
+
+    @property
+    def size(self) -> int:
+        return max(SMALLEST, min(self.limit, 16 * round(self._size / 16)))
+
+    def took(self, seconds: float) -> None:
+        """Learn from a picture of the present size; a single slow one counts little."""
+        change = math.sqrt(self.seconds / max(seconds, 1e-4))
+        self._size = min(max(self._size * min(max(change, 0.8), 1.2), SMALLEST), self.limit)

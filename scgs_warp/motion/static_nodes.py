@@ -1,0 +1,106 @@
+"""Gaussians that stand still, with control points to take hold of: what editing needs of a static scene."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..gaussians import GaussianParameters
+from ..ops.neighbors import nearest, rbf_weights
+from ..ops.sampling import farthest_points
+from ..ops.skinning import skin
+from ..types import Gaussians, Pose
+from .base import Motion
+
+COUNT = 512
+"""Control points, where nobody says how many."""
+NEIGHBORS = 4
+OPAQUE = 0.1
+"""Gaussians of less opacity are followed by no control point: floaters would take the farthest ones."""
+CORE = 0.98
+"""Share of the opaque Gaussians, nearest to their median first, that control points are sampled from."""
+SPACINGS = 0.75
+"""A control point's radius, in distances to its three nearest neighbours."""
+
+
+class StaticNodes(Motion):
+    """Control points [M, 3] at rest for ever; buffers, not parameters: nothing here is trained."""
+
+    name = "static"
+    moves = False
+    takes_time_tensor = True
+
+    def __init__(self, positions: Tensor, radii: Tensor) -> None:
+        super().__init__()
+        self.positions: Tensor
+        self.radii: Tensor
+        self.register_buffer("positions", positions.detach().clone())
+        self.register_buffer("radii", radii.detach().clone())
+
+    @staticmethod
+    @torch.no_grad()
+    def sample(gaussians: GaussianParameters, count: int = COUNT) -> StaticNodes:
+        """Spread evenly over the opaque Gaussians, as farthest points.
+
+        Args:
+            count: at most this many; fewer where there are fewer Gaussians.
+        """
+        means, opacities = gaussians.means.detach(), gaussians.opacities().detach()
+        finite = means.isfinite().all(dim=1)
+        opaque = finite & (opacities > OPAQUE)
+        points = means[opaque if bool(opaque.any()) else finite].contiguous()
+        if len(points) > 16:
+            away = (points - points.median(dim=0).values).norm(dim=1)
+            points = points[away <= away.quantile(CORE) if len(away) < 10_000_000 else away > -1].contiguous()
+        middle = (points - points.mean(dim=0)).norm(dim=1) if len(points) else torch.zeros(0)
+        start = int(middle.argmin()) if len(points) else 0
+        nodes = points[farthest_points(points, min(count, len(points)), start)]
+        return StaticNodes(nodes, spacing(nodes) * SPACINGS)
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+    def poses(self, times: Tensor) -> list[Pose]:
+        """Rest, at every time."""
+        zeros = torch.zeros_like(self.positions)
+        still = torch.zeros(len(self), 4, device=zeros.device)
+        still[:, 0] = 1.0
+        return [Pose(zeros, still) for _ in range(times.shape[0])]
+
+    def trajectories(self, times: Tensor) -> Tensor:
+        """[T, M, 3]"""
+        return self.positions.expand(times.shape[0], -1, -1)
+
+    def control_points_at(self, time: float) -> Tensor:
+        return self.positions
+
+    def neighbors(self, gaussians: GaussianParameters) -> Tensor:
+        """[N, K] int32, nearest first."""
+        means = gaussians.means.detach()
+        return nearest(means, self.positions, min(NEIGHBORS, len(self)))[0]
+
+    @torch.no_grad()
+    def binding(self, gaussians: GaussianParameters) -> tuple[Tensor, Tensor]:
+        """Neighbours and their RBF weights (SC-GS, Eq. 5): indices [N, K], weights [N, K]."""
+        indices = self.neighbors(gaussians)
+        return indices, rbf_weights(gaussians.means.detach(), self.positions, self.radii, indices)
+
+    @torch.no_grad()
+    def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
+        """Linear blend skinning of all Gaussians (SC-GS, Eq. 6-7)."""
+        means, quats, _ = skin(gaussians.means.detach(), gaussians.quats.detach(), self.positions, pose, *binding)
+        rest = gaussians.activate()
+        return Gaussians(means, quats, rest.scales, rest.opacities, rest.sh_dc, rest.sh_rest)
+
+    def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
+        return gaussians.activate()
+
+
+def spacing(nodes: Tensor) -> Tensor:
+    """[M] mean distance to the three nearest other nodes; 1 for a lone one."""
+    count = min(3, nodes.shape[0] - 1)
+    if count < 1:
+        return torch.ones(nodes.shape[0], device=nodes.device)
+    squared = nearest(nodes, nodes, count + 1)[1][:, 1:]
+    distances = squared.sqrt()
+    return (distances.sum(dim=1) / count).clamp_min(1e-6)

@@ -1,0 +1,96 @@
+"""Colours that turn with what they are painted on: rotation of spherical harmonics coefficients. No gradient."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..kernels import harmonics_rotation as kernels
+from ..warp_interop import launch
+
+SIZES = (0, 3, 8, 15)
+"""Coefficients above degree 0, for degrees 0 to 3."""
+
+
+def _basis(degree: int, d: np.ndarray) -> np.ndarray:
+    """[V, 2 l + 1] one band at unit directions [V, 3], with the signs of 3D-GS (``kernels/harmonics.py``)."""
+    x, y, z = d.T
+    xx, yy, zz = x * x, y * y, z * z
+    pi = math.pi
+    if degree == 1:
+        return math.sqrt(3 / (4 * pi)) * np.stack([-y, z, -x], 1)
+    if degree == 2:
+        a, b = math.sqrt(15 / (4 * pi)), math.sqrt(5 / (16 * pi))
+        return np.stack([a * x * y, -a * y * z, b * (3 * zz - 1), -a * x * z, 0.5 * a * (xx - yy)], 1)
+    a, b, c, e = (math.sqrt(n / pi) for n in (35 / 32, 105 / 4, 21 / 32, 7 / 16))
+    return np.stack(
+        [
+            a * y * (yy - 3 * xx),
+            b * x * y * z,
+            c * y * (1 - 5 * zz),
+            e * z * (5 * zz - 3),
+            c * x * (1 - 5 * zz),
+            0.5 * b * z * (xx - yy),
+            a * x * (3 * yy - xx),
+        ],
+        1,
+    )
+
+
+@functools.cache
+def _tables() -> tuple[Tensor, Tensor]:
+    """Directions [15, 3] and the inverses [83] of the bands' values there.
+
+    The directions are those of a seeded search for well-conditioned matrices: values are as exact as coefficients.
+    """
+    random = np.random.default_rng(1)
+    directions, inverses = [], []
+    for degree in (1, 2, 3):
+        tried = random.normal(size=(200, 2 * degree + 1, 3))
+        tried /= np.linalg.norm(tried, axis=-1, keepdims=True)
+        values = np.stack([_basis(degree, d) for d in tried])
+        best = int(np.linalg.cond(values).argmin())
+        directions.append(tried[best])
+        inverses.append(np.linalg.inv(values[best]).reshape(-1))
+    return torch.from_numpy(np.concatenate(directions)).float(), torch.from_numpy(np.concatenate(inverses)).float()
+
+
+def rotate_harmonics(sh_rest: Tensor, quats: Tensor) -> Tensor:
+    """Coefficients of the functions turned by ``quats``: seen along R d they show what they showed along d.
+
+    Args:
+        sh_rest: [N, R, 3] coefficients of degree 1 and up; R is 0, 3, 8 or 15.
+        quats: [N, 4] wxyz, any norm. Where x, y and z are 0 the coefficients stay as they are, to the bit.
+
+    Returns:
+        [N, R, 3]; degree 0 does not turn. No gradient.
+
+    Raises:
+        ValueError: shapes do not fit.
+    """
+    if sh_rest.ndim != 3 or sh_rest.shape[2] != 3 or sh_rest.shape[1] not in SIZES:
+        raise ValueError(f"sh_rest must be [N, R, 3] with R in {SIZES}, got {tuple(sh_rest.shape)}")
+    if tuple(quats.shape) != (sh_rest.shape[0], 4):
+        raise ValueError(f"quats must be [{sh_rest.shape[0]}, 4], got {tuple(quats.shape)}")
+    rest = sh_rest.shape[1]
+    if not rest:
+        return sh_rest.detach()
+    source = sh_rest.detach().contiguous()
+    turned = torch.empty_like(source)
+    directions, inverses = (table.to(source.device) for table in _tables())
+    launch(
+        kernels.rotate_harmonics,
+        source.shape[0],
+        source.view(-1, 3),
+        rest,
+        quats.detach().contiguous(),
+        directions,
+        inverses,
+        turned.view(-1, 3),
+        grain=256,
+    )
+    return turned

@@ -1,0 +1,298 @@
+"""The editor without a browser: what is chosen, held and pinned, time, undo, and where the gizmo stands."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from edit_scenes import bar_scene
+
+from scgs_warp.cameras import orbit_camera
+from scgs_warp.edit import EditSession, Film, Playback, Target, film_camera
+from scgs_warp.edit.handles import STAY
+from scgs_warp.edit.rotations import from_axis, from_matrix
+from scgs_warp.editor.model import Model, Moment, Region
+from scgs_warp.editor.overlays import CHOSEN, HELD, PINNED, PLAIN, node_colors
+from scgs_warp.editor.picture import take
+from scgs_warp.editor.placing import Place, place_of, place_of_selection, region_at, surface_point
+from scgs_warp.editor.shots import view_of
+from scgs_warp.editor.views import ClientCamera
+from scgs_warp.errors import UserError
+
+LEFT, RIGHT = (-0.1, -1.0, 0.25), (1.1, -1.0, 0.25)
+
+
+@pytest.fixture(scope="module")
+def loaded() -> EditSession:
+    return EditSession(bar_scene(gaussians=1500))
+
+
+@pytest.fixture
+def model(loaded) -> Model:
+    made = Model(loaded.fork())
+    made.pin_rings = None
+    return made
+
+
+def chosen(model: Model, point=RIGHT, rings: int = 1) -> tuple[int, ...]:
+    return model.session.ring([model.session.nearest(point, model.time)], rings)
+
+
+def client(session: EditSession, azimuth: float = 40.0, size: int = 96) -> ClientCamera:
+    """A browser that sees the scene as a film's camera does."""
+    camera = orbit_camera(session.scene.overview, azimuth, size)
+    wxyz = from_matrix(camera.viewmat[:3, :3].double().numpy().T)
+    fov = 2 * math.atan(camera.height / (2 * float(camera.K[1, 1])))
+    return ClientCamera(tuple(wxyz.tolist()), tuple(camera.position.tolist()), fov, camera.width, camera.height)
+
+
+def test_selections_replace_add_and_subtract(model):
+    model.select((3, 1))
+    model.select((5,), "add")
+    assert model.selection == (1, 3, 5)
+    model.select((3, 9), "subtract")
+    assert model.selection == (1, 5)
+    model.select((2,))
+    assert model.selection == (2,)
+
+
+def test_a_drag_is_one_step(model):
+    model.select(chosen(model))
+    name = model.grab(STAY)
+    for z in (0.1, 0.2, 0.3):
+        assert model.moment().live
+        model.drag(Target((0.0, 0.0, z)))
+    model.release()
+    assert not model.moment().live and model.session.edit.targets[name].translation == (0, 0, 0.3)
+    assert model.active == name and model.session.edit.handle(name).nodes == model.selection
+    assert model.undo()
+    assert not model.session.edit.handles and model.active is None and model.selection
+    assert not model.undo() and model.redo()
+    assert model.session.edit.targets[name].translation == (0, 0, 0.3)
+
+
+def test_without_a_selection_nothing_is_held(model):
+    with pytest.raises(UserError, match="nothing is chosen"):
+        model.grab(STAY)
+    assert not model.dragging and not model.session.edit.handles and not model.undo()
+
+
+@pytest.mark.parametrize("broken", [math.nan, math.inf])
+def test_a_broken_number_changes_nothing(model, broken):
+    model.select(chosen(model))
+    model.grab(STAY)
+    model.drag(Target((0.1, 0.0, 0.0)))
+    before = model.session.edit
+    with pytest.raises(UserError, match="finite"):
+        Place(np.zeros(3), np.array([1.0, 0, 0, 0])).target(np.array([broken, 0, 0]), np.array([1.0, 0, 0, 0]))
+    with pytest.raises(UserError, match="finite"):
+        model.drag(Target((broken, 0.0, 0.0)))
+    assert model.session.edit is before and model.dragging
+
+
+def test_a_kilometre_is_survived(model):
+    model.select(chosen(model))
+    model.pin_rings = 1
+    model.grab(STAY)
+    model.drag(Target((0.0, 0.0, 1000.0)))
+    for live in (True, False):
+        points = model.session.node_positions(0.0, live=live)
+        assert np.isfinite(points).all()
+    model.release()
+    assert float(model.session.node_positions(0.0)[list(model.selection), 2].min()) > 999
+    assert model.undo() and np.abs(model.session.node_positions(0.0)).max() < 10
+
+
+def test_pinning_the_rest_makes_way_for_the_next_handle(model):
+    model.pin_rings = 1
+    model.select(chosen(model, RIGHT, 0))
+    model.grab(STAY)
+    model.release()
+    session = model.session
+    assert set(session.edit.pins) == set(range(len(session))) - set(session.ring(model.selection, 1))
+    model.select(chosen(model, LEFT, 0))
+    model.grab(STAY)
+    model.release()
+    near = set(session.ring(session.edit.handles[0].nodes, 1)) | set(session.ring(session.edit.handles[1].nodes, 1))
+    assert set(session.edit.pins) == set(range(len(session))) - near
+    with model.changing():
+        session.pin([session.ring(model.selection, 1)[0]])
+    own = session.edit.pins
+    model.select(tuple(sorted({*chosen(model, (0.5, -1.0, 0.25), 0), own[0]})))
+    model.grab(STAY)
+    model.release()
+    assert set(session.edit.pins) == set(own) - set(model.selection), "what the user pinned stays, but for the handle"
+
+
+def test_a_handle_taken_from_bent_surroundings_leaves_them(model):
+    model.select(chosen(model))
+    model.grab(STAY)
+    model.drag(Target((0.0, 0.2, 0.3), tuple(from_axis([0, 1, 0], 30).tolist())))
+    model.release()
+    session, at = model.session, model.moment()
+    before = session.node_positions(0.0)
+    other = tuple(sorted(set(session.ring(model.selection, 1)) - set(model.selection)))
+    assert other
+    place, target = place_of_selection(session, other, at)
+    position, _ = place.pose(target)
+    assert position == pytest.approx(before[list(other)].mean(0), abs=1e-9)
+
+
+def test_the_gizmo_says_what_the_target_says(model):
+    model.select(chosen(model))
+    model.grab(STAY)
+    target = Target.of((0.1, -0.2, 0.3), from_axis([1, 2, 3], 50).tolist())
+    model.drag(target)
+    model.release()
+    session = model.session
+    for time in (0.0, 0.7):
+        place = place_of(session, session.edit.handles[0], time)
+        back = place.target(*place.pose(target))
+        assert back.translation == pytest.approx(target.translation, abs=1e-9)
+        assert back.rotation == pytest.approx(target.rotation, abs=1e-9)
+        where = session.node_positions(time)[list(model.selection)].mean(0)
+        assert place.pose(target)[0] == pytest.approx(where, abs=5e-3), "it stands on what it holds"
+    assert place.target(place.pivot, np.array([1.0, 1e-20, 0, 0])).is_identity, "noise is no rotation"
+
+
+def test_keyframes_lead_until_a_drag_begins(model):
+    model.replace(film=Film(seconds=2.0, fps=10))
+    model.select(chosen(model))
+    name = model.grab(STAY)
+    model.release()
+    model.add_keyframe()
+    model.seek(2.0)
+    model.grab(STAY)
+    model.drag(Target((0.0, 0.0, 1.0)))
+    model.release()
+    model.add_keyframe("linear")
+    assert [frame.at for frame in model.session.edit.keyframes] == [0.0, 2.0]
+    model.seek(1.0)
+    moment = model.moment()
+    height = model.session.engine.targets(model.session.edit, moment.at)[name].translation[2]
+    assert moment.at == 1.0 and 0.3 < height < 0.7
+    model.grab(STAY)
+    assert model.session.edit.targets[name].translation[2] == height, "the drag goes on from where it is seen"
+    assert model.moment().at is None
+    model.release()
+    model.add_keyframe()
+    assert len(model.session.edit.keyframes) == 3 and model.moment().at == 1.0
+
+
+def test_time_plays_and_stops_at_nothing(model):
+    model.replace(film=Film(seconds=2.0, fps=10), playback=Playback(repeat="loop"))
+    model.seek(0.5)
+    model.play(True)
+    start = model._played_from[0]
+    model.tick(start + 0.55)
+    assert model.at == pytest.approx(1.0)
+    model.tick(start + 1.7)
+    assert model.at == pytest.approx(0.2), "it begins again"
+    model.play(False)
+    model.seek(math.nan)
+    assert model.at == pytest.approx(0.2)
+    model.seek(1e9)
+    assert model.at == 2.0
+    model.replace(film=Film(seconds=1.0))
+    assert model.at == 1.0
+
+
+def test_handles_are_changed_reset_and_removed(model):
+    with pytest.raises(UserError, match="no handle"):
+        model.change_handle(lasts="frame")
+    with pytest.raises(UserError, match="no handle"):
+        model.remove_handle()
+    model.select(chosen(model))
+    name = model.grab(STAY)
+    model.release()
+    model.change_handle(lasts="fade", window=0.3)
+    assert model.session.edit.handle(name).lasts == "fade"
+    model.remove_handle()
+    assert model.active is None and not model.session.edit.handles
+    model.undo()
+    model.reset()
+    assert not model.session.edit.handles and not model.session.edit.pins
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"film": Film(seconds=math.nan)}, "film"),
+        ({"film": Film(fps=0.0)}, "film.fps"),
+        ({"film": Film(size=10**9)}, "film.size"),
+        ({"playback": Playback(speed=math.inf)}, "playback"),
+        ({"playback": Playback(repeat="never")}, "playback.repeat"),
+    ],
+)
+def test_what_a_page_sends_is_checked(model, fields, words):
+    before = model.session.edit
+    with pytest.raises(UserError, match=words):
+        model.replace(**fields)
+    model.select(chosen(model))
+    model.grab(STAY)
+    model.release()
+    with pytest.raises(UserError, match="lasts"):
+        model.change_handle(lasts="for ever")
+    assert model.undo() and model.session.edit == before
+
+
+def test_clicks_meet_the_surface(model):
+    session, moment = model.session, model.moment()
+    camera = client(session)
+    picture = take(session, moment, camera, 96)
+    assert picture.rgb.shape == (camera.height, camera.width, 3) == (*picture.depth.shape, 3)
+    rows, columns = np.nonzero(np.isfinite(picture.depth))
+    middle = len(rows) // 2
+    screen = (columns[middle] + 0.5) / camera.width, (rows[middle] + 0.5) / camera.height
+    point = surface_point(session, camera, screen, moment)
+    assert point is not None and np.linalg.norm(point - session.node_positions(0.0), axis=1).min() < 0.2
+    assert surface_point(session, camera, (0.0, 0.0), moment) is None
+    assert surface_point(session, camera, (-3.0, 7.0), moment) is None, "beside the canvas"
+    rings = region_at(session, point, Region("rings", 1), moment)
+    assert rings == session.ring([session.nearest(point.tolist(), 0.0)], 1)
+    assert len(region_at(session, point, Region("brush", radius=1e-6), moment)) == 1, "never none"
+    assert len(region_at(session, point, Region("brush", radius=10.0), moment)) == len(session)
+
+
+def test_side_by_side_and_split(model):
+    model.select(chosen(model))
+    model.grab(STAY)
+    model.drag(Target((0.0, 0.3, 0.4)))
+    model.release()
+    session, camera = model.session, client(model.session)
+    pictures = {}
+    for show in ("edited", "original", "side by side", "split"):
+        model.set(show=show)
+        pictures[show] = take(session, model.moment(), camera, 96).rgb.astype(int)
+        assert pictures[show].shape == pictures["edited"].shape
+    middle = camera.width // 2
+    assert (pictures["edited"] != pictures["original"]).any()
+    assert (pictures["split"][:, :middle] == pictures["original"][:, :middle]).all()
+    assert (pictures["split"][:, middle + 1 :] == pictures["edited"][:, middle + 1 :]).all()
+    assert (pictures["side by side"][:, middle] == 128).all()
+
+
+def test_the_film_can_begin_where_the_user_looks(model):
+    session = model.session
+    for azimuth in (0.0, 77.0, 200.0):
+        camera = client(session, azimuth)
+        view = view_of(session, camera)
+        assert view.azimuth == pytest.approx(azimuth, abs=1e-3)
+        shot = session.edit.film.shot.__class__(kind="fixed", views=(view,))
+        model.replace(film=Film(shot=shot))
+        film = film_camera(session, 0.0, 96)
+        assert torch.allclose(film.viewmat, camera.at_size(96).viewmat, atol=1e-4)
+    down = ClientCamera((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 5.0), 0.7, 64, 64)
+    with pytest.raises(UserError, match="from the side"):
+        view_of(session, down)
+
+
+def test_colours_of_control_points():
+    colors = node_colors(5, chosen=(2,), held=(1, 2), pins=(0, 1))
+    assert [tuple(row) for row in colors] == [PINNED, HELD, CHOSEN, PLAIN, PLAIN]
+
+
+def test_a_moment_shows_the_film_or_the_handles(model):
+    assert model.moment() == Moment(0.0, None, False, "edited", model.moment().reach)
