@@ -5,12 +5,16 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from scgs_warp.apps.cli import prepare, run
 from scgs_warp.apps.settings import BUILTIN, Settings, builtin_scene, configuration
 from scgs_warp.config import MotionName
+
+if TYPE_CHECKING:
+    from scgs_warp.data import Dataset
 
 RUNS = Path("runs")
 
@@ -20,8 +24,8 @@ class Place:
     """Listed before the settings."""
 
     data: Path | None = None
-    """Folder of a data set in D-NeRF layout (transforms_train.json ...) or nerfstudio's (transforms.json). Without it
-    the built-in scene is made."""
+    """Folder of a data set: D-NeRF, nerfstudio, HyperNeRF, NeRF-DS, Panoptic, Neural 3D Video or COLMAP (docs/data.md).
+    Without it the built-in scene is made."""
     output: Path | None = None
     """Run directory; runs/NAME by default."""
 
@@ -53,12 +57,17 @@ def main(args: list[str] | None) -> None:
     flags = {"motion.model": options.motion, "seed": options.seed}
     config, named = configuration(options, file, flags, "cpu" if options.data else None)
 
+    from scgs_warp.advice import advise, survey
     from scgs_warp.finish import summary, train_and_finish
     from scgs_warp.run_folder import refuse_existing
 
     refuse_existing(output, options.resume)
     folder = options.data or (Path(named) if named else builtin_scene(device))
-    metrics = train_and_finish(config, folder, output, device=device, resume=options.resume)
+
+    def look(data: Dataset) -> None:
+        print("\n".join(advise(survey(data), config, device)), flush=True)
+
+    metrics = train_and_finish(config, folder, output, device=device, resume=options.resume, look=look)
     print(summary(metrics))
     print(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
 

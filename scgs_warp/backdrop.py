@@ -55,10 +55,11 @@ def backdrop(
         points [B, 3], normalised, and their colours [B, 3], B <= ``count``. Their order is random: however many of the
         first are taken, they lie in the sight of all frames.
     """
-    frames = [data[index] for index in spread(len(data), MOST_VIEWS)]
+    chosen = spread(len(data), MOST_VIEWS)
     found, colors = [], []
-    for place, frame in enumerate(frames):
-        share = count * (place + 1) // len(frames) - count * place // len(frames)
+    for place, index in enumerate(chosen):
+        frame = data[index]
+        share = count * (place + 1) // len(chosen) - count * place // len(chosen)
         camera = normalisation.apply_camera(frame.camera).to("cpu")
         known, depths = _project(points.cpu(), camera)
         if share == 0 or len(known) == 0:
@@ -77,5 +78,5 @@ def backdrop(
         colors.append(frame.image[rows, columns])
     if not found:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    order = torch.randperm(sum(map(len, found)), generator=generator(seed, key, len(frames)))
+    order = torch.randperm(sum(map(len, found)), generator=generator(seed, key, len(chosen)))
     return torch.cat(found)[order], torch.cat(colors)[order]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -71,12 +70,12 @@ def refined(data: Dataset, folder: Path, normalisation: Normalisation) -> Datase
         return None
     found = CameraRefinement(len(data))
     found.twists.data[:] = twists
-    frames = []
-    for index, frame in enumerate(data):
+    cameras = []
+    for index, given in enumerate(data.cameras):
         with torch.no_grad():
-            camera = found.apply(normalisation.apply_camera(frame.camera), index)
-        frames.append(dataclasses.replace(frame, camera=normalisation.undo_camera(camera)))
-    return data.with_frames(frames)
+            camera = found.apply(normalisation.apply_camera(given), index)
+        cameras.append(normalisation.undo_camera(camera))
+    return data.with_cameras(cameras)
 
 
 def camera_rate(step: int, optim: OptimConfig, start: int) -> float:

@@ -114,8 +114,17 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds")
+FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds", "data.cache_mib")
 """Settings that change no bit of the result: not part of a checkpoint, and free when a run is resumed."""
+
+
+def lasting(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A configuration, as :func:`to_dict` makes it, without what is free to change."""
+    return {
+        name: lasting(value, f"{prefix}{name}.") if isinstance(value, dict) else value
+        for name, value in values.items()
+        if f"{prefix}{name}" not in FREE_TO_CHANGE
+    }
 
 
 def from_dict(values: dict[str, Any], source: str = "config", base: Any = None, prefix: str = "") -> TrainConfig:

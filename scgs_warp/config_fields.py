@@ -11,6 +11,8 @@ from typing import Any, Literal
 
 MotionName = Literal["control-points", "per-gaussian", "hexplane", "static"]
 PresetName = Literal["quick", "cpu", "paper"]
+CACHE_MIB = 2048
+"""Decoded images that are kept in memory, by default: 200 of 800 x 800 pixels with alpha."""
 
 
 def milestone(steps: int) -> Any:
@@ -28,6 +30,8 @@ class DataConfig:
     """How they are reduced; bicubic (through Pillow, 8 bit) makes the truth as the official code does."""
     background: Literal["black", "white", "random"] = "black"
     """What lies behind transparent pixels; random: another colour every step, black for evaluation."""
+    cache_mib: int = CACHE_MIB
+    """Decoded images kept in memory; the rest is decoded whenever it is needed. Changes no bit of the result."""
 
 
 @dataclass(frozen=True)

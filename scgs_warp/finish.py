@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from . import cameras, film
 from .config import TrainConfig, to_dict
-from .data import load
+from .data import ImageCache, load
 from .data.dataset import Dataset
 from .evaluate import Lpips, metrics_of, write_metrics
 from .overlay import Painter
@@ -22,6 +25,8 @@ from .train import fit
 FILM_FRAMES = 120
 FILM_SIZE = 400
 FPS = 30.0
+QUIET_SECONDS = 2.0
+"""Reading that takes longer shows how far it is."""
 
 
 def settings_of(config: TrainConfig, folder: Path) -> dict[str, Any]:
@@ -29,6 +34,25 @@ def settings_of(config: TrainConfig, folder: Path) -> dict[str, Any]:
     settings = to_dict(config)
     settings["data"]["folder"] = str(folder.resolve())
     return settings
+
+
+def load_splits(config: TrainConfig, folder: Path) -> tuple[Dataset, Dataset]:
+    """Training and held-out frames, which share what ``config.data`` gives them of memory."""
+    look, cache = dataclasses.asdict(config.data), ImageCache(config.data.cache_mib)
+
+    def read(split: str) -> Dataset:
+        began, shown = time.monotonic(), []
+        with ExitStack() as stack:
+
+            def show(done: int, total: int) -> None:
+                if shown:
+                    shown[0].advance()
+                elif time.monotonic() - began > QUIET_SECONDS:
+                    shown.append(stack.enter_context(progress(total, f"reading {split} images", start=done)))
+
+            return load(folder, split, **look, cache=cache, progress=show)
+
+    return read("train"), read("test")
 
 
 def train_and_finish(
@@ -40,6 +64,7 @@ def train_and_finish(
     resume: bool = False,
     frames: int = FILM_FRAMES,
     lpips: Lpips | None = None,
+    look: Callable[[Dataset], None] | None = None,
 ) -> dict[str, Any]:
     """Load, train, evaluate: what ``apps/train.py`` does.
 
@@ -48,6 +73,7 @@ def train_and_finish(
         output: run directory.
         resume: continue the run in ``output``.
         frames, lpips: as for :func:`finish`.
+        look: called with the training frames before training begins.
 
     Returns:
         what ``metrics.json`` holds.
@@ -56,8 +82,9 @@ def train_and_finish(
         UserError: of the data, the configuration, the run directory or the training.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
     """
-    look = dataclasses.asdict(config.data)
-    train, test = load(data, "train", **look), load(data, "test", **look)
+    train, test = load_splits(config, data)
+    if look is not None:
+        look(train)
     scene = fit(
         config, train, output=output, device=device, test=test, resume=resume, settings=settings_of(config, data)
     )

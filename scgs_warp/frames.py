@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from .config import TrainConfig
+from .data.cache import Pixels
 from .data.dataset import Dataset
 from .data.normalise import Normalisation
 from .optim import generator
@@ -21,36 +20,33 @@ SMALLEST = 64
 """Images with a shorter side than this are not halved."""
 
 
-def first_frames(data: Dataset) -> list[Frame]:
+def first_frames(data: Dataset) -> Dataset:
     """The first fifth of the frames by time, with which progressive pre-training begins."""
-    ordered = sorted(data, key=lambda frame: frame.time)
-    return ordered[: max(1, round(PROGRESSIVE_SHARE * len(ordered)))]
+    ordered = sorted(range(len(data)), key=lambda index: data.entries[index].time)
+    return data.subset(ordered[: max(1, round(PROGRESSIVE_SHARE * len(ordered)))])
 
 
-def _half(frame: Frame, camera: Camera) -> tuple[Frame, Camera]:
+def _half(frame: Frame) -> Pixels:
     def pool(image: Tensor) -> Tensor:
         return F.avg_pool2d(image[None], 2)[0]
 
     image = pool(frame.image.permute(2, 0, 1))
     alpha = None if frame.alpha is None else pool(frame.alpha[None])[0]
     mask = None if frame.mask is None else pool(frame.mask[None].float())[0] == 1.0
-    intrinsics = camera.K * camera.K.new_tensor([0.5, 0.5, 1.0])[:, None]
-    small = Camera(camera.viewmat, intrinsics, image.shape[2], image.shape[1])
-    return dataclasses.replace(frame, image=image.permute(1, 2, 0), alpha=alpha, mask=mask), small
+    return Pixels(image.permute(1, 2, 0), alpha, mask)
 
 
 class Frames:
     """Random order without replacement, the same for the same seed; every epoch another."""
 
     def __init__(self, data: Dataset, normalisation: Normalisation, config: TrainConfig, device: str) -> None:
-        self.frames = list(data)
+        self.frames = data
         self.config, self.device = config, device
-        self.cameras = [normalisation.apply_camera(frame.camera).to(device) for frame in self.frames]
+        self.cameras = [normalisation.apply_camera(frame.camera).to(device) for frame in data.entries]
         self.background = data.background_color.to(device)
         self.random_background = data.background == "random"
-        self._halved: dict[int, tuple[Frame, Camera]] = {}
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
-        self.by_time = sorted(range(len(self.frames)), key=lambda i: self.frames[i].time)
+        self.by_time = sorted(range(len(self.frames)), key=lambda i: data.entries[i].time)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -73,18 +69,28 @@ class Frames:
         return self.by_time[first + self._order[1][place]]
 
     def halved(self, index: int) -> tuple[Frame, Camera]:
-        """Frame and normalised camera at half the size, each pixel the mean of four; made once."""
-        if index not in self._halved:
-            self._halved[index] = _half(self.frames[index], self.cameras[index])
-        return self._halved[index]
+        """Frame and normalised camera at half the size, each pixel the mean of four."""
+        entry, camera = self.frames.entries[index], self.cameras[index]
+        half = self.frames.cache.get((self, index), lambda: _half(self.frames[index]))
+        intrinsics = camera.K * camera.K.new_tensor([0.5, 0.5, 1.0])[:, None]
+        small = Camera(camera.viewmat, intrinsics, half.image.shape[1], half.image.shape[0])
+        return Frame(entry.camera, entry.time, *half, name=entry.name), small
+
+    def expect(self, step: int, progressive: bool) -> None:
+        """Begin to read the frame of this step, if it must be read."""
+        index = self.index_at(step, progressive)
+        if (self, index) not in self.frames.cache:
+            self.frames.expect(index)
 
     def view(
         self, index: int, step: int, random_background: bool
     ) -> tuple[Frame, Camera, Tensor, Tensor, Tensor | None]:
         """Frame, normalised camera, truth [3, H, W] on the background of this step, that background [3], mask."""
-        frame, camera = self.frames[index], self.cameras[index]
+        camera = self.cameras[index]
         if step < self.config.half_size and min(camera.width, camera.height) >= SMALLEST:
             frame, camera = self.halved(index)
+        else:
+            frame = self.frames[index]
         truth = frame.image.to(self.device).permute(2, 0, 1).contiguous()
         background = self.background
         if frame.alpha is not None and (random_background or self.random_background):

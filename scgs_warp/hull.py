@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from .data.dataset import Dataset, spread
 from .data.normalise import Normalisation
 from .optim import generator
-from .types import Frame
+from .types import Camera
 
 HALF_SIZE = 1.3
 """Half the edge of the cube in which a scene without initial points starts (normalised units)."""
@@ -35,20 +35,15 @@ class Coverage(NamedTuple):
     """[P, 3] mean colour in those views; grey where there is none."""
 
 
-def coverage(points: Tensor, data: Sequence[Frame], normalisation: Normalisation) -> Coverage | None:
+def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Coverage | None:
     """Look every point up in up to 100 frames; None where no frame has alpha. ``points`` [P, 3] normalised."""
-    frames = [frame for frame in data if frame.alpha is not None]
-    if not frames:
+    chosen = data.with_alpha
+    if not chosen:
         return None
     covered, seen, colors = torch.zeros(len(points)), torch.zeros(len(points)), torch.zeros(len(points), 3)
-    for frame in frames[:: max(1, len(frames) // MOST_VIEWS)]:
-        camera = normalisation.apply_camera(frame.camera).to("cpu")
-        local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        pixels = local @ camera.K.T
-        column = (pixels[:, 0] / pixels[:, 2]).floor().long()
-        row = (pixels[:, 1] / pixels[:, 2]).floor().long()
-        inside = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        column, row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
+    for index in chosen[:: max(1, len(chosen) // MOST_VIEWS)]:
+        frame = data[index]
+        row, column, inside = _places(points, normalisation.apply_camera(frame.camera))
         assert frame.alpha is not None
         hit = (inside & (frame.alpha[row, column] > 0.5)).float()
         covered += hit
@@ -58,16 +53,39 @@ def coverage(points: Tensor, data: Sequence[Frame], normalisation: Normalisation
     return Coverage(covered / seen.clamp(min=1.0), colors / covered.clamp(min=1.0)[:, None] + grey)
 
 
+def _places(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Row and column [P] of the pixels that the points [P, 3] fall into, and whether there is such a pixel [P]."""
+    camera = camera.to("cpu")
+    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    pixels = local @ camera.K.T
+    column = (pixels[:, 0] / pixels[:, 2]).floor().long()
+    row = (pixels[:, 1] / pixels[:, 2]).floor().long()
+    inside = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1), inside
+
+
+def common_view(points: Tensor, data: Dataset, normalisation: Normalisation) -> Tensor:
+    """[P] share of up to 100 views that have the point, [P, 3] normalised, in the image."""
+    chosen = spread(len(data), MOST_VIEWS)
+    seen = torch.zeros(len(points))
+    for index in chosen:
+        seen += _places(points, normalisation.apply_camera(data.entries[index].camera))[2].float()
+    return seen / len(chosen)
+
+
 def likely_points(
-    count: int, data: Sequence[Frame], normalisation: Normalisation, seed: int, key: int
+    count: int, data: Dataset, normalisation: Normalisation, seed: int, key: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Random points [count, 3] in the cube and their colours [count, 3], drawn where the images are covered; uniform,
-    without colours, where no frame has alpha."""
+    """Random points [count, 3] in the cube and their colours [count, 3], drawn where the images are covered; where no
+    frame has alpha, in the cameras' common view, without colours."""
     candidates = random_points(max(CANDIDATES, count), seed, key)
     found = coverage(candidates, data, normalisation)
-    if found is None or not bool((found.share > 0).any()):
+    share = common_view(candidates, data, normalisation) if found is None else found.share
+    if not bool((share > 0).any()):
         return candidates[:count], None
     random = generator(seed, key, 1)
-    chosen = torch.multinomial(found.share**SHARPNESS, count, replacement=True, generator=random)
+    chosen = torch.multinomial(share**SHARPNESS, count, replacement=True, generator=random)
     spacing = 2.0 * HALF_SIZE / len(candidates) ** (1 / 3)  # the same candidate may be drawn twice
-    return candidates[chosen] + spacing * (torch.rand(count, 3, generator=random) - 0.5), found.colors[chosen]
+    return candidates[chosen] + spacing * (
+        torch.rand(count, 3, generator=random) - 0.5
+    ), None if found is None else found.colors[chosen]

@@ -17,7 +17,7 @@ AT_LEAST_ONE = (
     "loss.arap_every loss.arap_times loss.arap_refresh"
 ).split()
 NOT_NEGATIVE = (
-    "seed freeze coarse half_size checkpoint_seconds "
+    "data.cache_mib seed freeze coarse half_size checkpoint_seconds "
     "pretrain.steps pretrain.warm_up pretrain.clone_share pretrain.arap_weight "
     "densify.start densify.until densify.grad_threshold densify.min_opacity loss.ssim loss.arap loss.arap_end "
     "optim.cameras optim.shading optim.settle motion.time_noise motion.hyper_dim motion.hyper_dim_filled "

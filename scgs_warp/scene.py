@@ -12,7 +12,7 @@ from torch import Tensor
 
 from . import checkpoint
 from .cameras import Overview
-from .config import FREE_TO_CHANGE, TrainConfig, from_dict, to_dict
+from .config import TrainConfig, from_dict, lasting, to_dict
 from .data.dataset import BACKGROUND_COLORS
 from .data.normalise import Normalisation
 from .errors import UserError
@@ -160,7 +160,7 @@ class Scene:
 
     def metadata(self) -> dict[str, Any]:
         return {
-            "config": {name: value for name, value in to_dict(self.config).items() if name not in FREE_TO_CHANGE},
+            "config": lasting(to_dict(self.config)),
             "normalisation": {"centre": self.normalisation.centre.tolist(), "scale": self.normalisation.scale},
             "overview": self.overview.to_dict(),
             "step": self.step,

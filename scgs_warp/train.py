@@ -63,6 +63,7 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
     index = frames.index_at(step, config.pretrain.progressive and pretraining)
     random_background = pretraining and config.pretrain.random_background
     frame, camera, truth, background, mask = frames.view(index, state.step, random_background)
+    frames.expect(step + 1, config.pretrain.progressive and pretraining)
     set_rates(state)
     if state.refines_cameras:
         camera = state.cameras.apply(camera, index)

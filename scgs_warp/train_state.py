@@ -212,7 +212,7 @@ def suited(config: TrainConfig, data: Dataset) -> TrainConfig:
     Where there are points, control points begin as a sample of them, and Gaussians at them (2 dB better than spheres
     that have to find both).
     """
-    filled = not any(frame.alpha is not None for frame in data)
+    filled = not data.with_alpha
     motion, growth = config.motion, config.densify
     if filled:
         hyper_dim = max(motion.hyper_dim, motion.hyper_dim_filled)
@@ -230,13 +230,13 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     count = max(config.init_points, round(config.motion.nodes * config.pretrain.start_ratio))
     if data.points is None or not given(data, config):
         # Progressive pre-training starts from the pose of the first frames; what others cover is not there yet.
-        frames = first_frames(data) if config.pretrain.progressive and config.pretrain_steps else list(data)
+        frames = first_frames(data) if config.pretrain.progressive and config.pretrain_steps else data
         points, colors = likely_points(count, frames, normalisation, config.seed, 31)
         return points, torch.full_like(points, 0.5) if colors is None else colors
     order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
     points = normalisation.apply(data.points)[order].float().contiguous()
     colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
-    if any(frame.alpha is not None for frame in data):  # then nothing lies behind
+    if data.with_alpha:  # then nothing lies behind
         return points, colors
     behind = backdrop(count - len(points), points, data, normalisation, config.seed, 35)
     return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]])
@@ -244,7 +244,7 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
 
 def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
     for name, value in wanted.items():
-        if name in FREE_TO_CHANGE:
+        if f"{prefix}{name}" in FREE_TO_CHANGE:
             continue
         if isinstance(value, dict):
             _same_configuration(saved.get(name, {}), value, source, f"{prefix}{name}.")

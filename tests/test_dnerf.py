@@ -171,9 +171,9 @@ BAD_CONTENT = {
     "no angle": (lambda content: content.pop("camera_angle_x"), "camera_angle_x"),
     "focal": (lambda content: content.__setitem__("fl_x", "long"), "fl_x"),
     "width": (lambda content: content.__setitem__("w", 99), "w is 99"),
-    "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1 is 0.1"),
-    "a frame's distortion": (frame_field("p1", 0.1), "p1 is 0.1"),
-    "a frame's fisheye": (frame_field("camera_model", "OPENCV_FISHEYE"), "camera_model is 'OPENCV_FISHEYE'"),
+    "distortion": (lambda content: content.__setitem__("k1", "NaN"), "k1 is 'NaN'"),
+    "a frame's distortion": (frame_field("k6", 0.1), "k6 is 0.1"),
+    "a frame's model": (frame_field("camera_model", "EQUIRECTANGULAR"), "camera_model is 'EQUIRECTANGULAR'"),
     "long number": (lambda content: content.__setitem__("w", HUGE), "transforms_train.json: holds a number of more"),
 }
 

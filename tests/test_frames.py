@@ -8,6 +8,7 @@ import pytest
 import torch
 from tiny import tiny_config, tiny_dataset
 
+from scgs_warp.data.dataset import Dataset
 from scgs_warp.data.normalise import Normalisation
 from scgs_warp.frames import Frames
 
@@ -65,6 +66,7 @@ def test_small_images_and_masks_at_half_size():
     made = frames(64, half_size=10)
     mask = torch.ones(64, 64, dtype=torch.bool)
     mask[10, 11] = False
-    made.frames[1] = dataclasses.replace(made.frames[1], mask=mask)
+    masked = [dataclasses.replace(frame, mask=mask if index == 1 else None) for index, frame in enumerate(made.frames)]
+    made.frames = Dataset(masked, folder=made.frames.folder, split="train")
     half = made.view(1, 0, False)[4]
     assert half is not None and not half[5, 5] and int((~half).sum()) == 1

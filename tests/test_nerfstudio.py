@@ -13,9 +13,9 @@ import torch
 from scenes import look_at
 from tiny import tiny_config, tiny_dataset
 
-from scgs_warp.data import images, load, nerfstudio
+from scgs_warp.data import assemble, images, load
 from scgs_warp.data.borders import border_mask, reduce_mask
-from scgs_warp.data.nerfstudio import read_ply
+from scgs_warp.data.points import read_ply
 from scgs_warp.errors import UserError
 from scgs_warp.frames import Frames
 from scgs_warp.gaussians import SH_C0
@@ -228,9 +228,9 @@ def test_one_image_that_an_object_fills_keeps_its_alpha(tmp_path):
 def test_a_border_takes_few_images_to_find(tmp_path, monkeypatch, count):
     write(tmp_path, count)
     seen = []
-    monkeypatch.setattr(nerfstudio, "decode", lambda file: seen.append(file.stem) or images.decode(file))
+    monkeypatch.setattr(assemble, "decode", lambda file: seen.append(file.stem) or images.decode(file))
     load(tmp_path)
-    assert len(seen) == nerfstudio.BORDER_FRAMES
+    assert len(seen) == assemble.BORDER_FRAMES
     assert {"f_0", f"f_{count - 1}"} <= set(seen), "from the whole video"
 
 
@@ -341,12 +341,18 @@ def test_points_without_colours_and_bad_ones(tmp_path):
 
 
 FAULTS = {
-    "distortion": (lambda content: content.__setitem__("k1", 0.1), "k1 is 0.1, lens distortion, which is not supp"),
-    "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", 0.1), "p2 is 0.1"),
-    "k5": (lambda content: content.__setitem__("k5", 0.1), "k5 is 0.1"),
-    "parameters": (lambda content: content.__setitem__("distortion_params", [0, 0.1, 0, 0]), "distortion_params is [0"),
+    "distortion": (lambda content: content.__setitem__("k1", "much"), "k1 is 'much', no number"),
+    "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", None), "p2 is 'None'"),
+    "k5": (lambda content: content.__setitem__("k5", 0.1), "k5 is 0.1, a lens distortion that camera_model None does"),
+    "tangential fisheye": (
+        lambda content: content.update({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}),
+        "p1 is 0.1, a lens distortion that camera_model OPENCV_FISHEYE does not have",
+    ),
+    "parameters": (lambda content: content.__setitem__("distortion_params", [0] * 7), "distortion_params is [0, 0, 0"),
     "parameter": (lambda content: content["frames"][1].__setitem__("distortion_params", 0.1), "distortion_params is 0"),
-    "fisheye": (lambda content: content.__setitem__("camera_model", "OPENCV_FISHEYE"), "camera_model is 'OPENCV_FISH"),
+    "huge": (lambda content: content.__setitem__("k1", 1e10), "frames[0]: camera parameters are not finite"),
+    "huge focal": (lambda content: content.__setitem__("fl_x", 1e300), "its camera has numbers beyond 1e+30"),
+    "listed": (lambda content: content.__setitem__("distortion_params", [0, "a"]), "distortion_params (k2) is 'a'"),
     "sphere": (
         lambda content: content["frames"][3].__setitem__("camera_model", "EQUIRECTANGULAR"),
         "'EQUIRECTANGULAR'",

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from ..config_fields import CACHE_MIB
 from ..errors import UserError
-from . import dnerf, nerfstudio
+from . import colmap, dnerf, nerfies, nerfstudio, panoptic, poses_bounds
+from .cache import ImageCache
 from .dataset import Dataset
-from .images import check_options
+from .images import Look, check_options
 
-__all__ = ["Dataset", "load"]
+__all__ = ["Dataset", "ImageCache", "load"]
 
-READERS = (dnerf, nerfstudio)
-"""Asked in this order: ``recognises(folder)``, then ``read(folder, split, ...)``."""
+READERS = (dnerf, nerfstudio, nerfies, panoptic, poses_bounds, colmap)
+"""Asked in this order: ``recognises(folder)``, then ``read(folder, split, look)``."""
 
 
 def load(
@@ -24,18 +26,21 @@ def load(
     resample: str = "area",
     background: str = "black",
     progress: Callable[[int, int], None] | None = None,
+    cache_mib: float = CACHE_MIB,
+    cache: ImageCache | None = None,
 ) -> Dataset:
-    """Read one split of a data set.
+    """Read one split of a data set. ``docs/data.md`` describes the layouts.
 
     Args:
-        folder: holds ``transforms_train.json`` and so on (D-NeRF / Blender layout), or one ``transforms.json``
-            (nerfstudio layout).
+        folder: the layout is told by what lies in it.
         split: ``train``, ``test`` or ``val``.
         downscale: images become this many times smaller; the intrinsics follow.
         resample: ``area`` (float, premultiplied by alpha) or ``bicubic`` (8 bits, Pillow: as the official SC-GS).
         background: ``black`` or ``white``: RGBA images are composited on it, once. ``random``: they stay
             premultiplied, on black, for the trainer to composite.
         progress: called with (done, total) after each image.
+        cache_mib: decoded images that are kept in memory; the rest is decoded whenever it is asked for.
+        cache: where they are kept, shared with other splits; ``cache_mib`` is then that cache's.
 
     Returns:
         Frames in the file's order, images float32 in [0, 1].
@@ -48,13 +53,13 @@ def load(
         raise UserError(f"split is {split!r}; give train, test or val")
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; give one with transforms_train.json or transforms.json")
+        raise UserError(f"{folder}: no such folder; give that of a data set, as docs/data.md describes them")
+    look = Look(downscale, resample, background, progress, cache if cache is not None else ImageCache(cache_mib))
     for reader in READERS:
         if reader.recognises(folder):
-            return reader.read(
-                folder, split, downscale=downscale, resample=resample, background=background, progress=progress
-            )
+            return reader.read(folder, split, look)
     raise UserError(
-        f"{folder}: no transforms_{split}.json and no transforms.json here; give the folder of a D-NeRF / Blender or "
-        "nerfstudio data set"
+        f"{folder}: nothing known lies here: no transforms_{split}.json (D-NeRF, Blender), transforms.json "
+        "(nerfstudio), dataset.json (HyperNeRF, NeRF-DS), train_meta.json (Panoptic), poses_bounds.npy "
+        "(Neural 3D Video) or sparse/0 (COLMAP); give the folder that holds one of these"
     )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import overload
 
@@ -11,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..types import Camera, Frame
+from .cache import ImageCache, Pixels
 
 BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
 """What RGBA images are composited on when they are read. With ``random`` the trainer composites, once per step."""
@@ -23,8 +26,34 @@ def spread(count: int, most: int) -> list[int]:
     return [round(index * (count - 1) / max(most - 1, 1)) for index in range(most)]
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame whose pixels are on disk."""
+
+    camera: Camera
+    time: float
+    name: str
+    read: Callable[[], Pixels]
+    """Decodes the file: the same pixels every time."""
+    has_alpha: bool = False
+    """Whether the alpha of the file counts."""
+    common_mask: Tensor | None = None
+    """[H, W] bool, on top of the frame's own mask."""
+    key: object = field(default_factory=object)
+    """Under which the pixels are kept."""
+
+    def frame(self, cache: ImageCache) -> Frame:
+        image, alpha, mask = cache.get(self.key, self.read)
+        if self.common_mask is not None:
+            mask = self.common_mask if mask is None else mask & self.common_mask
+        return Frame(self.camera, self.time, image, alpha if self.has_alpha else None, mask, self.name)
+
+
 class Dataset(Sequence[Frame]):
     """Frames of one split, in the order of the file that lists them.
+
+    A frame's pixels are read when the frame is asked for, and kept as long as there is room in ``cache``: walk through
+    the frames one by one, and look at ``entries`` for what needs no pixels.
 
     With ``background == "random"`` every image is premultiplied colour on black, and ``alpha`` is what is needed to
     put it on any colour: ``image + (1 - alpha) * color``.
@@ -32,15 +61,17 @@ class Dataset(Sequence[Frame]):
 
     def __init__(
         self,
-        frames: Sequence[Frame],
+        frames: Sequence[Frame | View],
         *,
         folder: Path,
         split: str,
         background: str = "black",
         points: Tensor | None = None,
         colors: Tensor | None = None,
+        cache: ImageCache | None = None,
     ) -> None:
-        self._frames = tuple(frames)
+        self.entries = tuple(frames)
+        """Camera, time and name of each frame, without its pixels if they are on disk."""
         self.folder = folder
         self.split = split
         self.background = background
@@ -49,30 +80,59 @@ class Dataset(Sequence[Frame]):
         """[P, 3] initial points, world units, where the data has some."""
         self.colors = colors
         """[P, 3] their colours in [0, 1], where the data has those, too."""
+        self.cache = cache if cache is not None else ImageCache()
 
-    def with_frames(self, frames: Sequence[Frame]) -> Dataset:
-        """The same data set of other frames."""
+    def _with(self, entries: Sequence[Frame | View]) -> Dataset:
         return Dataset(
-            frames,
+            entries,
             folder=self.folder,
             split=self.split,
             background=self.background,
             points=self.points,
             colors=self.colors,
+            cache=self.cache,
         )
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> Dataset:
+        """The same data set seen by other cameras, one for each frame."""
+        return self._with([dataclasses.replace(entry, camera=camera) for entry, camera in zip(self.entries, cameras)])
+
+    def subset(self, indices: Sequence[int]) -> Dataset:
+        """Some of the frames, in this order."""
+        return self._with([self.entries[index] for index in indices])
 
     @overload
     def __getitem__(self, index: int) -> Frame: ...
     @overload
     def __getitem__(self, index: slice) -> tuple[Frame, ...]: ...
     def __getitem__(self, index: int | slice) -> Frame | tuple[Frame, ...]:
-        return self._frames[index]
+        if isinstance(index, slice):
+            return tuple(self._frame(entry) for entry in self.entries[index])
+        return self._frame(self.entries[index])
+
+    def _frame(self, entry: Frame | View) -> Frame:
+        return entry if isinstance(entry, Frame) else entry.frame(self.cache)
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.entries)
 
     def __iter__(self) -> Iterator[Frame]:
-        return iter(self._frames)
+        return (self._frame(entry) for entry in self.entries)
+
+    def expect(self, index: int) -> None:
+        """Begin to read a frame that will be asked for soon."""
+        entry = self.entries[index]
+        if isinstance(entry, View):
+            self.cache.expect(entry.key, entry.read)
+
+    @property
+    def with_alpha(self) -> list[int]:
+        """Indices of the frames that have alpha."""
+        return [
+            index
+            for index, entry in enumerate(self.entries)
+            if (entry.has_alpha if isinstance(entry, View) else entry.alpha is not None)
+        ]
 
     @property
     def background_color(self) -> Tensor:
@@ -82,17 +142,17 @@ class Dataset(Sequence[Frame]):
     @property
     def fingerprint(self) -> str:
         """Of the frames' names, times, sizes and background, without any path: a run resumes on the same frames."""
-        listed = [(frame.name, frame.time, *frame.image.shape) for frame in self._frames]
+        listed = [(entry.name, entry.time, entry.camera.height, entry.camera.width, 3) for entry in self.entries]
         return hashlib.sha256(repr((self.background, listed)).encode()).hexdigest()[:16]
 
     @property
     def cameras(self) -> list[Camera]:
-        return [frame.camera for frame in self._frames]
+        return [entry.camera for entry in self.entries]
 
     @property
     def times(self) -> Tensor:
         """[V] in [0, 1]."""
-        return torch.tensor([frame.time for frame in self._frames], dtype=torch.float32)
+        return torch.tensor([entry.time for entry in self.entries], dtype=torch.float32)
 
     @property
     def extent(self) -> float:

@@ -11,11 +11,14 @@ from typing import NamedTuple, TypeVar
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
 
 from .. import environment
 from ..errors import UserError
+from .borders import reduce_mask
+from .cache import ImageCache, Pixels
 from .dataset import BACKGROUND_COLORS
+from .files import size_text
+from .lens import Lens, seen, undistort
 
 RESAMPLES = ("area", "bicubic")
 SMALLEST_SIDE = 8
@@ -26,14 +29,26 @@ R = TypeVar("R")
 
 
 class Decoded(NamedTuple):
-    image: Tensor
-    """[H, W, 3] float32 on the background; stored planar."""
-    alpha: Tensor | None
-    """[H, W] float32, None for a file without alpha."""
+    pixels: Pixels
+    """On the background; ``alpha`` None for a file without alpha, ``mask`` None where every pixel is valid."""
     source_size: tuple[int, int]
     """(width, height) of the file, before the reduction."""
     transparent: bool
     """Whether any pixel of the file is less than opaque."""
+    lens: Lens
+    """Of the file."""
+
+
+class Look(NamedTuple):
+    """How a data set is to be read."""
+
+    downscale: float = 1
+    resample: str = "area"
+    background: str = "black"
+    progress: Callable[[int, int], None] | None = None
+    """Called with (done, total) after each image."""
+    cache: ImageCache | None = None
+    """Where decoded images go; None: one of its own."""
 
 
 def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[[int, int], None] | None = None):
@@ -77,43 +92,62 @@ def reduced_size(width: int, height: int, downscale: float, path: Path) -> tuple
     return size
 
 
-def read_image(path: Path, downscale: float, resample: str, background: str) -> Decoded:
-    """Decode one file, reduce it, and composite it on the background once.
+def read_image(
+    path: Path, look: Look, lens_of: Callable[[tuple[int, int]], Lens], mask_path: Path | None = None
+) -> Decoded:
+    """Decode one file, undistort it, reduce it, and composite it on the background once.
 
     ``area`` averages colour premultiplied by alpha over each target pixel, in float. ``bicubic`` repeats what the
     official SC-GS does: composite, truncate to 8 bits, then Pillow's bicubic filter on colour and alpha apart.
     With ``random`` the image is on black (= premultiplied).
 
+    Args:
+        lens_of: called with (width, height) of the file; raises UserError if they do not fit.
+        mask_path: an image, black where the frame is not valid; not all of it.
+
     Raises:
-        UserError: the file is missing or does not decode.
+        UserError: a file is missing or does not decode, or the mask has another size than the image.
     """
     pixels = decode(path)
     height, width = pixels.shape[:2]
-    size = reduced_size(width, height, downscale, path)
-    color = np.asarray(BACKGROUND_COLORS[background], np.float32)
-    if resample == "bicubic" and size != (width, height):
-        rgb, alpha = _bicubic(pixels, size, color)
+    lens = lens_of((width, height))
+    size = reduced_size(width, height, look.downscale, path)
+    mask = None if mask_path is None else read_mask(mask_path, path, (width, height))
+    if lens.distorted:
+        moved = seen(lens, width, height)
+        mask = moved if mask is None else moved & (undistort(mask.astype(np.float32), lens) > 1.0 - 1e-4)
+    color = np.asarray(BACKGROUND_COLORS[look.background], np.float32)
+    if look.resample == "bicubic" and size != (width, height):
+        rgb, alpha = _bicubic(undistort(pixels, lens) if lens.distorted else pixels, size, color)
     else:
-        rgb, alpha = _area(pixels, size, color)
+        rgb, alpha = _area(pixels, size, color, lens if lens.distorted else None)
     planar = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
     alpha_tensor = None if alpha is None else torch.from_numpy(np.ascontiguousarray(alpha))
-    return Decoded(planar.permute(1, 2, 0), alpha_tensor, (width, height), is_transparent(pixels))
+    mask_tensor = None if mask is None else torch.from_numpy(reduce_mask(mask, size))
+    found = Pixels(planar.permute(1, 2, 0), alpha_tensor, mask_tensor)
+    return Decoded(found, (width, height), is_transparent(pixels), lens)
+
+
+def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
+    """[H, W] bool, True where the mask is not black. ``size``: (width, height) of the image it belongs to.
+
+    Raises:
+        UserError: the file is missing or does not decode, is all black, or has another size.
+    """
+    mask = decode(path)[..., :3].max(axis=2) > 0
+    if not mask.any():
+        raise UserError(f"{path}: a mask that is all black leaves nothing to look at; drop the frame")
+    if mask.shape[::-1] != size:
+        raise UserError(
+            f"{image}: is {size_text(size)}, but its mask is {size_text(mask.shape[::-1])}; "
+            "give the mask the image's size"
+        )
+    return mask
 
 
 def is_transparent(pixels: np.ndarray) -> bool:
     """Whether any pixel of a file [H, W, 3 or 4] is less than opaque."""
     return pixels.shape[2] == 4 and bool((pixels[..., 3] < np.iinfo(pixels.dtype).max).any())
-
-
-def without_idle_alpha(images: Sequence[Decoded]) -> list[Decoded]:
-    """The images of a split, without alpha if it says nothing in any of them.
-
-    Many tools write RGBA whatever they are given; taken for cut-out objects, filled images would get neither a border
-    mask nor points on bare walls. One image that an object fills is another matter: it keeps its alpha.
-    """
-    if any(image.transparent for image in images):
-        return list(images)
-    return [image._replace(alpha=None) for image in images]
 
 
 def decode(path: Path) -> np.ndarray:
@@ -125,7 +159,7 @@ def decode(path: Path) -> np.ndarray:
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if _whole(data) else None
     except cv2.error:
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
@@ -137,10 +171,33 @@ def decode(path: Path) -> np.ndarray:
     return cv2.cvtColor(pixels, code)
 
 
-def _area(pixels: np.ndarray, size: tuple[int, int], color: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def _whole(data: np.ndarray) -> bool:
+    """False where a file ends too soon. Older versions of OpenCV fill up what is missing of a JPEG with grey."""
+    if data[:2].tobytes() != b"\xff\xd8":
+        return data.size > 0
+    content = data.tobytes()
+    return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # the end of the image, after its last scan
+
+
+def header_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) as the file's first bytes say; None where they say nothing, or there is no such file."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+
+
+def _area(
+    pixels: np.ndarray, size: tuple[int, int], color: np.ndarray, lens: Lens | None
+) -> tuple[np.ndarray, np.ndarray | None]:
     floats = pixels.astype(np.float32) * np.float32(1.0 / np.iinfo(pixels.dtype).max)
     if floats.shape[2] == 4:
         floats[..., :3] *= floats[..., 3:]
+    if lens is not None:
+        floats = undistort(floats, lens)
     if size != (floats.shape[1], floats.shape[0]):
         floats = cv2.resize(floats, size, interpolation=cv2.INTER_AREA)
     if floats.shape[2] == 3:

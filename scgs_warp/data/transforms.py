@@ -1,52 +1,35 @@
-"""What the ``transforms*.json`` layouts share: JSON, poses, times, intrinsics, and errors that name the field.
+"""What the ``transforms*.json`` layouts share: poses, times, intrinsics, lenses, and errors that name the field.
 
 Poses are camera-to-world, OpenGL (x right, y up, z backward), as NeRF's Blender scenes and nerfstudio write them.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ..errors import UserError
-from ..types import Camera
+from .files import as_number, is_rotation, read_json, size_text
+from .lens import Lens, make_lens
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-RIGID_TOLERANCE = 1e-3
-"""Largest entry of R^T R - I that passes as rounding."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Camera models (COLMAP's and nerfstudio's names) that are a pinhole where all distortion is 0; a fisheye is not."""
-
-
-def size_text(size: tuple[int, int]) -> str:
-    return f"{size[0]} x {size[1]} pixels"
+LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""What ``distortion_params`` lists, in nerfstudio's order."""
+PERSPECTIVES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Camera models (COLMAP's and nerfstudio's names) that are a pinhole where all distortion is 0: r, tangential, and with
+FULL_OPENCV a quotient of polynomials."""
+FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+"""Those in which the angle to the optical axis, times a polynomial, is the distance from the centre."""
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
     """The JSON object in ``path``, with at least one frame; UserError otherwise."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; this split needs it, or choose another split") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as UTF-8 text ({type(error).__name__}); restore the file") from None
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise UserError(
-            f"{path}: not valid JSON, line {error.lineno} column {error.colno}: {error.msg}; restore or correct it"
-        ) from None
-    except ValueError:  # of Python, not of JSON: it converts no more than 4,300 digits
-        raise UserError(f"{path}: holds a number of more than 4,300 digits; restore or correct the file") from None
-    except RecursionError:
-        raise UserError(f"{path}: JSON nested too deeply; restore the file") from None
+    content = read_json(path, "this split needs it, or choose another split")
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path}: 'frames' is missing, empty or no list; list at least one frame there")
@@ -54,17 +37,6 @@ def read_transforms(path: Path) -> dict[str, Any]:
         if not isinstance(entry, dict):
             raise UserError(f"{path}: frames[{index}] is no object; give file_path and transform_matrix")
     return content
-
-
-def as_number(value: Any) -> float | None:
-    """A finite number as float; None for anything else (bool and strings too)."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if math.isfinite(number) else None
 
 
 def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
@@ -82,9 +54,7 @@ def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
         raise UserError(f"{where} has shape {list(matrix.shape)}; give 4 rows of 4 numbers")
     if not np.isfinite(matrix).all():
         raise UserError(f"{where} holds NaN or infinity; correct the pose or drop the frame")
-    rotation = matrix[:3, :3]
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+    if not is_rotation(matrix[:3, :3]) or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise UserError(
             f"{where} is not rigid (scaled, sheared, mirrored, or last row not 0 0 0 1); "
             "give a rotation and a translation, or drop the frame"
@@ -124,33 +94,64 @@ def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> P
     return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
 
 
-def check_distortion(path: Path, content: dict[str, Any]) -> None:
-    """Images are taken as those of a pinhole camera. ``content``: the file's object, or one of its frames.
+def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and what follows (fx, fy, cx, cy) among its parameters. ``fields``: the file's, and a frame's over
+    them.
 
     Raises:
-        UserError: another camera model, or lens distortion.
+        UserError: a camera model that is not known, or parameters that are none of its.
     """
-    model = content.get("camera_model")
-    if model is not None and (not isinstance(model, str) or model.upper() not in PINHOLES):
+    name = fields.get("camera_model")
+    if name is not None and (not isinstance(name, str) or name.upper() not in (*PERSPECTIVES, *FISHEYES)):
         raise UserError(
-            f"{path}: camera_model is {str(model)[:40]!r}, which is not supported; "
-            f"undistort the images to one of {', '.join(PINHOLES)}"
+            f"{path}: camera_model is {str(name)[:40]!r}, which is not supported; "
+            f"undistort the images to one of {', '.join((*PERSPECTIVES, *FISHEYES))}"
         )
-    parameters = content.get("distortion_params")
-    if parameters is not None and (
-        not isinstance(parameters, list) or any(as_number(value) != 0.0 for value in parameters)
-    ):
-        raise UserError(
-            f"{path}: distortion_params is {repr(parameters)[:60]}, lens distortion, which is not supported yet; "
-            "undistort the images and leave it out"
-        )
-    for key in DISTORTION:
-        value = content.get(key, 0)
-        if as_number(value) != 0.0:
+    values = {key: _parameter(path, key, fields.get(key, 0.0)) for key in DISTORTION}
+    listed = fields.get("distortion_params")
+    if listed is not None:
+        if not isinstance(listed, list) or len(listed) > len(LISTED):
             raise UserError(
-                f"{path}: {key} is {value!r}, lens distortion, which is not supported yet; "
-                "undistort the images and set it to 0"
+                f"{path}: distortion_params is {repr(listed)[:60]}; give up to six numbers, {', '.join(LISTED)}"
             )
+        values |= {key: _parameter(path, f"distortion_params ({key})", value) for key, value in zip(LISTED, listed)}
+    k1, k2, k3, k4, k5, k6, p1, p2 = values.values()
+    if not any(values.values()) and (name is None or name.upper() in PERSPECTIVES) and not fields.get("is_fisheye"):
+        return "PINHOLE", ()
+    if fields.get("is_fisheye") or (name is not None and name.upper() in FISHEYES):
+        kind, unused = "OPENCV_FISHEYE", ("k5", "k6", "p1", "p2")
+    else:
+        kind, unused = "FULL_OPENCV", () if name is not None and name.upper() == "FULL_OPENCV" else ("k4", "k5", "k6")
+    for key in unused:
+        if values[key] != 0.0:
+            raise UserError(
+                f"{path}: {key} is {values[key]:g}, a lens distortion that camera_model {name} does not have; "
+                "name the model that was calibrated, or undistort the images and set it to 0"
+            )
+    return kind, (k1, k2, k3, k4) if kind == "OPENCV_FISHEYE" else (k1, k2, p1, p2, k3, k4, k5, k6)
+
+
+def _parameter(path: Path, key: str, value: Any) -> float:
+    number = as_number(value)
+    if number is None:
+        raise UserError(f"{path}: {key} is {str(value)[:40]!r}, no number; give the lens distortion, or 0")
+    return number
+
+
+def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int, int]) -> Lens:
+    """The lens at the files' size, from ``fields`` of the file and of a frame over them.
+
+    Raises:
+        UserError: intrinsics are missing, no numbers, or of images of another size than ``source`` (width, height).
+    """
+    fx, fy, cx, cy = read_intrinsics(path, fields, index, source)
+    model, further = read_distortion(path, fields)
+    if model == "PINHOLE":
+        return Lens(fx, fy, cx, cy)
+    try:
+        return make_lens(model, (fx, fy, cx, cy, *further))
+    except ValueError as error:
+        raise UserError(f"{path}: frames[{index}]: {error}; correct the lens, or undistort the images") from None
 
 
 def read_intrinsics(
@@ -185,17 +186,3 @@ def read_intrinsics(
     else:
         raise UserError(f"{path}: neither camera_angle_x nor fl_x is given; add the field of view in radians")
     return fx, fy, number("cx", 0.5 * width), number("cy", 0.5 * height)
-
-
-def make_camera(
-    viewmat: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    source: tuple[int, int],
-    image: torch.Tensor,
-) -> Camera:
-    """The camera of an image [H, W, 3] that was reduced from ``source`` (width, height), whose intrinsics these are."""
-    height, width = image.shape[:2]
-    fx, fy, cx, cy = intrinsics
-    sx, sy = width / source[0], height / source[1]
-    K = torch.tensor([[fx * sx, 0.0, cx * sx], [0.0, fy * sy, cy * sy], [0.0, 0.0, 1.0]], dtype=torch.float32)
-    return Camera(torch.from_numpy(viewmat).float(), K, width, height)

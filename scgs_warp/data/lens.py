@@ -1,0 +1,142 @@
+"""Lenses: the pinhole inside a camera model, and images as that pinhole would have taken them.
+
+pycolmap knows every camera model of COLMAP, which contain those of OpenCV and nerfstudio; OpenCV moves the pixels.
+Pixel centres are at +0.5, as COLMAP has them; OpenCV's own functions count from the first pixel's centre.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+ROWS = 64
+"""Rows of an image whose rays are projected at once: memory stays small."""
+DIRECTIONS = 16
+RADII = 512
+"""Rays towards the corners, on which a model is followed outwards to where it folds back."""
+SLACK = 0.01
+"""Pixels beyond the outermost centres that rounding may lead to."""
+SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_FISHEYE", "SIMPLE_DIVISION")
+SINGLE_FOCAL += ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+PINHOLE_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
+"""Models that are a pinhole where all parameters beyond the first three or four are 0."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics at the size of the file, and what bends rays before them."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: str = "PINHOLE"
+    """COLMAP's name."""
+    params: tuple[float, ...] = ()
+    """The model's, as COLMAP orders them, focal lengths and centre included; not needed for a pinhole."""
+    skew: float = 0.0
+    """Pixels that x moves by per unit of y."""
+
+    @property
+    def distorted(self) -> bool:
+        """Whether the file is not what the pinhole would have taken."""
+        if self.skew != 0.0:
+            return True
+        if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+            return False
+        first = 3 if self.model in SINGLE_FOCAL else 4
+        return self.model not in PINHOLE_AT_ZERO or any(value != 0.0 for value in self.params[first:])
+
+
+def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
+    """The lens of a COLMAP model with these parameters.
+
+    Raises:
+        ValueError: no such model, not that many parameters, or values that no camera has; says which.
+    """
+    import pycolmap
+
+    known = pycolmap.CameraModelId.__members__
+    if model not in known or model == "INVALID":
+        raise ValueError(f"camera model {model[:40]!r} is not known")
+    if model == "EQUIRECTANGULAR":
+        raise ValueError("camera model EQUIRECTANGULAR sees all around, which no pinhole does")
+    if not all(math.isfinite(value) and abs(value) < 1e9 for value in (*params, skew)):
+        raise ValueError("camera parameters are not finite, or absurd")
+    camera = pycolmap.Camera(model=model, width=1, height=1)
+    camera.params = list(params)
+    if not camera.verify_params():
+        raise ValueError(f"camera model {model} does not take {len(params)} parameters")
+    fx, fy = (params[0], params[0]) if model in SINGLE_FOCAL else params[:2]
+    cx, cy = params[1:3] if model in SINGLE_FOCAL else params[2:4]
+    if fx <= 0 or fy <= 0:
+        raise ValueError("the focal length is not positive")
+    return Lens(fx, fy, cx, cy, model, params, skew)
+
+
+def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
+    """[N, 2] where the rays [N, 3] of the camera (x right, y down, z forward) meet the file's image; NaN: nowhere."""
+    import pycolmap
+
+    model, params = lens.model, lens.params
+    if not params:
+        model, params = "PINHOLE", (lens.fx, lens.fy, lens.cx, lens.cy)
+    camera = pycolmap.Camera(model=model, width=1, height=1)
+    camera.params = list(params)
+    with np.errstate(all="ignore"):
+        pixels = np.asarray(camera.img_from_cam(np.ascontiguousarray(rays, np.float64)), np.float64)
+    pixels[:, 0] += lens.skew / lens.fy * (pixels[:, 1] - lens.cy)
+    return pixels
+
+
+def reach(lens: Lens, width: int, height: int) -> float:
+    """The tangent of the angle to the optical axis up to which the model carries rays outwards; polynomials of
+    distortion turn back beyond what they were fitted to. Infinite where it does so all over the image."""
+    corners = [abs(x) for x in (lens.cx, width - lens.cx)], [abs(y) for y in (lens.cy, height - lens.cy)]
+    farthest = math.hypot(max(corners[0]) / lens.fx, max(corners[1]) / lens.fy)
+    angles = np.linspace(0.0, 2.0 * math.pi, DIRECTIONS, endpoint=False)
+    radii = np.linspace(0.0, farthest, RADII)
+    across = radii[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], 1)[:, None]
+    rays = np.concatenate([across, np.ones((DIRECTIONS, RADII, 1))], 2)
+    pixels = project(lens, rays.reshape(-1, 3)).reshape(DIRECTIONS, RADII, 2) - (lens.cx, lens.cy)
+    with np.errstate(invalid="ignore"):
+        outwards = np.diff(np.linalg.norm(pixels, axis=2), axis=1) > 0  # NaN: no
+    stuck = ~outwards.all(axis=0)
+    return float(radii[stuck.argmax()]) if stuck.any() else math.inf
+
+
+@functools.lru_cache(maxsize=4)
+def maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the pinhole's pixels lie in the file, as OpenCV counts: x [H, W], y [H, W] float32; and which of them the
+    file has, [H, W] bool."""
+    x = (np.arange(width) + 0.5 - lens.cx) / lens.fx
+    y = (np.arange(height) + 0.5 - lens.cy) / lens.fy
+    limit = reach(lens, width, height)
+    columns, rows = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    valid = np.empty((height, width), bool)
+    for first in range(0, height, ROWS):
+        band = slice(first, min(first + ROWS, height))
+        grid = np.stack(np.broadcast_arrays(x[None, :], y[band, None], 1.0), axis=2)
+        pixels = project(lens, grid.reshape(-1, 3)).reshape(*grid.shape[:2], 2) - 0.5
+        inside = (pixels >= -SLACK) & (pixels <= (width - 1 + SLACK, height - 1 + SLACK))  # NaN: no
+        valid[band] = inside.all(axis=2) & (np.hypot(grid[..., 0], grid[..., 1]) < limit)
+        pixels = np.where(valid[band, :, None], pixels, -9.0)
+        columns[band], rows[band] = pixels[..., 0], pixels[..., 1]
+    return columns, rows, valid
+
+
+def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
+    """The image [H, W, ...] as the lens's pinhole would have taken it, bilinear; 0 where the file has nothing."""
+    columns, rows, valid = maps(lens, image.shape[1], image.shape[0])
+    moved = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    moved[~valid] = 0
+    return moved
+
+
+def seen(lens: Lens, width: int, height: int) -> np.ndarray:
+    """[H, W] bool: which pixels of the undistorted image the file has."""
+    return maps(lens, width, height)[2]

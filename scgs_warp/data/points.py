@@ -1,0 +1,59 @@
+"""Initial points of a data set: PLY files, and positions that training can take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+
+
+def finite(points: np.ndarray) -> np.ndarray:
+    """[P] bool: which points [P, 3] float64 are finite in float32, as training takes them."""
+    with np.errstate(over="ignore"):
+        return np.all(np.isfinite(points.astype(np.float32)), axis=1)
+
+
+def unit_colors(vertices: np.ndarray) -> np.ndarray | None:
+    """[P, 3] in [0, 1], grey where the file says nothing finite; None where it has no colours.
+
+    Whole numbers are shares of their type's largest; others of 1, or of 255 where any is above 1.
+    """
+    names = ("red", "green", "blue")
+    if not all(name in (vertices.dtype.names or ()) for name in names):
+        return None
+    raw = np.stack([np.asarray(vertices[name]) for name in names], axis=1)
+    if np.issubdtype(raw.dtype, np.integer):
+        return (raw / np.iinfo(raw.dtype).max).clip(0.0, 1.0)
+    colors = raw.astype(np.float64)
+    finite = np.isfinite(colors)
+    most = 255.0 if (colors[finite] > 1.0).any() else 1.0
+    return np.where(finite, colors / most, 0.5).clip(0.0, 1.0)
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Vertices [P, 3] float64 of a PLY file, and their colours [P, 3] in [0, 1] where it has some.
+
+    Points that are not finite in float32 are left out.
+
+    Raises:
+        UserError: the file is missing, no PLY, has no vertices with x, y, z, or claims more than fit into memory.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        elements = PlyData.read(path)
+        vertices = elements["vertex"].data
+        points = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
+        colors = unit_colors(vertices)
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file, though ply_file_path names it; restore it or drop the field") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
+    except (PlyParseError, KeyError, ValueError, TypeError):
+        raise UserError(f"{path}: no PLY file of vertices with x, y, z; export the points again") from None
+    except (MemoryError, OverflowError):
+        raise UserError(f"{path}: says it has more points than fit into memory; export the points again") from None
+    kept = finite(points)
+    return points[kept], None if colors is None else colors[kept]
