@@ -68,7 +68,7 @@ class Engine:
         with torch.no_grad():
             trajectories = self.rig.trajectories(sample_times(self.rig.moves))
             self.binding = self.rig.binding(scene.gaussians)
-        self.graph = build_graph(trajectories, shared=None if self.rig.moves else self._shared())
+        self.graph = build_graph(trajectories, shared=self._shared())
         if not self.rig.moves:
             self.binding = _across_no_gap(self.graph, *self.binding)
         self.solver = ArapSolver(self.graph)
@@ -83,7 +83,7 @@ class Engine:
     def _shared(self) -> np.ndarray:
         """[N, 2] the two nearest control points of every opaque Gaussian."""
         opaque = (self.scene.gaussians.opacities() > OPAQUE).cpu().numpy()
-        return self.binding[0][:, :2].cpu().numpy()[opaque]
+        return self.binding[0][:, :2].cpu().numpy()[opaque if opaque.any() else slice(None)]
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
         centre, scale = self.units

@@ -79,9 +79,9 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.nda
     Args:
         trajectories: [T, M, 3] control points at T times (one is enough for what stands still).
         neighbors: that each control point asks for, 1 .. 15.
-        shared: [N, K] control points that have a Gaussian in common, row by row. Given where no motion tells parts
-            apart: nearest neighbours are tied only through what they share (Martinetz & Schulten 1994), or through one
-            more control point, so that a gap stays a gap.
+        shared: [N, K] control points that have a Gaussian in common, row by row. Nearest neighbours are then tied only
+            through what they share (Martinetz & Schulten 1994), or through one more control point, so that a gap stays
+            a gap, and what moves nothing ties nothing.
     """
     nodes = trajectories.shape[1]
     found, _ = trajectory_graph(trajectories.float().cpu().contiguous(), neighbors)
