@@ -287,6 +287,8 @@ def test_a_static_scene_is_given_control_points():
     session.pin(left)
     session.move("right", [0, 0.5, 0])
     assert same(session.gaussians_at(0.1), session.gaussians_at(0.9))
+    kept = (session.gaussians_at(0.0).means == still.gaussians_at(0.0).means).all(1)
+    assert 20 < int(kept.sum()) < 380
     assert len(rig_static(still, 7).motion.positions) == 7
 
 

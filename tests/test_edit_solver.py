@@ -18,7 +18,7 @@ from scgs_warp.edit.handles import Goal, anchors_at
 from scgs_warp.edit.rotations import IDENTITY, angle, from_axis, from_matrix, rotate, to_matrix
 from scgs_warp.edit.solver import Anchors, Shape, count_steps
 
-X = np.array([1.0, 0.0, 0.0])
+X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def cloud(seed: int, count: int, spread=(1.0, 1.0, 1.0)) -> np.ndarray:
@@ -170,6 +170,18 @@ def test_the_graph_is_symmetric_and_parts_that_move_apart_are_not_tied():
     assert not any((a < 40) != (b < 40) for a, b in free.edges)
     assert set(tied.ring([0], 1)) == {0, *tied.neighbors[tied.begin[0] : tied.begin[1]].tolist()}
     assert tied.ring([0], 0) == (0,) and tied.ring([], 3) == ()
+
+
+def test_a_gap_stays_a_gap_where_nothing_moves():
+    """Two plates face each other, about as far apart as their control points: Gaussians say that they are two."""
+    grid = np.stack(np.meshgrid(np.arange(8), np.arange(8), [0.0]), -1).reshape(-1, 3)
+    plates = np.concatenate([grid, grid + 1.2 * Z])
+    fine = np.stack(np.meshgrid(np.linspace(0, 7, 50), np.linspace(0, 7, 50), [0.0, 1.2]), -1).reshape(-1, 3)
+    shared = np.argsort(np.linalg.norm(fine[:, None] - plates[None], axis=-1), axis=1)[:, :2]
+    near = build_graph(torch.from_numpy(plates).float()[None])
+    apart = build_graph(torch.from_numpy(plates).float()[None], shared=shared)
+    crossing = [sum((a < 64) != (b < 64) for a, b in graph.edges) for graph in (near, apart)]
+    assert crossing[0] > 50 and crossing[1] == 0
 
 
 def test_strays_follow_their_nearest_neighbour():

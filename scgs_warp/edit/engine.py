@@ -16,7 +16,7 @@ from ..motion.static import Static
 from ..scene import Scene
 from ..types import Gaussians
 from .document import Edit
-from .graph import build_graph, sample_times
+from .graph import ControlGraph, build_graph, sample_times
 from .handles import ONE_FRAME, STAY, Goal, Target, anchors_at, carried_goal
 from .keyframes import targets_at
 from .player import Player
@@ -29,6 +29,9 @@ CACHED = 64
 LIVE_STEPS = 4
 """Sub-steps that one drag update takes at most; a drag further than that catches up with the next updates."""
 LIVE_ITERATIONS = 8
+
+OPAQUE = 0.1
+"""Gaussians of less opacity tie no control points together."""
 
 Value = TypeVar("Value")
 
@@ -65,7 +68,9 @@ class Engine:
         with torch.no_grad():
             trajectories = self.rig.trajectories(sample_times(self.rig.moves))
             self.binding = self.rig.binding(scene.gaussians)
-        self.graph = build_graph(trajectories)
+        self.graph = build_graph(trajectories, shared=self._shared())
+        if not self.rig.moves:
+            self.binding = _across_no_gap(self.graph, *self.binding)
         self.solver = ArapSolver(self.graph)
         self.player = Player(self.graph, self.solver, self.motion_at)
         unit_of = scene.normalisation
@@ -74,6 +79,11 @@ class Engine:
         self._bases: OrderedDict[Any, NodePose] = OrderedDict()
         self._bent: OrderedDict[Any, NodePose | None] = OrderedDict()
         self._live: _Live | None = None
+
+    def _shared(self) -> np.ndarray:
+        """[N, 2] the two nearest control points of every opaque Gaussian."""
+        opaque = (self.scene.gaussians.opacities() > OPAQUE).cpu().numpy()
+        return self.binding[0][:, :2].cpu().numpy()[opaque if opaque.any() else slice(None)]
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
         centre, scale = self.units
@@ -219,6 +229,22 @@ class Engine:
             shift = np.linalg.norm(np.subtract(target.translation, old.translation)) * self.units[1]
             most = max(most, count_steps(2.0 * float(np.arccos(cosine)), float(shift), self.graph.edge_length))
         return most
+
+
+def _across_no_gap(
+    graph: ControlGraph, indices: torch.Tensor, weights: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """A static scene's binding, without control points that are not tied to a Gaussian's nearest one."""
+    nodes = indices.long().cpu().numpy()
+    tied = (
+        np.asarray(graph.matrix[nodes[:, :1].repeat(nodes.shape[1], 1).ravel(), nodes.ravel()]).reshape(nodes.shape) > 0
+    )
+    tied[:, 0] = True
+    kept = weights * torch.from_numpy(tied).to(weights.device)
+    total = kept.sum(dim=1, keepdim=True)
+    nearest = torch.zeros_like(kept)
+    nearest[:, 0] = 1.0
+    return indices, torch.where(total > 1e-6, kept / total.clamp_min(1e-6), nearest)
 
 
 def _between(before: Mapping[str, Target], after: Mapping[str, Target], share: float) -> dict[str, Target]:

@@ -69,7 +69,7 @@ class ControlGraph:
         return tuple(np.flatnonzero(inside).tolist())
 
 
-def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS) -> ControlGraph:
+def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.ndarray | None = None) -> ControlGraph:
     """Neighbours by mean squared distance over time (SC-GS, Eq. 10), so that parts which touch once and move apart
     are not tied; made symmetric by union, overlong edges dropped.
 
@@ -79,6 +79,9 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS) -> ControlGrap
     Args:
         trajectories: [T, M, 3] control points at T times (one is enough for what stands still).
         neighbors: that each control point asks for, 1 .. 15.
+        shared: [N, K] control points that have a Gaussian in common, row by row. Nearest neighbours are then tied only
+            through what they share (Martinetz & Schulten 1994), or through one more control point, so that a gap stays
+            a gap, and what moves nothing ties nothing.
     """
     nodes = trajectories.shape[1]
     found, _ = trajectory_graph(trajectories.float().cpu().contiguous(), neighbors)
@@ -87,6 +90,9 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS) -> ControlGrap
     columns = columns.reshape(-1)
     rows, columns = rows[columns >= 0], columns[columns >= 0]
     pairs = np.unique(np.stack([np.minimum(rows, columns), np.maximum(rows, columns)], 1), axis=0)
+    if shared is not None:
+        near = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(nodes, nodes)).tocsr()
+        pairs = np.stack(near.multiply(_near(shared, nodes)).nonzero(), axis=1)
     tracks = trajectories.detach().cpu().double().numpy()
     offsets = tracks[:, pairs[:, 0]] - tracks[:, pairs[:, 1]]
     lengths = np.sqrt((offsets**2).sum(-1).mean(0))
@@ -99,6 +105,15 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS) -> ControlGrap
     begin, columns = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32)
     stray = _strays(tracks, component, LONGEST * median)
     return ControlGraph(begin, columns, matrix.data.astype(np.float64), component, median or 1.0, stray)
+
+
+def _near(shared: np.ndarray, nodes: int) -> csr_matrix:
+    """[M, M] bool: control points with a Gaussian in common, or with one such neighbour in common."""
+    rows, columns = (shared[:, pick].reshape(-1) for pick in np.triu_indices(shared.shape[1], 1))
+    ones = np.ones(2 * len(rows), bool)
+    ends = np.concatenate([rows, columns]), np.concatenate([columns, rows])
+    direct = csr_matrix((ones, ends), shape=(nodes, nodes), dtype=bool)
+    return csr_matrix(direct + direct @ direct)
 
 
 def _strays(tracks: np.ndarray, component: np.ndarray, reach: float) -> np.ndarray:

@@ -87,9 +87,13 @@ class StaticNodes(Motion):
 
     @torch.no_grad()
     def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
-        """Linear blend skinning of all Gaussians (SC-GS, Eq. 6-7)."""
+        """Linear blend skinning of all Gaussians (SC-GS, Eq. 6-7); to the bit as they were where no control point has
+        moved."""
         means, quats, _ = skin(gaussians.means.detach(), gaussians.quats.detach(), self.positions, pose, *binding)
         rest = gaussians.activate()
+        moved = pose.translations.any(dim=1) | pose.rotations[:, 1:].any(dim=1)
+        touched = moved[binding[0].long()].any(dim=1, keepdim=True)
+        means, quats = torch.where(touched, means, rest.means), torch.where(touched, quats, rest.quats)
         return Gaussians(means, quats, rest.scales, rest.opacities, rest.sh_dc, rest.sh_rest)
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
