@@ -52,15 +52,11 @@ def preset(name: PresetName) -> TrainConfig:
         freeze=400,
         coarse=1_800,
         init_points=10_000,
-        init_from="spheres",
         evaluate_every=5_000,
-        pretrain=PretrainConfig(
-            steps=3_000, densify_until=2_000, warm_up=300, max_ratio=2.0, arap_weight=1e-3, progressive_every=300
-        ),
+        pretrain=PretrainConfig(steps=3_000, densify_until=2_000, warm_up=300, progressive_every=300),
         motion=MotionConfig(nodes=256),
         optim=OptimConfig(means_until=21_000, network_until=21_000),
         densify=DensifyConfig(
-            grad_threshold=1e-4,
             start=400,
             until=12_000,
             opacity_reset_every=3_000,
@@ -83,8 +79,7 @@ def preset(name: PresetName) -> TrainConfig:
         start_ratio=16.0,
     )
     quick = with_steps(cpu, 7_000)
-    growth = dataclasses.replace(quick.densify, grad_threshold=1.4e-4)  # 1e-4: a third slower
-    return dataclasses.replace(quick, preset="quick", half_size=1_800, pretrain=stage1, densify=growth)
+    return dataclasses.replace(quick, preset="quick", half_size=1_800, pretrain=stage1)
 
 
 def with_steps(config: TrainConfig, steps: int) -> TrainConfig:

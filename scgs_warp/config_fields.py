@@ -96,12 +96,12 @@ class PretrainConfig:
     """Share of the spheres that is cloned each time, those with the largest gradients, until the cap."""
     start_ratio: float = 8.0
     """Spheres per control point to start with; while they are at rest they cost little."""
-    max_ratio: float = 4.0
+    max_ratio: float = 2.0
     """At most this many spheres per control point once they move: each one queries the network."""
     opacity_rate: float = 0.02
     """Learning rates of the spheres; with the Gaussians' own they turn transparent before they find their colour."""
     color_rate: float = 1e-2
-    arap_weight: float = 1e-2
+    arap_weight: float = 1e-3
     random_background: bool = True
     """Where the data has alpha: another background every step, so that black cloth is not mistaken for nothing."""
     progressive: bool = False
@@ -115,7 +115,7 @@ class OptimConfig:
 
     means: float = 8e-4
     means_end: float = 8e-6
-    means_until: int = milestone(30_000)
+    means_until: int = milestone(66_000)
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
     opacity: float = 0.05
@@ -125,7 +125,7 @@ class OptimConfig:
     shading: float = 2.5e-3
     network: float = 8e-4
     network_end: float = 1.6e-6
-    network_until: int = milestone(40_000)
+    network_until: int = milestone(66_000)
     nodes: float = 8e-4
     """Radii, weights and hyper-coordinates of the control points."""
     node_positions: float = 8e-5
@@ -142,7 +142,7 @@ class DensifyConfig:
     """Growing, splitting and pruning Gaussians and control points, in main steps."""
 
     start: int = milestone(500)
-    until: int = milestone(50_000)
+    until: int = milestone(40_000)
     every: int = 100
     grad_threshold: float = 1.4e-4
     """Gradient of the loss to the 2D mean in normalised device coordinates, at 800 pixels (official code: 2e-4 at any
@@ -160,8 +160,8 @@ class DensifyConfig:
     """Prune what covers more than this share of the image (once opacities were reset)."""
     max_scale: float = 0.1
     """Prune what is larger than this share of the extent (once opacities were reset)."""
-    opacity_reset_every: int = milestone(3_000)
-    sh_every: int = milestone(1_000)
+    opacity_reset_every: int = milestone(10_000)
+    sh_every: int = milestone(1_500)
     """Main steps between two degrees of spherical harmonics."""
     nodes_every: int = milestone(5_000)
     nodes_until: int = milestone(25_000)
@@ -204,10 +204,10 @@ class TrainConfig:
     """Main steps during which control points and network stay as stage 1 left them."""
     coarse: int = milestone(6_000)
     """The same for models without stage 1: a static scene comes first."""
-    init_points: int = 100_000
+    init_points: int = 20_000
     """Gaussians to start with, and no more where the data brings more points; filled images get points behind theirs up
     to this total."""
-    init_from: Literal["points", "spheres"] = "points"
+    init_from: Literal["points", "spheres"] = "spheres"
     """points: at the data's points, else at random where the images' alpha allows something to be; spheres: around the
     control points that stage 1 found."""
     sh_degree: int = 3

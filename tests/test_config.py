@@ -32,7 +32,7 @@ def test_steps_scale_every_milestone():
     made = C.with_steps(C.preset("paper"), 8_000)
     assert made.steps == 8_000
     assert (made.pretrain.steps, made.pretrain.densify_until, made.freeze) == (1_000, 750, 300)
-    assert (made.densify.until, made.optim.means_until, made.loss.arap_until) == (5_000, 3_000, 8_000)
+    assert (made.densify.until, made.optim.means_until, made.loss.arap_until) == (4_000, 6_600, 8_000)
     assert made.densify.every == 100 and made.loss.arap_refresh == 200, "intervals are no milestones"
 
 
