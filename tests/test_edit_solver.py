@@ -216,3 +216,22 @@ def test_quaternions_and_matrices(seed):
     np.testing.assert_allclose(np.abs((back * quats).sum(1)), 1.0, atol=1e-12)
     vectors = random.normal(size=(5, 3))
     np.testing.assert_allclose(rotate(quats, vectors), (to_matrix(quats) @ vectors[..., None])[..., 0], atol=1e-12)
+
+
+def test_a_pair_tied_by_one_edge_is_turned_no_further_than_it_has_to_be():
+    """One edge leaves its own axis open."""
+    rest = np.concatenate([cloud(16, 40), [[30.0, 1.0, 2.0], [30.3, 1.4, 2.2]]])
+    graph = graph_of(rest)
+    assert graph.component[40] == graph.component[41] != graph.component[0]
+    solver = ArapSolver(graph)
+    np.testing.assert_array_equal(from_matrix(solver.turns(rest, rest))[:, 1:] ** 2 < 1e-20, True)
+    edge = rest[41] - rest[40]
+    for degrees in (1e-5, 30.0, 179.0):
+        axis = np.cross(edge, [0.0, 0.0, 1.0])
+        least = from_axis(axis, degrees)
+        posed = rest.copy()
+        posed[41] = rest[40] + rotate(least, edge)
+        np.testing.assert_allclose(from_matrix(solver.turns(rest, posed))[40:], [least, least], atol=1e-6)
+    posed[41] = rest[40] - edge
+    turned = solver.turns(rest, posed)[40:]
+    np.testing.assert_allclose(np.linalg.det(turned), 1.0, atol=1e-9)

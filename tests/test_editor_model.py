@@ -295,4 +295,4 @@ def test_colours_of_control_points():
 
 
 def test_a_moment_shows_the_film_or_the_handles(model):
-    assert model.moment() == Moment(0.0, None, False, "edited", model.moment().reach)
+    assert model.moment() == Moment(0.0, None, False, "edited")

@@ -205,8 +205,7 @@ def _pins(root: Node, handles: list[Handle], session: EditSession) -> tuple[int,
         node = Node(value, root.source, "pins")
         rings = node.integer("beyond", 2, 0, 1000)
         node.done()
-        free = {n for handle in handles for n in session.graph.ring(handle.nodes, rings)}
-        return tuple(n for n in range(len(session)) if n not in free)
+        return session.graph.beyond({n for handle in handles for n in handle.nodes}, rings)
     return _nodes(root, "pins", session)
 
 

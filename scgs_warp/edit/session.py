@@ -23,7 +23,7 @@ from . import script
 from .document import Edit
 from .engine import Engine
 from .graph import ControlGraph
-from .handles import ONE_FRAME, STAY, Handle, Target
+from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
 from .pose import NodePose
 
@@ -36,6 +36,7 @@ class EditSession:
 
     Whatever changes the edit can be undone; a drag counts as one change from its first ``drag`` to ``release``.
     Results depend on the edit alone, but for those with ``live=True``: they are for the eye while something is dragged.
+    ``frame`` is how far from its time an edit of one frame shows; None: as far as in the edit's film.
 
     Attributes: ``scene``, ``graph``, ``edit`` (replace it with :meth:`apply`).
     """
@@ -96,9 +97,11 @@ class EditSession:
 
     # Choosing control points
 
-    def node_positions(self, time: float, at: float | None = None, *, live: bool = False) -> np.ndarray:
+    def node_positions(
+        self, time: float, at: float | None = None, *, live: bool = False, frame: float | None = None
+    ) -> np.ndarray:
         """[M, 3] edited control points, world."""
-        bent = self._bend(time, at, live)
+        bent = self._bend(time, at, live, frame)
         time = min(max(float(time), 0.0), 1.0)
         positions = self.engine.motion_at(time).positions if bent is None else bent.positions
         return self.engine.to_world(positions)
@@ -184,10 +187,8 @@ class EditSession:
 
     def pin_rest(self, rings: int = 2) -> None:
         """Pin everything more than ``rings`` edges away from any handle."""
-        free: set[int] = set()
-        for handle in self.edit.handles:
-            free |= set(self.graph.ring(handle.nodes, rings))
-        self._change(pins=tuple(node for node in range(len(self)) if node not in free))
+        held = {node for handle in self.edit.handles for node in handle.nodes}
+        self._change(pins=self.graph.beyond(held, rings))
 
     def _handle(self, name: str) -> Handle:
         found = self.edit.handle(name)
@@ -268,16 +269,17 @@ class EditSession:
         """The moment of the motion that a moment of the film shows."""
         return self.edit.playback.time_at(at, self.edit.film.seconds)
 
-    def _bend(self, time: float, at: float | None, live: bool, frame: float = ONE_FRAME) -> NodePose | None:
+    def _bend(self, time: float, at: float | None, live: bool, frame: float | None = None) -> NodePose | None:
         if not (math.isfinite(time) and (at is None or math.isfinite(at))):
             raise UserError(f"time {time}, at {at}: give finite numbers")
         time = min(max(float(time), 0.0), 1.0)
+        frame = self.edit.reach if frame is None else frame
         if live and at is None:
             return self.engine.bend_live(self.edit, time, frame=frame)
         return self.engine.bend(self.edit, time, at, frame=frame)
 
     def gaussians_at(
-        self, time: float, at: float | None = None, *, live: bool = False, frame: float = ONE_FRAME
+        self, time: float, at: float | None = None, *, live: bool = False, frame: float | None = None
     ) -> Gaussians:
         """Activated Gaussians under the edit, world units; the scene's own bits where the edit changes nothing."""
         bent = self._bend(time, at, live, frame)
@@ -292,7 +294,7 @@ class EditSession:
         background: Sequence[float] | Tensor | None = None,
         *,
         live: bool = False,
-        frame: float = ONE_FRAME,
+        frame: float | None = None,
     ) -> Image:
         """The edited scene, as ``Scene.render`` shows the scene; its very bits where the edit changes nothing."""
         bent = self._bend(time, at, live, frame)

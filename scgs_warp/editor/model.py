@@ -15,7 +15,6 @@ from typing import Any, Literal
 import numpy as np
 
 from ..edit import Edit, EditSession, Target, script
-from ..edit.filming import frame_reach
 from ..errors import UserError
 
 Show = Literal["edited", "original", "side by side", "split"]
@@ -32,8 +31,6 @@ class Moment:
     """Second of the film whose keyframes lead the handles; None: where handles are now."""
     live: bool
     show: Show
-    reach: float
-    """How far from its time an edit of one frame shows."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,6 @@ class Model:
         self.dragging = False
         self._following = False
         self._played_from: tuple[float, float] | None = None
-        self._reach: tuple[Any, float] = (None, 0.0)
 
     # Time
 
@@ -125,13 +121,9 @@ class Model:
     def moment(self) -> Moment:
         with self.lock:
             self.tick()
-            edit = self.session.edit
-            key = edit.film, edit.playback
-            if self._reach[0] != key:
-                self._reach = key, frame_reach(self.session)
             live = self.dragging and not self.playing
             at = self.at if self._following and not live else None
-            return Moment(self.time, at, live, self.show, self._reach[1])
+            return Moment(self.time, at, live, self.show)
 
     # The edit
 
