@@ -58,7 +58,6 @@ def test_handles_have_no_effect_outside_their_time(lasts, stiffness):
         beside = [session.node_positions(time) for time in (0.0, 0.4, 0.69, 1.0)]
         shown = [np.array_equal(a, b) for a, b in zip(alone, beside)]
         assert shown == [True, lasts == "frame", True, True]
-        assert np.abs(session.node_positions(0.5) - motion(session, 0.5))[part(session, 0.5, 0.55)].min(0).max() < 0.11
 
 
 def test_fading_handles_let_go_without_a_jump():

@@ -90,8 +90,8 @@ class ControlGraph:
     def follow(
         self, rest: np.ndarray, positions: np.ndarray, turns: np.ndarray, stay: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [M, 3] and turns [M, 4] after strays have gone along with their leaders; those in ``stay`` [M] bool,
-        and those whose leader has not moved, are as they were."""
+        """Positions [M, 3] and turns [M, 4] after strays have gone along with their leaders; those in ``stay`` [M]
+        bool, and those whose leader has not moved, are as they were."""
         led = self.led[~stay[self.led]]
         leaders = self.stray[led]
         moved = (positions[leaders] != rest[leaders]).any(1) | turns[leaders, 1:].any(1)

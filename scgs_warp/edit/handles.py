@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..errors import UserError
+from .fields import LIMIT
 from .graph import ControlGraph
 from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
 from .solver import Anchors
@@ -41,12 +42,13 @@ class Target:
         """Checked and normalised.
 
         Raises:
-            UserError: a number is not finite, or the rotation has no direction.
+            UserError: a number is not finite or too large, or the rotation has no direction.
         """
         moved = tuple(float(x) for x in (translation if translation is not None else (0.0, 0.0, 0.0)))
         turned = tuple(float(x) for x in (rotation if rotation is not None else IDENTITY))
-        if len(moved) != 3 or not all(map(math.isfinite, moved)):
-            raise UserError(f"translation {list(moved)}: must be three finite numbers; the handle stays where it is")
+        if len(moved) != 3 or not all(math.isfinite(x) and abs(x) <= LIMIT for x in moved):
+            limits = f"must be three finite numbers from {-LIMIT:g} to {LIMIT:g}"
+            raise UserError(f"translation {list(moved)}: {limits}; the handle stays where it is")
         if len(turned) != 4 or not all(map(math.isfinite, turned)) or not any(turned):
             raise UserError(f"rotation {list(turned)}: must be four finite numbers, not all 0; the handle stays")
         if abs(math.fsum(x * x for x in turned) - 1.0) > 1e-12:

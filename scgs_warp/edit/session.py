@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -140,7 +141,8 @@ class EditSession:
     # Handles and pins
 
     def add_handle(self, nodes: Iterable[int], time: float, name: str | None = None, **fields: Any) -> Handle:
-        """Take hold of some control points; ``fields`` as in :class:`Handle`. A name that is taken is replaced.
+        """Take hold of some control points; ``fields`` as in :class:`Handle`. A name that is taken is taken over,
+        without its target and its part in keyframes.
 
         Raises:
             UserError: no node, or one that does not exist, or a field that makes no sense.
@@ -153,20 +155,23 @@ class EditSession:
             name = next(f"handle {i}" for i in range(1, len(taken) + 2) if f"handle {i}" not in taken)
         handle = Handle(name=name, nodes=chosen, time=float(time), **fields)
         script.check_handle(handle, len(self))
-        others = tuple(h for h in self.edit.handles if h.name != name)
-        self._change(handles=(*others, handle))
+        edit = self._without(name)
+        self.apply(dataclasses.replace(edit, handles=(*edit.handles, handle)))
         return handle
 
     def remove_handle(self, name: str) -> None:
         """With its target and its part in every keyframe."""
-        handle = self._handle(name)
+        self.apply(self._without(self._handle(name).name))
+
+    def _without(self, name: str) -> Edit:
+        """The edit without a handle of that name."""
         frames = []
         for frame in self.edit.keyframes:
             rest = {n: t for n, t in frame.targets.items() if n != name}
-            frames += [dataclasses.replace(frame, targets=rest)] if rest else []
+            frames += [dataclasses.replace(frame, targets=rest)] if rest or not frame.targets else []
         targets = {n: t for n, t in self.edit.targets.items() if n != name}
-        handles = tuple(h for h in self.edit.handles if h is not handle)
-        self._change(handles=handles, targets=targets, keyframes=tuple(frames))
+        handles = tuple(h for h in self.edit.handles if h.name != name)
+        return dataclasses.replace(self.edit, handles=handles, targets=targets, keyframes=tuple(frames))
 
     def pivot(self, name: str) -> np.ndarray:
         """[3] what a handle turns about, world, at its own time."""
@@ -242,8 +247,7 @@ class EditSession:
 
     def add_keyframe(self, at: float, easing: Easing = "smooth") -> Keyframe:
         """Keep where all handles are now, for a moment of the film; one that is there already is replaced."""
-        if not (math.isfinite(at) and at >= 0):
-            raise UserError(f"keyframe at {at}: give seconds from the film's beginning")
+        script.check_keyframe(at, easing)
         names = [handle.name for handle in self.edit.handles]
         if not names:
             raise UserError("a keyframe needs a handle; take hold of some control points first")
@@ -262,7 +266,12 @@ class EditSession:
     # Results
 
     def resize_film(self, size: int) -> None:
-        """Longer side of the film in pixels."""
+        """Longer side of the film in pixels.
+
+        Raises:
+            UserError: no film is that small or large.
+        """
+        script.check_size(size)
         self._change(film=dataclasses.replace(self.edit.film, size=size))
 
     def scene_time(self, at: float) -> float:
@@ -311,13 +320,14 @@ class EditSession:
     # Files
 
     def save(self, path: str | Path) -> None:
-        """As JSON; loading it gives the same edit.
+        """As JSON; loading it gives the same edit. A drag goes on.
 
         Raises:
-            UserError: the place cannot be written.
+            UserError: the place cannot be written, or the edit holds something that no file may say.
         """
-        self.release()
-        write_atomically(Path(path), script.to_json(self.edit, self).encode())
+        text = script.to_json(self.edit, self)
+        script.parse(json.loads(text), "the edit", self)
+        write_atomically(Path(path), text.encode())
 
     def load(self, path: str | Path) -> None:
         """The edit in a file; can be undone.
