@@ -234,6 +234,11 @@ class EditSession:
             self._past.append(before)
             self._future.clear()
 
+    def cancel(self) -> None:
+        """The drag has not been: the edit is what it was before."""
+        before, self._before_drag = self._before_drag, None
+        self.edit = self.edit if before is None else before
+
     def move(
         self, name: str, translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None
     ) -> Target:
