@@ -56,7 +56,7 @@ class Anchors(NamedTuple):
     """[M, 3], read where hard or soft."""
     rotations: np.ndarray
     """[M, 3, 3], read where turned or leaning."""
-    leaning: np.ndarray | None = None
+    leaning: np.ndarray
     """[M] >= 0: weight of a rotation that is asked for, as ``soft`` for positions; 0 where there is none."""
 
 
@@ -181,8 +181,7 @@ class ArapSolver:
 
     def _asked(self, anchors: Anchors) -> tuple[torch.Tensor, torch.Tensor]:
         """Weights [M] and values [M, 3, 3] of the rotations that are asked for."""
-        leaning = np.zeros(len(self.graph)) if anchors.leaning is None else anchors.leaning
-        weights = leaning * self._degree * self.graph.edge_length**2
+        weights = anchors.leaning * self._degree * self.graph.edge_length**2
         return torch.from_numpy(weights), torch.from_numpy(np.ascontiguousarray(anchors.rotations))
 
     def _guess(self, system: _System, anchors: Anchors, shape: Shape) -> np.ndarray:
@@ -191,7 +190,7 @@ class ArapSolver:
         turns = np.where(anchors.turned[:, None, None], anchors.rotations, shape.rotations)
         further = np.zeros((len(turns), 3))
         given = np.flatnonzero(anchors.turned)
-        wanted = given if anchors.leaning is None else np.flatnonzero(anchors.turned | (anchors.leaning > 0))
+        wanted = np.flatnonzero(anchors.turned | (anchors.leaning > 0))
         change = anchors.rotations[wanted] @ shape.rotations[wanted].transpose(0, 2, 1)
         further[wanted] = logarithm(from_matrix(change))
         if system.factor is None or not further.any():
@@ -240,11 +239,11 @@ class ArapSolver:
         own = np.repeat(np.arange(len(graph)), np.diff(graph.begin))
         edges = rest[own] - rest[graph.neighbors]
         wanted = np.einsum("eij,ej->ei", 0.5 * (rotations[own] + rotations[graph.neighbors]), edges)
-        hard = held.copy()
+        hard, none = held.copy(), np.zeros(len(graph))
         free_components = np.setdiff1d(graph.component, graph.component[held])
         labels, first = np.unique(graph.component, return_index=True)
         hard[first[np.isin(labels, free_components)]] = True
-        system = self._system(Anchors(hard, np.zeros(len(graph)), ~hard, rest, rotations))
+        system = self._system(Anchors(hard, none, ~hard, rest, rotations, none))
         positions = rest.copy()
         free = system.free.long().numpy()
         if system.factor is not None:
