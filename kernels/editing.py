@@ -21,10 +21,13 @@ def turn_nodes(
     weights_in: wp.array[wp.float64],  # [E]
     smoothness: wp.float64,  # weight of a neighbour's rotation, squared units of the positions
     rotations_in: wp.array[wp.mat33d],  # [M] of the step before
+    leaning_in: wp.array[wp.float64],  # [M] weight of a rotation that is asked for, squared units of the positions
+    asked_in: wp.array[wp.mat33d],  # [M] read where that is not 0
     # Out:
     rotations_out: wp.array[wp.mat33d],  # [M], rows of nodes_in only
 ):
-    """R = argmin sum w (|e' - R e|^2 + smoothness |R - R_j|^2), determinant +1 always (SR-ARAP, Levi & Gotsman)."""
+    """R = argmin sum w (|e' - R e|^2 + smoothness |R - R_j|^2) + leaning |R - asked|^2, determinant +1 always (SR-ARAP,
+    Levi & Gotsman). What edges along one line leave open is not turned: of all that explain those, the least."""
     i = nodes_in[first + wp.tid()]
     S = wp.mat33d(wp.float64(0.0))
     for at in range(begin_in[i], begin_in[i + 1]):
@@ -32,6 +35,8 @@ def turn_nodes(
         edge = rest_in[j] - rest_in[i]
         posed = posed_in[j] - posed_in[i]
         S += weights_in[at] * (wp.outer(posed, edge) + smoothness * rotations_in[j])
+    if leaning_in[i] > wp.float64(0.0):
+        S += leaning_in[i] * asked_in[i]
     largest = wp.float64(0.0)
     bad = int(0)
     for a in range(3):
@@ -41,12 +46,21 @@ def turn_nodes(
                 bad = 1
     R = rotations_in[i]
     if bad == 0 and largest > wp.float64(1.0e-60):
-        U, _sigma, V = wp.svd3(S / largest)
+        U, sigma, V = wp.svd3(S / largest)
         # singular values come in descending order: a reflection is undone along the least of them
         if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):
             for a in range(3):
                 U[a, 2] = -U[a, 2]
-        R = U * wp.transpose(V)
+        if sigma[1] > wp.float64(1.0e-12) * sigma[0]:
+            R = U * wp.transpose(V)
+        else:
+            before = wp.vec3d(V[0, 0], V[1, 0], V[2, 0])
+            after = wp.vec3d(U[0, 0], U[1, 0], U[2, 0])
+            axis = wp.cross(before, after)
+            cosine = wp.dot(before, after)
+            if cosine > wp.float64(-0.999999):
+                K = wp.skew(axis)
+                R = wp.identity(n=3, dtype=wp.float64) + K + K * K / (wp.float64(1.0) + cosine)
     rotations_out[i] = R
 
 

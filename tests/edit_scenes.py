@@ -65,11 +65,13 @@ def bar_points(count: int, seed: int) -> torch.Tensor:
     return (torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([2.4, 0.3, 0.3])
 
 
-def dress(points: torch.Tensor, seed: int = 3, degree: int = 3, shaded: bool = False) -> GaussianParameters:
+def dress(
+    points: torch.Tensor, seed: int = 3, degree: int = 3, shaded: bool = False, hyper_dim: int = 0
+) -> GaussianParameters:
     """Opaque Gaussians of random colours."""
     generator = torch.Generator().manual_seed(seed)
     made = gaussians_from_points(
-        points, torch.rand(len(points), 3, generator=generator), sh_degree=degree, hyper_dim=0, shaded=shaded
+        points, torch.rand(len(points), 3, generator=generator), sh_degree=degree, hyper_dim=hyper_dim, shaded=shaded
     )
     with torch.no_grad():
         made.opacity_logits.fill_(2.0)
@@ -79,16 +81,36 @@ def dress(points: torch.Tensor, seed: int = 3, degree: int = 3, shaded: bool = F
     return made
 
 
-def bar_scene(nodes: int = 60, gaussians: int = 400, seed: int = 0, shaded: bool = False, scale: float = 2.0) -> Scene:
-    """A bar along x, 2.4 / ``scale`` long in world units, one half of which swings."""
-    config = from_dict({"motion": {"nodes": nodes, "layers": 1, "width": 8, "skip": 0}})
+def bar_scene(
+    nodes: int = 60,
+    gaussians: int = 400,
+    seed: int = 0,
+    shaded: bool = False,
+    scale: float = 2.0,
+    stray: tuple[float, float, float] | None = None,
+    share: float | None = None,
+) -> Scene:
+    """A bar along x, 2.4 / ``scale`` long in world units, one half of which swings.
+
+    Args:
+        stray: where, in normalised units, one more control point is, the last.
+        share: what Gaussians take part in the motion with, by a mask; None: there is none.
+    """
+    fields = {"nodes": nodes, "layers": 1, "width": 8, "skip": 0, "mask": share is not None}
+    config = from_dict({"motion": fields})
     template = build_motion("control-points", config)
     assert isinstance(template, ControlPoints)
     points = bar_points(gaussians, seed)
     places = points[farthest_points(points, nodes)]
-    motion = Swing(places, torch.full((nodes,), 0.12), template.network, config.motion)
+    if stray is not None:
+        places = torch.cat([places, torch.tensor([stray])])
+    motion = Swing(places, torch.full((len(places),), 0.12), template.network, config.motion)
     unit = Normalisation(np.array([0.5, -1.0, 0.25]), scale)
-    scene = Scene(dress(points, shaded=shaded), motion, unit, config, OVERVIEW)
+    made = dress(points, shaded=shaded, hyper_dim=config.motion.hyper_dim + (share is not None))
+    if share is not None:
+        with torch.no_grad():
+            made.hyper[:, -1] = torch.tensor(share).logit()
+    scene = Scene(made, motion, unit, config, OVERVIEW)
     scene.motion.eval()
     scene.freeze_binding()
     return scene

@@ -15,7 +15,7 @@ from edit_scenes import bar_scene, dress
 
 from scgs_warp.apps import edit as app
 from scgs_warp.data.gaussian_ply import open_ply, read_gaussian_ply, write_gaussian_ply
-from scgs_warp.edit import EditSession, film_camera, render_film
+from scgs_warp.edit import Edit, EditSession, Film, film_camera, render_film
 from scgs_warp.edit.rotations import from_axis
 from scgs_warp.edit.script import parse, read
 from scgs_warp.errors import UserError
@@ -88,7 +88,7 @@ def changed(path: str, value: object) -> dict:
         ("handles.0.name", "tip", "taken"),
         ("handles.0.nodes", [1, 2.5], "2.5"),
         ("handles.0.nodes", [1, 99999], "99999"),
-        ("handles.0.nodes", [True], "True"),
+        ("handles.0.nodes", [True], "true"),
         ("handles.0.nodes", [], "empty"),
         ("handles.0.nodes", ..., "nodes"),
         ("handles.0.nodes", {"point": [0, 0]}, "point"),
@@ -105,6 +105,7 @@ def changed(path: str, value: object) -> dict:
         ("targets.tip", None, "tip"),
         ("targets.tip.rotation", [0, 0, 0, 0], "tip"),
         ("targets.tip.axis", [0, 0, 1], "degrees"),
+        ("targets.tip", {"axis": [1e-200, 0, 0], "degrees": 9}, "axis"),
         ("targets.tip.translation", [1e300, 0, 0], "translation"),
         ("keyframes.1.at", 0.0, "two at 0"),
         ("keyframes.1.at", ..., "at is missing"),
@@ -121,6 +122,7 @@ def changed(path: str, value: object) -> dict:
         ("film.shot.kind", "drone", "turntable"),
         ("film.shot.views.1.at", 0, "two at one moment"),
         ("film.shot.up", [0, 0, 0], "up"),
+        ("film.shot.up", [1e-200, 0, 0], "up"),
         ("scene", {"control_points": 5}, "control_points"),
         ("scene", {"fingerprint": "00000000"}, "fingerprint"),
         ("nonsense", 1, "nonsense"),
@@ -153,6 +155,68 @@ def test_files_that_are_no_edit(session, tmp_path, text, words):
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(UserError, match="no such file"):
         read(tmp_path / "missing.json", session)
+
+
+def nested(levels: int) -> list:
+    found: list = []
+    for _ in range(levels):
+        found = [found]
+    return found
+
+
+@pytest.mark.parametrize("value", ["a\nb" * 100_000, nested(3000), {"a\nb" * 100_000: {"x": 1}}, ["a\nb" * 100_000]])
+@pytest.mark.parametrize(
+    "path",
+    "format version scene handles handles.0.name handles.0.nodes pins targets targets.tip keyframes.0.targets "
+    "playback.map film hold.0.nodes".split(),
+)
+def test_whatever_stands_there_the_message_is_one_line(session, path, value):
+    with pytest.raises(UserError) as caught:
+        parse(changed(path, value), "edit.json", session)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 500
+
+
+def test_names_that_nobody_knows_are_cut_and_on_one_line(session):
+    for inner in ({"a\n" * 1000: 1}, {"targets": {"b\n" * 1000: {"axis": 1}}}, {"film": {"\ud800" * 999: 1}}):
+        with pytest.raises(UserError) as caught:
+            parse({**SCRIPT, **inner}, "edit.json", session)
+        assert str(caught.value).isprintable() and len(str(caught.value)) < 500
+    many = [{"name": f"a handle that is called number {i}", "nodes": [1]} for i in range(900)]
+    with pytest.raises(UserError, match="names no handle") as caught:
+        parse({**SCRIPT, "handles": many}, "edit.json", session)
+    assert len(str(caught.value)) < 500
+
+
+def test_another_count_of_control_points_says_how_to_ask_for_it(session, ply):
+    script = {"format": "scgs-warp edit", "version": 1, "scene": {"control_points": 33}}
+    with pytest.raises(UserError, match="--nodes 33"):
+        parse(script, "edit.json", EditSession(open_ply(ply, nodes=20)))
+    with pytest.raises(UserError) as caught:
+        parse(script, "edit.json", session)
+    assert "--nodes" not in str(caught.value)
+
+
+def test_what_is_saved_can_be_loaded(tmp_path):
+    """What no file may say is refused at once, and at the latest when it is saved."""
+    own = EditSession(bar_scene())
+    own.add_handle([1], 0.0, "a")
+    before = own.edit
+    for make, words in [
+        (lambda: own.move("a", [2e9, 0, 0]), "translation"),
+        (lambda: own.move("a", [0, 0, 1e150]), "translation"),
+        (lambda: own.add_keyframe(4000.0), "at"),
+        (lambda: own.add_keyframe(-1.0), "at"),
+        (lambda: own.add_keyframe(1.0, "bouncy"), "easing"),
+        (lambda: own.resize_film(10_000), "size"),
+        (lambda: own.add_handle([2], 0.0, "b", pivot=(2e9, 0.0, 0.0)), "pivot"),
+    ]:
+        with pytest.raises(UserError, match=words):
+            make()
+        assert own.edit == before
+    own.apply(Edit(film=Film(fps=1e6)))
+    with pytest.raises(UserError, match="fps"):
+        own.save(tmp_path / "edit.json")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_film_shows_what_the_session_shows(tmp_path):

@@ -301,6 +301,25 @@ def test_other_motion_models_say_so():
         EditSession(Scene(dress(torch.rand(5, 3)), motion, scene.normalisation, config, OVERVIEW))
 
 
+def test_a_name_that_is_taken_is_taken_over_at_rest(bent):
+    bent.add_keyframe(0.0)
+    bent.add_handle([1, 2], 0.0, "right")
+    assert not bent.edit.targets and not bent.edit.keyframes and len(bent.edit.handles) == 1
+    assert same(bent.gaussians_at(0.0), bent.scene.gaussians_at(0.0))
+    assert bent.undo() and bent.edit.keyframes and bent.edit.targets, "one step"
+
+
+def test_saving_does_not_end_a_drag(bent, tmp_path):
+    before = bent.edit
+    bent.drag("right", [0.2, 0.0, 0.0])
+    bent.save(tmp_path / "edit.json")
+    bent.drag("right", [0.3, 0.0, 0.0])
+    bent.release()
+    assert bent.undo() and bent.edit == before
+    bent.load(tmp_path / "edit.json")
+    assert bent.edit.targets["right"].translation == (0.2, 0.0, 0.0)
+
+
 def test_target_is_unit():
     target = Target.of(None, [2.0, 0.0, 0.0, 0.0])
     assert target.rotation == (1.0, 0.0, 0.0, 0.0) and target.is_identity

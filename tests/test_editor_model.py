@@ -109,11 +109,13 @@ def test_pinning_the_rest_makes_way_for_the_next_handle(model):
     model.pin_rings = 1
     model.select(chosen(model, RIGHT, 0))
     model.grab(STAY)
+    model.drag(STAY)
     model.release()
     session = model.session
     assert set(session.edit.pins) == set(range(len(session))) - set(session.ring(model.selection, 1))
     model.select(chosen(model, LEFT, 0))
     model.grab(STAY)
+    model.drag(STAY)
     model.release()
     near = set(session.ring(session.edit.handles[0].nodes, 1)) | set(session.ring(session.edit.handles[1].nodes, 1))
     assert set(session.edit.pins) == set(range(len(session))) - near
@@ -122,6 +124,7 @@ def test_pinning_the_rest_makes_way_for_the_next_handle(model):
     own = session.edit.pins
     model.select(tuple(sorted({*chosen(model, (0.5, -1.0, 0.25), 0), own[0]})))
     model.grab(STAY)
+    model.drag(STAY)
     model.release()
     assert set(session.edit.pins) == set(own) - set(model.selection), "what the user pinned stays, but for the handle"
 
@@ -161,6 +164,7 @@ def test_keyframes_lead_until_a_drag_begins(model):
     model.replace(film=Film(seconds=2.0, fps=10))
     model.select(chosen(model))
     name = model.grab(STAY)
+    model.drag(STAY)
     model.release()
     model.add_keyframe()
     model.seek(2.0)
@@ -206,6 +210,7 @@ def test_handles_are_changed_reset_and_removed(model):
         model.remove_handle()
     model.select(chosen(model))
     name = model.grab(STAY)
+    model.drag(STAY)
     model.release()
     model.change_handle(lasts="fade", window=0.3)
     assert model.session.edit.handle(name).lasts == "fade"
@@ -232,6 +237,7 @@ def test_what_a_page_sends_is_checked(model, fields, words):
         model.replace(**fields)
     model.select(chosen(model))
     model.grab(STAY)
+    model.drag(STAY)
     model.release()
     with pytest.raises(UserError, match="lasts"):
         model.change_handle(lasts="for ever")
@@ -295,4 +301,109 @@ def test_colours_of_control_points():
 
 
 def test_a_moment_shows_the_film_or_the_handles(model):
-    assert model.moment() == Moment(0.0, None, False, "edited", model.moment().reach)
+    assert model.moment() == Moment(0.0, None, False, "edited")
+
+
+def hold(model: Model, point=RIGHT, rings: int = 0) -> str:
+    model.select(chosen(model, point, rings))
+    name = model.grab(STAY)
+    model.drag(Target((0.0, 0.0, 0.05)))
+    model.release()
+    return name
+
+
+def test_pins_that_nobody_asked_for_go_with_their_handle(model):
+    model.pin_rings = 2
+    hold(model)
+    assert model.session.edit.pins
+    model.remove_handle()
+    assert not model.session.edit.pins
+    assert model.undo() and model.session.edit.handles and model.session.edit.pins, "one step"
+    model.remove_handle()
+    with model.changing() as session:
+        session.pin([0, 1])
+    hold(model)
+    assert set(model.session.edit.pins) == {0, 1} - set(model.selection)
+    model.remove_handle()
+    assert model.session.edit.pins, "these somebody asked for"
+
+
+def test_pins_make_way_after_the_number_of_rings_has_changed(model):
+    model.pin_rings = 1
+    first = hold(model)
+    model.pin_rings = 2
+    second = hold(model, LEFT)
+    session = model.session
+    free = {n for name in (first, second) for n in session.ring(session.edit.handle(name).nodes, 2)}
+    assert set(session.edit.pins) == set(range(len(session))) - free
+    model.undo()
+    model.pin_rings = 3
+    third = hold(model, LEFT)
+    assert not set(session.edit.pins) & set(session.ring(session.edit.handle(third).nodes, 3)), "after undo, too"
+
+
+def test_what_was_not_moved_has_not_been_in_hand(model):
+    model.pin_rings = 1
+    before = model.session.edit
+    model.select(chosen(model))
+    model.grab(STAY)
+    assert model.session.edit.handles and model.dragging
+    model.release()
+    assert model.session.edit is before and model.active is None and model.selection and not model.undo()
+    model.grab(STAY)
+    with pytest.raises(UserError, match="finite"):
+        model.drag(Target((math.nan, 0.0, 0.0)))
+    model.release()
+    assert model.session.edit is before and not model.undo()
+    model.grab(STAY)
+    assert not model.undo() and model.session.edit is before and not model.dragging
+    hold(model)
+    model.add_keyframe()
+    model.seek(0.0)
+    assert model.moment().at == 0.0
+    edit = model.session.edit
+    model.grab(STAY)
+    model.release()
+    assert model.session.edit is edit and model.moment().at == 0.0, "keyframes still lead"
+
+
+def test_a_keyframe_is_one_step(model):
+    model.replace(film=Film(seconds=2.0, fps=10))
+    name = hold(model)
+    model.add_keyframe()
+    model.seek(2.0)
+    model.grab(STAY)
+    model.drag(Target((0.0, 0.0, 1.0)))
+    model.release()
+    model.add_keyframe()
+    model.seek(1.0)
+    before = model.session.edit
+    model.add_keyframe()
+    assert len(model.session.edit.keyframes) == 3
+    assert model.undo() and model.session.edit == before and model.session.edit.targets[name].translation[2] == 1.0
+
+
+def test_the_target_is_that_of_the_moment_shown(model):
+    model.replace(film=Film(seconds=2.0, fps=10))
+    hold(model)
+    model.add_keyframe()
+    model.seek(2.0)
+    model.grab(STAY)
+    model.drag(Target((0.0, 0.0, 1.0), tuple(from_axis([0, 0, 1], 90).tolist())))
+    model.release()
+    model.add_keyframe()
+    assert model.target.translation[2] == 1.0
+    model.seek(0.0)
+    assert model.target == Target((0.0, 0.0, 0.05))
+    model.seek(1.0)
+    assert 0.3 < model.target.translation[2] < 0.7
+    model.select(())
+    assert model.target == STAY
+
+
+def test_a_moment_of_a_long_film_is_known_at_once(model, monkeypatch):
+    """It is asked for under the lock that the server's loop takes: no step of the film is computed."""
+    model.replace(film=Film(seconds=3600.0, fps=1000.0))
+    monkeypatch.setattr(Playback, "times_at", None)
+    monkeypatch.setattr(Playback, "time_at", lambda playback, at, seconds: 0.25)
+    assert model.moment() == Moment(0.25, None, False, "edited")

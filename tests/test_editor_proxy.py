@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -16,7 +17,7 @@ from edit_scenes import bar_scene
 from scgs_warp.data.gaussian_ply import write_gaussian_ply
 from scgs_warp.edit import EditSession
 from scgs_warp.editor import Editor, Proxy
-from scgs_warp.editor.proxy import COOKIE, KEY, guarded, is_local, parse_head, same_origin
+from scgs_warp.editor.proxy import KEY, MOST_STRANGERS, cookies, guarded, is_local, parse_head, same_origin
 from scgs_warp.errors import UserError
 
 viser = pytest.importorskip("viser", reason="the package viser is not installed")
@@ -109,7 +110,7 @@ def test_a_foreign_name_for_this_machine_is_refused(editor):
 def test_without_the_token_nothing_is_served(shared):
     for path in ("/", "/index.html", "/?token=", "/?token=wrong", f"/?token={shared.token}x", "/?token=a&token=b"):
         assert get(shared.public, path).status == 403, path
-    for cookie in ("", f"{COOKIE}=wrong", "other=1", f"{COOKIE}="):
+    for cookie in ("", f"{shared.cookie}=wrong", "other=1", f"{shared.cookie}="):
         assert get(shared.public, Cookie=cookie).status == 403
     assert not opens(shared.public, f"http://127.0.0.1:{shared.public}")
 
@@ -126,7 +127,7 @@ def test_the_token_becomes_a_cookie_that_opens_everything(shared):
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:1", "null", None])
 def test_with_the_token_foreign_pages_are_refused(shared, origin):
-    cookie = f"{COOKIE}={shared.token}"
+    cookie = f"{shared.cookie}={shared.token}"
     assert not opens(shared.public, origin, Cookie=cookie)
     if origin is not None:
         assert get(shared.public, Cookie=cookie, Origin=origin).status == 403
@@ -150,6 +151,7 @@ def test_behind_a_proxy_the_editors_own_port_takes_nobody_else(shared):
         b"GET / HTTP/1.1\r\nHost: a\r\n folded\r\n\r\n",
         b"GET / HTTP/1.1\r\nHo\x00st: a\r\n\r\n",
         b"nonsense\r\n\r\n",
+        b"GET //[ HTTP/1.1\r\nHost: a\r\n\r\n",
         b"\r\n\r\n",
     ],
 )
@@ -160,6 +162,50 @@ def test_what_no_page_sends_is_refused(shared, text):
         assert raw.recv(4096).startswith(b"HTTP/1.1 400 ")
 
 
+def test_odd_cookies_of_other_pages_hide_nothing(shared):
+    for others in ('x={"a":1}; ', "a b=c; ", "=; ;; ", 'q="; ', "scgs_editor=old; scgs_editor_1=another; "):
+        assert get(shared.public, Cookie=f"{others}{shared.cookie}={shared.token}").status == 200, others
+        assert get(shared.public, Cookie=f"{others}{shared.cookie}=wrong").status == 403, others
+    assert cookies("a=1;b = 2; c") == {"a": "1", "b ": " 2", "c": ""}
+
+
+def test_two_shared_editors_on_one_host_have_cookies_of_their_own(shared):
+    other = Proxy(1, "key", host="127.0.0.1")
+    try:
+        assert other.cookie != shared.cookie and other.cookie.endswith(str(other.public))
+        both = f"{other.cookie}={other.token}; {shared.cookie}={shared.token}"
+        assert get(shared.public, Cookie=both).status == 200
+    finally:
+        other.stop()
+
+
+@pytest.mark.parametrize("origin", ["http://[", "http://]", "http://[::1", "//[x"])
+def test_origins_that_are_no_address_are_refused(editor, shared, origin, capfd):
+    assert get(shared.public, Cookie=f"{shared.cookie}={shared.token}", Origin=origin).status == 403
+    assert get(editor.port, Origin=origin).status == 403
+    assert "Traceback" not in capfd.readouterr().err and not same_origin(origin, "[")
+
+
+def test_strangers_are_not_waited_for_without_end(shared):
+    page = f"{shared.cookie}={shared.token}"
+    waiting = [socket.create_connection(("127.0.0.1", shared.public), 20) for _ in range(MOST_STRANGERS)]
+    try:
+        with socket.create_connection(("127.0.0.1", shared.public), 20) as one_more:
+            one_more.settimeout(5)
+            assert one_more.recv(1) == b""
+    finally:
+        for one in waiting:
+            one.close()
+    until = time.monotonic() + 20
+    while True:
+        try:
+            assert get(shared.public, Cookie=page).status == 200
+            return
+        except (http.client.HTTPException, OSError):
+            assert time.monotonic() < until
+            time.sleep(0.1)
+
+
 def test_two_hosts_or_origins_are_none():
     head = parse_head(b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\nOrigin: http://a\r\n\r\n")
     assert head is not None and head.get("host") == ""
@@ -167,7 +213,7 @@ def test_two_hosts_or_origins_are_none():
 
 
 def test_a_second_request_on_one_connection_is_not_passed_on(shared):
-    cookie = f"Cookie: {COOKIE}={shared.token}"
+    cookie = f"Cookie: {shared.cookie}={shared.token}"
     one = f"GET /missing HTTP/1.1\r\nHost: a\r\n{cookie}\r\n\r\n"
     with socket.create_connection(("127.0.0.1", shared.public), 20) as raw:
         raw.sendall((one + one.replace(cookie, "Cookie: none=1")).encode())

@@ -267,3 +267,18 @@ def test_names(tmp_path):
         files.place(folder, "link", ".json")
     with pytest.raises(UserError, match="cannot be made"):
         files.place(path, "a", ".json")
+    for name in ("-rf.json", "caf\u00e9.json", "a..json", f"{'a' * 120}.json"):
+        (folder / name).write_text("{}")
+    assert files.edits(folder) == ("raise.json",), "what is listed can be loaded"
+
+
+def test_names_that_are_taken_are_numbered(tmp_path):
+    long = tmp_path / f"{'a' * 100}.mp4"
+    assert files.free(long) == long
+    for path in (tmp_path / "film.mp4", tmp_path / "film 2.mp4", long):
+        path.write_text("")
+    assert files.free(tmp_path / "film.mp4") == tmp_path / "film 3.mp4"
+    found = files.free(long)
+    assert found != long and files.place(tmp_path, found.name, ".mp4") == found
+    (tmp_path / "gone.ply").symlink_to(tmp_path / "nowhere")
+    assert files.free(tmp_path / "gone.ply").name == "gone 2.ply"

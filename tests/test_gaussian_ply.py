@@ -98,12 +98,15 @@ def test_bad_files_are_one_line(tmp_path):
         "property float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n"
     )
     (tmp_path / "empty.ply").write_bytes(b"")
+    many = b"ply\nformat binary_little_endian 1.0\nelement vertex 100000000000000000000\nproperty float x\nend_header\n"
+    (tmp_path / "many.ply").write_bytes(many)
     cut = make(tmp_path, 2)
     cut.write_bytes(cut.read_bytes()[:-100])
     cases = [
         (tmp_path / "missing.ply", "no such file"),
         (tmp_path / "no.ply", "no PLY"),
         (tmp_path / "empty.ply", "no PLY"),
+        (tmp_path / "many.ply", "no PLY"),
         (cut, "no PLY"),
         (tmp_path / "points.ply", "lack opacity"),
         (vertices(tmp_path, f_rest_8=None), "f_rest"),

@@ -83,7 +83,7 @@ def _vertices(path: Path) -> np.ndarray:
     try:
         elements = PlyData.read(str(path))
         data = np.asarray(elements["vertex"].data)
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError, OSError, MemoryError) as error:
+    except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise UserError(f"{path}: no PLY file with vertices ({type(error).__name__}); export it again") from None
     if data.dtype.names is None or len(data) == 0:
         raise UserError(f"{path}: holds no vertices; give a .ply of 3D Gaussian splatting")

@@ -3,11 +3,14 @@ list of these and a saved edit is the same edit."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from .handles import Handle, Target, Vector3
+import numpy as np
+
+from .handles import ONE_FRAME, Handle, Target, Vector3
 from .keyframes import Keyframe
 from .playback import Exaggerate, Hold, Playback
 
@@ -57,6 +60,15 @@ class Film:
         return max(1, round(self.seconds * self.fps))
 
 
+@functools.lru_cache(maxsize=16)
+def frame_reach(film: Film, playback: Playback) -> float:
+    """How far from its time an edit of one frame shows, so that one frame of the film does: half of its step."""
+    times = playback.times_at(np.arange(film.frames) / film.fps, film.seconds)
+    steps = np.abs(np.diff(times))
+    moving = steps[steps > 0]
+    return float(np.median(moving)) / 2 * (1 + 1e-9) if len(moving) else ONE_FRAME
+
+
 @dataclass(frozen=True)
 class Edit:
     """The whole edit."""
@@ -73,6 +85,11 @@ class Edit:
     holds: tuple[Hold, ...] = ()
     exaggerate: Exaggerate | None = None
     film: Film = Film()
+
+    @property
+    def reach(self) -> float:
+        """Scene time around its own in which an edit of one frame shows."""
+        return frame_reach(self.film, self.playback)
 
     def handle(self, name: str) -> Handle | None:
         return next((handle for handle in self.handles if handle.name == name), None)

@@ -3,6 +3,7 @@ the same edit gives the same bits, in whatever order times are asked for; only `
 
 from __future__ import annotations
 
+import dataclasses
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar, cast
@@ -21,7 +22,7 @@ from .handles import ONE_FRAME, STAY, Goal, Target, anchors_at, carried_goal
 from .keyframes import targets_at
 from .player import Player
 from .pose import MotionPose, NodePose, Rig, motion_pose, pose_gaussians
-from .rotations import from_matrix, rotate, slerp, unit
+from .rotations import from_matrix, slerp, unit
 from .solver import STEP_ITERATIONS, ArapSolver, Shape, count_steps
 
 CACHED = 64
@@ -42,6 +43,8 @@ class _Problem(NamedTuple):
     base: NodePose
     goals: list[Goal]
     pins: np.ndarray
+    stay: np.ndarray
+    """[M] bool: control points that follow nobody, as they are pinned or held."""
 
 
 class _Live(NamedTuple):
@@ -164,8 +167,8 @@ class Engine:
         posed = self._posed(time, bent)
         undo = self.scene.normalisation
         return Gaussians(
-            undo.undo(posed.means), posed.quats, undo.undo_scale(posed.scales), posed.opacities, posed.sh_dc,
-            posed.sh_rest,
+            undo.undo(posed.means), posed.quats, undo.undo_scale(posed.scales), posed.opacities,
+            posed.sh_dc.detach(), posed.sh_rest.detach(),
         )  # fmt: skip
 
     def normalised(self, time: float, bent: NodePose | None) -> Gaussians:
@@ -185,13 +188,15 @@ class Engine:
         return None if np.array_equal(base.positions, motion) and not base.turns[:, 1:].any() else base
 
     def _problem(self, edit: Edit, time: float, targets: Mapping[str, Target], frame: float) -> _Problem | None:
-        """Handles as goals at this time; None if none of them moves. Pieces of the graph in which nothing is moved are
-        left out: they stay to the bit."""
+        """Handles as goals at this time; None if none of them moves. Handles without strength now, and pieces of the
+        graph in which nothing is moved, are left out: they stay to the bit."""
         base = self.base_at(edit, time)
         goals = []
         for handle in edit.handles:
-            then = base if handle.time == time else self.base_at(edit, handle.time)
             share = handle.strength(time, frame)
+            if share == 0.0:
+                continue
+            then = base if handle.time == time else self.base_at(edit, handle.time)
             arguments = self.graph, then.positions, base.positions, self.units
             goals.append(carried_goal(handle, targets[handle.name], share, *arguments))
         component = self.graph.component
@@ -201,24 +206,16 @@ class Engine:
         alive = np.isin(component, np.concatenate(moved))
         used = [goal for goal in goals if alive[goal.nodes].any()]
         pins = np.array(edit.pins, np.int64)
-        return _Problem(base, used, pins[alive[pins]])
+        stay = np.isin(component, np.concatenate([component[goal.nodes] for goal in goals]))
+        stay[pins] = True
+        return _Problem(base, used, pins[alive[pins]], stay)
 
     def _finish(self, problem: _Problem, shape: Shape) -> NodePose:
         """Stray control points follow theirs."""
-        positions, turns = shape.positions, from_matrix(shape.rotations)
-        rest = problem.base.positions
-        stray = self.graph.stray
-        component = self.graph.component
-        held = np.concatenate([goal.nodes for goal in problem.goals])
-        follow = np.flatnonzero((stray >= 0) & (stray != np.arange(len(stray))) & ~np.isin(component, component[held]))
-        follow = np.setdiff1d(follow, problem.pins)
-        if len(follow):
-            leaders = stray[follow]
-            turned = turns[leaders]
-            positions, turns = positions.copy(), turns.copy()
-            positions[follow] = rotate(turned, rest[follow] - rest[leaders]) + positions[leaders]
-            turns[follow] = turned
-        return problem.base.then(positions, turns)
+        base = problem.base
+        turns = from_matrix(shape.rotations)
+        positions, turns = self.graph.follow(base.positions, shape.positions, turns, problem.stay)
+        return dataclasses.replace(base.then(positions, turns), base=base)
 
     def _distance(self, before: Mapping[str, Target], after: Mapping[str, Target]) -> int:
         """Sub-steps from one set of targets to another."""

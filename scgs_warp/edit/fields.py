@@ -12,6 +12,8 @@ from ..errors import UserError
 
 MAX_BYTES = 64 << 20
 """A larger file is no edit."""
+LIMIT = 1e9
+"""Of numbers that nothing else limits: beyond it float32 leaves no scene."""
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -68,13 +70,17 @@ class Node:
     def __init__(self, value: Any, source: str, place: str = "") -> None:
         self.source, self.place = source, place
         if not isinstance(value, dict):
-            raise self.wrong("", f"is {_shown(value)}", "give an object")
+            raise self.wrong("", f"is {shown(value)}", "give an object")
         self._value = value
         self._taken: set[str] = set()
 
     def wrong(self, name: str, what: str, remedy: str) -> UserError:
-        field = ".".join(part for part in (self.place, name) if part)
+        field = self._inside(name)
         return UserError(f"{self.source}: {field or 'the file'} {what}; {remedy}")
+
+    def _inside(self, name: str) -> str:
+        """The place of a field; names that people made up may be anything."""
+        return ".".join(part for part in (self.place, one_line(name)) if part)
 
     def __contains__(self, name: str) -> bool:
         return self._value.get(name) is not None
@@ -89,12 +95,12 @@ class Node:
             known = ", ".join(sorted(self._taken | set(also)))
             raise self.wrong(unknown[0], "is not known", f"known here: {known}")
 
-    def number(self, name: str, default: Any = None, low: float = -1e9, high: float = 1e9) -> Any:
+    def number(self, name: str, default: Any = None, low: float = -LIMIT, high: float = LIMIT) -> Any:
         value = self.raw(name)
         if value is None:
             return default
         if not _is_number(value) or not low <= value <= high:
-            raise self.wrong(name, f"is {_shown(value)}", f"give a number from {low:g} to {high:g}")
+            raise self.wrong(name, f"is {shown(value)}", f"give a number from {low:g} to {high:g}")
         return float(value)
 
     def integer(self, name: str, default: int, low: int, high: int) -> int:
@@ -102,13 +108,13 @@ class Node:
         if value is None:
             return default
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.wrong(name, f"is {_shown(value)}", f"give a whole number from {low} to {high}")
+            raise self.wrong(name, f"is {shown(value)}", f"give a whole number from {low} to {high}")
         return value
 
     def truth(self, name: str) -> bool | None:
         value = self.raw(name)
         if value is not None and not isinstance(value, bool):
-            raise self.wrong(name, f"is {_shown(value)}", "give true or false")
+            raise self.wrong(name, f"is {shown(value)}", "give true or false")
         return value
 
     def choice(self, name: str, options: tuple[str, ...], default: str) -> Any:
@@ -116,23 +122,23 @@ class Node:
         if value is None:
             return default
         if not isinstance(value, str) or value not in options:
-            raise self.wrong(name, f"is {_shown(value)}", f"choose one of {', '.join(options)}")
+            raise self.wrong(name, f"is {shown(value)}", f"choose one of {', '.join(options)}")
         return value
 
     def text(self, name: str) -> str:
         value = self.raw(name)
         if not isinstance(value, str) or not value.strip() or len(value) > 100 or not value.isprintable():
-            raise self.wrong(name, f"is {_shown(value)}", "give a name of 1 to 100 letters")
+            raise self.wrong(name, f"is {shown(value)}", "give a name of 1 to 100 letters")
         return value
 
-    def vector(self, name: str, size: int, default: Any = None, low: float = -1e9, high: float = 1e9) -> Any:
+    def vector(self, name: str, size: int, default: Any = None, low: float = -LIMIT, high: float = LIMIT) -> Any:
         value = self.raw(name)
         if value is None:
             return default
         fits = isinstance(value, list) and len(value) == size and all(map(_is_number, value))
         if not fits or not all(low <= x <= high for x in value):
-            limits = "" if high == 1e9 else f" from {low:g} to {high:g}"
-            raise self.wrong(name, f"is {_shown(value)}", f"give {size} numbers{limits}")
+            limits = "" if high == LIMIT else f" from {low:g} to {high:g}"
+            raise self.wrong(name, f"is {shown(value)}", f"give {size} numbers{limits}")
         return tuple(float(x) for x in value)
 
     def items(self, name: str, most: int = 100_000) -> list[Any]:
@@ -140,16 +146,16 @@ class Node:
         if value is None:
             return []
         if not isinstance(value, list) or len(value) > most:
-            raise self.wrong(name, f"is {_shown(value)}", f"give a list of at most {most}")
+            raise self.wrong(name, f"is {shown(value)}", f"give a list of at most {most}")
         return value
 
     def child(self, name: str) -> Node | None:
         value = self.raw(name)
-        return None if value is None else Node(value, self.source, ".".join(p for p in (self.place, name) if p))
+        return None if value is None else Node(value, self.source, self._inside(name))
 
     def children(self, name: str, most: int = 10_000) -> Iterator[Node]:
         for index, value in enumerate(self.items(name, most)):
-            yield Node(value, self.source, f"{'.'.join(p for p in (self.place, name) if p)}[{index}]")
+            yield Node(value, self.source, f"{self._inside(name)}[{index}]")
 
     def entries(self, name: str) -> Iterator[tuple[str, Node]]:
         """Of an object of objects."""
@@ -171,6 +177,16 @@ def _is_number(value: Any) -> bool:
         return False
 
 
-def _shown(value: Any) -> str:
-    text = json.dumps(value) if value is not None else "missing"
+def shown(value: Any) -> str:
+    """A JSON value in at most 60 characters of one line."""
+    try:
+        text = json.dumps(value) if value is not None else "missing"
+    except RecursionError:
+        return "nested too deeply"
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def one_line(text: str) -> str:
+    """A text in at most 100 characters of one line."""
+    plain = text if text.isprintable() else json.dumps(text)[1:-1]
+    return plain if len(plain) <= 100 else plain[:97] + "..."

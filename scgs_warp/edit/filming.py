@@ -16,7 +16,6 @@ from ..film import film
 from ..report import to_bytes
 from ..types import Camera
 from .document import Film, View
-from .handles import ONE_FRAME
 from .keyframes import cubic
 from .session import EditSession
 
@@ -65,19 +64,11 @@ def moments(settings: Film) -> list[float]:
     return [index / settings.fps for index in range(settings.frames)]
 
 
-def frame_reach(session: EditSession) -> float:
-    """How far from its time an edit of one frame shows, so that one frame of the film does: half of its step."""
-    times = [session.scene_time(at) for at in moments(session.edit.film)]
-    steps = np.abs(np.diff(times))
-    moving = steps[steps > 0]
-    return float(np.median(moving)) / 2 * (1 + 1e-9) if len(moving) else ONE_FRAME
-
-
-def film_frame(session: EditSession, at: float, reach: float, size: int | None = None) -> np.ndarray:
-    """[H, W, 3] uint8, the film's picture at a moment in seconds; ``reach`` is ``frame_reach``'s."""
+def film_frame(session: EditSession, at: float, size: int | None = None) -> np.ndarray:
+    """[H, W, 3] uint8, the film's picture at a moment in seconds."""
     camera = film_camera(session, at, size).to(session.scene.device)
     background = session.edit.film.background
-    return to_bytes(session.render(camera, session.scene_time(at), at, background, frame=reach).rgb)
+    return to_bytes(session.render(camera, session.scene_time(at), at, background).rgb)
 
 
 def _at_once(draw: Callable[[], np.ndarray]) -> np.ndarray:
@@ -105,10 +96,9 @@ def render_film(
         UserError: it cannot be written there.
     """
     settings = session.edit.film
-    reach = frame_reach(session)
     with film(output, settings.fps) as writer:
         for at in moments(settings):
-            writer.write(compute(functools.partial(film_frame, session, at, reach)))
+            writer.write(compute(functools.partial(film_frame, session, at)))
             if advance is not None:
                 advance()
     return settings.frames

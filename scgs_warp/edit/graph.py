@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from ..ops.arap import trajectory_graph
+from .rotations import rotate
 
 NEIGHBORS = 7
 """Control points each one asks for; the union of both sides wishes makes it some nine."""
@@ -67,6 +68,40 @@ class ControlGraph:
                 break
             inside = grown
         return tuple(np.flatnonzero(inside).tolist())
+
+    @property
+    def led(self) -> np.ndarray:
+        """Strays [S] that follow another control point."""
+        return np.flatnonzero((self.stray >= 0) & (self.stray != np.arange(len(self))))
+
+    def with_strays(self, nodes: Iterable[int]) -> tuple[int, ...]:
+        """The nodes and the strays that follow them, ascending."""
+        inside = np.zeros(len(self), bool)
+        inside[list(nodes)] = True
+        led = self.led
+        inside[led[inside[self.stray[led]]]] = True
+        return tuple(np.flatnonzero(inside).tolist())
+
+    def beyond(self, nodes: Iterable[int], rings: int) -> tuple[int, ...]:
+        """Everything more than so many edges away from the nodes, ascending; a stray is where its leader is."""
+        near = set(self.with_strays(self.ring(nodes, rings)))
+        return tuple(node for node in range(len(self)) if node not in near)
+
+    def follow(
+        self, rest: np.ndarray, positions: np.ndarray, turns: np.ndarray, stay: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [M, 3] and turns [M, 4] after strays have gone along with their leaders; those in ``stay`` [M]
+        bool, and those whose leader has not moved, are as they were."""
+        led = self.led[~stay[self.led]]
+        leaders = self.stray[led]
+        moved = (positions[leaders] != rest[leaders]).any(1) | turns[leaders, 1:].any(1)
+        led, leaders = led[moved], leaders[moved]
+        if not len(led):
+            return positions, turns
+        positions, turns = positions.copy(), turns.copy()
+        turns[led] = turns[leaders]
+        positions[led] = rotate(turns[leaders], rest[led] - rest[leaders]) + positions[leaders]
+        return positions, turns
 
 
 def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.ndarray | None = None) -> ControlGraph:

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..errors import UserError
+from .fields import LIMIT
 from .graph import ControlGraph
 from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
 from .solver import Anchors
@@ -20,6 +21,10 @@ Lasting = Literal["motion", "frame", "fade"]
 
 ONE_FRAME = 5e-3
 """What lasts one frame shows this far from its time, where nobody says how far frames are apart."""
+GRIP = 10.0
+"""Stiffness of a fading handle half way: it lets go of its nodes as its strength goes to 0, so that nothing jumps."""
+WEAKEST, STRONGEST = 1e-6, 1e6
+"""Limits of a stiffness."""
 FEWEST_FOR_A_FRAME = 4
 """A region of fewer nodes takes its neighbours along to tell how it turns."""
 
@@ -37,12 +42,13 @@ class Target:
         """Checked and normalised.
 
         Raises:
-            UserError: a number is not finite, or the rotation has no direction.
+            UserError: a number is not finite or too large, or the rotation has no direction.
         """
         moved = tuple(float(x) for x in (translation if translation is not None else (0.0, 0.0, 0.0)))
         turned = tuple(float(x) for x in (rotation if rotation is not None else IDENTITY))
-        if len(moved) != 3 or not all(map(math.isfinite, moved)):
-            raise UserError(f"translation {list(moved)}: must be three finite numbers; the handle stays where it is")
+        if len(moved) != 3 or not all(math.isfinite(x) and abs(x) <= LIMIT for x in moved):
+            limits = f"must be three finite numbers from {-LIMIT:g} to {LIMIT:g}"
+            raise UserError(f"translation {list(moved)}: {limits}; the handle stays where it is")
         if len(turned) != 4 or not all(map(math.isfinite, turned)) or not any(turned):
             raise UserError(f"rotation {list(turned)}: must be four finite numbers, not all 0; the handle stays")
         if abs(math.fsum(x * x for x in turned) - 1.0) > 1e-12:
@@ -108,6 +114,8 @@ class Goal(NamedTuple):
     """[n, 3] what the rigid motion does not explain."""
     own_turns: np.ndarray | None = None
     """[n, 4] rotations of single nodes beyond the rigid motion."""
+    leaning: float | None = None
+    """None: rotations are as given. A number: they are drawn there, as positions by a stiffness."""
 
     @property
     def is_identity(self) -> bool:
@@ -151,7 +159,7 @@ def carried_goal(
     """A handle's target, said at the handle's time, at another instant: carried by the rigid motion of its nodes.
 
     Args:
-        share: how much of the target counts.
+        share: how much of the target counts, above 0; below 1 its nodes are held less firmly, too.
         then, now: [M, 3] control points at the handle's time and at the instant asked for, normalised units; the same
             object where they are the same.
         to_units: (centre, scale) of the normalised scene.
@@ -172,7 +180,15 @@ def carried_goal(
         pivot = rotate(frame, pivot - before) + after
         quat = multiply(multiply(frame, quat), conjugate(frame)) if quat[1:].any() else quat
         translation = rotate(frame, translation)
-    return Goal(nodes, pivot, quat, translation, handle.stiffness, handle.gives_rotation)
+    stiffness, leaning = handle.stiffness, None
+    if share < 1.0:
+        leaning = _limited(GRIP * share / (1.0 - share))
+        stiffness = leaning if stiffness is None else _limited(stiffness * share)
+    return Goal(nodes, pivot, quat, translation, stiffness, handle.gives_rotation, leaning=leaning)
+
+
+def _limited(stiffness: float) -> float:
+    return min(max(stiffness, WEAKEST), STRONGEST)
 
 
 def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share: float) -> Anchors:
@@ -183,7 +199,7 @@ def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share:
         rest: [M, 3]
     """
     count = len(rest)
-    hard, turned, soft = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count)
+    hard, turned, soft, leaning = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count), np.zeros(count)
     positions, rotations = rest.copy(), np.tile(np.eye(3), (count, 1, 1))
     hard[pins] = turned[pins] = True
     for goal in goals:
@@ -191,5 +207,6 @@ def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share:
         positions[goal.nodes], rotations[goal.nodes] = at, turns
         hard[goal.nodes] = goal.stiffness is None
         soft[goal.nodes] = 0.0 if goal.stiffness is None else goal.stiffness
-        turned[goal.nodes] = goal.gives_rotation
-    return Anchors(hard, soft, turned, positions, rotations)
+        turned[goal.nodes] = goal.gives_rotation and goal.leaning is None
+        leaning[goal.nodes] = goal.leaning if goal.gives_rotation and goal.leaning is not None else 0.0
+    return Anchors(hard, soft, turned, positions, rotations, leaning)

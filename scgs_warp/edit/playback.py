@@ -27,17 +27,21 @@ class Playback:
 
     def time_at(self, at: float, film_seconds: float) -> float:
         """Scene time in [0, 1] at a moment of the film."""
+        return float(self.times_at(np.array([at]), film_seconds)[0])
+
+    def times_at(self, at: np.ndarray, film_seconds: float) -> np.ndarray:
+        """As ``time_at``, of many moments [F] at once."""
         if self.freeze is not None:
-            return self.freeze
+            return np.full(len(at), self.freeze)
         if self.map:
-            return float(np.interp(at, [a for a, _ in self.map], [t for _, t in self.map]))
+            return np.interp(at, [a for a, _ in self.map], [t for _, t in self.map])
         seconds = self.seconds if self.seconds is not None else film_seconds
-        phase = self.start + abs(self.speed) * at / seconds if seconds > 0 else self.start
+        phase = self.start + abs(self.speed) * at / seconds if seconds > 0 else np.full(len(at), self.start)
         if self.repeat == "loop":
             phase = phase % 1.0
         elif self.repeat == "swing":
-            phase = 1.0 - abs(phase % 2.0 - 1.0)
-        phase = min(max(phase, 0.0), 1.0)
+            phase = 1.0 - np.abs(phase % 2.0 - 1.0)
+        phase = phase.clip(0.0, 1.0)
         return 1.0 - phase if self.speed < 0 else phase
 
 

@@ -33,7 +33,7 @@ class Player:
         rest = now.positions
         near = np.zeros(len(rest), bool)
         for hold in holds:
-            near[list(self.graph.ring(hold.nodes, hold.rings))] = True
+            near[list(self.graph.with_strays(self.graph.ring(hold.nodes, hold.rings)))] = True
         pins = np.flatnonzero(~near)
         goals, looks_of = [], []
         for hold in holds:
@@ -43,15 +43,18 @@ class Player:
         sweeps = [goal.sweep(rest) for goal in goals]
         steps = max(count_steps(turned, moved, self.graph.edge_length) for turned, moved in sweeps)
         shape = self.solver.solve(rest, lambda share: anchors_at(goals, pins, rest, share), steps)
-        turns = from_matrix(shape.rotations)
+        held = ~near
+        for goal in goals:
+            held[goal.nodes] = True
+        positions, turns = self.graph.follow(rest, shape.positions, from_matrix(shape.rotations), held)
         looks = turns.copy()
         for goal, own in zip(goals, looks_of):
             looks[goal.nodes] = own
-        return now.then(shape.positions, turns, looks)
+        return now.then(positions, turns, looks)
 
     def _goal(self, hold: Hold, time: float, now: NodePose, exaggerate: Exaggerate | None) -> tuple[Goal, np.ndarray]:
-        """What holding a region asks for, and what its colours turn by."""
-        nodes = np.array(hold.nodes, np.int64)
+        """What holding a region, with the strays that follow it, asks for, and what its colours turn by."""
+        nodes = np.array(self.graph.with_strays(hold.nodes), np.int64)
         still = np.tile(IDENTITY, (len(nodes), 1))
         if hold.time == time:
             return Goal(nodes, np.zeros(3), IDENTITY, np.zeros(3)), still
@@ -89,6 +92,7 @@ class Player:
             from_middle = here[members].mean(0) - middle[members].mean(0)
             centre = middle[members].mean(0) + exaggerate.factor * from_middle
             positions[members] += centre - positions[members].mean(0)
+        positions, further = self.graph.follow(here, positions, further, np.zeros(len(here), bool))
         return NodePose.of(here).then(positions, further)
 
     def _turned(self, time: float) -> tuple[np.ndarray, np.ndarray]:

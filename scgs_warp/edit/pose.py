@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..environment import one_piece
 from ..gaussians import GaussianParameters
 from ..ops.harmonics_rotation import rotate_harmonics
 from ..ops.skinning import skin
@@ -49,6 +50,8 @@ class NodePose:
     looks: np.ndarray
     """[M, 4] wxyz, what their colours turn by: as ``turns``, but for what is held at another instant, whose colours
     never turned with the trained motion."""
+    base: NodePose | None = None
+    """The same with holds and exaggeration alone, before any handle: what a mask weakens. None: there is no handle."""
 
     @staticmethod
     def of(positions: np.ndarray) -> NodePose:
@@ -107,8 +110,12 @@ def pose_gaussians(
 
     Args:
         binding: what ``rig.binding(gaussians)`` gives; it depends on neither time nor edit.
-        masked: the last hyper-coordinate is the logit of a Gaussian's share in the motion.
+        masked: the last hyper-coordinate is the logit of a Gaussian's share in the motion. It has that share in holds
+            and exaggeration, which change the motion; handles take all of it, or what stands still could not be moved.
     """
+    if masked and bent.base is not None:
+        posed = pose_gaussians(rig, gaussians, motion, bent.base, binding, masked)
+        return _on_top(posed, gaussians, bent, bent.base, binding)
     posed = rig.apply_pose(gaussians, compose(motion, bent), binding)
     if not bent.looks[:, 1:].any():
         return posed
@@ -121,9 +128,42 @@ def pose_gaussians(
     if sh_rest.shape[1]:
         looks = _blend(bent.looks, gaussians, binding)
         if masked:
-            looks[:, 1:] *= gaussians.hyper[:, -1:].sigmoid()
+            looks = _share_of(looks, gaussians)
         sh_rest = rotate_harmonics(sh_rest, looks)
     return Gaussians(posed.means, posed.quats, posed.scales, posed.opacities, sh_dc, sh_rest)
+
+
+def _share_of(turns: Tensor, gaussians: GaussianParameters) -> Tensor:
+    """[N, 4] turns as a mask weakens them: straight from the identity, the short way, as the Gaussians' own."""
+    with one_piece():
+        share = gaussians.hyper.detach()[:, -1:].sigmoid()
+    none = torch.zeros_like(turns)
+    none[:, 0] = 1.0
+    turns = torch.where(turns[:, :1] < 0, -turns, turns)
+    return none + share * (turns - none)
+
+
+def _on_top(
+    posed: Gaussians, gaussians: GaussianParameters, bent: NodePose, base: NodePose, binding: tuple[Tensor, Tensor]
+) -> Gaussians:
+    """Gaussians that follow control points from ``base`` to ``bent``, whatever moved them before; to the bit as they
+    were where none of their control points has moved."""
+    device = posed.means.device
+    further = multiply(bent.turns, conjugate(base.turns))
+    still = (bent.turns == base.turns).all(1)
+    further[still] = IDENTITY
+    shift = bent.positions - base.positions
+    nodes, shifts, turns = (torch.from_numpy(x).float().to(device) for x in (base.positions, shift, further))
+    means, quats, _ = skin(posed.means, posed.quats, nodes, Pose(shifts, turns), *binding)
+    moved = torch.from_numpy(shift.any(1) | ~still).to(device)
+    touched = moved[binding[0].long()].any(dim=1, keepdim=True)
+    sh_rest = posed.sh_rest
+    if sh_rest.shape[1]:
+        sh_rest = rotate_harmonics(sh_rest, _blend(further, gaussians, binding))
+    return Gaussians(
+        torch.where(touched, means, posed.means), torch.where(touched, quats, posed.quats), posed.scales,
+        posed.opacities, posed.sh_dc, sh_rest,
+    )  # fmt: skip
 
 
 def _blend(turns: np.ndarray, gaussians: GaussianParameters, binding: tuple[Tensor, Tensor]) -> Tensor:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import UserError
 from .document import Edit, Film, Shot, View
-from .fields import Node, read_object
+from .fields import LIMIT, Node, one_line, read_object, shown
 from .handles import Handle, Lasting, Target
 from .keyframes import Easing, Keyframe
 from .playback import Exaggerate, Hold, Playback
@@ -82,9 +82,9 @@ def parse(content: Any, source: str, session: EditSession) -> Edit:
     """As ``read``, of a JSON value; ``source`` is what errors name."""
     root = Node(content, source)
     if root.raw("format") != FORMAT:
-        raise root.wrong("format", f"is {root.raw('format')!r}", f'an edit has "format": "{FORMAT}"')
+        raise root.wrong("format", f"is {shown(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
     if root.raw("version") != VERSION:
-        raise root.wrong("version", f"is {root.raw('version')!r}", f"this program reads version {VERSION}")
+        raise root.wrong("version", f"is {shown(root.raw('version'))}", f"this program reads version {VERSION}")
     _check_scene(root, session)
     handles: list[Handle] = []
     for node in root.children("handles", 1000):
@@ -119,6 +119,8 @@ def _check_scene(root: Node, session: EditSession) -> None:
     count = scene.integer("control_points", len(session), 0, 1 << 31)
     if count != len(session):
         remedy = f"this scene has {len(session)}: give the scene that it was made for"
+        if not session.engine.rig.moves:
+            remedy += f", with --nodes {count}"
         raise scene.wrong("control_points", f"is {count}", remedy)
     mark = scene.raw("fingerprint")
     if mark is not None and mark != fingerprint(session):
@@ -137,7 +139,7 @@ def _nodes(node: Node, name: str, session: EditSession, *, time: float = 0.0) ->
     last = len(session) - 1
     for index in value:
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index <= last:
-            raise node.wrong(name, f"names control point {index!r}", f"give whole numbers from 0 to {last}")
+            raise node.wrong(name, f"names control point {shown(index)}", f"give whole numbers from 0 to {last}")
     return tuple(sorted(set(value)))
 
 
@@ -190,11 +192,36 @@ def check_handle(handle: Handle, count: int) -> None:
     node = Node(_plain(handle), f"handle {handle.name!r}")
     node.text("name")
     node.number("time", 0.0, 0.0, 1.0)
-    if handle.pivot is not None and (len(handle.pivot) != 3 or not np.isfinite(handle.pivot).all()):
-        raise node.wrong("pivot", f"is {list(handle.pivot)}", "give 3 finite numbers")
+    if handle.pivot is not None and (len(handle.pivot) != 3 or not np.all(np.abs(handle.pivot) <= LIMIT)):
+        raise node.wrong("pivot", f"is {list(handle.pivot)}", f"give 3 finite numbers from {-LIMIT:g} to {LIMIT:g}")
     node.number("stiffness", None, 1e-6, 1e6)
     node.choice("lasts", get_args(Lasting), "motion")
     node.number("window", 0.1, 1e-6, 10.0)
+
+
+def check_keyframe(at: float, easing: str) -> None:
+    """What ``_keyframe`` checks.
+
+    Raises:
+        UserError: naming the field.
+    """
+    node = Node({"at": at, "easing": easing}, "keyframe")
+    node.number("at", None, 0.0, MOST_SECONDS)
+    node.choice("easing", get_args(Easing), "smooth")
+
+
+def check_size(size: int) -> None:
+    """What ``_film`` checks of a film's size.
+
+    Raises:
+        UserError: naming the field.
+    """
+    Node({"size": size}, "film").integer("size", 512, 16, LARGEST)
+
+
+def _too_short(direction: tuple[float, ...]) -> bool:
+    """Its length cannot be told."""
+    return not sum(x * x for x in direction) > 1e-200
 
 
 def _pins(root: Node, handles: list[Handle], session: EditSession) -> tuple[int, ...]:
@@ -205,8 +232,7 @@ def _pins(root: Node, handles: list[Handle], session: EditSession) -> tuple[int,
         node = Node(value, root.source, "pins")
         rings = node.integer("beyond", 2, 0, 1000)
         node.done()
-        free = {n for handle in handles for n in session.graph.ring(handle.nodes, rings)}
-        return tuple(n for n in range(len(session)) if n not in free)
+        return session.graph.beyond({n for handle in handles for n in handle.nodes}, rings)
     return _nodes(root, "pins", session)
 
 
@@ -218,8 +244,8 @@ def _target(node: Node) -> Target:
     if (axis is None) != (degrees is None) or (rotation is not None and axis is not None):
         raise node.wrong("axis", "and degrees belong together", "give both, or rotation alone")
     if axis is not None:
-        if not any(axis):
-            raise node.wrong("axis", "has no direction", "give 3 numbers, not all 0")
+        if _too_short(axis):
+            raise node.wrong("axis", "has no direction", "give 3 numbers, not all 0 or next to it")
         rotation = tuple(from_axis(axis, degrees).tolist())
     node.done()
     try:
@@ -232,7 +258,7 @@ def _targets(root: Node, names: set[str]) -> dict[str, Target]:
     found = {}
     for name, node in root.entries("targets"):
         if name not in names:
-            raise node.wrong("", "names no handle", f"there is {', '.join(sorted(names)) or 'none'}")
+            raise node.wrong("", "names no handle", f"there is {one_line(', '.join(sorted(names))) or 'none'}")
         found[name] = _target(node)
     return found
 
@@ -322,8 +348,8 @@ def _shot(node: Node | None) -> Shot:
         up=node.vector("up", 3),
         fov=node.number("fov", None, 1.0, 150.0),
     )
-    if found.up is not None and not any(found.up):
-        raise node.wrong("up", "has no direction", "give 3 numbers, not all 0")
+    if found.up is not None and _too_short(found.up):
+        raise node.wrong("up", "has no direction", "give 3 numbers, not all 0 or next to it")
     if any(a.at == b.at for a, b in pairwise(views)):
         raise node.wrong("views", "has two at one moment", "give every view a moment of its own")
     node.done()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -23,7 +24,7 @@ from . import script
 from .document import Edit
 from .engine import Engine
 from .graph import ControlGraph
-from .handles import ONE_FRAME, STAY, Handle, Target
+from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
 from .pose import NodePose
 
@@ -36,6 +37,7 @@ class EditSession:
 
     Whatever changes the edit can be undone; a drag counts as one change from its first ``drag`` to ``release``.
     Results depend on the edit alone, but for those with ``live=True``: they are for the eye while something is dragged.
+    ``frame`` is how far from its time an edit of one frame shows; None: as far as in the edit's film.
 
     Attributes: ``scene``, ``graph``, ``edit`` (replace it with :meth:`apply`).
     """
@@ -96,9 +98,11 @@ class EditSession:
 
     # Choosing control points
 
-    def node_positions(self, time: float, at: float | None = None, *, live: bool = False) -> np.ndarray:
+    def node_positions(
+        self, time: float, at: float | None = None, *, live: bool = False, frame: float | None = None
+    ) -> np.ndarray:
         """[M, 3] edited control points, world."""
-        bent = self._bend(time, at, live)
+        bent = self._bend(time, at, live, frame)
         time = min(max(float(time), 0.0), 1.0)
         positions = self.engine.motion_at(time).positions if bent is None else bent.positions
         return self.engine.to_world(positions)
@@ -137,7 +141,8 @@ class EditSession:
     # Handles and pins
 
     def add_handle(self, nodes: Iterable[int], time: float, name: str | None = None, **fields: Any) -> Handle:
-        """Take hold of some control points; ``fields`` as in :class:`Handle`. A name that is taken is replaced.
+        """Take hold of some control points; ``fields`` as in :class:`Handle`. A name that is taken is taken over,
+        without its target and its part in keyframes.
 
         Raises:
             UserError: no node, or one that does not exist, or a field that makes no sense.
@@ -150,20 +155,23 @@ class EditSession:
             name = next(f"handle {i}" for i in range(1, len(taken) + 2) if f"handle {i}" not in taken)
         handle = Handle(name=name, nodes=chosen, time=float(time), **fields)
         script.check_handle(handle, len(self))
-        others = tuple(h for h in self.edit.handles if h.name != name)
-        self._change(handles=(*others, handle))
+        edit = self._without(name)
+        self.apply(dataclasses.replace(edit, handles=(*edit.handles, handle)))
         return handle
 
     def remove_handle(self, name: str) -> None:
         """With its target and its part in every keyframe."""
-        handle = self._handle(name)
+        self.apply(self._without(self._handle(name).name))
+
+    def _without(self, name: str) -> Edit:
+        """The edit without a handle of that name."""
         frames = []
         for frame in self.edit.keyframes:
             rest = {n: t for n, t in frame.targets.items() if n != name}
-            frames += [dataclasses.replace(frame, targets=rest)] if rest else []
+            frames += [dataclasses.replace(frame, targets=rest)] if rest or not frame.targets else []
         targets = {n: t for n, t in self.edit.targets.items() if n != name}
-        handles = tuple(h for h in self.edit.handles if h is not handle)
-        self._change(handles=handles, targets=targets, keyframes=tuple(frames))
+        handles = tuple(h for h in self.edit.handles if h.name != name)
+        return dataclasses.replace(self.edit, handles=handles, targets=targets, keyframes=tuple(frames))
 
     def pivot(self, name: str) -> np.ndarray:
         """[3] what a handle turns about, world, at its own time."""
@@ -184,10 +192,8 @@ class EditSession:
 
     def pin_rest(self, rings: int = 2) -> None:
         """Pin everything more than ``rings`` edges away from any handle."""
-        free: set[int] = set()
-        for handle in self.edit.handles:
-            free |= set(self.graph.ring(handle.nodes, rings))
-        self._change(pins=tuple(node for node in range(len(self)) if node not in free))
+        held = {node for handle in self.edit.handles for node in handle.nodes}
+        self._change(pins=self.graph.beyond(held, rings))
 
     def _handle(self, name: str) -> Handle:
         found = self.edit.handle(name)
@@ -228,6 +234,11 @@ class EditSession:
             self._past.append(before)
             self._future.clear()
 
+    def cancel(self) -> None:
+        """The drag has not been: the edit is what it was before."""
+        before, self._before_drag = self._before_drag, None
+        self.edit = self.edit if before is None else before
+
     def move(
         self, name: str, translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None
     ) -> Target:
@@ -241,8 +252,7 @@ class EditSession:
 
     def add_keyframe(self, at: float, easing: Easing = "smooth") -> Keyframe:
         """Keep where all handles are now, for a moment of the film; one that is there already is replaced."""
-        if not (math.isfinite(at) and at >= 0):
-            raise UserError(f"keyframe at {at}: give seconds from the film's beginning")
+        script.check_keyframe(at, easing)
         names = [handle.name for handle in self.edit.handles]
         if not names:
             raise UserError("a keyframe needs a handle; take hold of some control points first")
@@ -261,23 +271,29 @@ class EditSession:
     # Results
 
     def resize_film(self, size: int) -> None:
-        """Longer side of the film in pixels."""
+        """Longer side of the film in pixels.
+
+        Raises:
+            UserError: no film is that small or large.
+        """
+        script.check_size(size)
         self._change(film=dataclasses.replace(self.edit.film, size=size))
 
     def scene_time(self, at: float) -> float:
         """The moment of the motion that a moment of the film shows."""
         return self.edit.playback.time_at(at, self.edit.film.seconds)
 
-    def _bend(self, time: float, at: float | None, live: bool, frame: float = ONE_FRAME) -> NodePose | None:
+    def _bend(self, time: float, at: float | None, live: bool, frame: float | None = None) -> NodePose | None:
         if not (math.isfinite(time) and (at is None or math.isfinite(at))):
             raise UserError(f"time {time}, at {at}: give finite numbers")
         time = min(max(float(time), 0.0), 1.0)
+        frame = self.edit.reach if frame is None else frame
         if live and at is None:
             return self.engine.bend_live(self.edit, time, frame=frame)
         return self.engine.bend(self.edit, time, at, frame=frame)
 
     def gaussians_at(
-        self, time: float, at: float | None = None, *, live: bool = False, frame: float = ONE_FRAME
+        self, time: float, at: float | None = None, *, live: bool = False, frame: float | None = None
     ) -> Gaussians:
         """Activated Gaussians under the edit, world units; the scene's own bits where the edit changes nothing."""
         bent = self._bend(time, at, live, frame)
@@ -292,7 +308,7 @@ class EditSession:
         background: Sequence[float] | Tensor | None = None,
         *,
         live: bool = False,
-        frame: float = ONE_FRAME,
+        frame: float | None = None,
     ) -> Image:
         """The edited scene, as ``Scene.render`` shows the scene; its very bits where the edit changes nothing."""
         bent = self._bend(time, at, live, frame)
@@ -309,13 +325,14 @@ class EditSession:
     # Files
 
     def save(self, path: str | Path) -> None:
-        """As JSON; loading it gives the same edit.
+        """As JSON; loading it gives the same edit. A drag goes on.
 
         Raises:
-            UserError: the place cannot be written.
+            UserError: the place cannot be written, or the edit holds something that no file may say.
         """
-        self.release()
-        write_atomically(Path(path), script.to_json(self.edit, self).encode())
+        text = script.to_json(self.edit, self)
+        script.parse(json.loads(text), "the edit", self)
+        write_atomically(Path(path), text.encode())
 
     def load(self, path: str | Path) -> None:
         """The edit in a file; can be undone.

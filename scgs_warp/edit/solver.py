@@ -55,7 +55,9 @@ class Anchors(NamedTuple):
     positions: np.ndarray
     """[M, 3], read where hard or soft."""
     rotations: np.ndarray
-    """[M, 3, 3], read where turned."""
+    """[M, 3, 3], read where turned or leaning."""
+    leaning: np.ndarray
+    """[M] >= 0: weight of a rotation that is asked for, as ``soft`` for positions; 0 where there is none."""
 
 
 @dataclass
@@ -99,6 +101,7 @@ class ArapSolver:
         self._begin = torch.from_numpy(graph.begin)
         self._neighbors = torch.from_numpy(graph.neighbors)
         self._weights = torch.from_numpy(graph.weights)
+        self._degree = np.asarray(graph.matrix.sum(1)).reshape(-1)
         self._systems: OrderedDict[bytes, _System] = OrderedDict()
 
     def _system(self, anchors: Anchors) -> _System:
@@ -117,7 +120,7 @@ class ArapSolver:
         held = anchors.hard | (anchors.soft > 0)
         alive = np.isin(component, np.unique(component[held]))
         free = alive & ~anchors.hard
-        degree = np.asarray(self.graph.matrix.sum(1)).reshape(-1)
+        degree = self._degree
         pulls = np.where(free, anchors.soft * degree, 0.0)
         lone = free & (degree == 0)  # an isolated node goes where its soft target is
         pulls[lone] = np.maximum(anchors.soft[lone], 1e-12)
@@ -150,6 +153,7 @@ class ArapSolver:
         positions = np.where(anchors.hard[:, None], anchors.positions, shape.positions)
         posed, rotations = torch.from_numpy(positions), torch.from_numpy(self._guess(system, anchors, shape))
         targets = torch.from_numpy(np.ascontiguousarray(anchors.positions))
+        asked = self._asked(anchors)
         spare = rotations.clone()
         edges = self._begin, self._neighbors, self._weights
         free = system.free.long().numpy()
@@ -161,7 +165,7 @@ class ArapSolver:
         for step in range(1 if same else 0, iterations + 1):
             if step:
                 inputs = system.turning, start, posed, *edges
-                launch(kernels.turn_nodes, len(system.turning), *inputs, smooth, rotations, spare, grain=64)
+                launch(kernels.turn_nodes, len(system.turning), *inputs, smooth, rotations, *asked, spare, grain=64)
                 rotations, spare = spare, rotations
             if system.factor is None:
                 break
@@ -175,14 +179,20 @@ class ArapSolver:
                 break
         return Shape(positions, rotations.numpy(), anchors)
 
+    def _asked(self, anchors: Anchors) -> tuple[torch.Tensor, torch.Tensor]:
+        """Weights [M] and values [M, 3, 3] of the rotations that are asked for."""
+        weights = anchors.leaning * self._degree * self.graph.edge_length**2
+        return torch.from_numpy(weights), torch.from_numpy(np.ascontiguousarray(anchors.rotations))
+
     def _guess(self, system: _System, anchors: Anchors, shape: Shape) -> np.ndarray:
         """[M, 3, 3] rotations: given where they are, else those of ``shape`` turned by a harmonic mean of what the
-        given ones have turned since."""
+        given ones, and those that are asked for, have turned since."""
         turns = np.where(anchors.turned[:, None, None], anchors.rotations, shape.rotations)
         further = np.zeros((len(turns), 3))
         given = np.flatnonzero(anchors.turned)
-        change = turns[given] @ shape.rotations[given].transpose(0, 2, 1)
-        further[given] = logarithm(from_matrix(change))
+        wanted = np.flatnonzero(anchors.turned | (anchors.leaning > 0))
+        change = anchors.rotations[wanted] @ shape.rotations[wanted].transpose(0, 2, 1)
+        further[wanted] = logarithm(from_matrix(change))
         if system.factor is None or not further.any():
             return turns
         free = system.free.long().numpy()
@@ -215,9 +225,10 @@ class ArapSolver:
         edges = self._begin, self._neighbors, self._weights
         rotations = torch.from_numpy(np.tile(np.eye(3), (len(rest), 1, 1)))
         spare = rotations.clone()
+        none = torch.zeros(len(rest), dtype=torch.float64), rotations
         for step in range(TURN_ITERATIONS):
             smooth = self.smoothness * self.graph.edge_length**2 if step else 0.0  # the first ones know nothing yet
-            launch(kernels.turn_nodes, len(rest), *inputs, *edges, smooth, rotations, spare, grain=64)
+            launch(kernels.turn_nodes, len(rest), *inputs, *edges, smooth, rotations, *none, spare, grain=64)
             rotations, spare = spare, rotations
         return rotations.numpy()
 
@@ -228,11 +239,11 @@ class ArapSolver:
         own = np.repeat(np.arange(len(graph)), np.diff(graph.begin))
         edges = rest[own] - rest[graph.neighbors]
         wanted = np.einsum("eij,ej->ei", 0.5 * (rotations[own] + rotations[graph.neighbors]), edges)
-        hard = held.copy()
+        hard, none = held.copy(), np.zeros(len(graph))
         free_components = np.setdiff1d(graph.component, graph.component[held])
         labels, first = np.unique(graph.component, return_index=True)
         hard[first[np.isin(labels, free_components)]] = True
-        system = self._system(Anchors(hard, np.zeros(len(graph)), ~hard, rest, rotations))
+        system = self._system(Anchors(hard, none, ~hard, rest, rotations, none))
         positions = rest.copy()
         free = system.free.long().numpy()
         if system.factor is not None:

@@ -78,7 +78,7 @@ class Editor:
         self.session, self.folder = session, folder
         self.views = Views()
         self.quick, self.full = Pace(QUICK, 256, 512), Pace(PATIENT, min(640, size), size)
-        self.worker = Worker(self.views, self._draw, lambda: self.model.busy)
+        self.worker = Worker(self.views, self._draw, lambda: self.model.busy, failed=self._picture_failed)
         self.model = Model(session, self.refresh)
         self.latency: list[float] = []
         self._said: dict[str, float] = {}
@@ -191,6 +191,16 @@ class Editor:
         """Our mistake, while it is being handled."""
         traceback.print_exc(file=sys.stderr)
         self.say(client, "Internal error", f"{type(error).__name__}: {error}")
+
+    def _picture_failed(self, number: int, error: Exception) -> None:
+        """On the worker's thread: the picture of one client could not be drawn."""
+        client = self.server.get_clients().get(number)
+        if client is None:
+            return
+        if isinstance(error, UserError):
+            self.say(client, "The picture cannot be drawn", str(error))
+        else:
+            self._failed(client, error)
 
     def on_value(self, handle: Any, action: Callable[[Any], Any]) -> Any:
         """The handle of a control; whenever a user changes its value, ``action`` is called with it."""
@@ -329,9 +339,7 @@ class Editor:
 
     def put(self, target: Target) -> None:
         """The chosen handle, at once: what the numbers in the panel do."""
-        if self._place is None:
-            raise UserError("nothing is chosen; click on the picture first")
-        self.model.grab(self._place[1])
+        self.model.grab(STAY if self._place is None else self._place[1])
         try:
             self.model.drag(target)
         finally:

@@ -19,10 +19,8 @@ def place(folder: Path, name: str, suffix: str) -> Path:
     Raises:
         UserError: the name has anything in it but letters, digits, spaces, dots, dashes, or the folder cannot be made.
     """
-    name = name.strip()
-    if name.lower().endswith(suffix):
-        name = name[: -len(suffix)]
-    if not NAME.fullmatch(name) or name.endswith((".", " ")):
+    name = _bare(name, suffix)
+    if not _good(name):
         raise UserError(f"file name {name[:100]!r}: take letters, digits, spaces, dots and dashes, a letter first")
     path = folder / f"{name}{suffix}"
     if path.is_symlink():
@@ -34,6 +32,28 @@ def place(folder: Path, name: str, suffix: str) -> Path:
     return path
 
 
+def _bare(name: str, suffix: str) -> str:
+    name = name.strip()
+    return name[: -len(suffix)] if name.lower().endswith(suffix) else name
+
+
+def _good(name: str) -> bool:
+    return bool(NAME.fullmatch(name)) and not name.endswith((".", " "))
+
+
+def free(path: Path) -> Path:
+    """The path, or, if something is there, the first of ``name 2``, ``name 3`` ... where nothing is."""
+    found, number = path, 1
+    while found.exists() or found.is_symlink():
+        number += 1
+        ending = f" {number}{path.suffix}"
+        found = path.with_name(path.name.removesuffix(path.suffix)[: 100 - len(ending)].rstrip(". ") + ending)
+    return found
+
+
 def edits(folder: Path) -> tuple[str, ...]:
-    """Names of the saved edits."""
-    return tuple(sorted(path.name for path in folder.glob("*.json"))) if folder.is_dir() else ()
+    """Names of the saved edits that ``place`` takes."""
+    if not folder.is_dir():
+        return ()
+    paths = sorted(folder.glob("*.json"))
+    return tuple(path.name for path in paths if _good(_bare(path.name, ".json")) and not path.is_symlink())

@@ -8,6 +8,7 @@ import dataclasses
 import json
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -15,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..edit import Edit, EditSession, Target, script
-from ..edit.filming import frame_reach
+from ..edit.handles import STAY
 from ..errors import UserError
 
 Show = Literal["edited", "original", "side by side", "split"]
@@ -32,8 +33,6 @@ class Moment:
     """Second of the film whose keyframes lead the handles; None: where handles are now."""
     live: bool
     show: Show
-    reach: float
-    """How far from its time an edit of one frame shows."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,14 @@ class Model:
         self.show: Show = "edited"
         self.at = 0.0
         self.dragging = False
+        self._dragged: bool | None = None
+        """Whether something was moved since ``grab``; None: nothing is in hand."""
+        self._led = False
+        """Whether keyframes led before ``grab``."""
+        self._automatic: deque[tuple[int, ...]] = deque(maxlen=100)
+        """Pins as ``grab`` has made them: nobody else has asked for them."""
         self._following = False
         self._played_from: tuple[float, float] | None = None
-        self._reach: tuple[Any, float] = (None, 0.0)
 
     # Time
 
@@ -125,13 +129,9 @@ class Model:
     def moment(self) -> Moment:
         with self.lock:
             self.tick()
-            edit = self.session.edit
-            key = edit.film, edit.playback
-            if self._reach[0] != key:
-                self._reach = key, frame_reach(self.session)
             live = self.dragging and not self.playing
             at = self.at if self._following and not live else None
-            return Moment(self.time, at, live, self.show, self._reach[1])
+            return Moment(self.time, at, live, self.show)
 
     # The edit
 
@@ -155,18 +155,18 @@ class Model:
 
     def undo(self) -> bool:
         with self.changing() as session:
-            self.dragging = False
+            self._let_go()
             return session.undo()
 
     def redo(self) -> bool:
         with self.changing() as session:
-            self.dragging = False
+            self._let_go()
             return session.redo()
 
     def reset(self) -> None:
         """No edit; can be undone."""
         with self.changing() as session:
-            self.dragging = False
+            self._let_go()
             session.reset()
 
     def set(self, **fields: Any) -> None:
@@ -200,11 +200,22 @@ class Model:
             session.apply(self._checked(dataclasses.replace(session.edit, handles=handles)))
 
     def remove_handle(self) -> None:
-        """The active handle, with its part in every keyframe."""
+        """The active handle, with its part in every keyframe; with the last one, pins that nobody has asked for."""
         with self.changing() as session:
             if self.active is None:
                 raise UserError("no handle is chosen; click on what it holds first")
-            session.remove_handle(self.active)
+            draft = session.fork()
+            draft.remove_handle(self.active)
+            if not draft.edit.handles and self._pins_are_automatic():
+                draft.unpin()
+            session.apply(draft.edit)
+
+    @property
+    def target(self) -> Target:
+        """Of the active handle, as it is shown."""
+        with self.lock:
+            moment = self.moment()
+            return self.session.engine.targets(self.session.edit, moment.at).get(self.active or "", STAY)
 
     # Selecting
 
@@ -239,9 +250,10 @@ class Model:
             UserError: nothing is selected; the edit is as before.
         """
         with self.lock:
-            self.session.release()
+            self._let_go()
             if self.active is None and not self.selection:
                 raise UserError("nothing is chosen; click on the picture first")
+            self._dragged, self._led = False, self._following
             self._take_over()
             if self.active is None:
                 draft = self.session.fork()
@@ -254,22 +266,25 @@ class Model:
 
     def _take_hold(self, draft: EditSession, target: Target) -> str:
         """A handle on the selection; its name."""
-        automatic = self.pin_rings is not None and set(draft.edit.pins) == self._rest(self.pin_rings)
+        automatic = self._pins_are_automatic()
         fields = {"lasts": self.lasts, "window": self.window, "stiffness": self.stiffness}
         handle = draft.add_handle(self.selection, self.time, **fields)
         if self.pin_rings is not None and (automatic or not draft.edit.pins):
             draft.pin_rest(self.pin_rings)
+            self._automatic.append(draft.edit.pins)
         draft.unpin(set(handle.nodes) & set(draft.edit.pins))
         if not target.is_identity:
             draft.move(handle.name, target.translation, target.rotation)
         return handle.name
 
-    def _rest(self, rings: int) -> set[int]:
-        """What ``pin_rest`` pins: pins of that kind make way for new handles."""
-        near: set[int] = set()
-        for handle in self.session.edit.handles:
-            near |= set(self.session.graph.ring(handle.nodes, rings))
-        return set(range(len(self.session))) - near
+    def _pins_are_automatic(self) -> bool:
+        """Whether pins are those of a handle, and make way for the next one."""
+        edit = self.session.edit
+        held = {node for handle in edit.handles for node in handle.nodes}
+        rings = self.pin_rings
+        return edit.pins in self._automatic or (
+            rings is not None and edit.pins == self.session.graph.beyond(held, rings)
+        )
 
     def _take_over(self) -> None:
         """Handles go on from where keyframes have them at this moment; part of the drag that begins."""
@@ -289,18 +304,30 @@ class Model:
                 return
             self._take_over()
             self.session.drag(self.active, target.translation, target.rotation)
+            self._dragged = True
         self.changed()
 
     def release(self) -> None:
+        """The drag is over; if nothing was moved, it has not been."""
         with self.lock:
-            self.dragging = False
-            self.session.release()
+            self._let_go()
         self.changed()
+
+    def _let_go(self) -> None:
+        self.dragging = False
+        if self._dragged is False:
+            self.session.cancel()
+            self._following = self._led
+            self._check()
+        self._dragged = None
+        self.session.release()
 
     def add_keyframe(self, easing: Any = "smooth") -> None:
         """At the moment shown; from then on keyframes lead."""
         with self.changing() as session:
+            draft = session.fork()
             if self._following:
-                session.show_keyframes(self.at)
-            session.add_keyframe(self.at, easing)
+                draft.show_keyframes(self.at)
+            draft.add_keyframe(self.at, easing)
+            session.apply(draft.edit)
             self._following = True

@@ -86,8 +86,10 @@ class Panel:
             self.editor.color_overlays()
 
     def show_time(self) -> None:
+        """As ``show``, of what goes with the moment shown."""
         with self._lock:
             self.time.show()
+            self.shape.show_target()
 
     def _said(self) -> str:
         model = self.editor.model

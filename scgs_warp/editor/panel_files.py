@@ -31,6 +31,9 @@ class FilesSection:
         gui.add_markdown(f"Files go to `{editor.folder.name}/` and to the browser.")
         with gui.add_folder("The edit"):
             self.name = gui.add_text("Name", "edit")
+            self.replace = gui.add_checkbox(
+                "Replace files", False, hint="Else a number is added to names that are taken"
+            )
             click(gui.add_button("Save edit"), lambda event: self.save(event.client))
             self.saved = gui.add_dropdown("Saved", (NONE,))
             click(gui.add_button("Load edit"), lambda event: self.load(self.saved.value))
@@ -46,7 +49,8 @@ class FilesSection:
         button.on_click(self.editor.guarded(action))
 
     def _path(self, suffix: str) -> Path:
-        return files.place(self.editor.folder, self.name.value, suffix)
+        path = files.place(self.editor.folder, self.name.value, suffix)
+        return path if self.replace.value else files.free(path)
 
     def offer(self, client: Any, path: Path) -> None:
         """Send a file to the browser, which shows a link to it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from ..edit.keyframes import Easing
@@ -14,8 +15,10 @@ if TYPE_CHECKING:
 
 NONE = "none"
 EASINGS: tuple[Easing, ...] = ("smooth", "linear", "ease", "step")
-LONGEST = 600.0
-"""Seconds of a film that the panel offers; scripts may ask for more."""
+SHORTEST, LONGEST = 0.04, 600.0
+"""Seconds of a film that the panel offers; scripts may ask for others."""
+SLOWEST, FASTEST = 1.0, 120.0
+"""The same of its frames a second."""
 REPEATS = ("once", "loop", "swing", "stand still")
 
 
@@ -26,7 +29,8 @@ class TimeSection:
         gui, self.model = editor.server.gui, editor.model
         film = self.model.session.edit.film
         self.at = editor.on_value(
-            gui.add_slider("Second", 0.0, film.seconds, 1.0 / film.fps, 0.0, hint="Of the film"), self.model.seek
+            gui.add_slider("Second", 0.0, film.seconds, min(1.0 / film.fps, film.seconds), 0.0, hint="Of the film"),
+            self.model.seek,
         )
         self.play = gui.add_button("Play")
         self.play.on_click(editor.guarded(lambda event: self.model.play(not self.model.playing)))
@@ -60,11 +64,15 @@ class FilmSection:
         gui, on, film = self.editor.server.gui, self.editor.on_value, self.model.session.edit.film
         with gui.add_folder("Film"):
             self.seconds = on(
-                gui.add_number("Seconds", film.seconds, min=0.04, max=max(LONGEST, film.seconds), step=0.01),
+                gui.add_number(
+                    "Seconds", film.seconds, min=min(SHORTEST, film.seconds), max=max(LONGEST, film.seconds), step=0.01
+                ),
                 lambda value: self._film(seconds=float(value)),
             )
             self.fps = on(
-                gui.add_number("Frames a second", film.fps, min=1.0, max=max(120.0, film.fps), step=1.0),
+                gui.add_number(
+                    "Frames a second", film.fps, min=min(SLOWEST, film.fps), max=max(FASTEST, film.fps), step=1.0
+                ),
                 lambda value: self._film(fps=float(value)),
             )
             self.size = on(
@@ -102,7 +110,10 @@ class FilmSection:
             self.model.seek(self._moments()[name])
 
     def _moments(self) -> dict[str, float]:
-        return {_name(frame.at): frame.at for frame in self.model.session.edit.keyframes}
+        times = [frame.at for frame in self.model.session.edit.keyframes]
+        short = [f"{at:.3f} s" for at in times]
+        often = Counter(short)
+        return {label if often[label] == 1 else f"{at!r} s": at for label, at in zip(short, times)}
 
     def _remove(self) -> None:
         at = self._moments().get(self.chosen.value)
@@ -121,10 +132,9 @@ class FilmSection:
         if self.chosen.options != names:
             self.chosen.options = names
         self.chosen.value = next((n for n, at in self._moments().items() if at == self.model.at), NONE)
+        self.seconds.min, self.seconds.max = min(SHORTEST, film.seconds), max(LONGEST, film.seconds)
+        self.fps.min, self.fps.max = min(SLOWEST, film.fps), max(FASTEST, film.fps)
         self.seconds.value, self.fps.value, self.size.value = film.seconds, film.fps, film.size
         self.repeat.value = playback.repeat if playback.freeze is None else "stand still"
+        self.speed.min, self.speed.max = min(-100.0, playback.speed), max(100.0, playback.speed)
         self.speed.value = playback.speed
-
-
-def _name(at: float) -> str:
-    return f"{at:.3f} s"

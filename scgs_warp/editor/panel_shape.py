@@ -62,9 +62,7 @@ class ShapeSection:
     def _dress_handle(self) -> None:
         gui, model, on = self.editor.server.gui, self.model, self.editor.on_value
         with gui.add_folder("Handle"):
-            self.handle = on(
-                gui.add_dropdown("Handle", (NEW,)), lambda name: model.activate(None if name == NEW else name)
-            )
+            self.handle = on(gui.add_dropdown("Handle", (NEW,)), lambda label: model.activate(self._names()[label]))
             self.move = on(
                 gui.add_vector3("Move", (0.0, 0.0, 0.0), step=_round(0.1 * self.editor.edge_length)), self._moved
             )
@@ -91,17 +89,24 @@ class ShapeSection:
             self.remove = gui.add_button_group("", ("Put back", "Remove"))
             self.remove.on_click(self.editor.guarded(lambda event: self._ended(event.target.value)))
 
-    def _target(self) -> Target:
-        return self.model.session.edit.targets.get(self.model.active or "", STAY)
+    def _names(self) -> dict[str, str | None]:
+        """Handles by their labels; a handle may be called anything, even what stands for none."""
+        found: dict[str, str | None] = {NEW: None}
+        for handle in self.model.session.edit.handles:
+            label = handle.name
+            while label in found:
+                label += " (handle)"
+            found[label] = handle.name
+        return found
 
     def _moved(self, where: tuple[float, float, float]) -> None:
-        self.editor.put(Target.of(where, self._target().rotation))
+        self.editor.put(Target.of(where, self.model.target.rotation))
 
     def _turned(self, degrees: tuple[float, float, float]) -> None:
         if not all(map(math.isfinite, degrees)):
             raise UserError(f"turn {list(degrees)}: must be three finite numbers; the handle stays where it is")
         turn = exponential(np.radians(degrees))
-        self.editor.put(Target.of(self._target().translation, turn.tolist()))
+        self.editor.put(Target.of(self.model.target.translation, turn.tolist()))
 
     def _set(self, **fields: Any) -> None:
         """Of the handle in hand, and of the next ones."""
@@ -151,19 +156,25 @@ class ShapeSection:
         model, edit = self.model, self.model.session.edit
         self.kind.value, self.rings.value, self.combine.value = model.region.kind, model.region.rings, model.combine
         self.rings.visible, self.radius.visible = model.region.kind == "rings", model.region.kind == "brush"
-        names = (NEW, *(handle.name for handle in edit.handles))
-        if self.handle.options != names:
-            self.handle.options = names
-        self.handle.value = model.active or NEW
+        labels = self._names()
+        if self.handle.options != tuple(labels):
+            self.handle.options = tuple(labels)
+        self.handle.value = next((label for label, name in labels.items() if name == model.active), NEW)
         handle = edit.handle(model.active or "")
         source = handle or model
         self.lasts.value, self.window.value = source.lasts, source.window
         self.stiffness.value = EXACT if source.stiffness is None else source.stiffness
         self.window.visible = source.lasts == "fade"
-        target = self._target()
-        self.move.value = target.translation
-        self.turn.value = tuple(np.degrees(logarithm(np.array(target.rotation))).tolist())
+        self.show_target()
         self.rest.value = model.pin_rings is not None
+
+    def show_target(self) -> None:
+        """Where the handle is that is in hand, at the moment shown."""
+        target = self.model.target
+        turned = tuple(np.degrees(logarithm(np.array(target.rotation))).tolist())
+        for control, value in ((self.move, target.translation), (self.turn, turned)):
+            if control.value != value:
+                control.value = value
 
 
 def _round(length: float) -> float:

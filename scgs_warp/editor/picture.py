@@ -47,7 +47,7 @@ def _image(
 ) -> Picture:
     view = camera.at_size(size, share).to(session.scene.device)
     if edited:
-        image = session.render(view, moment.time, moment.at, live=moment.live, frame=moment.reach)
+        image = session.render(view, moment.time, moment.at, live=moment.live)
     else:
         image = session.scene.render(view, moment.time)
     return Picture(to_bytes(image.rgb), _depth(image))

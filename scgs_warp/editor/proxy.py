@@ -15,7 +15,6 @@ import http
 import secrets
 import threading
 from collections.abc import Iterator
-from http.cookies import CookieError, SimpleCookie
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
@@ -23,11 +22,14 @@ from ..errors import UserError
 
 LOCAL = {"127.0.0.1", "localhost", "::1"}
 KEY = "x-editor-key"
-COOKIE = "scgs_editor"
+COOKIE = "scgs_editor_"
+"""The port follows: cookies know hosts only, and there may be several editors on one."""
 MOST_HEAD = 32 << 10
 """Bytes of a request's head."""
 PATIENCE = 10.0
 """Seconds in which a request's head has to be there."""
+MOST_STRANGERS = 200
+"""Connections that have not shown the token; more are closed at once."""
 
 
 class Head(NamedTuple):
@@ -54,6 +56,7 @@ def parse_head(text: bytes) -> Head | None:
         first, *rest = text.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
         method, target, version = first.split(" ")
         headers = [(line.partition(":")[0].lower(), line.partition(":")[2].strip()) for line in rest]
+        urlsplit(target)
     except ValueError:
         return None
     plain = all(name and ":" in line and name.replace("-", "").isalnum() for (name, _), line in zip(headers, rest))
@@ -68,8 +71,17 @@ def same_origin(origin: str | None, host: str | None) -> bool:
     """Whether a page of this origin came from the host that it now asks."""
     if not origin or not host:
         return False
-    parts = urlsplit(origin)
+    try:
+        parts = urlsplit(origin)
+    except ValueError:
+        return False
     return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower()
+
+
+def cookies(header: str) -> dict[str, str]:
+    """By name, of a Cookie header. Other pages of the host may set what they like: odd ones hide no others."""
+    pairs = (part.strip().partition("=") for part in header.split(";"))
+    return {name: value for name, _, value in pairs}
 
 
 def is_local(host: str | None) -> bool:
@@ -141,7 +153,8 @@ class Proxy:
         host, public: where to listen; 0 takes any port.
         key: what the editor's ``guarded`` port knows it by.
 
-    Attributes: ``token``, ``public`` (the port), ``url`` (as seen from this machine, with the token).
+    Attributes: ``token``, ``public`` (the port), ``url`` (as seen from this machine, with the token), ``cookie`` (the
+    name of the one that keeps the token).
 
     Raises:
         UserError: it cannot listen there.
@@ -152,6 +165,7 @@ class Proxy:
         self.token = secrets.token_urlsafe(24)
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._strangers = 0
         self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
         self._thread.start()
         try:
@@ -163,6 +177,10 @@ class Proxy:
     @property
     def url(self) -> str:
         return f"http://127.0.0.1:{self.public}/?token={self.token}"
+
+    @property
+    def cookie(self) -> str:
+        return f"{COOKIE}{self.public}"
 
     def stop(self) -> None:
         """Every connection ends."""
@@ -196,32 +214,43 @@ class Proxy:
             writer.close()
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        text = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
-        head = parse_head(text)
+        if self._strangers >= MOST_STRANGERS:
+            return
+        self._strangers += 1
+        try:
+            head = await self._admit(reader, writer)
+        finally:
+            self._strangers -= 1
         if head is None:
-            return await _reply(writer, "400 Bad Request", "not a request of this page")
-        given = self._given(head)
-        if given is None or not hmac.compare_digest(given.encode(), self.token.encode()):
-            return await _reply(writer, "403 Forbidden", "open the address that the editor printed, token and all")
+            return
         origin = head.get("origin")
         if (head.upgrades or origin is not None) and not same_origin(origin, head.get("host")):
             return await _reply(writer, "403 Forbidden", "a page from elsewhere may not use the editor")
         if "token" in parse_qs(urlsplit(head.target).query):
             # From here on the cookie says it: the token stands in no address, so in no history and no Referer
-            cookie = f"{COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Lax"
+            cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
             return await _reply(writer, "303 See Other", "", f"Location: /\r\nSet-Cookie: {cookie}\r\n")
         await self._pass_on(head, reader, writer)
+
+    async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Head | None:
+        """The head of a request that has the token; None if it was refused."""
+        text = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
+        head = parse_head(text)
+        if head is None:
+            await _reply(writer, "400 Bad Request", "not a request of this page")
+            return None
+        given = self._given(head)
+        if given is None or not hmac.compare_digest(given.encode(), self.token.encode()):
+            await _reply(writer, "403 Forbidden", "open the address that the editor printed, token and all")
+            return None
+        return head
 
     def _given(self, head: Head) -> str | None:
         """The token of a request: in its address, once, then in the cookie."""
         asked = parse_qs(urlsplit(head.target).query).get("token")
         if asked is not None:
             return asked[0] if len(asked) == 1 else None
-        try:
-            found = SimpleCookie(head.get("cookie") or "").get(COOKIE)
-        except CookieError:
-            return None
-        return None if found is None else found.value
+        return cookies(head.get("cookie") or "").get(self.cookie)
 
     async def _pass_on(self, head: Head, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Head first, then bytes both ways. One request a connection, unless it becomes a WebSocket: what is not

@@ -32,6 +32,7 @@ class Worker:
         views: who needs a picture; guarded by this worker's lock.
         draw: called with (client, quality) without the lock, from this thread only.
         busy: whether something is being dragged or played.
+        failed: called with the client and the error where ``draw`` raises, while that is being handled.
     """
 
     def __init__(
@@ -40,7 +41,9 @@ class Worker:
         draw: Callable[[int, str], None],
         busy: Callable[[], bool],
         clock: Callable[[], float] = time.monotonic,
+        failed: Callable[[int, Exception], None] | None = None,
     ) -> None:
+        self._failed = failed
         self.views, self._draw, self._busy, self._clock = views, draw, busy, clock
         self._condition = threading.Condition()
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
@@ -135,8 +138,14 @@ class Worker:
     def _picture(self, client: int, quality: str) -> None:
         try:
             self._draw(client, quality)
-        except Exception:  # a picture that fails must not take the editor with it
-            traceback.print_exc(file=sys.stderr)
+        except Exception as error:  # a picture that fails must not take the editor with it
+            if self._failed is None:
+                traceback.print_exc(file=sys.stderr)
+                return
+            try:
+                self._failed(client, error)
+            except Exception:
+                traceback.print_exc(file=sys.stderr)
 
 
 def _fulfil(future: Future[Any], action: Callable[[], Any]) -> None:
