@@ -48,20 +48,23 @@ class Options:
     device: Device = "auto"
     """Where features are compared; auto takes a GPU if there is one."""
     threads: int | None = None
-    """CPU threads; all cores by default."""
+    """CPU threads; all cores by default. pycolmap's own work takes one."""
 
 
 def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="capture.py")
     device = prepare(options.device, options.threads)
 
+    import cv2
+
     from scgs_warp import environment
     from scgs_warp.capture import Request, capture
 
+    cv2.setNumThreads(environment.thread_count())
     o = options
     film = (o.video, o.frames, o.start, o.end, o.size, o.masks)
     request = Request(*film, o.matching, o.camera_model, o.fov, o.features, o.least, o.seed)
-    made = capture(request, o.output, device=device, threads=environment.thread_count())
+    made = capture(request, o.output, device=device)
     print("\n".join(made.lines))
     registered = f"{made.outcome.registered} of {made.outcome.picked} frames have a camera"
     print(f"{o.output}: {registered}; contact_sheet.png, cameras.png{' (made before)' if made.made_before else ''}")

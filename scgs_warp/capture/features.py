@@ -92,7 +92,7 @@ def begin(database: Path, shots: Shots, model: CameraModel, focal: float | None)
         )
 
 
-def extract(database: Path, shots: Shots, most: int, threads: int, done: Callable[[], object]) -> None:
+def extract(database: Path, shots: Shots, most: int, done: Callable[[], object]) -> None:
     """Features of every frame that has none yet, outside of its mask.
 
     Args:
@@ -100,7 +100,7 @@ def extract(database: Path, shots: Shots, most: int, threads: int, done: Callabl
         done: called after each frame.
     """
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
-        options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
+        options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
         options.sift.max_num_features = most
         extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
         for name in shots.names:

@@ -108,14 +108,11 @@ def check(request: Request) -> None:
         raise UserError(f"--seed {request.seed}: give 0 or more")
 
 
-def capture(
-    request: Request, folder: Path, *, device: str = "cpu", threads: int = 1, show: Show = progress
-) -> Captured:
+def capture(request: Request, folder: Path, *, device: str = "cpu", show: Show = progress) -> Captured:
     """Make the data set in ``folder``, or go on with what an interrupted attempt has left there.
 
     Args:
         device: where descriptors are compared.
-        threads: of the search for features; all else is done by one, so that the same film gives the same cameras.
         show: ``show(total, text)`` is a context that shows progress; its value has ``advance()``.
 
     Raises:
@@ -129,7 +126,7 @@ def capture(
     frames = _frames(request, source, journal, show)
     _enough(request, frames)
     shots = _masks(request, source, frames, journal, show)
-    outcome, solved = _solve(request, source, frames, shots, journal, device, threads, show)
+    outcome, solved = _solve(request, source, frames, shots, journal, device, show)
     lines = _lines(frames, outcome)
     if not before:
         _draw_sheet(folder / SHEET, frames, shots, solved, source.video)
@@ -239,7 +236,6 @@ def _solve(
     shots: Shots,
     journal: Journal,
     device: str,
-    threads: int,
     show: Show,
 ) -> tuple[Outcome, mapping.Solved | None]:
     """Features, matches, cameras."""
@@ -251,7 +247,7 @@ def _solve(
     def find() -> None:
         features.begin(database, shots, request.camera_model, focal)
         with show(count, "features") as bar:
-            features.extract(database, shots, request.features, threads, bar.advance)
+            features.extract(database, shots, request.features, bar.advance)
 
     def compare() -> None:
         with show(len(chosen), "matching") as bar:
