@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 
 import cv2
 import numpy as np
@@ -179,6 +180,19 @@ def test_a_video_keeps_its_moments(tmp_path):
     assert video.count == 10 and [still.index for still in stills] == list(range(10))
     np.testing.assert_allclose([still.seconds for still in stills], np.arange(10) / 12.5, atol=1e-3)
     assert stills[0].image.shape == (60, 80, 3)
+
+
+def test_pixels_are_made_square(tmp_path):
+    import av
+
+    with av.open(str(tmp_path / "film.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 144, 120, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        for frame in pan([0, 3], 120, 144):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    assert {still.image.shape for still in Video(tmp_path / "film.mp4").frames(1000)} == {(120, 192, 3)}
 
 
 def test_pictures_are_turned_as_they_were_held():

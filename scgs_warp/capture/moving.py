@@ -21,7 +21,7 @@ SIDE = 480
 """Longer side of the images in which flow is computed, pixels."""
 STEPS = (-2, -1, 1, 2)
 """Frames that each frame is compared with."""
-GRID = 8
+GRID = 12
 """Every so many pixels a flow vector takes part in the search for the camera's motion."""
 FEWEST = 60
 """Flow vectors without which no motion is sought."""
@@ -54,20 +54,34 @@ def consensus(load: Callable[[int], np.ndarray], count: int, done: Callable[[], 
         [H, W] bool at the frames' size, True where something moves by itself.
     """
     kept: dict[int, np.ndarray] = {}
+    flows: dict[tuple[int, int], np.ndarray] = {}
     masks = []
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+
+    def flow(one: int, two: int) -> np.ndarray:
+        if (one, two) not in flows:
+            flows[one, two] = search.calc(kept[one], kept[two], None)  # type: ignore[call-overload]
+        return flows[one, two]
+
+    size = (0, 0)
     for index in range(count):
         around = [index + step for step in STEPS if 0 <= index + step < count]
-        kept = {k: kept[k] if k in kept else _gray(load(k)) for k in (index, *around)}
+        for k in (index, *around):
+            if k not in kept:
+                image = load(k)
+                kept[k], size = _gray(image), (image.shape[1], image.shape[0])
         votes, asked = np.zeros(kept[index].shape, np.float32), np.zeros(kept[index].shape, np.float32)
         for other in around:
-            answer = off_line(flow, kept[index], kept[other])
+            answer = off_line(kept[index], flow(index, other), flow(other, index))
             if answer is not None:
                 moves, sure = answer
                 votes += moves & sure
                 asked += sure
         mask = (votes >= 1) & (votes >= AGREE * asked)
-        masks.append(_tidy(mask, load(index).shape[1::-1]))
+        masks.append(_tidy(mask, size))
+        gone = index + min(STEPS)
+        kept.pop(gone, None)
+        flows = {pair: found for pair, found in flows.items() if min(pair) > gone}
         done()
     return masks
 
@@ -76,14 +90,16 @@ def _gray(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(shrunk(image, SIDE), cv2.COLOR_RGB2GRAY)
 
 
-def off_line(flow: cv2.DISOpticalFlow, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Which pixels of ``one`` [H, W] leave their epipolar lines on the way to ``two``, and of which that can be said.
+def off_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Which pixels of an image leave their epipolar lines on the way to another, and of which that can be said.
+
+    Args:
+        one: [H, W] uint8.
+        forth, back: [H, W, 2] flow from it to the other image, and from that to it.
 
     Returns:
         [H, W] bool twice; None where no motion of the camera is found.
     """
-    forth = flow.calc(one, two, None)  # type: ignore[call-overload]
-    back = flow.calc(two, one, None)  # type: ignore[call-overload]
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     there = np.stack([x, y], 2) + forth
@@ -96,7 +112,7 @@ def off_line(flow: cv2.DISOpticalFlow, one: np.ndarray, two: np.ndarray) -> tupl
     if chosen.sum() < FEWEST:
         return None
     here = np.stack([x, y], 2)
-    matrix, _ = cv2.findFundamentalMat(here[chosen], there[chosen], cv2.USAC_MAGSAC, 0.5, 0.999, 5000)
+    matrix, _ = cv2.findFundamentalMat(here[chosen], there[chosen], cv2.USAC_MAGSAC, 0.5, 0.999, 2000)
     if matrix is None or matrix.shape != (3, 3):
         return None
     distance = sampson(matrix, here, there)

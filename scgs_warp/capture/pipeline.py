@@ -120,6 +120,8 @@ def capture(request: Request, folder: Path, *, device: str = "cpu", show: Show =
     """
     check(request)
     source = open_source(request.source)
+    if request.masks not in ("auto", "none"):
+        open_source(Path(request.masks))
     journal = Journal(folder, source.digest())
     before = journal.finished
     journal.start()

@@ -106,6 +106,7 @@ class Video:
         with self._opened() as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
+            shape = float(stream.sample_aspect_ratio or 1)
             first, index = None, 0
             for packet in container.demux(stream):
                 try:
@@ -115,7 +116,7 @@ class Video:
                 for frame in decoded:
                     seconds = float(frame.time) if frame.time is not None else index / self.rate
                     first = seconds if first is None else first
-                    yield Still(index, seconds - first, _picture(frame, longest), "")
+                    yield Still(index, seconds - first, _picture(frame, longest, shape), "")
                     index += 1
         if index == 0:
             raise UserError(f"{self.path}: no frame can be decoded; save it as .mp4, or give a folder of images")
@@ -124,12 +125,10 @@ class Video:
         return _digest([self.path])
 
 
-def _picture(frame: Any, longest: int) -> np.ndarray:
-    """A decoded frame as it is to be shown: pixels made square, turned as the phone was held."""
-    width, height = frame.width, frame.height
-    shape = getattr(frame, "sample_aspect_ratio", None)
-    if shape:
-        width = max(1, round(width * float(shape)))
+def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
+    """A decoded frame as it is to be shown: pixels, ``shape`` times as wide as high, made square; turned as the phone
+    was held."""
+    width, height = frame.width * shape, frame.height
     scale = min(1.0, longest / max(width, height))
     image = frame.to_ndarray(format="rgb24")
     size = max(1, round(width * scale)), max(1, round(height * scale))
