@@ -71,7 +71,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _up(rotations: np.ndarray) -> np.ndarray:
+def agreed_up(rotations: np.ndarray) -> np.ndarray:
     """[3] the direction that the cameras agree to call up.
 
     Cameras held level have x axes perpendicular to it, whatever their pitch, so it is the direction in which the x
@@ -145,7 +145,7 @@ def overview(cameras: Sequence[Camera]) -> Overview:
     viewmats = torch.stack([camera.viewmat.detach().cpu().double() for camera in cameras]).numpy()
     rotations = viewmats[:, :3, :3]
     positions = -np.einsum("vji,vj->vi", rotations, viewmats[:, :3, 3])
-    up = _up(rotations)
+    up = agreed_up(rotations)
     centre = _centre(positions, rotations[:, 2])
     offsets = positions - centre
     distances = np.linalg.norm(offsets, axis=1)

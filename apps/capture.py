@@ -1,0 +1,79 @@
+"""Make a data set of a film: ``python apps/capture.py film.mp4 --output data/film``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from scgs_warp.apps.cli import Device, prepare, run
+
+
+@dataclass(frozen=True)
+class Options:
+    """Find where a video was filmed from: frames, cameras, times and points, in a folder for train.py --data."""
+
+    video: tyro.conf.Positional[Path]
+    """A video, or a folder of images that one camera took."""
+    output: Path
+    """Folder to make. The same command goes on where it was interrupted; finished work is never overwritten."""
+    frames: int | None = None
+    """At most so many frames, the sharpest, spread over time and motion; 150 of a video by default, all of a folder."""
+    start: float | None = None
+    """Second of the video to begin at."""
+    end: float | None = None
+    """Second of the video to end at."""
+    size: int = 1280
+    """Longer side of the images in pixels; smaller ones are not enlarged."""
+    masks: str = "auto"
+    """auto: what moves against the scene at rest is found and takes no part in finding the cameras; none; or a folder
+    or video of masks, black where something moves."""
+    matching: Literal["auto", "sequential", "exhaustive"] = "auto"
+    """Frames compared with those around them, or each with each; auto: by their number."""
+    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
+        "SIMPLE_RADIAL"
+    )
+    """COLMAP's name; one camera for all frames, found with the poses. OPENCV for wide angles, OPENCV_FISHEYE beyond."""
+    fov: float | None = None
+    """Horizontal field of view in degrees, to begin with, if you know it."""
+    features: int = 4096
+    """At most, of a frame."""
+    least: float = 0.5
+    """Share of the frames that must get a camera; with less it is an error, which says what to do."""
+    seed: int = 0
+    """Of what is drawn at random; the same film and seed give the same frames and cameras."""
+    device: Device = "auto"
+    """Where features are compared; auto takes a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all cores by default. pycolmap's own work takes one."""
+
+
+def main(args: list[str] | None) -> None:
+    options = tyro.cli(Options, args=args, prog="capture.py")
+    device = prepare(options.device, options.threads)
+
+    import cv2
+
+    from scgs_warp import environment
+    from scgs_warp.capture import Request, capture
+
+    cv2.setNumThreads(environment.thread_count())
+    o = options
+    film = (o.video, o.frames, o.start, o.end, o.size, o.masks)
+    request = Request(*film, o.matching, o.camera_model, o.fov, o.features, o.least, o.seed)
+    made = capture(request, o.output, device=device)
+    print("\n".join(made.lines))
+    registered = f"{made.outcome.registered} of {made.outcome.picked} frames have a camera"
+    print(f"{o.output}: {registered}; contact_sheet.png, cameras.png{' (made before)' if made.made_before else ''}")
+    print(f"next: python apps/train.py --data {o.output}")
+
+
+def cli(args: list[str] | None = None) -> int:
+    return run(main, args)
+
+
+if __name__ == "__main__":
+    sys.exit(cli())

@@ -1,0 +1,233 @@
+"""Features of the picked frames and what of them agrees between frames, in COLMAP's database. Interrupted work goes on.
+
+pycolmap finds the features (SIFT) and the geometry of two views. Descriptors are compared here, all with all: they are
+bytes, whose products are exact in float32, so that no bit depends on the device or on the number of threads, as it does
+with the search trees of COLMAP's own matcher on CPUs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from ..errors import UserError
+from .source import read_rgb
+
+Tensor = torch.Tensor
+
+CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+Matching = Literal["auto", "sequential", "exhaustive"]
+RATIO = 0.8
+"""Largest ratio of the angles to the best and the second best descriptor (Lowe 2004)."""
+ANGLE = 0.7
+"""Largest angle between descriptors that match, radians."""
+UNIT = 512.0
+"""Length of a descriptor of bytes."""
+EXHAUSTIVE_VIDEO = 40
+"""Up to so many frames of a video are compared each with each ..."""
+EXHAUSTIVE_FOLDER = 120
+"""... and up to so many images of a folder, which need not be in order."""
+FOLLOWING = 8
+"""Frames that a frame is compared with; then those 16, 32, 64 ... later ..."""
+LOOP = 10
+"""... and every tenth with every tenth: the camera may come back."""
+INITIAL_FOCAL = 1.2
+"""Focal length over the longer side, where nobody knows: 45 degrees."""
+
+
+class Shots(NamedTuple):
+    """What features are taken from."""
+
+    folder: Path
+    """Of the frames."""
+    names: list[str]
+    """Files in the folder, in order of time; all of one size and one camera."""
+    masks: Path | None
+    """Folder of masks of the same names, black where something moves."""
+
+
+@contextmanager
+def quiet() -> Iterator[Any]:
+    """pycolmap without its log.
+
+    Raises:
+        UserError: it is too old.
+    """
+    import pycolmap
+
+    if not hasattr(pycolmap, "FeatureExtractor"):
+        raise UserError(f"pycolmap {pycolmap.__version__} is too old for capture; pip install 'pycolmap>=4.1'")
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    try:
+        yield pycolmap
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def begin(database: Path, shots: Shots, model: CameraModel, focal: float | None) -> None:
+    """A database of the frames, with one camera for all, unless it is there.
+
+    Args:
+        focal: in pixels, where it is known.
+    """
+    with quiet() as pycolmap:
+        with pycolmap.Database.open(database) as there:
+            if there.num_images():
+                return
+        options = pycolmap.ImageReaderOptions(camera_model=model, default_focal_length_factor=INITIAL_FOCAL)
+        if focal is not None:
+            height, width = read_rgb(shots.folder / shots.names[0]).shape[:2]
+            camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
+            options.camera_params = ",".join(repr(float(value)) for value in camera.params)
+        pycolmap.import_images(
+            database, shots.folder, pycolmap.CameraMode.SINGLE, image_names=shots.names, options=options
+        )
+
+
+def extract(database: Path, shots: Shots, most: int, done: Callable[[], object]) -> None:
+    """Features of every frame that has none yet, outside of its mask.
+
+    Args:
+        most: features a frame.
+        done: called after each frame.
+    """
+    with quiet() as pycolmap, pycolmap.Database.open(database) as there:
+        options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+        options.sift.max_num_features = most
+        extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+        for name in shots.names:
+            image = there.read_image_with_name(name).image_id
+            if not there.exists_keypoints(image):
+                gray = cv2.cvtColor(read_rgb(shots.folder / name), cv2.COLOR_RGB2GRAY)
+                keypoints, descriptors = extractor.extract_from_uint8_array(gray)
+                rows = pycolmap.keypoints_to_matrix(keypoints)
+                if shots.masks is not None and len(rows):
+                    kept = ~_masked(shots.masks / name, rows[:, :2])
+                    rows, descriptors.data = rows[kept], descriptors.data[kept]
+                there.write_descriptors(image, descriptors)
+                there.write_keypoints(image, rows)
+            done()
+
+
+def _masked(file: Path, pixels: np.ndarray) -> np.ndarray:
+    """[N] bool: which of the pixels [N, 2] the mask hides."""
+    mask = read_rgb(file)[..., 0] < 128
+    columns, rows = np.floor(pixels).astype(int).T
+    return mask[rows.clip(0, mask.shape[0] - 1), columns.clip(0, mask.shape[1] - 1)]
+
+
+def pairs(count: int, matching: Matching, video: bool) -> list[tuple[int, int]]:
+    """Which of ``count`` frames are compared, ascending."""
+    if matching == "auto":
+        matching = "exhaustive" if count <= (EXHAUSTIVE_VIDEO if video else EXHAUSTIVE_FOLDER) else "sequential"
+    if matching == "exhaustive":
+        return [(i, j) for i in range(count) for j in range(i + 1, count)]
+    steps = [*range(1, FOLLOWING + 1)]
+    while 2 * steps[-1] < count:
+        steps.append(2 * steps[-1])
+    found = {(i, i + step) for i in range(count) for step in steps if i + step < count}
+    found |= {(i, j) for i in range(0, count, LOOP) for j in range(i + LOOP, count, LOOP)}
+    return sorted(found)
+
+
+def match(
+    database: Path, shots: Shots, chosen: Sequence[tuple[int, int]], seed: int, device: str, done: Callable[..., object]
+) -> None:
+    """Matches of every pair of frames that has none yet, and the geometry that they agree with.
+
+    Args:
+        chosen: numbers of frames.
+        device: where descriptors are compared.
+        done: called after each pair.
+    """
+    kept: dict[int, Tensor] = {}
+    with quiet() as pycolmap, pycolmap.Database.open(database) as there:
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = seed
+        images = [there.read_image_with_name(name) for name in shots.names]
+        points = [there.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
+        camera = there.read_camera(images[0].camera_id)
+        for a, b in chosen:
+            one, two = images[a].image_id, images[b].image_id
+            if not there.exists_two_view_geometry(one, two):
+                kept = {k: v for k, v in kept.items() if k >= a}  # ascending pairs do not go back
+                for k in (a, b):
+                    if k not in kept:
+                        kept[k] = torch.from_numpy(there.read_descriptors(images[k].image_id).data.copy()).to(device)
+                found = nearest_mutual(kept[a], kept[b])
+                if not there.exists_matches(one, two):
+                    there.write_matches(one, two, found)
+                geometry = pycolmap.estimate_two_view_geometry(camera, points[a], camera, points[b], found, options)
+                there.write_two_view_geometry(one, two, geometry)
+            done()
+
+
+def forget(database: Path) -> None:
+    """Remove all matches; features stay."""
+    with quiet() as pycolmap, pycolmap.Database.open(database) as there:
+        there.clear_matches()
+        there.clear_two_view_geometries()
+
+
+def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
+    """[M, 2] uint32: descriptors [N, 128] uint8 of two frames that are each other's nearest, clearly so."""
+    if len(one) < 2 or len(two) < 2:
+        return np.zeros((0, 2), np.uint32)
+    cosines = (one.float() @ two.float().T) / UNIT**2
+    forth, there = _distinct(cosines)
+    back, here = _distinct(cosines.T)
+    mutual = forth & back[there] & (here[there] == torch.arange(len(one), device=one.device))
+    chosen = mutual.nonzero()[:, 0]
+    return torch.stack([chosen, there[chosen]], 1).cpu().numpy().astype(np.uint32)
+
+
+def _distinct(cosines: Tensor) -> tuple[Tensor, Tensor]:
+    """Of each row, whether its best is good and much better than the second best; and which it is."""
+    best, where = cosines.topk(2, dim=1)
+    angles = best.clamp(-1.0, 1.0).acos()
+    return (angles[:, 0] <= ANGLE) & (angles[:, 0] <= RATIO * angles[:, 1]), where[:, 0]
+
+
+class Links(NamedTuple):
+    """How much the frames have in common."""
+
+    features: int
+    """Median of a frame."""
+    inliers: int
+    """Median of the pairs of frames that follow each other: matches that agree with one geometry."""
+    linked: float
+    """Share of these pairs that agree at all."""
+    planar: float
+    """Share of all agreeing pairs for which one homography does: the camera turned without moving, or saw a plane."""
+
+
+def links(database: Path, shots: Shots) -> Links:
+    """Count what is in the database."""
+    with quiet() as pycolmap, pycolmap.Database.open(database) as there:
+        images = [there.read_image_with_name(name).image_id for name in shots.names]
+        features = [there.num_keypoints_for_image(image) for image in images]
+        found = [
+            there.read_two_view_geometry(a, b) if there.exists_two_view_geometry(a, b) else None
+            for a, b in pairwise(images)
+        ]
+        counts = [0 if pair is None else len(pair.inlier_matches) for pair in found]
+        flat = _configs(pycolmap, ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC"))
+        planar = [pair.config in flat for pair in there.read_two_view_geometries()[1] if len(pair.inlier_matches)]
+    return Links(
+        int(np.median(features)) if features else 0,
+        int(np.median(counts)) if counts else 0,
+        float(np.mean(np.array(counts) > 0)) if counts else 0.0,
+        float(np.mean(planar)) if planar else 0.0,
+    )
+
+
+def _configs(pycolmap: Any, names: Sequence[str]) -> set[int]:
+    return {int(pycolmap.TwoViewGeometryConfiguration.__members__[name]) for name in names}

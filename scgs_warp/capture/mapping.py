@@ -1,0 +1,115 @@
+"""Where the camera was: COLMAP's incremental mapping of matched frames, the largest of its models."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .features import Shots, quiet
+
+FEWEST_VIEWS = 3
+"""Frames that a point must be seen in ..."""
+LARGEST_ERROR = 2.0
+"""... and pixels by which its projections may miss on average."""
+
+
+class Solved(NamedTuple):
+    """A model of the scene at rest, in COLMAP's frame and scale, which mean nothing."""
+
+    model: str
+    """The camera's, COLMAP's name."""
+    params: tuple[float, ...]
+    width: int
+    height: int
+    places: list[int]
+    """Of the registered frames, ascending."""
+    viewmats: np.ndarray
+    """[V, 4, 4] world-to-camera, OpenCV."""
+    points: np.ndarray
+    """[P, 3] that several frames agree on."""
+    colors: np.ndarray
+    """[P, 3] uint8"""
+    error: float
+    """Mean distance of projections from features, pixels."""
+    arc: float
+    """Degrees: how far apart rays to a point are, at the median of all points."""
+
+
+def solve(database: Path, shots: Shots, folder: Path, seed: int, done: Callable[[], object]) -> int:
+    """Run the mapper, on one thread: sums over threads would differ from run to run. Its largest model goes to
+    ``folder``, unless there is none.
+
+    Args:
+        done: called after each frame that a model takes.
+
+    Returns:
+        Registered frames of that model; 0 without one.
+    """
+    attempts = folder.with_name(f"{folder.name}-attempts")
+    shutil.rmtree(attempts, ignore_errors=True)
+    attempts.mkdir(parents=True)
+    with quiet() as pycolmap:
+        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=3)
+        options.mapper.num_threads = 1
+        options.mapper.random_seed = seed
+        options.triangulation.random_seed = seed
+        pycolmap.set_random_seed(seed)
+        found = pycolmap.incremental_mapping(
+            database, shots.folder, attempts, options, next_image_callback=lambda: _ignore(done())
+        )
+        best = max(found.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+        if best is not None and best.num_reg_images():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            best.write_binary(folder)
+    shutil.rmtree(attempts, ignore_errors=True)
+    return 0 if best is None else best.num_reg_images()
+
+
+def _ignore(_: object) -> None:
+    """The mapper's callback must return nothing."""
+
+
+def read_solution(folder: Path, shots: Shots) -> Solved | None:
+    """The model that :func:`solve` left; None without one."""
+    if not (folder / "images.bin").is_file():
+        return None
+    with quiet() as pycolmap:
+        model = pycolmap.Reconstruction(folder)
+        place = {name: number for number, name in enumerate(shots.names)}
+        images = {place[image.name]: image for image in model.images.values() if image.has_pose}
+        places = sorted(images)
+        viewmats = np.tile(np.eye(4), (len(places), 1, 1))
+        for row, number in enumerate(places):
+            viewmats[row, :3] = images[number].cam_from_world().matrix()
+        camera = next(iter(model.cameras.values()))
+        points = [model.points3D[key] for key in sorted(model.points3D)]
+        kept = [p for p in points if p.track.length() >= FEWEST_VIEWS and p.error <= LARGEST_ERROR] or points
+        return Solved(
+            camera.model_name,
+            tuple(float(value) for value in camera.params),
+            camera.width,
+            camera.height,
+            places,
+            viewmats,
+            np.array([point.xyz for point in kept], np.float64).reshape(-1, 3),
+            np.array([point.color for point in kept], np.uint8).reshape(-1, 3),
+            float(model.compute_mean_reprojection_error()),
+            _arc(model, points),
+        )
+
+
+def _arc(model, points: list) -> float:
+    """Degrees between the first and the last camera that see a point, at the median."""
+    centres = {key: image.projection_center() for key, image in model.images.items() if image.has_pose}
+    angles = []
+    for point in points[:: max(1, len(points) // 2000)]:
+        seen = sorted(element.image_id for element in point.track.elements)
+        a, b = (centres[key] - point.xyz for key in (seen[0], seen[-1]))
+        cosine = a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-18)
+        angles.append(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return float(np.median(angles)) if angles else 0.0

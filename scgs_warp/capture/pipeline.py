@@ -1,0 +1,293 @@
+"""From a film to a folder that trains, stage by stage: frames, masks, features, matches, cameras, images."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import UserError
+from ..film import write_png
+from ..progress import progress
+from . import features, mapping, moving, picking, pictures, writing
+from .diagnosis import Outcome, notes, too_few
+from .features import CameraModel, Matching, Shots
+from .journal import Journal
+from .source import Source, Still, open_source, read_rgb
+
+FEWEST = 6
+"""Frames from which nothing can be learnt of a motion."""
+SHEET, CAMERAS = "contact_sheet.png", "cameras.png"
+VIDEO_FRAMES = 150
+
+Show = Callable[[int, str], AbstractContextManager[Any]]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to make of a film."""
+
+    source: Path
+    """A video, or a folder of images."""
+    frames: int | None = None
+    """At most; None: ``VIDEO_FRAMES`` of a video, all images of a folder."""
+    start: float | None = None
+    end: float | None = None
+    """Seconds of the video that are used."""
+    size: int = 1280
+    """Longer side of the images, pixels; smaller ones stay."""
+    masks: str = "auto"
+    """``auto``: what moves against the rest; ``none``; else a path of masks."""
+    matching: Matching = "auto"
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    fov: float | None = None
+    """Horizontal field of view, degrees, where it is known."""
+    features: int = 4096
+    """At most, of a frame."""
+    least: float = 0.5
+    """Share of the frames that must get a camera."""
+    seed: int = 0
+
+
+class Frames(NamedTuple):
+    """The picked ones."""
+
+    indices: list[int]
+    """Places in the video."""
+    seconds: list[float]
+    names: list[str]
+    """Of the images in a folder that was given; empty for a video."""
+    span: tuple[float, float]
+    """Seconds of the video that become times 0 and 1."""
+    size: tuple[int, int]
+    """(width, height)"""
+    seen: int
+    """Frames that were looked at."""
+    blurred: int
+    alike: int
+
+    @property
+    def files(self) -> list[str]:
+        return [f"{moving.frame_name(index)}.png" for index in self.indices]
+
+
+class Captured(NamedTuple):
+    outcome: Outcome
+    lines: list[str]
+    """What was found, for the user."""
+    made_before: bool
+
+
+def check(request: Request) -> None:
+    """Refuse what cannot work.
+
+    Raises:
+        UserError: naming the option, its value and the remedy.
+    """
+    if request.frames is not None and request.frames < FEWEST:
+        raise UserError(f"--frames {request.frames}: give at least {FEWEST}")
+    if not 64 <= request.size <= 8192:
+        raise UserError(f"--size {request.size}: give 64 to 8192 pixels")
+    if request.fov is not None and not 5.0 <= request.fov <= 170.0:
+        raise UserError(f"--fov {request.fov:g}: give 5 to 170 degrees")
+    if not 64 <= request.features <= 32768:
+        raise UserError(f"--features {request.features}: give 64 to 32768")
+    if not 0.0 <= request.least <= 1.0:
+        raise UserError(f"--least {request.least:g}: give a share from 0 to 1")
+    start, end = request.start or 0.0, math.inf if request.end is None else request.end
+    if not 0.0 <= start < end:
+        raise UserError(f"--start {start:g} --end {end:g}: give two seconds of the video, the earlier one as --start")
+    if not 0 <= request.seed < 2**31:
+        raise UserError(f"--seed {request.seed}: give 0 or more")
+
+
+def capture(request: Request, folder: Path, *, device: str = "cpu", show: Show = progress) -> Captured:
+    """Make the data set in ``folder``, or go on with what an interrupted attempt has left there.
+
+    Args:
+        device: where descriptors are compared.
+        show: ``show(total, text)`` is a context that shows progress; its value has ``advance()``.
+
+    Raises:
+        UserError: the source, the masks or an option cannot be used, or too few frames got a camera.
+    """
+    check(request)
+    source = open_source(request.source)
+    if request.masks not in ("auto", "none"):
+        open_source(Path(request.masks))
+    journal = Journal(folder, source.digest())
+    before = journal.finished
+    journal.start()
+    frames = _frames(request, source, journal, show)
+    _enough(request, frames)
+    shots = _masks(request, source, frames, journal, show)
+    outcome, solved = _solve(request, source, frames, shots, journal, device, show)
+    lines = _lines(frames, outcome)
+    if not before:
+        _draw_sheet(folder / SHEET, frames, shots, solved, source.video)
+    if solved is None or outcome.registered < max(request.least * len(frames.indices), 3):
+        raise UserError(too_few(str(folder), outcome))
+    if not before:
+        _write(folder, frames, shots, solved, show)
+    return Captured(outcome, [*lines, *notes(outcome)], before)
+
+
+def _enough(request: Request, frames: Frames) -> None:
+    if len(frames.indices) >= FEWEST:
+        return
+    if frames.seen < FEWEST:
+        raise UserError(f"{request.source}: {frames.seen} frames are too few; film a few seconds, or give more images")
+    raise UserError(
+        f"{request.source}: {len(frames.indices)} of {frames.seen} frames are neither blurred nor alike "
+        f"({frames.blurred} blurred, {frames.alike} alike); hold the camera more steadily and walk with it"
+    )
+
+
+def _frames(request: Request, source: Source, journal: Journal, show: Show) -> Frames:
+    """Pick frames and write them."""
+    place = journal.work / "frames"
+
+    def make() -> dict[str, Any]:
+        chosen = _choose(request, source, show)
+        wanted = dict.fromkeys(chosen.indices)
+        place.mkdir(exist_ok=True)
+        size, names = (0, 0), []
+        with show(len(wanted), "writing frames") as bar:
+            for still in _until(source.frames(request.size), max(wanted, default=-1)):
+                if still.index in wanted:
+                    write_png(place / f"{moving.frame_name(still.index)}.png", still.image)
+                    size = still.image.shape[1], still.image.shape[0]
+                    names.append(still.name)
+                    bar.advance()
+        return chosen._replace(size=size, names=names)._asdict()
+
+    settings = {key: getattr(request, key) for key in ("frames", "start", "end", "size")}
+    found = journal.stage("frames", settings, make, lambda: shutil.rmtree(place, ignore_errors=True))
+    return Frames(**{**found, "span": tuple(found["span"]), "size": tuple(found["size"])})
+
+
+def _until(stills: Iterator[Still], last: int) -> Iterator[Still]:
+    return takewhile(lambda still: still.index <= last, stills)
+
+
+def _choose(request: Request, source: Source, show: Show) -> Frames:
+    """Which frames to take; of a folder, all of them unless a number is given."""
+    start, end = request.start or 0.0, math.inf if request.end is None else request.end
+    with show(source.count, "looking at frames") as bar:
+        within = (
+            still
+            for still in takewhile(lambda still: still.seconds <= end or not source.video, _shown(source, bar))
+            if still.seconds >= start or not source.video
+        )
+        found = picking.measure(within)
+    if not len(found.index):
+        raise UserError(f"--start {start:g}: {source.path} ends before; give a second of the video")
+    if source.video or request.frames is not None:
+        picked = picking.pick(found, request.frames or VIDEO_FRAMES)
+    else:
+        picked = picking.Picked(list(range(len(found.index))), 0, 0)
+    seconds = found.seconds[picked.places].tolist()
+    span = (float(found.seconds[0]), float(found.seconds[-1]))
+    indices = found.index[picked.places].tolist()
+    return Frames(indices, seconds, [], span, (0, 0), len(found.index), picked.blurred, picked.alike)
+
+
+def _shown(source: Source, bar: Any) -> Iterator[Still]:
+    for still in source.frames(picking.LOOK_SIDE):
+        yield still
+        bar.advance()
+
+
+def _masks(request: Request, source: Source, frames: Frames, journal: Journal, show: Show) -> Shots:
+    """Write masks, if there are to be any."""
+    folder, place = journal.work / "frames", journal.work / "masks"
+    files = frames.files
+    if request.masks == "none":
+        journal.stage("masks", "none", dict, lambda: shutil.rmtree(place, ignore_errors=True))
+        return Shots(folder, files, None)
+    path = Path(request.masks)
+
+    def make() -> dict[str, Any]:
+        place.mkdir(exist_ok=True)
+        with show(len(files), "finding what moves" if request.masks == "auto" else "reading masks") as bar:
+            if request.masks == "auto":
+                found = moving.consensus(lambda k: read_rgb(folder / files[k]), len(files), bar.advance)
+            else:
+                found = moving.given(path, source, frames.indices, frames.names, frames.size)
+                bar.advance(len(files))
+        for name, mask in zip(files, found):
+            write_png(place / name, np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, 2))
+        return {"share": float(np.mean([mask.mean() for mask in found]))}
+
+    kind = "auto" if request.masks == "auto" else open_source(path).digest()
+    journal.stage("masks", kind, make, lambda: shutil.rmtree(place, ignore_errors=True))
+    return Shots(folder, files, place)
+
+
+def _solve(
+    request: Request,
+    source: Source,
+    frames: Frames,
+    shots: Shots,
+    journal: Journal,
+    device: str,
+    show: Show,
+) -> tuple[Outcome, mapping.Solved | None]:
+    """Features, matches, cameras."""
+    database, model = journal.work / "database.db", journal.work / "model"
+    count = len(shots.names)
+    focal = None if request.fov is None else 0.5 * frames.size[0] / math.tan(math.radians(request.fov) / 2)
+    chosen = features.pairs(count, request.matching, source.video)
+
+    def find() -> None:
+        features.begin(database, shots, request.camera_model, focal)
+        with show(count, "features") as bar:
+            features.extract(database, shots, request.features, bar.advance)
+
+    def compare() -> None:
+        with show(len(chosen), "matching") as bar:
+            features.match(database, shots, chosen, request.seed, device, bar.advance)
+
+    def place() -> int:
+        with show(count, "cameras") as bar:
+            return mapping.solve(database, shots, model, request.seed, lambda: bar.done < count and bar.advance())
+
+    settings = [request.camera_model, request.fov, request.features]
+    journal.stage("features", settings, find, lambda: database.unlink(missing_ok=True))
+    journal.stage("matches", [request.matching, request.seed], compare, lambda: features.forget(database))
+    journal.stage("cameras", request.seed, place, lambda: shutil.rmtree(model, ignore_errors=True))
+    solved = mapping.read_solution(model, shots)
+    masked = 0.0 if shots.masks is None else float(journal.result("masks")["share"])
+    registered, arc = (len(solved.places), solved.arc) if solved else (0, 0.0)
+    return Outcome(count, registered, arc, features.links(database, shots), masked), solved
+
+
+def _lines(frames: Frames, outcome: Outcome) -> list[str]:
+    left_out = f" ({frames.blurred} blurred, {frames.alike} alike)" if frames.blurred or frames.alike else ""
+    return [
+        f"{outcome.picked} of {frames.seen} frames picked{left_out}, {frames.size[0]} x {frames.size[1]}; "
+        f"{100 * outcome.masked:.0f} % of their pixels move; {outcome.links.features} features a frame",
+    ]
+
+
+def _draw_sheet(path: Path, frames: Frames, shots: Shots, solved: mapping.Solved | None, video: bool) -> None:
+    def load(k: int) -> tuple[np.ndarray, np.ndarray | None]:
+        mask = None if shots.masks is None else read_rgb(shots.masks / shots.names[k])[..., 0] < 128
+        return read_rgb(shots.folder / shots.names[k]), mask
+
+    pictures.sheet(path, load, frames.seconds, set(solved.places if solved else ()), video)
+
+
+def _write(folder: Path, frames: Frames, shots: Shots, solved: mapping.Solved, show: Show) -> None:
+    with show(len(solved.places), "undistorting") as bar:
+        pinhole = writing.undistort(shots, solved, folder, bar.advance)
+    scene = writing.scene_of(shots, solved, pinhole, frames.seconds, frames.span)
+    pictures.cameras(folder / CAMERAS, scene)
+    writing.write_scene(folder, scene)

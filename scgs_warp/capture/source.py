@@ -1,0 +1,212 @@
+"""What was filmed, frame by frame: a video through PyAV, or a folder of images. Upright, with square pixels."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+
+from ..data.files import natural, size_text
+from ..errors import UserError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+DIGEST_BYTES = 1 << 20
+"""Of the beginning and the end of a file, which tell it from others; videos are large."""
+
+
+class Still(NamedTuple):
+    """One frame."""
+
+    index: int
+    """Its place in the video, or in the order of names; from 0."""
+    seconds: float
+    """Since the first frame; of a folder: its place."""
+    image: np.ndarray
+    """[H, W, 3] uint8 RGB"""
+    name: str
+    """Of the image's file; of a video: empty."""
+
+
+class Source(Protocol):
+    """Something that was filmed."""
+
+    path: Path
+    video: bool
+    """Whether frames follow each other in time as they were filmed; else someone chose them."""
+    count: int
+    """Frames, as the file says before it is decoded; may be wrong."""
+
+    def frames(self, longest: int) -> Iterator[Still]:
+        """All frames in order. ``longest``: images are made smaller until their longer side is this, or kept.
+
+        Raises:
+            UserError: one of them cannot be decoded.
+        """
+        ...
+
+    def digest(self) -> str:
+        """Tells this source from others."""
+        ...
+
+
+def open_source(path: Path) -> Source:
+    """The video, or the folder of images, at ``path``.
+
+    Raises:
+        UserError: there is none, or it cannot be read.
+    """
+    if path.is_dir():
+        return Folder(path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file or folder; give a video, or a folder of images")
+    return Video(path)
+
+
+class Video:
+    """A file that ffmpeg's libraries decode."""
+
+    video = True
+
+    def __init__(self, path: Path) -> None:
+        """
+        Raises:
+            UserError: it is no video.
+        """
+        self.path = path
+        with self._opened() as container:
+            stream = container.streams.video[0]
+            rate = float(stream.average_rate or 30)
+            seconds = float(container.duration or 0) / 1e6
+            self.count = int(stream.frames) or max(1, round(seconds * rate))
+            self.rate = rate
+
+    def _opened(self) -> Any:
+        import av
+        from av.error import FFmpegError
+
+        try:
+            container = av.open(str(self.path))
+        except (FFmpegError, OSError) as error:
+            reason = getattr(error, "strerror", None) or type(error).__name__
+            raise UserError(
+                f"{self.path}: is no video that can be decoded ({reason}); save it as .mp4, or give a folder of images"
+            ) from None
+        if not container.streams.video:
+            container.close()
+            raise UserError(f"{self.path}: holds no pictures; give a video, or a folder of images")
+        return container
+
+    def frames(self, longest: int) -> Iterator[Still]:
+        from av.error import FFmpegError
+
+        with self._opened() as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            shape = float(stream.sample_aspect_ratio or 1)
+            first, index = None, 0
+            for packet in container.demux(stream):
+                try:
+                    decoded = packet.decode()
+                except FFmpegError:  # a damaged packet; what follows may be whole
+                    continue
+                for frame in decoded:
+                    seconds = float(frame.time) if frame.time is not None else index / self.rate
+                    first = seconds if first is None else first
+                    yield Still(index, seconds - first, _picture(frame, longest, shape), "")
+                    index += 1
+        if index == 0:
+            raise UserError(f"{self.path}: no frame can be decoded; save it as .mp4, or give a folder of images")
+
+    def digest(self) -> str:
+        return _digest([self.path])
+
+
+def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
+    """A decoded frame as it is to be shown: pixels, ``shape`` times as wide as high, made square; turned as the phone
+    was held."""
+    width, height = frame.width * shape, frame.height
+    scale = min(1.0, longest / max(width, height))
+    image = frame.to_ndarray(format="rgb24")
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    if size != (frame.width, frame.height):
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return upright(image, getattr(frame, "rotation", 0) or 0)
+
+
+def upright(image: np.ndarray, degrees: float) -> np.ndarray:
+    """The image turned counter-clockwise by ``degrees``, to the nearest quarter."""
+    return np.ascontiguousarray(np.rot90(image, round(degrees / 90) % 4))
+
+
+class Folder:
+    """Images in the natural order of their names."""
+
+    video = False
+
+    def __init__(self, path: Path) -> None:
+        """
+        Raises:
+            UserError: it holds no images.
+        """
+        self.path = path
+        files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
+        self.files = sorted(files, key=lambda file: natural(file.name))
+        self.count = len(files)
+        if not files:
+            raise UserError(f"{path}: holds no images ({', '.join(SUFFIXES)}); give the folder that does, or a video")
+
+    def frames(self, longest: int) -> Iterator[Still]:
+        size = None
+        for index, file in enumerate(self.files):
+            image = read_rgb(file)
+            size = size or image.shape[1::-1]
+            if image.shape[1::-1] != size:
+                raise UserError(
+                    f"{file}: is {size_text(image.shape[1::-1])}, but {self.files[0].name} is {size_text(size)}; "
+                    "give images of one camera and one size"
+                )
+            yield Still(index, float(index), shrunk(image, longest), file.name)
+
+    def digest(self) -> str:
+        return _digest(self.files)
+
+
+def read_rgb(file: Path) -> np.ndarray:
+    """[H, W, 3] uint8 RGB, turned as its EXIF tags say; UserError where it is no image."""
+    try:
+        data = np.fromfile(file, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise UserError(f"{file}: is no image that decodes; save it again as PNG or JPEG, or take it out")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
+    """The image with its longer side at most ``longest``."""
+    scale = longest / max(image.shape[:2])
+    if scale >= 1:
+        return image
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _digest(files: list[Path]) -> str:
+    """Of sizes, and of both ends of each file; names and dates do not count."""
+    found = hashlib.sha256()
+    for file in files:
+        size = file.stat().st_size
+        found.update(f"{size},".encode())
+        with file.open("rb") as content:
+            found.update(content.read(DIGEST_BYTES))
+            if size > 2 * DIGEST_BYTES:
+                content.seek(size - DIGEST_BYTES)
+                found.update(content.read(DIGEST_BYTES))
+    return found.hexdigest()

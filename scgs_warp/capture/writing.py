@@ -1,0 +1,149 @@
+"""The folder that training takes: undistorted images, cameras and times in nerfstudio's layout, points."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ..data.files import held_out
+from ..data.transforms import OPENGL_TO_OPENCV
+from ..film import write_png
+from .features import Shots, quiet
+from .mapping import Solved
+from .similarity import upright
+from .source import read_rgb
+
+FILE = "transforms.json"
+POINTS = "points.ply"
+
+
+class Pinhole(NamedTuple):
+    """Of the undistorted images."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+class Scene(NamedTuple):
+    """What is written; world: z up."""
+
+    pinhole: Pinhole
+    viewmats: np.ndarray
+    """[V, 4, 4] world-to-camera, OpenCV."""
+    times: list[float]
+    """[0, 1]"""
+    seconds: list[float]
+    """In the video."""
+    names: list[str]
+    """Files in ``images``."""
+    points: np.ndarray
+    """[P, 3]"""
+    colors: np.ndarray
+    """[P, 3] uint8"""
+
+
+def pinhole_of(solved: Solved) -> tuple[Pinhole, np.ndarray, np.ndarray]:
+    """The largest pinhole image without empty pixels inside a distorted one, and where its pixels lie there:
+    x [H, W], y [H, W] float32, as OpenCV counts."""
+    with quiet() as pycolmap:
+        camera = pycolmap.Camera(model=solved.model, width=solved.width, height=solved.height)
+        camera.params = list(solved.params)
+        flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+        fx, fy, cx, cy = (float(value) for value in flat.params)
+        x, y = np.meshgrid((np.arange(flat.width) + 0.5 - cx) / fx, (np.arange(flat.height) + 0.5 - cy) / fy)
+        rays = np.stack([x, y, np.ones_like(x)], 2).reshape(-1, 3)
+        pixels = np.asarray(camera.img_from_cam(rays)).reshape(*x.shape, 2).astype(np.float32) - 0.5
+    return Pinhole(fx, fy, cx, cy, flat.width, flat.height), pixels[..., 0].copy(), pixels[..., 1].copy()
+
+
+def undistort(shots: Shots, solved: Solved, folder: Path, done: Callable[[], object]) -> Pinhole:
+    """Write ``images/`` and, where there are any, ``masks/`` of the registered frames.
+
+    Args:
+        done: called after each frame.
+    """
+    pinhole, x, y = pinhole_of(solved)
+    (folder / "images").mkdir(exist_ok=True)
+    if shots.masks is not None:
+        (folder / "masks").mkdir(exist_ok=True)
+    for place in solved.places:
+        name = shots.names[place]
+        image = cv2.remap(read_rgb(shots.folder / name), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        write_png(folder / "images" / name, image)
+        if shots.masks is not None:
+            mask = read_rgb(shots.masks / name)
+            moved = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+            write_png(folder / "masks" / name, moved)
+        done()
+    return pinhole
+
+
+def scene_of(
+    shots: Shots, solved: Solved, pinhole: Pinhole, seconds: Sequence[float], span: tuple[float, float]
+) -> Scene:
+    """Cameras and points upright, times from 0 to 1 over ``span`` (seconds of the video)."""
+    moved = upright(solved.viewmats, solved.points)
+    length = max(span[1] - span[0], 1e-9)
+    chosen = [seconds[place] for place in solved.places]
+    return Scene(
+        pinhole,
+        moved.viewmats(solved.viewmats),
+        [min(max((second - span[0]) / length, 0.0), 1.0) for second in chosen],
+        chosen,
+        [shots.names[place] for place in solved.places],
+        moved.points(solved.points),
+        solved.colors,
+    )
+
+
+def write_scene(folder: Path, scene: Scene) -> None:
+    """``points.ply`` and, last, ``transforms.json``: where it is, the folder is complete."""
+    write_points(folder / POINTS, scene.points, scene.colors)
+    inside = [f"images/{name}" for name in scene.names]
+    lists = {split: held_out(folder, range(len(inside)), split) for split in ("train", "test")}
+    frames = [
+        {
+            "file_path": file,
+            "transform_matrix": (np.linalg.inv(viewmat) @ OPENGL_TO_OPENCV).tolist(),
+            "time": time,
+            "seconds": second,
+        }
+        for file, viewmat, time, second in zip(inside, scene.viewmats, scene.times, scene.seconds)
+    ]
+    p = scene.pinhole
+    content = {
+        "camera_model": "PINHOLE",
+        **{"w": p.width, "h": p.height, "fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy},
+        "ply_file_path": POINTS,
+        "frames": frames,
+        **{f"{split}_filenames": [inside[index] for index in chosen] for split, chosen in lists.items()},
+    }
+    write_text(folder / FILE, json.dumps(content, indent=1) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """All of it or nothing."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)
+
+
+def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    """A binary PLY file of points [P, 3] and colours [P, 3] uint8."""
+    from plyfile import PlyData, PlyElement
+
+    fields = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+    rows = np.empty(len(points), fields)
+    for k, (name, _) in enumerate(fields):
+        rows[name] = (points if k < 3 else colors)[:, k % 3]
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
