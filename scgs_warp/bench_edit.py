@@ -60,6 +60,7 @@ def hold(model: Model) -> None:
     for end in reversed(ends):
         model.select(session.ring([end], 1))
         model.grab(STAY)
+        model.drag(STAY)  # what was not moved would be let go of
         model.release()
     model.grab(STAY)
 

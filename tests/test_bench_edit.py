@@ -5,9 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from edit_scenes import bar_scene
 from test_bench import TINY, app, check_rows, rows_of
 
 from scgs_warp import bench_edit
+from scgs_warp.edit import EditSession
+from scgs_warp.editor.model import Model
 from scgs_warp.editor.picture import Picture
 
 pytestmark = pytest.mark.usefixtures("all_threads")
@@ -20,6 +23,13 @@ def test_a_drag_in_the_editor(tmp_path, device, capsys):
     drawn = ["project", "harmonics", "bin", "composite"]
     assert stages == ["solve", "skin", *drawn, "bytes", "encode", "rest"], "every stage is in use"
     assert "edit/drag" in capsys.readouterr().out
+
+
+def test_three_handles_are_held_and_one_is_in_hand():
+    model = Model(EditSession(bar_scene()))
+    bench_edit.hold(model)
+    assert len(model.session.edit.handles) == bench_edit.HANDLES == 3
+    assert model.dragging and model.active == model.session.edit.handles[-1].name
 
 
 def test_what_cannot_be_dragged_is_said(tmp_path, capsys):
