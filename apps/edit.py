@@ -103,9 +103,9 @@ def open_browser(session: EditSession, options: Options) -> None:
         UserError: it cannot be shown here.
     """
     import secrets
-    import threading
 
     from scgs_warp.editor import Editor, Proxy
+    from scgs_warp.train import stop_signals
 
     source = options.run if options.ply is None else options.ply.parent
     assert source is not None
@@ -123,8 +123,8 @@ def open_browser(session: EditSession, options: Options) -> None:
             print(
                 "what is sent is not encrypted: outside a network that you trust, forward the port over SSH", flush=True
             )
-        threading.Event().wait()
-    except KeyboardInterrupt:
+        with stop_signals() as stop:  # also where a shell has background processes ignore Ctrl-C
+            stop.wait()
         print("the editor has ended", flush=True)
     finally:
         if proxy is not None:

@@ -26,7 +26,7 @@ from scgs_warp.types import Camera
 pytest.importorskip("viser", reason="the package viser is not installed")
 
 SIZE = {"width": 1000, "height": 640}
-PATIENCE = 60.0
+PATIENCE = 120.0
 
 
 def until(condition: Callable[[], Any], seconds: float = PATIENCE) -> None:
@@ -52,6 +52,7 @@ class Window:
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.on("console", lambda m: self.problems.append(m.text) if m.type == "error" else None)
         self.page.goto(url)
+        self.page.set_default_timeout(1e3 * PATIENCE)
         self.page.get_by_text("Undo", exact=True).wait_for(timeout=1e3 * PATIENCE)
         until(lambda: len(editor.views))
         still(editor)
