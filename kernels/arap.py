@@ -5,6 +5,18 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def largest_entry(S: wp.mat33d):
+    """The largest absolute value; 0 where an entry is not finite, as no rotation can be had of such a matrix either."""
+    largest = wp.float64(0.0)
+    for a in range(3):
+        for b in range(3):
+            if not wp.isfinite(S[a, b]):
+                return wp.float64(0.0)
+            largest = wp.max(largest, wp.abs(S[a, b]))
+    return largest
+
+
 @wp.kernel
 def local_rotations(
     first: int,
@@ -28,15 +40,9 @@ def local_rotations(
             edge = wp.vec3d(rest_in[n]) - wp.vec3d(rest_in[i])
             posed = wp.vec3d(posed_in[n]) - wp.vec3d(posed_in[i])
             S += wp.float64(weights_in[i, j]) * wp.outer(posed, edge)
-    largest = wp.float64(0.0)
-    bad = int(0)
-    for a in range(3):
-        for b in range(3):
-            largest = wp.max(largest, wp.abs(S[a, b]))
-            if not wp.isfinite(S[a, b]):
-                bad = 1
+    largest = largest_entry(S)
     R = wp.identity(n=3, dtype=wp.float64)
-    if bad == 0 and largest > wp.float64(1.0e-60):
+    if largest > wp.float64(1.0e-60):
         U, _sigma, V = wp.svd3(S / largest)
         # singular values come in descending order: a reflection is undone along the least of them
         if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):

@@ -6,6 +6,8 @@ In float64 throughout: a few hundred points, bent by hand, whose result is compa
 
 import warp as wp
 
+from .arap import largest_entry
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -37,15 +39,9 @@ def turn_nodes(
         S += weights_in[at] * (wp.outer(posed, edge) + smoothness * rotations_in[j])
     if leaning_in[i] > wp.float64(0.0):
         S += leaning_in[i] * asked_in[i]
-    largest = wp.float64(0.0)
-    bad = int(0)
-    for a in range(3):
-        for b in range(3):
-            largest = wp.max(largest, wp.abs(S[a, b]))
-            if not wp.isfinite(S[a, b]):
-                bad = 1
+    largest = largest_entry(S)
     R = rotations_in[i]
-    if bad == 0 and largest > wp.float64(1.0e-60):
+    if largest > wp.float64(1.0e-60):
         U, sigma, V = wp.svd3(S / largest)
         # singular values come in descending order: a reflection is undone along the least of them
         if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):

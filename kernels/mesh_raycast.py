@@ -7,6 +7,8 @@ in stored values, as splats are composited.
 
 import warp as wp
 
+from .rays import eye_of, eye_of_view, in_view, ray_through
+
 wp.set_module_options({"enable_backward": False})
 
 REPEAT = wp.constant(0)
@@ -170,18 +172,15 @@ def raycast_mesh(
     i = first + wp.tid()
     y = top + i // columns
     x = left + i % columns
-    eye = wp.vec3(camera_in[0, 3], camera_in[1, 3], camera_in[2, 3])
-    right = wp.vec3(camera_in[0, 0], camera_in[1, 0], camera_in[2, 0])
-    down = wp.vec3(camera_in[0, 1], camera_in[1, 1], camera_in[2, 1])
-    forward = wp.vec3(camera_in[0, 2], camera_in[1, 2], camera_in[2, 2])
+    eye = eye_of(camera_in)
     step = 1.0 / float(samples)
     total = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for s in range(samples * samples):
         sy = s // samples
         sx = s % samples
-        v = (float(y) + (float(sy) + 0.5) * step - K_in[1, 2]) / K_in[1, 1]
-        u = (float(x) + (float(sx) + 0.5) * step - K_in[0, 2]) / K_in[0, 0]
-        direction = wp.normalize(right * u + down * v + forward)
+        direction = ray_through(
+            camera_in, K_in, float(x) + (float(sx) + 0.5) * step, float(y) + (float(sy) + 0.5) * step
+        )
         travelled = float(0.0)
         passing = float(1.0)
         layer = int(0)
@@ -245,21 +244,10 @@ def visible_on_mesh(
     """Whether a camera sees a surface point: inside the frustum, and something stops the ray there, not before."""
     i = first + wp.tid()
     point = points_in[i]
-    rotation = wp.matrix_from_rows(
-        wp.vec3(viewmat_in[0, 0], viewmat_in[0, 1], viewmat_in[0, 2]),
-        wp.vec3(viewmat_in[1, 0], viewmat_in[1, 1], viewmat_in[1, 2]),
-        wp.vec3(viewmat_in[2, 0], viewmat_in[2, 1], viewmat_in[2, 2]),
-    )
-    translation = wp.vec3(viewmat_in[0, 3], viewmat_in[1, 3], viewmat_in[2, 3])
-    q = rotation * point + translation
     visible_out[i] = 0
-    if q[2] <= 0.0:
+    if not in_view(viewmat_in, K_in, width, height, point):
         return
-    x = K_in[0, 0] * q[0] / q[2] + K_in[0, 2]
-    y = K_in[1, 1] * q[1] / q[2] + K_in[1, 2]
-    if x < 0.0 or y < 0.0 or x >= float(width) or y >= float(height):
-        return
-    eye = -(wp.transpose(rotation) * translation)
+    eye = eye_of_view(viewmat_in)
     distance = wp.length(point - eye)
     direction = (point - eye) / distance
     travelled = float(0.0)

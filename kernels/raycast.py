@@ -7,6 +7,8 @@ figure in ``scgs_warp/data/synthetic_figure.py``.
 
 import warp as wp
 
+from .rays import eye_of, eye_of_view, in_view, ray_through
+
 wp.set_module_options({"enable_backward": False})
 
 STRIPES = wp.constant(0)
@@ -243,18 +245,15 @@ def raycast(
     i = first + wp.tid()
     y = top + i // columns
     x = left + i % columns
-    origin = wp.vec3(camera_in[0, 3], camera_in[1, 3], camera_in[2, 3])
-    right = wp.vec3(camera_in[0, 0], camera_in[1, 0], camera_in[2, 0])
-    down = wp.vec3(camera_in[0, 1], camera_in[1, 1], camera_in[2, 1])
-    forward = wp.vec3(camera_in[0, 2], camera_in[1, 2], camera_in[2, 2])
+    origin = eye_of(camera_in)
     step = 1.0 / float(samples)
     color = wp.vec3(0.0, 0.0, 0.0)
     hits = float(0.0)
     for sy in range(samples):
-        v = (float(y) + (float(sy) + 0.5) * step - K_in[1, 2]) / K_in[1, 1]
         for sx in range(samples):
-            u = (float(x) + (float(sx) + 0.5) * step - K_in[0, 2]) / K_in[0, 0]
-            direction = wp.normalize(right * u + down * v + forward)
+            direction = ray_through(
+                camera_in, K_in, float(x) + (float(sx) + 0.5) * step, float(y) + (float(sy) + 0.5) * step
+            )
             query = wp.mesh_query_ray(mesh, origin, direction, FAR)
             if query.result:
                 f = query.face
@@ -301,21 +300,11 @@ def visible(
     """Whether a camera sees a surface point: inside the frustum, and the first thing on the ray from the camera."""
     i = first + wp.tid()
     point = points_in[i]
-    rotation = wp.matrix_from_rows(
-        wp.vec3(viewmat_in[0, 0], viewmat_in[0, 1], viewmat_in[0, 2]),
-        wp.vec3(viewmat_in[1, 0], viewmat_in[1, 1], viewmat_in[1, 2]),
-        wp.vec3(viewmat_in[2, 0], viewmat_in[2, 1], viewmat_in[2, 2]),
-    )
-    translation = wp.vec3(viewmat_in[0, 3], viewmat_in[1, 3], viewmat_in[2, 3])
-    q = rotation * point + translation
     seen = int(0)
-    if q[2] > 0.0:
-        x = K_in[0, 0] * q[0] / q[2] + K_in[0, 2]
-        y = K_in[1, 1] * q[1] / q[2] + K_in[1, 2]
-        if x >= 0.0 and y >= 0.0 and x < float(width) and y < float(height):
-            origin = -(wp.transpose(rotation) * translation)
-            distance = wp.length(point - origin)
-            query = wp.mesh_query_ray(mesh, origin, (point - origin) / distance, distance + tolerance)
-            if query.result and query.t > distance - tolerance:
-                seen = 1
+    if in_view(viewmat_in, K_in, width, height, point):
+        origin = eye_of_view(viewmat_in)
+        distance = wp.length(point - origin)
+        query = wp.mesh_query_ray(mesh, origin, (point - origin) / distance, distance + tolerance)
+        if query.result and query.t > distance - tolerance:
+            seen = 1
     visible_out[i] = seen
