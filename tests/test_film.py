@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -131,3 +134,27 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path) -> None:
 def test_wrong_frames_raise(tmp_path: Path, frame: np.ndarray) -> None:
     with pytest.raises(ValueError, match="uint8"), film(tmp_path / "film.gif") as writer:
         writer.write(frame)
+
+
+FRESH_MEMORY = """
+import sys
+import numpy as np
+from scgs_warp.film import film
+y, x = np.mgrid[0:64, 0:64]
+with film(sys.argv[1], 8) as writer:
+    for k in range(8):
+        disc = np.hypot(x - 25 - 2 * k, y - 30) < 15
+        writer.write(np.stack([disc * (120 + 3 * ((x * y) % 7)), (x + y + k) % 200 * disc, 0 * x], -1).astype(np.uint8))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fills fresh memory through glibc")
+def test_the_same_frames_are_the_same_film_whatever_lay_in_memory(tmp_path):
+    """x264's macroblock tree read what it never wrote: the film's first picture then changed from run to run."""
+    films = []
+    for fill in ("1", "254"):
+        path = tmp_path / f"{fill}.mp4"
+        environ = {**os.environ, "MALLOC_PERTURB_": fill}
+        subprocess.run([sys.executable, "-c", FRESH_MEMORY, str(path)], env=environ, check=True)
+        films.append(path.read_bytes())
+    assert films[0] == films[1]
