@@ -140,11 +140,12 @@ FRESH_MEMORY = """
 import sys
 import numpy as np
 from scgs_warp.film import film
-y, x = np.mgrid[0:64, 0:64]
+y, x = np.mgrid[0:64, 0:95]
 with film(sys.argv[1], 8) as writer:
-    for k in range(8):
-        disc = np.hypot(x - 25 - 2 * k, y - 30) < 15
-        writer.write(np.stack([disc * (120 + 3 * ((x * y) % 7)), (x + y + k) % 200 * disc, 0 * x], -1).astype(np.uint8))
+    for k in range(4):
+        disc = np.hypot(x - 32 - 2 * k, y - 32) < 16
+        picture = np.stack([disc * (120 + 3 * ((x * y) % 7)), (x + y + k) % 200 * disc, x % 255], -1)
+        writer.write(picture.astype(np.uint8))
 """
 
 
