@@ -1,4 +1,4 @@
-"""The curves of a run for TensorBoard (extra ``tensorboard``): event files beside ``log.jsonl``, from the same entries."""
+"""A run's curves for TensorBoard (extra ``tensorboard``): event files beside ``log.jsonl``, of the same entries."""
 
 from __future__ import annotations
 

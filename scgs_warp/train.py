@@ -260,7 +260,7 @@ def fit(
         the scene after the last step.
 
     Raises:
-        UserError: a bad configuration, a checkpoint that does not fit, repeated non-finite losses, no package tensorboard.
+        UserError: a bad configuration, a checkpoint that does not fit, repeated non-finite losses, no TensorBoard.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
     """
     check(config)
