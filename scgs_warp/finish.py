@@ -73,7 +73,8 @@ def train_and_finish(
         data: folder of the data set; its train split is learnt, its test split measured.
         output: run directory.
         resume: continue the run in ``output``.
-        frames, lpips: as for :func:`finish`.
+        frames: length of the turntable; 0: none.
+        lpips: the perceptual distance, if it is to be measured.
         look: called with the training frames before training begins.
         tensorboard: also write event files for TensorBoard to ``output``.
 
