@@ -247,10 +247,11 @@ def fit(
     """Train a scene; the run directory holds a resumable checkpoint at any time.
 
     Args:
-        config: the complete configuration.
-        data: training frames.
+        config: the complete configuration: a ``config.preset``, and what ``config.with_steps`` and ``from_dict`` make
+            of it.
+        data: training frames, world units (``data.load``).
         output: run directory; made if needed.
-        device: where everything is computed.
+        device: where everything is computed, ``cpu`` or ``cuda``.
         test: held-out frames, looked at for the curve and the previews alone; nothing is selected by them.
         resume: continue from the checkpoint in ``output``, to the same bits as an uninterrupted run.
         settings: what to write to ``config.json``; default: the configuration.
