@@ -72,6 +72,7 @@ def test_every_public_name_is_in_the_api(site):
     found = {match.rsplit(".", 1)[-1] for match in re.findall(r'id="(scgs_warp[\w.]*)"', text)}
     assert set(scgs_warp.__all__) - {"__version__"} <= found
     assert {"EditSession", "load", "UserError", "TrainConfig", "look_at", "film"} <= found
+    assert not re.search(r":(class|func|meth):", text), "markup that is not rendered"
 
 
 def test_every_example_is_on_its_page(site):
