@@ -30,7 +30,7 @@ def main(output: Path = Path("ball.png"), count: int = 3000, size: int = 256) ->
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=1)
     means = directions.clone().requires_grad_()  # [N, 3] world
     quats = torch.randn(count, 4, generator=random).requires_grad_()  # [N, 4] wxyz, need not be unit
-    scales = torch.full((count, 3), 0.04).requires_grad_()  # [N, 3] standard deviations
+    scales = torch.tensor([0.06, 0.04, 0.02]).repeat(count, 1).requires_grad_()  # [N, 3] standard deviations
     opacities = torch.full((count,), 0.8).requires_grad_()  # [N]
     colors = (0.5 + 0.5 * directions).requires_grad_()  # [N, 3]
 

@@ -32,8 +32,8 @@ def main(
     """
     scene = scgs_warp.Scene.load(run)
     times = np.linspace(0.0, 1.0, moments)
-    solid = scene.gaussians_at(0.0).opacities > 0.3  # what is nearly transparent is no surface
-    chosen = torch.nonzero(solid)[:, 0]
+    opacities = scene.gaussians_at(0.0).opacities
+    chosen = torch.nonzero(opacities >= opacities.median())[:, 0]  # what is nearly transparent is no surface
     chosen = chosen[torch.linspace(0, len(chosen) - 1, min(points, len(chosen))).long()]
     tracks = np.stack([scene.gaussians_at(float(time)).means[chosen].numpy() for time in times])
     np.savez_compressed(output, times=times, tracks=tracks)

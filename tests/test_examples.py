@@ -28,7 +28,7 @@ QUICK: dict[str, list[str]] = {
     "02_render_at_time.py": ["--size", "48", "--times", "0", "1"],
     "03_slow_motion.py": ["--size", "32", "--fps", "4", "--output", "slow"],
     "04_edit_a_pose.py": ["--size", "64"],
-    "05_rasterization_like_gsplat.py": ["--size", "64", "--count", "500"],
+    "05_rasterization_like_gsplat.py": ["--size", "64", "--count", "2000"],
     "06_optimise_an_image.py": ["--size", "48", "--count", "300", "--steps", "60"],
     "07_follow_points.py": ["--points", "20", "--moments", "5"],
     "08_your_own_images.py": ["--frames", "5", "--size", "48"],
@@ -86,7 +86,9 @@ def edited(place: Path, said: str) -> None:
 
 def ball(place: Path, said: str) -> None:
     views = pixels(place / "ball.png")
-    assert views.shape == (64, 128, 3) and views[32, 32].max() > 0.3 and views[0, 0].max() == 0.0
+    assert views.shape == (64, 128, 3) and views[0, 0].max() == 0.0
+    left, right = views[28:36, 28:36].mean(axis=(0, 1)), views[28:36, 92:100].mean(axis=(0, 1))
+    assert left[0] > left[1] + 0.1 and right[1] > right[0] + 0.1, "the colour is the direction: red x, green y"
     norms = [float(number) for number in re.findall(r"norm (\S+)", said)]
     assert len(norms) == 4 and min(norms) > 0.0
     nearest, farthest = map(float, re.findall(r"depth (\S+) to (\S+)", said)[0])
