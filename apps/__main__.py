@@ -10,6 +10,11 @@ APPS = ("train", "evaluate", "view", "edit", "bench", "ablate", "synthesize", "c
 
 def main() -> int:
     arguments = sys.argv[1:]
+    if arguments[:1] == ["--version"]:
+        from scgs_warp import __version__
+
+        print(f"scgs-warp {__version__}")
+        return 0
     if not arguments or arguments[0] not in APPS:
         wanted = not arguments or arguments[0] in ("-h", "--help")
         print(

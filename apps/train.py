@@ -40,6 +40,8 @@ class Options(Settings, Place):
     """The same seed gives the same bits on the same machine."""
     resume: bool = False
     """Continue the run in --output."""
+    tensorboard: bool = False
+    """Also write curves and pictures for TensorBoard to the run directory: tensorboard --logdir runs."""
 
 
 def default_output(options: Options) -> Path:
@@ -60,14 +62,19 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.advice import advise, survey
     from scgs_warp.finish import summary, train_and_finish
     from scgs_warp.run_folder import refuse_existing
+    from scgs_warp.tensorboard import check_installed
 
+    if options.tensorboard:
+        check_installed()
     refuse_existing(output, options.resume)
     folder = options.data or (Path(named) if named else builtin_scene(device))
 
     def look(data: Dataset) -> None:
         print("\n".join(advise(survey(data), config, device)), flush=True)
 
-    metrics = train_and_finish(config, folder, output, device=device, resume=options.resume, look=look)
+    metrics = train_and_finish(
+        config, folder, output, device=device, resume=options.resume, look=look, tensorboard=options.tensorboard
+    )
     print(summary(metrics))
     print(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
 

@@ -176,7 +176,8 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
     """The viewmat of a camera at ``eye`` that sees ``target`` at its image's centre and ``up`` upwards.
 
     Args:
-        eye, target: [3] world.
+        eye: [3] world.
+        target: [3] world.
         up: [3] any length; if it points along the view, some other direction is taken.
 
     Returns:

@@ -65,6 +65,7 @@ def train_and_finish(
     frames: int = FILM_FRAMES,
     lpips: Lpips | None = None,
     look: Callable[[Dataset], None] | None = None,
+    tensorboard: bool = False,
 ) -> dict[str, Any]:
     """Load, train, evaluate: what ``apps/train.py`` does.
 
@@ -72,8 +73,10 @@ def train_and_finish(
         data: folder of the data set; its train split is learnt, its test split measured.
         output: run directory.
         resume: continue the run in ``output``.
-        frames, lpips: as for :func:`finish`.
+        frames: length of the turntable; 0: none.
+        lpips: the perceptual distance, if it is to be measured.
         look: called with the training frames before training begins.
+        tensorboard: also write event files for TensorBoard to ``output``.
 
     Returns:
         what ``metrics.json`` holds.
@@ -86,7 +89,14 @@ def train_and_finish(
     if look is not None:
         look(train)
     scene = fit(
-        config, train, output=output, device=device, test=test, resume=resume, settings=settings_of(config, data)
+        config,
+        train,
+        output=output,
+        device=device,
+        test=test,
+        resume=resume,
+        settings=settings_of(config, data),
+        tensorboard=tensorboard,
     )
     return finish(scene, test, output, frames=frames, lpips=lpips)
 

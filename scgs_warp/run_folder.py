@@ -19,6 +19,7 @@ from .errors import UserError
 from .metrics import psnr
 from .progress import Progress
 from .scene import Scene
+from .tensorboard import TensorBoard, check_installed
 
 if TYPE_CHECKING:
     from .train import StepResult
@@ -28,6 +29,8 @@ LOG_EVERY = 50
 PREVIEW_SECONDS = 15.0
 LOCK = ".lock"
 TEST_IMAGES = 4
+BOARD_IMAGES = 20
+"""Training pictures that a run shows in TensorBoard."""
 
 
 def read_seconds(folder: Path) -> float | None:
@@ -56,11 +59,26 @@ def refuse_existing(path: Path, resume: bool) -> None:
 class RunFolder:
     """Use as a context manager: holds a lock, so that two trainers cannot share one directory.
 
+    With ``tensorboard`` the log's entries, and a picture now and then, also go to event files.
+
     Raises:
-        UserError: not writable, in use, or there is a run already and ``resume`` was not asked for.
+        UserError: not writable, in use, or there is a run already and ``resume`` was not asked for; ``tensorboard``
+            without the package.
     """
 
-    def __init__(self, path: str | Path, config: TrainConfig, settings: dict[str, Any] | None, *, resume: bool) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        config: TrainConfig,
+        settings: dict[str, Any] | None,
+        *,
+        resume: bool,
+        tensorboard: bool = False,
+    ) -> None:
+        if tensorboard:
+            check_installed()
+        self.tensorboard = tensorboard
+        self._board: TensorBoard | None = None
         self.path = Path(path)
         self.settings = settings if settings is not None else to_dict(config)
         self.resume = resume
@@ -86,6 +104,8 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._board is not None:
+            self._board.close()
         os.close(self._lock_file)
 
     def _lock(self) -> None:
@@ -108,6 +128,7 @@ class RunFolder:
         write_atomically(self.path / "config.json", text.encode())
         log = self.path / "log.jsonl"
         kept: list[str] = []
+        entries: list[dict[str, Any]] = []
         if self.resume and log.is_file():
             for line in log.read_text(encoding="utf-8").splitlines():
                 try:
@@ -116,8 +137,11 @@ class RunFolder:
                     continue  # the line that a kill cut short
                 if entry.get("step", 0) <= step:
                     kept.append(line)
+                    entries.append(entry)
                     self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
         write_atomically(log, "".join(line + "\n" for line in kept).encode())
+        if self.tensorboard:
+            self._board = TensorBoard(self.path, entries, step, self.seconds)
         self._began = time.perf_counter()
 
     @property
@@ -128,6 +152,8 @@ class RunFolder:
     def log(self, entry: dict[str, Any]) -> None:
         with open(self.path / "log.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps({**entry, "seconds": round(self.elapsed, 2)}) + "\n")
+        if self._board is not None:
+            self._board.record(entry)
 
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
         """Progress, a log line every 50 steps, a preview every 15 seconds. ``state.step`` counts the step as done."""
@@ -154,6 +180,9 @@ class RunFolder:
             bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
         else:
             bar.advance(1)
+        between = max(1, state.config.steps // BOARD_IMAGES)
+        if self._board is not None and state.step % between == 0 and result.failed is None:
+            self._board.show("train", result.truth, result.render, state.step)
         if time.monotonic() - self._shown_at >= PREVIEW_SECONDS:
             self._shown_at = time.monotonic()
             self.show(result)
@@ -178,6 +207,8 @@ class RunFolder:
             image = scene.render(frame.camera, frame.time).rgb.cpu()
             valid = slice(None) if frame.mask is None else frame.mask
             values.append(float(psnr(image[valid], frame.image[valid])))
+            if i == 0 and self._board is not None:
+                self._board.show("held_out", frame.image.permute(2, 0, 1), image.permute(2, 0, 1), scene.step)
         scene.motion.train()
         values = [value for value in values if math.isfinite(value)]
         if values:

@@ -49,10 +49,17 @@ class Scene:
 
     @staticmethod
     def load(run: str | Path, device: str = "cpu") -> Scene:
-        """Read a run directory.
+        """Read a run directory, as :func:`scgs_warp.fit` and ``apps/train.py`` leave it.
+
+        Args:
+            run: the folder, which holds ``checkpoint.safetensors``.
+            device: where the scene is to live and to be rendered, ``cpu`` or ``cuda``.
+
+        Returns:
+            the scene of the newest checkpoint, ready to render.
 
         Raises:
-            UserError: it is missing or damaged.
+            UserError: it is missing or damaged, or training has not come to its second stage.
         """
         folder = Path(run)
         if not folder.is_dir():
@@ -81,18 +88,22 @@ class Scene:
 
     @property
     def device(self) -> torch.device:
+        """Where the scene lives and is rendered."""
         return self.gaussians.means.device
 
     @property
     def motion_name(self) -> str:
+        """``control-points``, ``per-gaussian``, ``hexplane`` or ``static``."""
         return self.motion.name
 
     @property
     def gaussian_count(self) -> int:
+        """N."""
         return len(self.gaussians)
 
     @property
     def control_point_count(self) -> int:
+        """M; 0 for motion models without."""
         return self.control_points_at(0.0).shape[0]
 
     @property
@@ -102,7 +113,15 @@ class Scene:
 
     @torch.no_grad()
     def gaussians_at(self, time: float) -> Gaussians:
-        """Activated Gaussians, posed at ``time`` in [0, 1], world units."""
+        """The Gaussians at one moment, activated: as other renderers take them.
+
+        Args:
+            time: in [0, 1].
+
+        Returns:
+            N Gaussians in world units on the scene's device. The order is the same at every time: row i is one point
+            of the surface, followed through the motion.
+        """
         posed = self.motion.gaussians_at(self.gaussians, float(time))
         undo = self.normalisation
         return Gaussians(
@@ -124,6 +143,10 @@ class Scene:
             camera: any device.
             time: clamped to [0, 1].
             background: colour in [0, 1]; None: ``background_color``.
+
+        Returns:
+            ``rgb`` [H, W, 3], ``alpha`` and ``depth`` [H, W], float32 on the scene's device; ``rgb`` may leave [0, 1] a
+            little.
         """
         time = min(max(float(time), 0.0), 1.0)
         color = torch.as_tensor(self.background_color if background is None else background, dtype=torch.float32)
@@ -149,7 +172,7 @@ class Scene:
 
     @torch.no_grad()
     def control_points_at(self, time: float) -> Tensor:
-        """[M, 3] control points at ``time``, world; [0, 3] for motion models without."""
+        """[M, 3] control points at ``time`` in [0, 1], world; [0, 3] for motion models without."""
         return self.normalisation.undo(self.motion.control_points_at(float(time)))
 
     def tensors(self) -> dict[str, Tensor]:

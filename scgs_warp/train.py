@@ -242,23 +242,26 @@ def fit(
     test: Dataset | None = None,
     resume: bool = False,
     settings: dict[str, Any] | None = None,
+    tensorboard: bool = False,
 ) -> Scene:
     """Train a scene; the run directory holds a resumable checkpoint at any time.
 
     Args:
-        config: the complete configuration.
-        data: training frames.
+        config: the complete configuration: a ``config.preset``, and what ``config.with_steps`` and ``from_dict`` make
+            of it.
+        data: training frames, world units (``data.load``).
         output: run directory; made if needed.
-        device: where everything is computed.
+        device: where everything is computed, ``cpu`` or ``cuda``.
         test: held-out frames, looked at for the curve and the previews alone; nothing is selected by them.
         resume: continue from the checkpoint in ``output``, to the same bits as an uninterrupted run.
         settings: what to write to ``config.json``; default: the configuration.
+        tensorboard: also write event files for TensorBoard to ``output``; changes no bit of the scene.
 
     Returns:
         the scene after the last step.
 
     Raises:
-        UserError: a bad configuration, a checkpoint that does not fit, repeated non-finite losses.
+        UserError: a bad configuration, a checkpoint that does not fit, repeated non-finite losses, no TensorBoard.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
     """
     check(config)
@@ -267,7 +270,7 @@ def fit(
         raise UserError(f"{data.folder}: loaded on {data.background}, but data.background is {config.data.background}")
     if len(data) == 0:
         raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
-    with RunFolder(output, config, settings, resume=resume) as folder:
+    with RunFolder(output, config, settings, resume=resume, tensorboard=tensorboard) as folder:
         state = (
             TrainState.resume(folder.path, config, data, device) if resume else TrainState.begin(config, data, device)
         )

@@ -14,16 +14,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in OpenCV convention: x right, y down, z forward; pixel centres at +0.5."""
+    """A pinhole camera in OpenCV convention: x right, y down, z forward; pixel centres at +0.5. Nothing is checked.
+
+    OpenGL's and Blender's camera-to-world ``c2w`` becomes a viewmat by ``inv(c2w @ diag(1, -1, -1, 1))``.
+    """
 
     viewmat: Tensor
     """[4, 4] world-to-camera, float32."""
     K: Tensor
     """[3, 3] intrinsics in pixels, float32."""
     width: int
+    """Of the image, pixels."""
     height: int
+    """Of the image, pixels."""
 
     def to(self, device: torch.device | str) -> Camera:
+        """The same camera with its tensors on a device."""
         return Camera(self.viewmat.to(device), self.K.to(device), self.width, self.height)
 
     @property
@@ -37,7 +43,9 @@ class Frame:
     """One observation: a camera, a time in [0, 1] and what it saw. Images are stored planar; [H, W, 3] is a view."""
 
     camera: Camera
+    """Where it was taken, world."""
     time: float
+    """When it was taken, in [0, 1]."""
     image: Tensor
     """[H, W, 3] float32 in [0, 1], on the data set's background; ``image.permute(2, 0, 1)`` is contiguous."""
     alpha: Tensor | None = None
@@ -64,10 +72,11 @@ class Pose:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Activated Gaussians at one instant: nothing here knows time."""
+    """Activated Gaussians at one instant: nothing here knows time. float32, one device, world units unless said
+    otherwise."""
 
     means: Tensor
-    """[N, 3]"""
+    """[N, 3] centres."""
     quats: Tensor
     """[N, 4] wxyz, need not be unit."""
     scales: Tensor
@@ -75,9 +84,9 @@ class Gaussians:
     opacities: Tensor
     """[N] in [0, 1]"""
     sh_dc: Tensor
-    """[N, 3] spherical harmonics coefficients of degree 0."""
+    """[N, 3] spherical harmonics coefficients of degree 0: colour is ``0.5 + 0.2821 * sh_dc``, and what follows."""
     sh_rest: Tensor
-    """[N, K - 1, 3] the higher ones."""
+    """[N, K - 1, 3] the higher ones; K = (degree + 1)^2."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,8 @@ def make_synthetic(
 
     Args:
         size: width and height in pixels.
-        train, test: number of frames, each with its own camera.
+        train: number of frames to train on, each with its own camera.
+        test: number of frames held out, each with its own camera.
         seed: of the cameras and of the surface points.
         progress: called with (done, total) after each picture.
         device: where rays are cast, ``cpu`` or ``cuda``.

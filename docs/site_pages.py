@@ -1,0 +1,54 @@
+"""MkDocs hook: pages of the site that the repository keeps elsewhere: README, changelog, examples."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages."""
+    pages = {
+        "index.md": from_docs((ROOT / "README.md").read_text(encoding="utf-8")),
+        "changelog.md": from_docs((ROOT / "CHANGELOG.md").read_text(encoding="utf-8")),
+        "examples.md": examples_page(),
+    }
+    for name, content in pages.items():
+        files.append(File.generated(config, name, content=content))
+    return files
+
+
+def on_page_content(html: str, **known: Any) -> str:
+    """Docstrings say :class:`Name`, as editors show it; here the name does."""
+    return re.sub(r":(?:class|func|meth|mod):(?=<code>)", "", html)
+
+
+def from_docs(text: str) -> str:
+    """Links that lead from the repository's root, as the site has them: what is wrong then is found by --strict."""
+    text = re.sub(r"(\]\()docs/", r"\1", text)
+    return re.sub(r"(\]\()examples/?(?=\))", r"\1examples.md", text)
+
+
+def examples_page() -> str:
+    """Every script in examples/ with what it says of itself."""
+    parts = [
+        "# Examples\n\nShort scripts in `examples/`, to be read and changed. Each explains its options with `--help`.\n"
+    ]
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        code = path.read_text(encoding="utf-8")
+        about = ast.get_docstring(ast.parse(code)) or ""
+        title, _, rest = about.partition("\n")
+        body = code.split('"""', 2)[2].strip()
+        rest = re.sub(r"(?m)^    (.*)$", r"\1", re.sub(r"(?ms)^(    .*?)(?=\n\n|\Z)", r"```bash\n\1\n```", rest))
+        name, _, tail = title.partition(": ")
+        heading = f"{path.stem[:2]} {name.rstrip('.')}"
+        lead = f"{tail[:1].upper()}{tail[1:]}\n" if tail else ""
+        parts.append(f"## {heading}\n\n{lead}{rest}\n\n`examples/{path.name}`:\n\n```python\n{body}\n```\n")
+    return "\n".join(parts)
