@@ -196,9 +196,7 @@ def _export_cameras(request: Request, device: str) -> str:
     settings = scene.settings.get("data", {})
     folder = settings.get("folder")
     if not isinstance(folder, str) or not Path(folder).is_dir():
-        raise UserError(
-            f"{request.run}/config.json: data.folder {folder} is no folder; put the data back or correct it"
-        )
+        raise UserError(f"{request.run}/config.json: data.folder {folder} is no folder; put it back or correct it")
     how = {key: settings[key] for key in ("downscale", "resample", "background") if key in settings}
     splits = {split: data.load(folder, split, **how) for split in ("train", "test")}
     splits["train"] = refined(splits["train"], request.run, scene.normalisation) or splits["train"]
