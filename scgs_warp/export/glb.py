@@ -36,6 +36,7 @@ def write_glb(
     document = Document()
     document.json["extensionsUsed"] = [EXTENSION]
     attributes = _attributes(document, gaussians)
+    # A bound mesh's own node turns nothing, by the standard; this one is for programs that leave points unbound.
     node: dict[str, Any] = {"name": "Gaussians", "rotation": upright(up)}
     if skeleton is not None:
         for index, (joints, weights) in enumerate(influences(skeleton.indices, skeleton.weights)):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..overlay import position_colors
 from .glb import point_colors
-from .gltf import INDICES, VERTICES, Document, add_skeleton, upright
+from .gltf import INDICES, VERTICES, Document, add_skeleton
 from .skeleton import Skeleton
 
 POINT, EDGE = 0.12, 0.02
@@ -65,7 +65,7 @@ def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[flo
     }
     mesh = document.append("meshes", {"name": "control graph", "primitives": [primitive]})
     skin = add_skeleton(document, skeleton, up, "motion")
-    node = {"name": "control graph", "rotation": upright(up), "mesh": mesh, "skin": skin}
+    node = {"name": "control graph", "mesh": mesh, "skin": skin}
     document.json["scenes"][0]["nodes"].insert(0, document.append("nodes", node))
     document.write(path)
 
