@@ -18,6 +18,7 @@ from scgs_warp import checkpoint
 from scgs_warp.apps import edit as edit_app
 from scgs_warp.apps import export as app
 from scgs_warp.apps import view as view_app
+from scgs_warp.config import from_dict
 from scgs_warp.data import load
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_axis, rotate, unit
@@ -27,6 +28,8 @@ from scgs_warp.export.gltf import influences
 from scgs_warp.export.graph import write_graph
 from scgs_warp.export.job import write_still
 from scgs_warp.export.skeleton import Skeleton, at_rest, build_skeleton, even_moments
+from scgs_warp.motion import Static, build_motion
+from scgs_warp.motion.control_points import ControlPoints
 from scgs_warp.scene import Scene
 from scgs_warp.types import Gaussians
 
@@ -103,12 +106,19 @@ def save(scene: Scene, folder: Path) -> Path:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A run whose network moves things a little, with shading."""
-    scene = bar_scene(nodes=24, gaussians=120, shaded=True)
+    like = bar_scene(nodes=24, gaussians=120, shaded=True)
+    fields = {"nodes": 24, "layers": 3, "width": 32, "skip": 2}
+    config = from_dict({"motion": fields})
+    template = build_motion("control-points", config)
+    assert isinstance(template, ControlPoints)
+    rig = like.motion
+    assert isinstance(rig, ControlPoints)
+    motion = ControlPoints(rig.positions.detach(), rig.log_radii.detach().exp(), template.network, config.motion)
     torch.manual_seed(0)
     with torch.no_grad():
-        for name, parameter in scene.motion.named_parameters():
-            if name.startswith("network."):
-                parameter.copy_(0.3 * torch.randn_like(parameter))
+        for parameter in motion.network.parameters():
+            parameter.copy_(0.3 * torch.randn_like(parameter))
+    scene = Scene(like.gaussians, motion, like.normalisation, config, like.overview)
     return save(scene, tmp_path_factory.mktemp("runs") / "run")
 
 
@@ -172,7 +182,7 @@ def test_graph_is_valid(run, tmp_path):
     np.testing.assert_allclose(found["POSITION"][:144].reshape(24, 6, 3).mean(1),
                                session.engine.to_world(session.engine.rig.positions.detach().double().numpy()),
                                atol=1e-6)  # fmt: skip
-    lone = build_skeleton(EditSession(bar_scene(nodes=1, gaussians=20)), even_moments(2, 2.0))
+    lone = build_skeleton(EditSession(bar_scene(nodes=4, gaussians=20)), even_moments(2, 2.0))
     write_graph(tmp_path / "lone.glb", lone, np.zeros((0, 2), int), (0.0, 0.0, 1.0))
     assert gltf_errors(tmp_path / "lone.glb") == []
 
@@ -307,7 +317,5 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
 
 
 def still_scene() -> Scene:
-    from scgs_warp.motion import Static
-
     scene = bar_scene(nodes=8, gaussians=20)
     return Scene(scene.gaussians, Static(), scene.normalisation, scene.config, scene.overview)
