@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 INSTALL = "npm install --prefix .node @playcanvas/splat-transform gltf-validator three"
+"""As .ci/run does it."""
 
 
 @functools.cache
