@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 
-APPS = ("train", "evaluate", "view", "edit", "bench", "ablate", "synthesize", "capture")
+APPS = ("train", "evaluate", "view", "edit", "bench", "ablate", "synthesize", "capture", "export")
 
 
 def main() -> int:

@@ -22,7 +22,7 @@ class Options:
     run: Path | None = None
     """Folder of a run, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: a .ply of 3D Gaussian splatting, as a scene that stands still."""
+    """Instead of a run: a .ply of 3D Gaussian splatting, a .splat or a .spz, as a scene that stands still."""
     script: Path | None = None
     """An edit, as JSON (docs/editing.md). Without an output, the editor begins with it."""
     output: Path | None = None

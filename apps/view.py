@@ -5,9 +5,12 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from scgs_warp.apps.cli import Device, prepare, run
+
+if TYPE_CHECKING:
+    from scgs_warp.scene import Scene
 
 LARGEST = 8192
 
@@ -16,10 +19,12 @@ LARGEST = 8192
 class Options:
     """Render a film of a trained scene, off screen."""
 
-    run: Path
-    """Folder of a run, as apps/train.py writes it."""
     output: Path
     """Where the film goes: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
+    run: Path | None = None
+    """Folder of a run, as apps/train.py writes it."""
+    ply: Path | None = None
+    """Instead of a run: a .ply of 3D Gaussian splatting, a .splat or a .spz, as a scene that stands still."""
     mode: Literal["turntable", "time", "both"] = "both"
     """turntable: the camera goes round, the scene stands still; time: the scene moves; both: both at once. Where the
     training cameras saw the scene from one side only, the camera swings within what they saw."""
@@ -48,6 +53,8 @@ def check(options: Options) -> None:
     from scgs_warp import film
     from scgs_warp.errors import UserError
 
+    if (options.run is None) == (options.ply is None):
+        raise UserError("view.py: give one of --run and --ply")
     if options.frames < 1:
         raise UserError(f"--frames {options.frames}: a film needs at least 1")
     if not 16 <= options.size <= LARGEST:
@@ -57,6 +64,18 @@ def check(options: Options) -> None:
     if not 0 <= options.time <= 1:
         raise UserError(f"--time {options.time:g}: give a time from 0 to 1")
     film.check_path(options.output)
+
+
+def open_scene(options: Options, device: str) -> Scene:
+    """What is filmed."""
+    from scgs_warp.scene import Scene
+
+    if options.ply is not None:
+        from scgs_warp.data.gaussian_ply import open_ply
+
+        return open_ply(options.ply, device)
+    assert options.run is not None
+    return Scene.load(options.run, device=device)
 
 
 def main(args: list[str] | None) -> None:
@@ -69,9 +88,8 @@ def main(args: list[str] | None) -> None:
     from scgs_warp import cameras, film
     from scgs_warp.overlay import Painter
     from scgs_warp.progress import progress
-    from scgs_warp.scene import Scene
 
-    scene = Scene.load(options.run, device=device)
+    scene = open_scene(options, device)
     if options.mode == "time":
         path = [cameras.orbit_camera(scene.overview, scene.overview.azimuth, options.size)] * options.frames
     else:

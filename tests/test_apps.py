@@ -14,7 +14,7 @@ import pytest
 from tiny import write_dnerf
 
 ROOT = Path(__file__).parent.parent
-APPS = ["train", "evaluate", "view", "bench", "ablate", "synthesize", "capture"]
+APPS = ["train", "evaluate", "view", "bench", "ablate", "synthesize", "capture", "export"]
 SMALL = ["--preset", "cpu", "--set", "motion.layers=3", "--set", "motion.width=32", "--set", "motion.skip=2",
          "--set", "init_points=300", "--nodes", "16", "--device", "cpu"]  # fmt: skip
 

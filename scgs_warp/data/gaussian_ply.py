@@ -58,17 +58,28 @@ def read_gaussian_ply(path: str | Path) -> GaussianParameters:
     sh_rest = np.zeros((len(data), 0, 3), np.float32)
     if rest:  # channel by channel in the file
         sh_rest = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, rest // 3).transpose(0, 2, 1)
-    logits, log_scales = columns("opacity")[:, 0], columns("scale_0", "scale_1", "scale_2")
-    quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
-    parts = means, dc, sh_rest.reshape(len(data), -1), logits[:, None], log_scales, quats
-    good = np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0) & quats.any(axis=1)
-    if not good.any():
-        raise UserError(f"{path}: none of its {len(data)} Gaussians is finite; export it again")
-    made = GaussianParameters.empty(int(good.sum()), rest // 3, 0, False, "cpu")
     values = {
-        "means": means, "sh_dc": dc, "sh_rest": sh_rest, "opacity_logits": logits, "log_scales": log_scales,
-        "quats": quats,
+        "means": means, "sh_dc": dc, "sh_rest": sh_rest, "opacity_logits": columns("opacity")[:, 0],
+        "log_scales": columns("scale_0", "scale_1", "scale_2"), "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
     }  # fmt: skip
+    return to_parameters(path, values)
+
+
+def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParameters:
+    """Rows that a file held as parameters, without those that are not finite or have no rotation.
+
+    Args:
+        values: float32, by the names of :class:`GaussianParameters`, [N, ...]; harmonics [N, K - 1, 3].
+
+    Raises:
+        UserError: no row is left.
+    """
+    total, rest = values["sh_rest"].shape[:2]
+    flat = [np.reshape(value, (total, -1)) for value in values.values()]
+    good = np.all([np.isfinite(part).all(axis=1) for part in flat], axis=0) & values["quats"].any(axis=1)
+    if not good.any():
+        raise UserError(f"{path}: none of its {total} Gaussians is finite; export it again")
+    made = GaussianParameters.empty(int(good.sum()), rest, 0, False, "cpu")
     with torch.no_grad():
         for name, value in values.items():
             getattr(made, name).copy_(torch.from_numpy(np.ascontiguousarray(value[good])))
@@ -96,16 +107,18 @@ def _vertices(path: Path) -> np.ndarray:
 def open_ply(
     path: str | Path, device: str = "cpu", nodes: int = COUNT, up: tuple[float, float, float] | None = None
 ) -> Scene:
-    """A static scene with control points, from a 3D-GS file.
+    """A static scene with control points, from a file of Gaussians: ``.ply``, ``.splat`` or ``.spz``.
 
     Args:
         nodes: control points, sampled from the Gaussians.
         up: for cameras of films; None: -y, as structure from motion has it.
 
     Raises:
-        UserError: as :func:`read_gaussian_ply`.
+        UserError: as :func:`~scgs_warp.data.gaussian_files.read_gaussians`.
     """
-    gaussians = read_gaussian_ply(path)
+    from .gaussian_files import read_gaussians  # which knows this file's reader
+
+    gaussians = read_gaussians(path)
     world = gaussians.means.detach().double().numpy()
     solid = world[(gaussians.opacities() > OPAQUE).numpy()]
     low, high = np.quantile(solid if len(solid) else world, BULK, axis=0)

@@ -21,7 +21,7 @@ from .assemble import Shot, assemble, video_border, with_points
 from .dataset import Dataset
 from .files import by_name, held_out
 from .images import Look
-from .points import read_ply
+from .points import read_points
 from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
 
 FILE = "transforms.json"
@@ -117,7 +117,7 @@ def _points(
         return None, None
     if not isinstance(name, str) or not name or "\0" in name:
         raise UserError(f"{path}: ply_file_path is no text; name the file of points or leave it out")
-    points, colors = read_ply(folder / name.replace("\\", "/"))
+    points, colors = read_points(folder / name.replace("\\", "/"))
     moved = _applied(path, content, points)
     # Writers disagree whether the transform that was applied to the poses was applied to the points, too.
     if moved is not None and _seen(moved, cameras) > _seen(points, cameras):

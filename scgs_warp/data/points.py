@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
+from ..gaussians import SH_C0
 
 
 def finite(points: np.ndarray) -> np.ndarray:
@@ -18,9 +19,14 @@ def finite(points: np.ndarray) -> np.ndarray:
 def unit_colors(vertices: np.ndarray) -> np.ndarray | None:
     """[P, 3] in [0, 1], grey where the file says nothing finite; None where it has no colours.
 
-    Whole numbers are shares of their type's largest; others of 1, or of 255 where any is above 1.
+    Whole numbers are shares of their type's largest; others of 1, or of 255 where any is above 1. Gaussians' points
+    have the colours of their harmonics of degree 0.
     """
     names = ("red", "green", "blue")
+    harmonics = [f"f_dc_{channel}" for channel in range(3)]
+    if all(name in (vertices.dtype.names or ()) for name in harmonics):
+        raw = np.stack([np.asarray(vertices[name], np.float64) for name in harmonics], axis=1)
+        return np.where(np.isfinite(raw), 0.5 + SH_C0 * raw, 0.5).clip(0.0, 1.0)
     if not all(name in (vertices.dtype.names or ()) for name in names):
         return None
     raw = np.stack([np.asarray(vertices[name]) for name in names], axis=1)
@@ -30,6 +36,20 @@ def unit_colors(vertices: np.ndarray) -> np.ndarray | None:
     finite = np.isfinite(colors)
     most = 255.0 if (colors[finite] > 1.0).any() else 1.0
     return np.where(finite, colors / most, 0.5).clip(0.0, 1.0)
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Initial points [P, 3] float64 and their colours [P, 3] in [0, 1], from a PLY file of points or of Gaussians, or
+    from the Gaussians of a ``.splat`` or ``.spz``.
+
+    Raises:
+        UserError: as :func:`read_ply` and ``gaussian_files.read_gaussians``.
+    """
+    if path.suffix.lower() in (".splat", ".spz"):
+        from .gaussian_files import gaussian_points  # which knows scenes, and those know data sets
+
+        return gaussian_points(path)
+    return read_ply(path)
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:

@@ -19,7 +19,7 @@ from .dataset import Dataset
 from .files import is_rotation, natural, read_npy, size_text
 from .images import Look
 from .lens import Lens
-from .points import read_ply
+from .points import read_points
 from .transforms import SUFFIXES
 
 FILE = "poses_bounds.npy"
@@ -72,7 +72,7 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
             shots.append(Shot(file, viewmat, place / last, lens, f"{_label(folder, cameras[index])}_{file.stem}"))
     data = assemble(shots, look, folder=folder, split=split)
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
-    return data if points is None else with_points(data, *read_ply(points))
+    return data if points is None else with_points(data, *read_points(points))
 
 
 def _label(folder: Path, camera: Path) -> str:

@@ -1,0 +1,39 @@
+"""Write a scene as files that other programs open: ``python apps/export.py --run runs/jj --output jj.glb``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from scgs_warp.apps.cli import Device, prepare, run
+from scgs_warp.export.request import Request, check
+
+
+@dataclass(frozen=True)
+class Options(Request):
+    """Write a scene as a file that other programs open (docs/formats.md)."""
+
+    device: Device = "auto"
+    """Where to compute; auto takes a GPU if there is one."""
+    threads: int | None = None
+    """CPU threads; all cores by default."""
+
+
+def main(args: list[str] | None) -> None:
+    import tyro
+
+    options = tyro.cli(Options, args=args, prog="export.py")
+    check(options)
+    device = prepare(options.device, options.threads)
+
+    from scgs_warp.export.job import export
+
+    print(export(options, device))
+
+
+def cli(args: list[str] | None = None) -> int:
+    return run(main, args)
+
+
+if __name__ == "__main__":
+    sys.exit(cli())

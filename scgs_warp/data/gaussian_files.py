@@ -1,0 +1,39 @@
+"""Files of Gaussians, told apart by how their names end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+from ..gaussians import SH_C0, GaussianParameters
+from .gaussian_ply import read_gaussian_ply
+from .gaussian_splat import read_splat
+from .gaussian_spz import read_spz
+
+READERS = {".ply": read_gaussian_ply, ".splat": read_splat, ".spz": read_spz}
+
+
+def read_gaussians(path: str | Path) -> GaussianParameters:
+    """Raw parameters as a ``.ply`` of 3D Gaussian splatting, a ``.splat`` or a ``.spz`` has them, world units.
+
+    Raises:
+        UserError: another kind of file, missing, damaged, or without a finite Gaussian.
+    """
+    path = Path(path)
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise UserError(f"{path}: Gaussians are read from {', '.join(READERS)}; give one of these or convert it")
+    return reader(path)
+
+
+def gaussian_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Where the Gaussians of a file are, [P, 3] float64, and their colours of degree 0, [P, 3] in [0, 1].
+
+    Raises:
+        UserError: as :func:`read_gaussians`.
+    """
+    found = read_gaussians(path)
+    colors = 0.5 + SH_C0 * found.sh_dc.detach().double().numpy()
+    return found.means.detach().double().numpy(), colors.clip(0.0, 1.0)

@@ -1,0 +1,162 @@
+"""glTF 2.0 as one binary file: accessors in, bytes out. y is up there: scenes are turned by their root nodes."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..checkpoint import write_atomically
+from ..edit.rotations import unit
+from ..errors import UserError
+from .skeleton import Skeleton
+
+COMPONENTS = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}
+KINDS = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+VERTICES, INDICES = 34962, 34963
+"""Targets of buffer views."""
+LARGEST = 2**32 - 1
+
+
+class Document:
+    """A glTF file in the making. ``json`` may be filled by hand; what is appended gets the index that is returned."""
+
+    def __init__(self) -> None:
+        self.json: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": f"scgs_warp {__version__}"},
+            "scene": 0,
+            "scenes": [{"nodes": []}],
+        }
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def append(self, group: str, item: dict[str, Any]) -> int:
+        """Put an item into ``nodes``, ``meshes`` or another list of the file."""
+        found = self.json.setdefault(group, [])
+        found.append(item)
+        return len(found) - 1
+
+    def view(self, content: bytes, target: int | None = None) -> int:
+        """A buffer view of its own."""
+        item = {"buffer": 0, "byteOffset": self._size, "byteLength": len(content)}
+        padding = b"\0" * (-len(content) % 4)
+        self._parts += [content, padding]
+        self._size += len(content) + len(padding)
+        return self.append("bufferViews", item if target is None else {**item, "target": target})
+
+    def accessor(
+        self, values: np.ndarray, *, target: int | None = None, bounds: bool = False, normalized: bool = False
+    ) -> int:
+        """An array [N], [N, C] or [N, 4, 4] (column by column) of float32 or unsigned integers, in a view of its own.
+
+        Args:
+            target: ``VERTICES``, ``INDICES``, or None for neither.
+            bounds: state the smallest and largest values, as positions and times of animations must.
+        """
+        values = np.ascontiguousarray(values)
+        values = values.astype(values.dtype.newbyteorder("<"), copy=False)
+        item = self._item(self.view(values.tobytes(), target), values)
+        if bounds:
+            low, high = np.atleast_1d(values.min(axis=0)), np.atleast_1d(values.max(axis=0))
+            item |= {"min": low.tolist(), "max": high.tolist()}
+        return self.append("accessors", {**item, "normalized": True} if normalized else item)
+
+    def tracks(self, values: np.ndarray) -> list[int]:
+        """One accessor for each of M tracks [M, T, C] of float32, all in one view."""
+        values = np.ascontiguousarray(values, "<f4")
+        view = self.view(values.tobytes())
+        step = values[0].nbytes
+        return [
+            self.append("accessors", {**self._item(view, track), "byteOffset": index * step})
+            for index, track in enumerate(values)
+        ]
+
+    @staticmethod
+    def _item(view: int, values: np.ndarray) -> dict[str, Any]:
+        kind = COMPONENTS[values.dtype.str[1:]]
+        return {"bufferView": view, "componentType": kind, "count": len(values), "type": KINDS[values.shape[1:]]}
+
+    def content(self) -> bytes:
+        """The file.
+
+        Raises:
+            UserError: it is larger than the format can be.
+        """
+        text = json.dumps({**self.json, "buffers": [{"byteLength": self._size}]}, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        total = 12 + 8 + len(text) + 8 + self._size
+        if total > LARGEST:
+            raise UserError(f"the .glb would have {total / 2**30:.1f} GiB; the format ends at 4: give fewer --frames")
+        head = struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A)
+        return b"".join([head, text, struct.pack("<II", self._size, 0x004E4942), *self._parts])
+
+    def write(self, path: Path) -> None:
+        """All of it or nothing.
+
+        Raises:
+            UserError: too large, or the place cannot be written.
+        """
+        write_atomically(path, self.content())
+
+
+def upright(up: tuple[float, float, float]) -> list[float]:
+    """xyzw of the shortest turn that brings ``up`` to +y; half a turn about x where it is -y, as of cameras that look
+    along z with y down."""
+    x, y, z = unit([*up, 0.0])[:3]
+    if y < -1.0 + 1e-9:
+        return [1.0, 0.0, 0.0, 0.0]
+    turn = unit([1.0 + y, -z, 0.0, x])  # the half-way vector between up and y, times y
+    return [float(value) for value in turn[[1, 2, 3, 0]]]
+
+
+def xyzw(quats: np.ndarray) -> np.ndarray:
+    """Unit quaternions [..., 4] wxyz in glTF's order, float32."""
+    return unit(quats)[..., [1, 2, 3, 0]].astype("<f4")
+
+
+def add_skeleton(document: Document, skeleton: Skeleton, up: tuple[float, float, float], name: str) -> int:
+    """Joints ``node_0000`` and so on under one root, their animation, and the skin that binds vertices at rest.
+
+    Returns:
+        Index of the skin.
+    """
+    places = skeleton.positions.transpose(1, 0, 2)
+    turns = xyzw(skeleton.rotations.transpose(1, 0, 2))
+    joints = [
+        document.append(
+            "nodes",
+            {"name": f"node_{index:04d}", "translation": place[0].tolist(), "rotation": turn[0].tolist()},
+        )
+        for index, (place, turn) in enumerate(zip(places.astype("<f4"), turns))
+    ]
+    root = document.append("nodes", {"name": "control points", "rotation": upright(up), "children": joints})
+    document.json["scenes"][0]["nodes"].append(root)
+    bind = np.tile(np.eye(4), (len(joints), 1, 1))
+    bind[:, 3, :3] = -skeleton.rest  # column by column
+    skin = {"inverseBindMatrices": document.accessor(bind.astype("<f4")), "joints": joints, "skeleton": root}
+    if len(skeleton.seconds) > 1:
+        when = document.accessor(skeleton.seconds.astype("<f4"), bounds=True)
+        samplers, channels = [], []
+        for path, tracks in (("translation", document.tracks(places)), ("rotation", document.tracks(turns))):
+            for joint, track in zip(joints, tracks):
+                channels.append({"sampler": len(samplers), "target": {"node": joint, "path": path}})
+                samplers.append({"input": when, "output": track, "interpolation": "LINEAR"})
+        document.append("animations", {"name": name, "samplers": samplers, "channels": channels})
+    return document.append("skins", skin)
+
+
+def influences(indices: np.ndarray, weights: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Joints [N, 4] uint16 and weights [N, 4] float32 in sets of four, the largest weights first; rows sum to 1."""
+    order = np.argsort(-weights, axis=1, kind="stable")
+    joints, shares = np.take_along_axis(indices, order, 1), np.take_along_axis(weights, order, 1)
+    shares = np.where(shares < 1e-8, 0.0, shares).astype(np.float32)
+    shares[:, 0] += 1.0 - shares.sum(axis=1, dtype=np.float64)  # what rounding left
+    width = -shares.shape[1] % 4
+    joints = np.where(shares > 0, joints, 0)  # as the format wants it of unused ones
+    joints, shares = np.pad(joints, ((0, 0), (0, width))), np.pad(shares, ((0, 0), (0, width)))
+    sets = range(0, joints.shape[1], 4)
+    return [(joints[:, first : first + 4].astype("<u2"), shares[:, first : first + 4]) for first in sets]

@@ -1,0 +1,64 @@
+"""A moving scene as plain arrays: Gaussians at rest, what they follow, and where that goes. ``docs/formats.md`` has a
+player of a few lines."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from ..checkpoint import write_atomically
+from ..types import Gaussians
+from .skeleton import Skeleton
+
+FORMAT = "scgs-warp motion"
+VERSION = 1
+
+
+def write_npz(
+    path: Path,
+    rest: Gaussians,
+    skeleton: Skeleton,
+    *,
+    shading: np.ndarray | None = None,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> None:
+    """Write a moving scene, world units, float32, compressed; the same scene gives the same bytes.
+
+    Args:
+        rest: activated Gaussians before any motion.
+        skeleton: its Gaussians are these.
+        shading: [N, 10] brightness that follows the turn of the surface; None: there is none.
+        up: unit vector.
+
+    Raises:
+        UserError: the place cannot be written.
+    """
+    quats = rest.quats.detach().cpu().double().numpy()
+    arrays: dict[str, np.ndarray] = {
+        "means": rest.means.detach().cpu().numpy(),
+        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": rest.scales.detach().cpu().numpy(),
+        "opacities": rest.opacities.detach().cpu().numpy(),
+        "sh_dc": rest.sh_dc.detach().cpu().numpy(),
+        "sh_rest": rest.sh_rest.detach().cpu().numpy(),
+        "weights": skeleton.weights,
+        "nodes": skeleton.rest,
+        "times": skeleton.times,
+        "seconds": skeleton.seconds,
+        "node_positions": skeleton.positions,
+        "node_rotations": skeleton.rotations,
+        "up": np.array(up),
+    }
+    if shading is not None and shading.shape[1]:
+        arrays["shading"] = shading
+    if skeleton.shape_rotations is not None:
+        arrays["node_shape_rotations"] = skeleton.shape_rotations
+    if skeleton.log_scales is not None:
+        arrays["node_log_scales"] = skeleton.log_scales
+    arrays = {name: np.asarray(value, "<f4") for name, value in arrays.items()}
+    arrays["indices"] = skeleton.indices.astype("<i4")
+    content = io.BytesIO()
+    np.savez_compressed(content, format=np.array(FORMAT), version=np.array(VERSION), **arrays)  # pyright: ignore
+    write_atomically(path, content.getvalue())

@@ -1,0 +1,138 @@
+"""What an export is asked for, and whether that can be; loads nothing heavy."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from ..errors import UserError
+
+Format = Literal["ply", "ply-sequence", "splat", "spz", "glb", "graph", "npz", "cameras", "html"]
+SUFFIXES: dict[Format, str] = {
+    "ply": ".ply",
+    "splat": ".splat",
+    "spz": ".spz",
+    "glb": ".glb",
+    "npz": ".npz",
+    "cameras": ".json",
+    "html": ".html",
+    "graph": ".glb",
+    "ply-sequence": "",
+}
+"""How the output's name ends; the first format of a suffix is what the suffix alone means."""
+STILL = ("ply", "splat", "spz", "glb")
+"""Formats that hold Gaussians at one instant; ``glb`` holds the motion where no instant is given."""
+MOST_FRAMES = 100_000
+
+
+@dataclass(frozen=True)
+class Request:
+    """Write a scene as a file that other programs open (docs/formats.md)."""
+
+    output: Path
+    """File to write, or the folder of a ply-sequence. What is there is replaced when the new one is complete."""
+    run: Path | None = None
+    """Folder of a run, as apps/train.py writes it."""
+    ply: Path | None = None
+    """Instead of a run: Gaussians in a .ply of 3D Gaussian splatting, a .splat or a .spz, to be converted."""
+    format: Format | None = None
+    """ply, splat, spz: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF with Gaussians, moved
+    by control points as an animated skeleton; still with --time. graph: the control points and their edges as an
+    animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras as nerfstudio's
+    transforms.json. html: a page that plays the scene. By default what the output's name ends in says."""
+    time: float | None = None
+    """Instant of a still, from 0 to 1; without it Gaussians are as they are at rest, before the motion."""
+    edit: Path | None = None
+    """An edit (docs/editing.md) to put on the scene."""
+    at: float | None = None
+    """With --edit: the second of the edit's film that a still shows; 0 by default."""
+    frames: int | None = None
+    """Instants of a sequence or an animation, evenly from time 0 to 1; 60 by default, with --edit all of its film."""
+    fps: float | None = None
+    """Frames a second of an animation; 30 by default."""
+    title: str = ""
+    """Of the page; the run's name by default."""
+    max_mib: float | None = None
+    """Largest page in MiB; the least important Gaussians are left out beyond it."""
+
+    @property
+    def kind(self) -> Format:
+        """The format, said or told by the output's suffix.
+
+        Raises:
+            UserError: the suffix says nothing.
+        """
+        if self.format is not None:
+            return self.format
+        suffix = self.output.suffix.lower()
+        for name, ending in SUFFIXES.items():
+            if ending == suffix:
+                return name
+        raise UserError(
+            f"--output {self.output}: no format ends in {suffix}; give --format {'|'.join(get_args(Format))}"
+        )
+
+    @property
+    def still(self) -> bool:
+        """Whether Gaussians at one instant are wanted."""
+        return self.kind in STILL and (self.kind != "glb" or self.time is not None or self.at is not None)
+
+
+def check(request: Request) -> None:
+    """Refuse what cannot work before anything is loaded.
+
+    Raises:
+        UserError: naming the option and the remedy.
+    """
+    kind = request.kind
+    if (request.run is None) == (request.ply is None):
+        raise UserError("export.py: give one of --run and --ply")
+    if request.run is None and kind in ("cameras", "html"):
+        raise UserError(f"--format {kind}: needs --run; a file of Gaussians has no cameras and no motion")
+    if request.run is None and request.edit is None and kind not in STILL:
+        raise UserError(f"--format {kind}: needs --run, or an --edit that moves the Gaussians of {request.ply}")
+    if request.time is not None and not 0 <= request.time <= 1:
+        raise UserError(f"--time {request.time:g}: give a time from 0 to 1")
+    if request.time is not None and (kind not in STILL or request.edit is not None):
+        other = (
+            "an edit's film is shown at --at SECONDS" if request.edit else "leave it out: the format holds all times"
+        )
+        raise UserError(f"--time {request.time:g}: {other}")
+    if request.edit is not None and kind in ("cameras", "html"):
+        raise UserError(f"--format {kind}: shows the scene as it was trained; leave --edit out, or write a glb")
+    if request.at is not None and (request.edit is None or kind not in STILL):
+        raise UserError(f"--at {request.at:g}: is a second of an edit's film; give it with --edit and a still format")
+    if request.at is not None and not 0 <= request.at <= 3600:
+        raise UserError(f"--at {request.at:g}: give a second of the film, from 0 to 3600")
+    if request.edit is not None and (request.frames, request.fps) != (None, None):
+        raise UserError("--frames, --fps: an edit's film says how long it is; change film in the edit")
+    if request.frames is not None and not 1 <= request.frames <= MOST_FRAMES:
+        raise UserError(f"--frames {request.frames}: give 1 to {MOST_FRAMES}")
+    if request.fps is not None and not 0 < request.fps <= 1000:
+        raise UserError(f"--fps {request.fps:g}: give more than 0 and at most 1000 frames a second")
+    if request.max_mib is not None and not request.max_mib > 0:
+        raise UserError(f"--max-mib {request.max_mib:g}: give more than 0 MiB")
+    check_place(request.output, kind)
+
+
+def check_place(path: Path, kind: Format) -> None:
+    """Whether the output can be written there; missing folders above are made.
+
+    Raises:
+        UserError: the wrong suffix, a folder in the way, a place that cannot be written.
+    """
+    ending = SUFFIXES[kind]
+    if ending and path.suffix.lower() != ending:
+        raise UserError(f"--output {path}: end the name in {ending} for --format {kind}")
+    if ending and path.is_dir():
+        raise UserError(f"--output {path}: is a folder; give another name")
+    if not ending and path.exists() and not path.is_dir():
+        raise UserError(f"--output {path}: is a file; name a folder for --format {kind}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        raise UserError(f"{path.parent}: cannot be written ({error.strerror}); give another folder") from None

@@ -1,0 +1,56 @@
+"""A moving scene as a folder of 3D-GS files, one a frame."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from ..data.gaussian_ply import write_gaussian_ply
+from ..errors import UserError
+from ..types import Gaussians
+
+NAME = "frame_{:05d}.ply"
+
+
+def check_folder(path: Path) -> None:
+    """Whether a sequence may be written there.
+
+    Raises:
+        UserError: the folder holds anything else than an earlier sequence.
+    """
+    if path.is_dir() and not all(re.fullmatch(r"frame_\d{5,}\.ply", entry.name) for entry in path.iterdir()):
+        raise UserError(f"{path}: holds other files than a sequence's frames; name a new folder")
+
+
+def write_sequence(path: Path, frames: Iterable[Gaussians], advance: Callable[[], None] | None = None) -> int:
+    """Write activated Gaussians, world units, as ``frame_00000.ply`` and so on; an earlier sequence in the same folder
+    is replaced as a whole, once the new one is complete.
+
+    Returns:
+        Number of frames.
+
+    Raises:
+        UserError: as :func:`check_folder`, or the place cannot be written.
+    """
+    check_folder(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    shutil.rmtree(temporary, ignore_errors=True)
+    count = 0
+    try:
+        for gaussians in frames:
+            write_gaussian_ply(temporary / NAME.format(count), gaussians)
+            count += 1
+            if advance is not None:
+                advance()
+        check_folder(path)
+        if path.is_dir():
+            shutil.rmtree(path)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}); give another folder") from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return count

@@ -1,0 +1,199 @@
+"""A moving scene as a skeleton: control points as joints, Gaussians bound to them at rest. World units, float64.
+
+SC-GS's skinning (Eq. 6) of a Gaussian at rest x, ``sum_k w_k (R_k (x - p_k) + p_k + T_k)``, is linear blend skinning: a
+joint stands at ``p_k + T_k``, turned by ``R_k``, and its inverse bind matrix shifts by ``-p_k``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..edit import EditSession
+from ..edit.pose import compose
+from ..errors import UserError
+from ..gaussians import GaussianParameters
+from ..scene import Scene
+from ..types import Gaussians, Pose
+
+
+class Moment(NamedTuple):
+    """One frame of an animation."""
+
+    seconds: float
+    """Since the animation began."""
+    time: float
+    """Of the scene, in [0, 1]."""
+    at: float | None = None
+    """Of an edit's film, in seconds."""
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """T moments of M joints, and what N Gaussians follow."""
+
+    seconds: np.ndarray
+    """[T]"""
+    times: np.ndarray
+    """[T] of the scene, in [0, 1]."""
+    rest: np.ndarray
+    """[M, 3] where joints are when every Gaussian is at rest."""
+    positions: np.ndarray
+    """[T, M, 3]"""
+    rotations: np.ndarray
+    """[T, M, 4] wxyz, unit; neighbours in time lie on the same side."""
+    shape_rotations: np.ndarray | None
+    """[T, M, 4] what turns the Gaussians' shapes, where that is something else."""
+    log_scales: np.ndarray | None
+    """[T, M, 3] change of the logarithms of scales, where there is any."""
+    indices: np.ndarray
+    """[N, K] int32"""
+    weights: np.ndarray
+    """[N, K] rows sum to 1."""
+
+    def select(self, rows: np.ndarray) -> Skeleton:
+        """Some of the Gaussians: [N] bool."""
+        fields = {**vars(self), "indices": self.indices[rows], "weights": self.weights[rows]}
+        return Skeleton(**fields)
+
+
+def even_moments(frames: int, fps: float) -> list[Moment]:
+    """Evenly from time 0 to 1."""
+    return [Moment(frame / fps, frame / max(frames - 1, 1)) for frame in range(frames)]
+
+
+def film_moments(session: EditSession) -> list[Moment]:
+    """Every frame of an edit's film."""
+    film = session.edit.film
+    return [Moment(i / film.fps, session.scene_time(i / film.fps), i / film.fps) for i in range(film.frames)]
+
+
+def posed(scene: Scene, session: EditSession | None, moment: Moment) -> Gaussians:
+    """Activated Gaussians, world units, under the edit if there is one."""
+    if session is None:
+        return scene.gaussians_at(moment.time)
+    return session.gaussians_at(moment.time, moment.at)
+
+
+@torch.no_grad()
+def at_rest(scene: Scene) -> Gaussians:
+    """Activated Gaussians before any motion, world units."""
+    rest, undo = scene.gaussians.activate(), scene.normalisation
+    return Gaussians(
+        undo.undo(rest.means), rest.quats, undo.undo_scale(rest.scales), rest.opacities, rest.sh_dc, rest.sh_rest
+    )
+
+
+def finite_rows(gaussians: Gaussians) -> np.ndarray:
+    """[N] bool: Gaussians that files may hold."""
+    count = len(gaussians.means)
+    parts = [part.detach().reshape(count, -1).isfinite().all(dim=1) for part in vars(gaussians).values()]
+    return (torch.stack(parts).all(dim=0) & gaussians.quats.any(dim=1)).cpu().numpy()
+
+
+def select(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+    """Some of the Gaussians: [N] bool, on the CPU."""
+    chosen = torch.from_numpy(rows)
+    return Gaussians(**{name: value.detach().cpu()[chosen] for name, value in vars(gaussians).items()})
+
+
+def kept(gaussians: Gaussians) -> Gaussians:
+    """Those that are finite, on the CPU.
+
+    Raises:
+        UserError: there is none.
+    """
+    rows = finite_rows(gaussians)
+    if not rows.any():
+        raise UserError(f"none of {len(rows)} Gaussians is finite; train again with a lower rate")
+    return select(gaussians, rows)
+
+
+@torch.no_grad()
+def build_skeleton(session: EditSession, moments: list[Moment], advance: Callable[[], None] | None = None) -> Skeleton:
+    """The session's control points at some moments, under its edit.
+
+    Args:
+        advance: called after each moment.
+
+    Raises:
+        UserError: an edit of a scene with a mask, whose Gaussians do not simply follow their control points.
+    """
+    engine, scene = session.engine, session.scene
+    masked = bool(scene.config.motion.mask) and engine.rig.moves
+    poses = []
+    for moment in moments:
+        poses.append(_pose(session, moment, masked))
+        if advance is not None:
+            advance()
+    rest = engine.rig.positions.detach().cpu().double()
+    places = torch.stack([rest + pose.translations.detach().cpu().double() for pose in poses]).numpy()
+    indices, weights = (part.detach().cpu().numpy() for part in engine.binding)
+    weights = weights.astype(np.float64) / weights.sum(axis=1, dtype=np.float64, keepdims=True)
+    skeleton = Skeleton(
+        np.array([moment.seconds for moment in moments]),
+        np.array([moment.time for moment in moments]),
+        engine.to_world(rest.numpy()),
+        engine.to_world(places),
+        _unit([pose.rotations for pose in poses]),
+        None if poses[0].shape_rotations is None else _unit([_there(pose.shape_rotations) for pose in poses]),
+        None if poses[0].log_scales is None else _stack([_there(pose.log_scales) for pose in poses]),
+        indices,
+        weights,
+    )
+    return _with_rest(skeleton, scene.gaussians) if masked else skeleton
+
+
+def _pose(session: EditSession, moment: Moment, masked: bool) -> Pose:
+    engine, edit = session.engine, session.edit
+    motion = engine.motion_at(moment.time)
+    bent = engine.bend(edit, moment.time, moment.at, frame=edit.reach)
+    if bent is None:
+        return motion.pose
+    if masked:
+        raise UserError("--edit: this scene's motion has a mask (motion.mask); write the edit as a ply-sequence")
+    return compose(motion, bent)
+
+
+def _there(value: Tensor | None) -> Tensor:
+    assert value is not None  # a motion model's poses are all of one kind
+    return value
+
+
+def _stack(values: list[Tensor]) -> np.ndarray:
+    return torch.stack(values).detach().cpu().double().numpy()
+
+
+def _unit(rotations: list[Tensor]) -> np.ndarray:
+    """[T, M, 4] unit, each on the side of the one before: players interpolate along the shorter way."""
+    found = _stack(rotations)
+    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    for frame in range(1, len(found)):
+        found[frame] *= np.where((found[frame] * found[frame - 1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    return found
+
+
+def _with_rest(skeleton: Skeleton, gaussians: GaussianParameters) -> Skeleton:
+    """One more joint, which never moves and takes what a mask leaves of every Gaussian."""
+    share = gaussians.hyper.detach()[:, -1:].sigmoid().cpu().double().numpy()
+    frames, joints = skeleton.positions.shape[:2]
+    still = np.zeros((frames, 1, 4))
+    still[..., 0] = 1.0
+    shapes, sizes = skeleton.shape_rotations, skeleton.log_scales
+    middle = skeleton.rest.mean(axis=0, keepdims=True)
+    return Skeleton(
+        skeleton.seconds,
+        skeleton.times,
+        np.concatenate([skeleton.rest, middle]),
+        np.concatenate([skeleton.positions, np.broadcast_to(middle, (frames, 1, 3))], axis=1),
+        np.concatenate([skeleton.rotations, still], axis=1),
+        None if shapes is None else np.concatenate([shapes, still], axis=1),
+        None if sizes is None else np.concatenate([sizes, np.zeros((frames, 1, 3))], axis=1),
+        np.column_stack([skeleton.indices, np.full(len(share), joints, np.int32)]),
+        np.column_stack([share * skeleton.weights, 1.0 - share]),
+    )
