@@ -135,6 +135,8 @@ def test_installed_into_an_empty_environment(wheel, tmp_path):
     (work / "edit.json").write_text('{"format": "scgs-warp edit", "version": 1, "playback": {"freeze": 0.5}}')
     run("scgs-warp", "edit", "--run", "run", "--script", "edit.json", "--export", "edited.ply")
     assert (work / "edited.ply").stat().st_size > 1000
+    run("scgs-warp", "export", "--run", "run", "--time", "0.5", "--output", "moment.ply")
+    assert (work / "moment.ply").stat().st_size > 1000
     run("scgs-warp", "view", "--run", "nowhere", "--output", "x.mp4", status=2)
 
     (work / "client.py").write_text(CLIENT)
