@@ -7,7 +7,6 @@ import hashlib
 import html
 import json
 import re
-from importlib import resources
 from pathlib import Path
 
 from ..checkpoint import write_atomically
@@ -19,6 +18,7 @@ from .page_scene import page_scene
 SCRIPTS = ("data", "camera", "renderer", "player", "controls", "main")
 SHADERS = ("splat.frag", "draw.vert", "draw.frag", "screen.vert", "screen.frag")
 MOST_DEGREE = 3
+WEB = Path(__file__).parent / "web"
 TITLE = "Moving scene"
 MIB = 2**20
 
@@ -98,7 +98,7 @@ def _program() -> str:
 
 
 def _read(name: str) -> str:
-    return resources.files(__package__).joinpath("web", name).read_text(encoding="utf-8").replace("\r\n", "\n")
+    return (WEB / name).read_text(encoding="utf-8")  # with \n alone, as the browser will hash it
 
 
 def _hash(text: str) -> str:

@@ -33,13 +33,13 @@ BITS = {
     "log_scales": 9,
     "opacities": 8,
     "sh_dc": 10,
-    "sh_rest": 7,
-    "shading": 8,
+    "sh_rest": 6,
+    "shading": 7,
     "weights": 9,
     "share": 8,
-    "pose": 16,
+    "pose": 14,
 }
-"""How finely each part is stored; docs/page.md says what that costs."""
+"""How finely each part is stored; docs/page.md says what that costs. ``sh_rest`` at most 8: the page unpacks bytes."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ class Clock {
     const { player } = this;
     this.playing = playing && player.model.nodes > 0;
     if (this.playing && element("ending").value === "stop" && player.time >= 1) player.seek(0);
-    element("play").textContent = this.playing ? "\u23f8" : "\u25b6";
+    element("play").classList.toggle("on", this.playing);
     element("play").setAttribute("aria-label", this.playing ? "Pause" : "Play");
     this.last = performance.now();
   }

@@ -29,7 +29,7 @@ async function start() {
   const loop = (now) => {
     clock.tick(now);
     if (clock.playing) showTime(player);
-    player.frame();
+    player.tick(now);
     requestAnimationFrame(loop);
   };
   requestAnimationFrame(loop);

@@ -1,6 +1,10 @@
 // The page: time, camera, the worker that sorts, and frames when something has changed.
 
 const SECONDS = 4; // a scene's whole time at speed 1
+const SLOW = 50; // milliseconds a frame: slower machines draw fewer pixels while something moves ...
+const COARSEST = 0.4; // ... but not fewer than so many of each side's
+const REST = 250; // milliseconds of stillness after which a frame is drawn in full
+const BREAK = 1000; // milliseconds between two frames that do not belong to one movement
 
 class Player {
   constructor(canvas, model) {
@@ -13,6 +17,11 @@ class Player {
     this.table = new Float32Array(20 * Math.max(model.nodes, 1));
     this.time = 0;
     this.frames = 0;
+    this.adaptive = true;
+    this.coarse = 1; // share of each side's pixels that is drawn while something moves
+    this.moving = false;
+    this.interval = SLOW / 2; // milliseconds between frames, of late
+    this.drawn = 0;
     this.stale = this.unsorted = true; // the picture, the order
     this.order = new Uint32Array(model.count);
     this.spare = new Uint32Array(model.count);
@@ -70,11 +79,33 @@ class Player {
   }
 
   resize() {
-    const ratio = Math.min(devicePixelRatio || 1, 2), { clientWidth, clientHeight } = this.canvas;
-    this.canvas.width = Math.max(1, Math.round(clientWidth * ratio));
-    this.canvas.height = Math.max(1, Math.round(clientHeight * ratio));
-    this.changed();
+    const { canvas } = this, share = this.moving ? this.coarse : 1, ratio = share * Math.min(devicePixelRatio || 1, 2);
+    const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
+    const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+    if (canvas.width === width && canvas.height === height) return;
+    canvas.width = width;
+    canvas.height = height;
+    this.stale = true;
     this.frame(); // at once: a resized canvas is blank
+  }
+
+  // Called for every frame of the screen.
+  tick(now) {
+    if (this.stale) {
+      const passed = now - this.drawn;
+      this.moving = passed < BREAK;
+      if (this.moving) this.interval += 0.2 * (Math.min(passed, 1.6 * SLOW) - this.interval); // one hitch is no trend
+      if (this.adaptive && this.interval > SLOW && this.coarse > COARSEST) {
+        this.coarse = Math.max(COARSEST, 0.8 * this.coarse);
+        this.interval = SLOW / 2;
+      }
+      this.drawn = now;
+      this.resize();
+      this.frame();
+    } else if (this.moving && now - this.drawn > Math.max(REST, 3 * this.interval)) {
+      this.moving = false;
+      this.resize();
+    }
   }
 
   seek(time) {
