@@ -26,7 +26,7 @@ from scgs_warp.motion import build_motion
 from scgs_warp.scene import Scene
 from scgs_warp.types import Camera
 
-PATIENCE = 120.0
+PATIENCE = 60.0
 SIZE = {"width": 480, "height": 360}
 RENDER = """async ([time, viewmat, K, width, height, background]) => {
   const { pixels } = await window.scgs.renderAt(time, viewmat, K, width, height, background);

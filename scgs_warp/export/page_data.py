@@ -7,6 +7,7 @@ stores a plane whose values use a few bits in about so many, and the reader need
 from __future__ import annotations
 
 import json
+import math
 import struct
 import zlib
 from dataclasses import dataclass
@@ -54,18 +55,12 @@ class Column:
         }
 
 
-def quantise(name: str, values: np.ndarray, bits: int, *, step: float | None = None, delta: bool = False) -> Column:
-    """Spread ``values`` [R] evenly over codes, so that the least and the largest are exact.
-
-    Args:
-        bits: 1 to 24.
-        step: width of a code, instead; ``bits`` becomes what that needs, 24 at most (then the step is as wide as it
-            has to be).
-    """
+def quantise(name: str, values: np.ndarray, step: float, *, most_bits: int = 24, delta: bool = False) -> Column:
+    """``values`` [R] as codes no wider than ``step``, the least and the largest exact; wider where ``most_bits`` (1 to
+    24) do not reach."""
     values = values.astype(np.float64)
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-    if step is not None:
-        bits = min(24, max(1, int(np.ceil(np.log2((high - low) / step + 1.0)))))
+    bits = min(most_bits, max(1, math.ceil(math.log2((high - low) / step + 1.0))))
     width = (high - low) / ((1 << bits) - 1)
     codes = np.zeros(len(values), np.uint32) if width == 0 else np.rint((values - low) / width).astype(np.uint32)
     return Column(name, codes, bits, low, width, delta)

@@ -17,8 +17,6 @@ from ..motion.static_nodes import StaticNodes
 from ..scene import Scene
 from .page_data import Column, integers, quantise
 
-MEAN_STEP = 2.5e-5
-"""Of positions, normalised units (what cameras saw has a radius of some 1.4): a hundredth of a pixel at 800 x 800."""
 FEWEST_SAMPLES, MOST_SAMPLES = 33, 257
 """Times at which control points are sampled: twice as many, again and again ..."""
 COARSE_ERROR = 8e-4
@@ -28,18 +26,21 @@ POSE_PARTS = ("translation", "rotation", "shape", "log_scale")
 QUATERNIONS = ("rotation", "shape")
 TIMES_AT_ONCE = 16
 """Of the network's evaluations, so that many control points do not need much memory."""
-BITS = {
-    "quats": 10,
-    "log_scales": 9,
-    "opacities": 8,
-    "sh_dc": 10,
-    "sh_rest": 6,
-    "shading": 7,
-    "weights": 9,
-    "share": 8,
-    "pose": 14,
+STEPS = {
+    "mean": 2.5e-5,  # normalised units (what cameras saw has a radius of 1.4): a hundredth of a pixel at 800 x 800
+    "quat": 1.4e-3,
+    "log_scale": 0.02,
+    "opacity": 1 / 255,
+    "sh_dc": 6e-3,
+    "sh_rest": 9e-3,
+    "shading": 0.07,
+    "weight": 2e-3,
+    "rest": 1e-6,
+    "pose": 1e-4,
 }
-"""How finely each part is stored; docs/page.md says what that costs. ``sh_rest`` at most 8: the page unpacks bytes."""
+"""How finely each part is stored; docs/page.md says what that costs."""
+BYTE = 8
+"""Bits of ``sh_rest`` at most: the page unpacks bytes."""
 
 
 @dataclass(frozen=True)
@@ -123,31 +124,29 @@ def _facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
 
 def _gaussian_columns(gaussians: GaussianParameters, kept: Tensor, sh_degree: int) -> list[Column]:
     means, dc = _array(gaussians.means[kept]), _array(gaussians.sh_dc[kept])
-    columns = [quantise(f"mean{a}", means[:, a], 24, step=MEAN_STEP, delta=True) for a in range(3)]
-    columns += _quaternion_columns("quat", _array(gaussians.quats[kept]), BITS["quats"])
+    columns = [quantise(f"mean{a}", means[:, a], STEPS["mean"], delta=True) for a in range(3)]
+    columns += _quaternion_columns("quat", _array(gaussians.quats[kept]))
     scales = _array(gaussians.log_scales[kept])
-    columns += [quantise(f"scale{a}", scales[:, a], BITS["log_scales"]) for a in range(3)]
-    columns.append(quantise("opacity", _array(gaussians.opacities()[kept]), BITS["opacities"]))
-    columns += [quantise(f"dc{c}", dc[:, c], BITS["sh_dc"]) for c in range(3)]
+    columns += [quantise(f"scale{a}", scales[:, a], STEPS["log_scale"]) for a in range(3)]
+    columns.append(quantise("opacity", _array(gaussians.opacities()[kept]), STEPS["opacity"]))
+    columns += [quantise(f"dc{c}", dc[:, c], STEPS["sh_dc"]) for c in range(3)]
     rest = _array(gaussians.sh_rest[kept])
     for k in range((sh_degree + 1) ** 2 - 1):
-        columns += [quantise(f"sh{k}_{c}", rest[:, k, c], BITS["sh_rest"]) for c in range(3)]
+        columns += [quantise(f"sh{k}_{c}", rest[:, k, c], STEPS["sh_rest"], most_bits=BYTE) for c in range(3)]
     shading = _array(gaussians.shading[kept])
-    columns += [quantise(f"shading{k}", shading[:, k], BITS["shading"]) for k in range(shading.shape[1])]
+    columns += [quantise(f"shading{k}", shading[:, k], STEPS["shading"]) for k in range(shading.shape[1])]
     return columns
 
 
-def _quaternion_columns(name: str, quats: np.ndarray, bits: int) -> list[Column]:
+def _quaternion_columns(name: str, quats: np.ndarray) -> list[Column]:
     """The largest of the four, as an index, is left out and made positive; the others lie within 1 / sqrt 2."""
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))
     quats = np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None] * quats
     others = np.stack([quats[rows, (largest + 1 + k) % 4] for k in range(3)])
-    edge, width = 0.5**0.5, 2 * 0.5**0.5 / ((1 << bits) - 1)
-    codes = np.rint((others + edge) / width).clip(0, (1 << bits) - 1).astype(np.uint32)
     columns = [integers(f"{name}_largest", largest)]
-    return columns + [Column(f"{name}{k}", codes[k], bits, -edge, width) for k in range(3)]
+    return columns + [quantise(f"{name}{k}", others[k], STEPS["quat"]) for k in range(3)]
 
 
 def _binding_columns(
@@ -158,9 +157,9 @@ def _binding_columns(
     count = indices.shape[1]
     facts.update(nodes=len(motion), neighbors=count, masked=bool(motion.config.mask))
     columns = [integers(f"node{k}", indices[:, k].cpu().numpy()) for k in range(count)]
-    columns += [quantise(f"weight{k}", _array(weights[:, k]), BITS["weights"]) for k in range(1, count)]
+    columns += [quantise(f"weight{k}", _array(weights[:, k]), STEPS["weight"]) for k in range(1, count)]
     if motion.config.mask:
-        columns.append(quantise("share", _array(gaussians.hyper[kept, -1].sigmoid()), BITS["share"]))
+        columns.append(quantise("share", _array(gaussians.hyper[kept, -1].sigmoid()), STEPS["opacity"]))
     return columns
 
 
@@ -169,10 +168,10 @@ def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
     poses = sample_poses(motion)
     facts.update(samples=len(poses["translation"]), shapes="shape" in poses, scaled="log_scale" in poses)
     rest = _array(motion.positions)
-    columns = [quantise(f"rest{a}", rest[:, a], 24) for a in range(3)]
+    columns = [quantise(f"rest{a}", rest[:, a], STEPS["rest"]) for a in range(3)]
     for name, values in poses.items():
         for a in range(values.shape[2]):
-            columns.append(quantise(f"{name}{a}", values[:, :, a].T.reshape(-1), BITS["pose"], delta=True))
+            columns.append(quantise(f"{name}{a}", values[:, :, a].T.reshape(-1), STEPS["pose"], delta=True))
     return columns
 
 

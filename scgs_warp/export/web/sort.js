@@ -49,6 +49,7 @@ function makeSorter(model) {
         }
         depth = shares ? depth + shares[i] * (moved - depth) : moved;
       }
+      depth = Math.fround(depth); // as it is stored: the farthest must not lie beyond `most`
       if (!(depth >= 0.01)) continue;
       depths[i] = depth;
       half[amount++] = i;
