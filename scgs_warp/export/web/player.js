@@ -4,7 +4,7 @@ const SECONDS = 4; // a scene's whole time at speed 1
 const SLOW = 50; // milliseconds a frame: slower machines draw fewer pixels while something moves ...
 const COARSEST = 0.4; // ... but not fewer than so many of each side's
 const REST = 250; // milliseconds of stillness after which a frame is drawn in full
-const BREAK = 1000; // milliseconds between two frames that do not belong to one movement
+const BREAK = 3000; // milliseconds between two frames that do not belong to one movement
 
 class Player {
   constructor(canvas, model) {
