@@ -95,25 +95,19 @@ class Renderer {
   }
 
   makeOrder() {
-    const { gl, model } = this;
+    const { gl } = this;
     this.nothing = gl.createVertexArray();
-    this.quads = gl.createVertexArray();
-    this.order = gl.createBuffer();
+    this.splats.u_order = this.texture(gl.R32UI, WIDTH, this.rows);
+    this.padded = new Uint32Array(WIDTH * this.rows);
     this.amount = 0;
-    gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * model.count, gl.DYNAMIC_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
-    gl.bindVertexArray(null);
   }
 
   setOrder(order, amount) {
-    const { gl } = this;
+    const { gl, padded } = this, rows = Math.ceil(amount / WIDTH);
     this.amount = amount;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order, 0, amount);
+    padded.set(order.subarray(0, amount));
+    gl.bindTexture(gl.TEXTURE_2D, this.splats.u_order);
+    if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, padded);
   }
 
   // The sum, one size at a time.
@@ -175,8 +169,7 @@ class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     this.use(this.draw, this.splats);
     gl.uniform2f(this.draw.place("u_size"), width, height);
-    gl.bindVertexArray(this.quads);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.amount);
+    gl.drawArrays(gl.TRIANGLES, 0, 6 * this.amount);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.disable(gl.BLEND);
     this.use(this.screen, { u_image: sum.texture });
