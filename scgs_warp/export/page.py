@@ -1,0 +1,105 @@
+"""A page that plays a moving scene in a browser: one file, no server, no network. docs/page.md describes it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from pathlib import Path
+
+from ..checkpoint import write_atomically
+from ..errors import UserError
+from ..scene import Scene
+from .page_data import pack
+from .page_scene import page_scene
+
+SCRIPTS = ("data", "camera", "renderer", "player", "controls", "main")
+SHADERS = ("splat.frag", "draw.vert", "draw.frag", "screen.vert", "screen.frag")
+MOST_DEGREE = 3
+WEB = Path(__file__).parent / "web"
+TITLE = "Moving scene"
+MIB = 2**20
+
+
+def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | None = None) -> None:
+    """Write one HTML file that plays ``scene``; an existing file is replaced once the new one is complete.
+
+    Args:
+        scene: with control points, or static.
+        path: ends in .html or .htm; missing folders above are made.
+        title: shown on the page, any text.
+        max_mib: the file's largest size in MiB. Colours lose their highest degrees of spherical harmonics, one by one,
+            until it fits.
+
+    Raises:
+        UserError: the name does not end in .html; the motion model has no control points; the page does not fit; the
+            place cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise UserError(f"{path}: end the name of a page in .html")
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; give the page another name")
+    if max_mib is not None and not max_mib > 0:
+        raise UserError(f"max_mib is {max_mib:g}; give a size in MiB above 0, or none")
+    page = _fitting(scene, path, title, max_mib)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{path.parent}: cannot be made ({error.strerror}); give another folder") from None
+    write_atomically(path, page)
+
+
+def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> bytes:
+    """The page of the highest degree that is small enough."""
+    page = b""
+    for degree in range(min(scene.gaussians.sh_degree, MOST_DEGREE), -1, -1):
+        content = page_scene(scene, degree)
+        page = assemble(pack(content.facts, content.columns), title)
+        if max_mib is None or len(page) <= max_mib * MIB:
+            return page
+    least = len(page) / MIB
+    raise UserError(
+        f"{path}: takes {least:.2f} MiB even with colours that do not depend on the view, more than max_mib "
+        f"{max_mib:g}; allow that much, or train with a smaller --max-gaussians"
+    )
+
+
+def assemble(data: bytes, title: str = "") -> bytes:
+    """The page around its packed data: program, style and data in one UTF-8 text."""
+    program, style = _program(), _read("style.css")
+    policy = (
+        # Nothing from the network, and no script but this one, whatever a title may hold
+        f"default-src 'none'; script-src {_hash(program)} blob:; worker-src blob:; style-src {_hash(style)}; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    parts = {
+        "policy": policy,
+        "title": html.escape(" ".join(title.split()) or TITLE),
+        "style": style,
+        "data": base64.b64encode(data).decode("ascii"),
+        "program": program,
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], _read("index.html")).encode()
+
+
+def _program() -> str:
+    """All scripts as one, with the shaders and the worker's text as strings."""
+    shaders = json.dumps({name: _read(f"{name}.glsl") for name in SHADERS})
+    sort = _read("sort.js")
+    texts = [f"const SHADERS = {shaders};", f"const SHARED = {json.dumps({'sort': sort})};", sort]
+    texts += [_read(f"{name}.js") for name in SCRIPTS]
+    program = '(() => {\n"use strict";\n' + "\n".join(texts) + "\n})();\n"
+    if "</" in program or "<!--" in program:
+        raise AssertionError("the program would end its own script element")
+    return program
+
+
+def _read(name: str) -> str:
+    return (WEB / name).read_text(encoding="utf-8")  # with \n alone, as the browser will hash it
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"

@@ -1,0 +1,225 @@
+"""A scene as a page's columns: one set of Gaussians, their control points, and the control points' way through time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import UserError
+from ..gaussians import GaussianParameters
+from ..kernels.types import ALPHA_MIN
+from ..motion.control_points import ControlPoints
+from ..motion.static_nodes import StaticNodes
+from ..scene import Scene
+from .page_data import Column, integers, quantise
+
+FEWEST_SAMPLES, MOST_SAMPLES = 33, 257
+"""Times at which control points are sampled: twice as many, again and again ..."""
+COARSE_ERROR = 8e-4
+"""... until they were off by no more than this (root mean square, normalised units and radians) halfway between two
+times before the last doubling, which leaves about a quarter of it."""
+POSE_PARTS = ("translation", "rotation", "shape", "log_scale")
+QUATERNIONS = ("rotation", "shape")
+TIMES_AT_ONCE = 16
+"""Of the network's evaluations, so that many control points do not need much memory."""
+STEPS = {
+    "mean": 2.5e-5,  # normalised units (what cameras saw has a radius of 1.4): a hundredth of a pixel at 800 x 800
+    "quat": 1.4e-3,
+    "log_scale": 0.02,
+    "opacity": 1 / 255,
+    "sh_dc": 6e-3,
+    "sh_rest": 9e-3,
+    "shading": 0.07,
+    "weight": 2e-3,
+    "rest": 1e-6,
+    "pose": 1e-4,
+}
+"""How finely each part is stored; docs/page.md says what that costs."""
+BYTE = 8
+"""Bits of ``sh_rest`` at most: the page unpacks bytes."""
+
+
+@dataclass(frozen=True)
+class PageScene:
+    """Facts for the page's header, and its columns."""
+
+    facts: dict[str, Any]
+    columns: list[Column]
+
+
+def page_scene(scene: Scene, sh_degree: int) -> PageScene:
+    """Quantise a scene for a page.
+
+    Args:
+        sh_degree: of the colours; at most the scene's own.
+
+    Raises:
+        UserError: the motion model has no control points to skin by, or no Gaussian can be seen.
+    """
+    gaussians, motion = scene.gaussians, scene.motion
+    if not isinstance(motion, ControlPoints | StaticNodes) and motion.moves:
+        raise UserError(
+            f"--format html: the motion model {motion.name} has no control points for a page to move Gaussians by; "
+            "train with --motion control-points, or export a film with apps/view.py"
+        )
+    with torch.no_grad():
+        kept = visible(gaussians)
+        if not len(kept):
+            raise UserError("--format html: the scene has no Gaussian that can be seen; train it first")
+        kept = kept[morton_order(gaussians.means[kept])]
+        columns = _gaussian_columns(gaussians, kept, sh_degree)
+        facts = _facts(scene, len(kept), sh_degree)
+        if isinstance(motion, ControlPoints):
+            columns += _binding_columns(motion, gaussians, kept, facts)
+            columns += _pose_columns(motion, facts)
+    return PageScene(facts, columns)
+
+
+def visible(gaussians: GaussianParameters) -> Tensor:
+    """[V] int64, the Gaussians that can be drawn at all: finite, and opaque enough to change an 8-bit picture."""
+    parts = gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest.flatten(1)
+    finite = torch.stack([part.isfinite().all(dim=1) for part in parts]).all(dim=0)
+    solid = gaussians.opacities() >= float(ALPHA_MIN)
+    return (finite & solid & gaussians.quats.any(dim=1)).nonzero()[:, 0]
+
+
+def morton_order(points: Tensor) -> Tensor:
+    """[N] int64 along a curve that keeps neighbours together: deflate stores what resembles its neighbour in less."""
+    cloud = points.cpu().double().numpy()
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    cells = ((cloud - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.uint64)
+    code = np.zeros(len(cloud), np.uint64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return torch.from_numpy(np.argsort(code, kind="stable")).to(points.device)
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()
+
+
+def _facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
+    unit = scene.normalisation
+    return {
+        "gaussians": count,
+        "sh_degree": sh_degree,
+        "shaded": scene.gaussians.shading.shape[1] > 0,
+        "antialiased": bool(scene.config.antialiased),
+        "background": list(scene.background_color),
+        "overview": scene.overview.to_dict(),
+        "normalisation": {"centre": unit.centre.tolist(), "scale": unit.scale},
+        "nodes": 0,
+        "neighbors": 0,
+        "samples": 0,
+        "masked": False,
+        "shapes": False,
+        "scaled": False,
+    }
+
+
+def _gaussian_columns(gaussians: GaussianParameters, kept: Tensor, sh_degree: int) -> list[Column]:
+    means, dc = _array(gaussians.means[kept]), _array(gaussians.sh_dc[kept])
+    columns = [quantise(f"mean{a}", means[:, a], STEPS["mean"], delta=True) for a in range(3)]
+    columns += _quaternion_columns("quat", _array(gaussians.quats[kept]))
+    scales = _array(gaussians.log_scales[kept])
+    columns += [quantise(f"scale{a}", scales[:, a], STEPS["log_scale"]) for a in range(3)]
+    columns.append(quantise("opacity", _array(gaussians.opacities()[kept]), STEPS["opacity"]))
+    columns += [quantise(f"dc{c}", dc[:, c], STEPS["sh_dc"]) for c in range(3)]
+    rest = _array(gaussians.sh_rest[kept])
+    for k in range((sh_degree + 1) ** 2 - 1):
+        columns += [quantise(f"sh{k}_{c}", rest[:, k, c], STEPS["sh_rest"], most_bits=BYTE) for c in range(3)]
+    shading = _array(gaussians.shading[kept])
+    columns += [quantise(f"shading{k}", shading[:, k], STEPS["shading"]) for k in range(shading.shape[1])]
+    return columns
+
+
+def _quaternion_columns(name: str, quats: np.ndarray) -> list[Column]:
+    """The largest of the four, as an index, is left out and made positive; the others lie within 1 / sqrt 2."""
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    largest = np.abs(quats).argmax(axis=1)
+    rows = np.arange(len(quats))
+    quats = np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None] * quats
+    others = np.stack([quats[rows, (largest + 1 + k) % 4] for k in range(3)])
+    columns = [integers(f"{name}_largest", largest)]
+    return columns + [quantise(f"{name}{k}", others[k], STEPS["quat"]) for k in range(3)]
+
+
+def _binding_columns(
+    motion: ControlPoints, gaussians: GaussianParameters, kept: Tensor, facts: dict[str, Any]
+) -> list[Column]:
+    """Which control points move a Gaussian, and the weights of all but the first: they sum to one."""
+    indices, weights = (value[kept] for value in motion.binding(gaussians))
+    count = indices.shape[1]
+    facts.update(nodes=len(motion), neighbors=count, masked=bool(motion.config.mask))
+    columns = [integers(f"node{k}", indices[:, k].cpu().numpy()) for k in range(count)]
+    columns += [quantise(f"weight{k}", _array(weights[:, k]), STEPS["weight"]) for k in range(1, count)]
+    if motion.config.mask:
+        columns.append(quantise("share", _array(gaussians.hyper[kept, -1].sigmoid()), STEPS["opacity"]))
+    return columns
+
+
+def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
+    """Rest positions, and the poses at evenly spaced times: of each node, one time after the other."""
+    poses = sample_poses(motion)
+    facts.update(samples=len(poses["translation"]), shapes="shape" in poses, scaled="log_scale" in poses)
+    rest = _array(motion.positions)
+    columns = [quantise(f"rest{a}", rest[:, a], STEPS["rest"]) for a in range(3)]
+    for name, values in poses.items():
+        for a in range(values.shape[2]):
+            columns.append(quantise(f"{name}{a}", values[:, :, a].T.reshape(-1), STEPS["pose"], delta=True))
+    return columns
+
+
+def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
+    """[T, M, 3] ``translation``, [T, M, 4] ``rotation``, and where the model has them ``shape`` [T, M, 4] and
+    ``log_scale`` [T, M, 3], at T evenly spaced times; quaternions keep to their side from time to time."""
+    count = FEWEST_SAMPLES
+    poses = _poses_at(motion, torch.linspace(0.0, 1.0, count))
+    while count < MOST_SAMPLES:
+        between = _poses_at(motion, (torch.arange(count - 1) + 0.5) / (count - 1))
+        errors = [(2.0 if name in QUATERNIONS else 1.0) * _error(poses[name], between[name]) for name in poses]
+        poses = {name: _interleaved(poses[name], between[name]) for name in poses}
+        count = 2 * count - 1
+        if max(errors) <= COARSE_ERROR:
+            break
+    return {name: _one_sided(rows) if name in QUATERNIONS else rows for name, rows in poses.items()}
+
+
+def _interleaved(values: np.ndarray, between: np.ndarray) -> np.ndarray:
+    """[2 T - 1, ...] of [T, ...] and [T - 1, ...], by time."""
+    merged = np.empty((len(values) + len(between), *values.shape[1:]))
+    merged[::2], merged[1::2] = values, between
+    return merged
+
+
+def _one_sided(quats: np.ndarray) -> np.ndarray:
+    """[T, M, 4] with signs such that no quaternion turns over from one time to the next."""
+    flips = (quats[1:] * quats[:-1]).sum(axis=2, keepdims=True) < 0
+    quats = quats.copy()
+    quats[1:] *= np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
+    return quats
+
+
+def _error(values: np.ndarray, between: np.ndarray) -> float:
+    """Root mean square distance of the rows halfway between two times from the mean of the two; quaternions may lie on
+    either side."""
+    before, after = values[:-1], values[1:]
+    if values.shape[2] == 4:
+        before, after = (np.where((x * between).sum(2, keepdims=True) < 0, -x, x) for x in (before, after))
+    return float(((0.5 * (before + after) - between) ** 2).sum(axis=2).mean() ** 0.5)
+
+
+def _poses_at(motion: ControlPoints, times: Tensor) -> dict[str, np.ndarray]:
+    found: dict[str, list[np.ndarray]] = {}
+    for part in times.split(TIMES_AT_ONCE):
+        for pose in motion.poses(part):
+            fields = pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales
+            for name, value in zip(POSE_PARTS, fields, strict=True):
+                if value is not None:
+                    found.setdefault(name, []).append(_array(value))
+    return {name: np.stack(rows) for name, rows in found.items()}

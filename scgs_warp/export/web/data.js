@@ -1,0 +1,181 @@
+// Reads what the page holds; docs/page.md describes it.
+
+const WIDTH = 2048; // of all data textures
+
+async function inflate(text) {
+  const letters = atob(text);
+  const bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+function readColumns(raw) {
+  const length = new DataView(raw.buffer).getUint32(0, true);
+  const facts = JSON.parse(new TextDecoder().decode(raw.subarray(4, 4 + length)));
+  const columns = {};
+  let offset = 4 + length;
+  for (const { name, rows, bits, low, step, delta } of facts.columns) {
+    const codes = new Uint32Array(rows);
+    for (let shift = 0; shift < bits; shift += 8) {
+      for (let i = 0; i < rows; i++) codes[i] |= raw[offset + i] << shift;
+      offset += rows;
+    }
+    if (delta) {
+      const mask = 2 ** bits - 1;
+      for (let i = 1; i < rows; i++) codes[i] = (codes[i] + codes[i - 1]) & mask;
+    }
+    columns[name] = { codes, low, step };
+  }
+  return { facts, columns };
+}
+
+// Values of several columns side by side, `stride` numbers a row, from number `first` of the row on.
+function fill(target, stride, first, columns) {
+  columns.forEach(({ codes, low, step }, k) => {
+    for (let i = 0; i < codes.length; i++) target[stride * i + first + k] = low + step * codes[i];
+  });
+}
+
+// An array for `rows` rows of `stride` numbers in texels of four, filled up to whole lines of a texture.
+function room(Type, rows, stride) {
+  const texels = Math.ceil((rows * stride) / 4);
+  return new Type(4 * WIDTH * Math.max(1, Math.ceil(texels / WIDTH)));
+}
+
+function readQuaternions(columns, target, stride) {
+  const largest = columns.quat_largest.codes;
+  const others = [0, 1, 2].map((k) => columns["quat" + k]);
+  for (let i = 0; i < largest.length; i++) {
+    let rest = 1;
+    others.forEach(({ codes, low, step }, k) => {
+      const value = low + step * codes[i];
+      rest -= value * value;
+      target[stride * i + ((largest[i] + 1 + k) & 3)] = value;
+    });
+    target[stride * i + largest[i]] = Math.sqrt(Math.max(rest, 0));
+  }
+}
+
+function readBinding(facts, columns, model) {
+  const { count, stride, indices, weights } = model;
+  for (let k = 0; k < facts.neighbors; k++) fill(indices, stride, k, [columns["node" + k]]);
+  for (let k = 1; k < facts.neighbors; k++) fill(weights, stride, k, [columns["weight" + k]]);
+  for (let i = 0; i < count; i++) {
+    let first = 1; // weights sum to one
+    for (let k = 1; k < facts.neighbors; k++) first -= weights[stride * i + k];
+    weights[stride * i] = first;
+  }
+  if (facts.masked) {
+    model.shares = new Float32Array(count);
+    fill(model.shares, 1, 0, [columns.share]);
+    fill(model.scales, 4, 3, [columns.share]);
+  }
+}
+
+function readHarmonics(facts, columns, model) {
+  const coefficients = (facts.sh_degree + 1) ** 2 - 1, stride = 4 * Math.ceil(coefficients / 4);
+  model.harmonics = room(Uint32Array, model.count, stride);
+  model.shLow = new Float32Array(45);
+  model.shStep = new Float32Array(45);
+  for (let k = 0; k < coefficients; k++) {
+    for (let c = 0; c < 3; c++) {
+      const { codes, low, step } = columns[`sh${k}_${c}`];
+      model.shLow[3 * k + c] = low;
+      model.shStep[3 * k + c] = step;
+      for (let i = 0; i < codes.length; i++) model.harmonics[stride * i + k] |= codes[i] << (8 * c);
+    }
+  }
+}
+
+function readNodes(facts, columns) {
+  const read = (name, width, rows) => {
+    const values = new Float32Array(width * rows);
+    fill(values, width, 0, Array.from({ length: width }, (_, a) => columns[name + a]));
+    return values;
+  };
+  const rows = facts.nodes * facts.samples;
+  return {
+    rest: read("rest", 3, facts.nodes),
+    translation: read("translation", 3, rows),
+    rotation: read("rotation", 4, rows),
+    shape: facts.shapes ? read("shape", 4, rows) : null,
+    log_scale: facts.scaled ? read("log_scale", 3, rows) : null,
+  };
+}
+
+async function readModel(text) {
+  const { facts, columns } = readColumns(await inflate(text));
+  const count = facts.gaussians, stride = 4 * Math.ceil(facts.neighbors / 4);
+  const colorStride = facts.shaded ? 16 : 4;
+  const model = {
+    facts, count, stride, nodes: facts.nodes, shares: null,
+    means: room(Float32Array, count, 4),
+    quats: room(Float32Array, count, 4),
+    scales: room(Float32Array, count, 4),
+    colors: room(Float32Array, count, colorStride),
+    indices: room(Uint16Array, count, stride),
+    weights: room(Float32Array, count, stride),
+  };
+  const named = (name, amount) => Array.from({ length: amount }, (_, k) => columns[name + k]);
+  fill(model.means, 4, 0, [...named("mean", 3), columns.opacity]);
+  fill(model.scales, 4, 0, named("scale", 3));
+  fill(model.colors, colorStride, 0, named("dc", 3));
+  if (facts.shaded) {
+    fill(model.colors, colorStride, 3, [columns.shading9]);
+    fill(model.colors, colorStride, 4, named("shading", 9));
+  }
+  readQuaternions(columns, model.quats, 4);
+  readHarmonics(facts, columns, model);
+  if (facts.nodes) {
+    readBinding(facts, columns, model);
+    model.trajectories = readNodes(facts, columns);
+  }
+  return model;
+}
+
+// Control points at a time in [0, 1]: 20 numbers each, the rows of x -> R (x - p) + p + t, the rotation of shapes, and
+// the change of log scales.
+function poseAt(model, time, table) {
+  const { nodes, facts, trajectories } = model;
+  if (!nodes) return table;
+  const last = facts.samples - 1, at = Math.min(Math.max(time, 0), 1) * last;
+  const sample = Math.min(Math.floor(at), last - 1), share = at - sample;
+  const quat = [0, 0, 0, 0];
+  const blend = (values, width, m, into) => {
+    const from = width * (facts.samples * m + sample);
+    for (let a = 0; a < width; a++) into[a] = (1 - share) * values[from + a] + share * values[from + width + a];
+  };
+  const unit = (values, m) => {
+    blend(values, 4, m, quat);
+    const norm = Math.hypot(...quat);
+    for (let a = 0; a < 4; a++) quat[a] /= norm;
+  };
+  const shift = [0, 0, 0], grown = [0, 0, 0];
+  for (let m = 0; m < nodes; m++) {
+    unit(trajectories.rotation, m);
+    blend(trajectories.translation, 3, m, shift);
+    const rows = rotationRows(quat);
+    for (let r = 0; r < 3; r++) {
+      let offset = shift[r] + trajectories.rest[3 * m + r];
+      for (let c = 0; c < 3; c++) {
+        table[20 * m + 4 * r + c] = rows[3 * r + c];
+        offset -= rows[3 * r + c] * trajectories.rest[3 * m + c];
+      }
+      table[20 * m + 4 * r + 3] = offset;
+    }
+    if (trajectories.shape) unit(trajectories.shape, m);
+    if (trajectories.log_scale) blend(trajectories.log_scale, 3, m, grown);
+    table.set(quat, 20 * m + 12);
+    table.set(grown, 20 * m + 16);
+  }
+  return table;
+}
+
+function rotationRows([w, x, y, z]) {
+  return [
+    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+  ];
+}

@@ -1,0 +1,156 @@
+// The page: time, camera, the worker that sorts, and frames when something has changed.
+
+const SECONDS = 4; // a scene's whole time at speed 1
+const SLOW = 50; // milliseconds a frame: slower machines draw fewer pixels while something moves ...
+const COARSEST = 0.4; // ... but not fewer than so many of each side's
+const REST = 250; // milliseconds of stillness after which a frame is drawn in full
+const BREAK = 3000; // milliseconds between two frames that do not belong to one movement
+
+class Player {
+  constructor(canvas, model) {
+    this.canvas = canvas;
+    this.model = model;
+    this.gl = canvas.getContext("webgl2", { antialias: false, depth: false, alpha: false });
+    if (!this.gl) throw new Error("WebGL 2 is missing");
+    this.orbit = new Orbit(model.facts.overview);
+    this.background = model.facts.background;
+    this.table = new Float32Array(20 * Math.max(model.nodes, 1));
+    this.time = 0;
+    this.frames = 0;
+    this.adaptive = true;
+    this.coarse = 1; // share of each side's pixels that is drawn while something moves
+    this.moving = false;
+    this.interval = SLOW / 2; // milliseconds between frames, of late
+    this.drawn = 0;
+    this.stale = this.unsorted = true; // the picture, the order
+    this.order = new Uint32Array(model.count);
+    this.spare = new Uint32Array(model.count);
+    this.amount = 0;
+    this.startSorter();
+    this.renderer = new Renderer(this.gl, model);
+    canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault(); // else it never comes back
+      this.renderer = null;
+    });
+    canvas.addEventListener("webglcontextrestored", () => {
+      this.renderer = new Renderer(this.gl, model);
+      this.takeOrder(this.order, this.amount);
+    });
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    this.resize();
+  }
+
+  startSorter() {
+    const { count, stride, nodes, means, indices, weights, shares } = this.model;
+    const model = { count, stride, nodes, means, indices, weights, shares };
+    this.sort = makeSorter(model);
+    this.sorting = false;
+    try {
+      const text = `${SHARED.sort}\nserveSorter(self);`;
+      this.worker = new Worker(URL.createObjectURL(new Blob([text], { type: "text/javascript" })));
+      this.worker.onmessage = ({ data }) => {
+        this.sorting = false;
+        this.spare = this.order;
+        this.takeOrder(data.order, data.amount);
+      };
+      this.worker.onerror = () => this.sortHere();
+      this.worker.postMessage({ model });
+    } catch {
+      this.worker = null; // a browser that allows none: sort here
+    }
+  }
+
+  sortHere() {
+    this.worker = null;
+    this.sorting = false;
+    this.spare ??= new Uint32Array(this.model.count);
+    this.changed();
+  }
+
+  takeOrder(order, amount) {
+    this.order = order;
+    this.amount = amount;
+    this.renderer?.setOrder(order, amount);
+    this.stale = true;
+  }
+
+  changed() {
+    this.stale = this.unsorted = true;
+  }
+
+  resize() {
+    const { canvas } = this, share = this.moving ? this.coarse : 1, ratio = share * Math.min(devicePixelRatio || 1, 2);
+    const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
+    const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+    if (canvas.width === width && canvas.height === height) return;
+    canvas.width = width;
+    canvas.height = height;
+    this.stale = true;
+    this.frame(); // at once: a resized canvas is blank
+  }
+
+  // Called for every frame of the screen.
+  tick(now) {
+    if (this.stale) {
+      const passed = now - this.drawn;
+      this.moving = passed < BREAK;
+      if (this.moving) this.interval += 0.2 * (Math.min(passed, 1.6 * SLOW) - this.interval); // one hitch is no trend
+      if (this.adaptive && this.interval > SLOW && this.coarse > COARSEST) {
+        this.coarse = Math.max(COARSEST, 0.8 * this.coarse);
+        this.interval = SLOW / 2;
+      }
+      this.drawn = now;
+      this.resize();
+      this.frame();
+    } else if (this.moving && now - this.drawn > Math.max(REST, 3 * this.interval)) {
+      this.moving = false;
+      this.resize();
+    }
+  }
+
+  seek(time) {
+    this.time = Math.min(Math.max(time, 0), 1);
+    this.changed();
+  }
+
+  view() {
+    const { width, height } = this.canvas;
+    return normalised(this.orbit.camera(width, height), this.model.facts.normalisation);
+  }
+
+  requestOrder(view) {
+    const row = view.rows[2], shift = view.shift[2];
+    if (!this.worker) {
+      this.unsorted = false;
+      this.takeOrder(this.order, this.sort(row, shift, this.table, this.order));
+    } else if (!this.sorting) {
+      this.unsorted = false;
+      this.sorting = true;
+      const order = this.spare;
+      this.spare = null;
+      this.worker.postMessage({ row, shift, table: this.table, order }, [order.buffer]);
+    }
+  }
+
+  // Draw if something has changed. Gaussians are where they belong at once; their order follows within a frame or two.
+  frame() {
+    if (!this.renderer || !this.stale) return;
+    const view = this.view();
+    poseAt(this.model, this.time, this.table);
+    this.stale = false;
+    if (this.unsorted) this.requestOrder(view);
+    this.renderer.render(view, this.table, this.background, null);
+    this.frames++;
+  }
+
+  // An exact frame in memory, sorted for this very view; what is on the screen stays.
+  renderAt(time, viewmat, K, width, height, background) {
+    const view = normalised({ viewmat, K, width, height }, this.model.facts.normalisation);
+    const table = poseAt(this.model, time, new Float32Array(this.table.length));
+    const order = new Uint32Array(this.model.count);
+    this.renderer.setOrder(order, this.sort(view.rows[2], view.shift[2], table, order));
+    const pixels = this.renderer.read(view, table, background ?? this.background);
+    this.takeOrder(this.order, this.amount);
+    return { width, height, pixels };
+  }
+}

@@ -1,0 +1,77 @@
+// Farthest first. The same text runs in a worker, beside the page, and in the page where an exact frame is asked for.
+
+// model: count, stride (neighbours a Gaussian, padded), nodes, means [N * 4], indices, weights [N * stride], shares
+function makeSorter(model) {
+  const { count, stride, nodes, means, indices, weights, shares } = model;
+  const BINS = 4096; // 12 bits a pass, two passes: as fine as depths in float32 are over a scene
+  const depths = new Float32Array(count), keys = new Uint32Array(count);
+  const ids = new Uint32Array(count), half = new Uint32Array(count);
+  const histogram = new Uint32Array(BINS);
+  const planes = new Float64Array(4 * Math.max(nodes, 1));
+
+  // Depth is linear in the position, and so it is under every control point's own map.
+  function nodePlanes(row, shift, table) {
+    for (let m = 0; m < nodes; m++) {
+      for (let c = 0; c < 4; c++) {
+        let sum = c === 3 ? shift : 0;
+        for (let r = 0; r < 3; r++) sum += row[r] * table[20 * m + 4 * r + c];
+        planes[4 * m + c] = sum;
+      }
+    }
+  }
+
+  function pass(from, to, amount, bits) {
+    histogram.fill(0);
+    for (let j = 0; j < amount; j++) histogram[(keys[from[j]] >>> bits) & (BINS - 1)]++;
+    let total = 0;
+    for (let b = 0; b < BINS; b++) {
+      const here = histogram[b];
+      histogram[b] = total;
+      total += here;
+    }
+    for (let j = 0; j < amount; j++) to[histogram[(keys[from[j]] >>> bits) & (BINS - 1)]++] = from[j];
+  }
+
+  // row, shift: third row of the world-to-camera matrix; table: of poseAt; order: Uint32Array [N] to be filled.
+  // Returns how many Gaussians lie in front of the camera.
+  return function sort(row, shift, table, order) {
+    nodePlanes(row, shift, table);
+    let amount = 0, least = Infinity, most = -Infinity;
+    for (let i = 0; i < count; i++) {
+      const x = means[4 * i], y = means[4 * i + 1], z = means[4 * i + 2];
+      let depth = 0;
+      if (nodes === 0 || shares) depth = row[0] * x + row[1] * y + row[2] * z + shift;
+      if (nodes > 0) {
+        let moved = 0;
+        for (let k = stride * i; k < stride * (i + 1); k++) {
+          const m = 4 * indices[k];
+          moved += weights[k] * (planes[m] * x + planes[m + 1] * y + planes[m + 2] * z + planes[m + 3]);
+        }
+        depth = shares ? depth + shares[i] * (moved - depth) : moved;
+      }
+      depth = Math.fround(depth); // as it is stored: the farthest must not lie beyond `most`
+      if (!(depth >= 0.01)) continue;
+      depths[i] = depth;
+      half[amount++] = i;
+      if (depth < least) least = depth;
+      if (depth > most) most = depth;
+    }
+    const scale = most > least ? (BINS * BINS - 1) / (most - least) : 0;
+    for (let j = 0; j < amount; j++) keys[half[j]] = (most - depths[half[j]]) * scale;
+    pass(half, ids, amount, 0);
+    pass(ids, order, amount, 12);
+    return amount;
+  };
+}
+
+function serveSorter(scope) {
+  let sort = null;
+  scope.onmessage = ({ data }) => {
+    if (data.model) {
+      sort = makeSorter(data.model);
+      return;
+    }
+    const amount = sort(data.row, data.shift, data.table, data.order);
+    scope.postMessage({ amount, order: data.order }, [data.order.buffer]);
+  };
+}
