@@ -219,9 +219,3 @@ def test_bad_places_are_refused(tmp_path):
         page.write_page(scene, tmp_path / "file" / "page.html")
     page.write_page(scene, tmp_path / "new" / "page.html")
     assert (tmp_path / "new" / "page.html").is_file()
-
-
-def test_a_wheel_takes_the_program_along():
-    text = (Path(__file__).parent.parent / "pyproject.toml").read_text(encoding="utf-8")
-    assert '"scgs_warp.export",' in text and '"scgs_warp.export" = ["web/*"]' in text
-    assert all(path.is_file() for path in page.WEB.iterdir())
