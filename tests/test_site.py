@@ -91,7 +91,8 @@ def test_pages_name_only_programs_that_exist():
     assert len(used) >= 8
     for name, rest in used:
         source = (ROOT / "apps" / f"{name}.py").read_text(encoding="utf-8")
-        source += (ROOT / "apps/settings.py").read_text(encoding="utf-8") if name == "train" else ""
+        elsewhere = {"train": "apps/settings.py", "export": "scgs_warp/export/request.py"}
+        source += (ROOT / elsewhere[name]).read_text(encoding="utf-8") if name in elsewhere else ""
         for option in re.findall(r"--([\w-]+)", rest.split("#")[0]):
             field = option.replace("-", "_")
             assert re.search(rf"^    {field}:", source, re.MULTILINE), f"{name}.py has no --{option}"
