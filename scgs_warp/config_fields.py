@@ -95,9 +95,9 @@ class PretrainConfig:
     clone_share: float = 0.2
     """Share of the spheres that is cloned each time, those with the largest gradients, until the cap."""
     start_ratio: float = 8.0
-    """Spheres per control point to start with; while they are at rest they cost little."""
+    """Spheres per control point (or as for 256 of them) to start with; while they are at rest they cost little."""
     max_ratio: float = 2.0
-    """At most this many spheres per control point once they move: each one queries the network."""
+    """At most so many per control point (or as for 256 of them) once they move: each one queries the network."""
     opacity_rate: float = 0.02
     """Learning rates of the spheres; with the Gaussians' own they turn transparent before they find their colour."""
     color_rate: float = 1e-2

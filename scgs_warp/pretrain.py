@@ -22,6 +22,15 @@ TRAJECTORY_TIMES = 16
 START_RADIUS = 0.5
 """Of the spheres of progressive pre-training, as a share of their spacing."""
 DEAD_OPACITY = 0.01
+SOLID_OPACITY = 0.1
+"""Spheres of less show nothing: neither control points nor Gaussians begin there while there are others."""
+FEWEST_SPHERES = 256
+"""Stage 1 works as if there were at least so many control points: fewer spheres cannot make out a figure."""
+
+
+def sphere_base(config: TrainConfig) -> int:
+    """What the numbers of spheres in stage 1 are multiples of: N_p, or more where that is too few."""
+    return max(config.motion.nodes, FEWEST_SPHERES)
 
 
 def begin_spheres(
@@ -34,7 +43,7 @@ def begin_spheres(
     the first pose: there the spheres stay as dense as the points, and start smaller than their spacing, because one
     that sticks out of a thin limb turns transparent before it has shrunk.
     """
-    count = min(round(config.motion.nodes * config.pretrain.start_ratio), len(points))
+    count = min(round(sphere_base(config) * config.pretrain.start_ratio), len(points))
     index = torch.arange(count, device=points.device)
     if not config.pretrain.progressive and count < len(points):
         index = farthest_points(points, count)
@@ -78,7 +87,7 @@ def densify_spheres(
         if not bool(alive.any()):
             alive[:] = True
         kept = torch.where(alive)[0]
-        limit = round(config.motion.nodes * config.pretrain.max_ratio)
+        limit = round(sphere_base(config) * config.pretrain.max_ratio)
         if len(kept) > limit and step + 1 >= config.pretrain.warm_up:
             kept = kept[opacities[kept].argsort(descending=True, stable=True)[:limit]].sort().values
         gradient = mean_gradient(stats)[kept]
@@ -96,14 +105,20 @@ def densify_spheres(
 
 
 def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Spheres, nodes: int) -> None:
-    """Farthest-point sampling to N_p in trajectory space, so that parts that move apart are both represented."""
+    """Farthest-point sampling to N_p in trajectory space, so that parts that move apart are both represented.
+
+    Among solid spheres, if they are enough: the farthest ones of all are strays in empty space that nobody sees.
+    """
     if len(gaussians) <= nodes:
         return
     with torch.no_grad():
+        opacities = gaussians.opacities()
+        count = max(int((opacities >= SOLID_OPACITY).sum()), nodes)
+        kept = opacities.argsort(descending=True, stable=True)[:count].sort().values
         times = torch.linspace(0.0, 1.0, TRAJECTORY_TIMES)
         tracks = gaussians.means + spheres.translations(gaussians.means, times)
-        flat = tracks.permute(1, 0, 2).reshape(len(gaussians), -1).contiguous()
-        index = farthest_points(flat, nodes).to(flat.device)
+        flat = tracks.permute(1, 0, 2).reshape(len(gaussians), -1)[kept].contiguous()
+        index = kept[farthest_points(flat, nodes).to(flat.device)]
     optimizer.regather(gaussians, GaussianParameters.NAMES, index, torch.zeros_like(index, dtype=torch.bool))
     spheres.graph = None
 
@@ -132,7 +147,7 @@ def begin_gaussians(
         return gaussians_from_points(points[:count], colors[:count], **options)
     parents, motion = spheres
     with torch.no_grad():
-        opaque = torch.where(parents.opacities() >= 0.1)[0]
+        opaque = torch.where(parents.opacities() >= SOLID_OPACITY)[0]
         opaque = opaque if len(opaque) else torch.arange(len(parents), device=opaque.device)
         random = generator(config.seed, 34)
         chosen = opaque[torch.randint(len(opaque), (count,), generator=random).to(opaque.device)]

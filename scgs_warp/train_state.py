@@ -23,7 +23,7 @@ from .hull import likely_points
 from .motion.base import Motion
 from .motion.spheres import Spheres
 from .optim import Adam, generator
-from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, thin_spheres
+from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, sphere_base, thin_spheres
 from .scene import Scene, scene_from
 from .types import Stats
 
@@ -227,7 +227,7 @@ def suited(config: TrainConfig, data: Dataset) -> TrainConfig:
 def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
     """Points [P, 3], normalised, and colours [P, 3]: the data's own points in a random order, and some for what has no
     texture; else likely ones."""
-    count = max(config.init_points, round(config.motion.nodes * config.pretrain.start_ratio))
+    count = max(config.init_points, round(sphere_base(config) * config.pretrain.start_ratio))
     if data.points is None or not given(data, config):
         # Progressive pre-training starts from the pose of the first frames; what others cover is not there yet.
         frames = first_frames(data) if config.pretrain.progressive and config.pretrain_steps else data

@@ -136,6 +136,34 @@ def test_stage_one_never_falls_below_its_count(opaque, device):
     assert len(set(nodes.log_radii.tolist())) == 1
 
 
+@pytest.mark.parametrize("solid", [4, 16, 40])
+def test_control_points_are_no_strays(solid, device):
+    """Spheres that show nothing lie anywhere, and far away: only what solid ones leave open is filled with them."""
+    config = tiny_config()
+    points = torch.rand(64, 3, generator=torch.Generator().manual_seed(2)).to(device)
+    points[solid:] *= 50.0
+    gaussians, spheres = begin_spheres(config, points, points, device)
+    order = torch.cdist(gaussians.means.detach(), points).argmin(1)
+    with torch.no_grad():
+        gaussians.opacity_logits.copy_(torch.where(order < solid, 1.0, -3.0))
+    optimizer = Adam(dict(gaussians.named_parameters()), RATES)
+    nodes = config.motion.nodes
+    thin_spheres(gaussians, optimizer, spheres, nodes)
+    assert len(gaussians) == nodes
+    assert int((gaussians.opacities() > 0.5).sum()) == min(solid, nodes)
+    positions = control_points_of(gaussians, spheres, config).positions.detach()
+    assert solid < nodes or float(positions.abs().max()) <= 1.0
+
+
+def test_few_control_points_begin_among_as_many_spheres_as_more_would(device):
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(3)).to(device)
+    counts = []
+    for nodes in (16, 256, 400):
+        config = tiny_config(motion={"nodes": nodes})
+        counts.append(len(begin_spheres(config, points, points, device)[0]))
+    assert counts == [2048, 2048, 3200]
+
+
 def test_control_points_clone_where_the_image_pulls_and_idle_ones_go(device):
     config = tiny_config().motion
     positions = torch.tensor([[float(i), 0.0, 0.0] for i in range(6)] + [[0.0, 0.0, 90.0]], device=device)
