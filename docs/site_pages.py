@@ -25,6 +25,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def on_page_markdown(markdown: str, **known: Any) -> str:
+    """The folder of examples is a page here."""
+    return markdown.replace("](../examples/)", "](examples.md)")
+
+
 def on_page_content(html: str, **known: Any) -> str:
     """Docstrings say :class:`Name`, as editors show it; here the name does."""
     return re.sub(r":(?:class|func|meth|mod):(?=<code>)", "", html)

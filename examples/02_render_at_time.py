@@ -5,6 +5,7 @@ convention and intrinsics in pixels.
 
     python examples/01_train_builtin.py
     python examples/02_render_at_time.py
+    python examples/02_render_at_time.py --run runs/figure-quick    # after the README's first command
 """
 
 from __future__ import annotations
