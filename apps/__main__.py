@@ -5,7 +5,17 @@ from __future__ import annotations
 import importlib
 import sys
 
-APPS = ("train", "evaluate", "view", "edit", "bench", "ablate", "synthesize", "capture", "export")
+APPS = {
+    "train": "learn a scene",
+    "evaluate": "score a run on held-out views",
+    "view": "film a scene",
+    "edit": "move parts of it, in the browser or by script",
+    "export": "write it for other programs, or as a web page",
+    "capture": "make a data set of a video",
+    "synthesize": "make a data set of an animated mesh",
+    "ablate": "compare settings in a table",
+    "bench": "measure how fast it is here",
+}
 
 
 def main() -> int:
@@ -16,12 +26,12 @@ def main() -> int:
         print(f"scgs-warp {__version__}")
         return 0
     if not arguments or arguments[0] not in APPS:
-        wanted = not arguments or arguments[0] in ("-h", "--help")
-        print(
-            f"usage: scgs-warp {{{','.join(APPS)}}} [options]; 'scgs-warp train --help' explains each option",
-            file=sys.stdout if wanted else sys.stderr,
-        )
-        return 0 if wanted else 2
+        if arguments and arguments[0] not in ("-h", "--help"):
+            print(f"error: no command {arguments[0]!r}; give one of {', '.join(APPS)}", file=sys.stderr)
+            return 2
+        print("usage: scgs-warp COMMAND [options]; 'scgs-warp train --help' explains each option\n")
+        print("\n".join(f"  {name:11} {what}" for name, what in APPS.items()))
+        return 0
     app = importlib.import_module(f"scgs_warp.apps.{arguments[0]}")
     return app.cli(arguments[1:])
 

@@ -160,3 +160,15 @@ def test_a_reader_that_stops_reading_is_no_error(trained):
     command = f"{sys.executable} {ROOT / 'apps/train.py'} --help | head -1"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=dict(os.environ))
     assert "Traceback" not in done.stderr
+
+
+def test_the_console_script_lists_its_commands(monkeypatch, capsys):
+    from scgs_warp.apps import __main__ as console
+
+    for arguments, status in ([], 0), (["--help"], 0), (["exprot"], 2):
+        monkeypatch.setattr(sys, "argv", ["scgs-warp", *arguments])
+        assert console.main() == status
+        said = capsys.readouterr()
+        assert all(name in (said.err if status else said.out) for name in console.APPS)
+    folder = Path(console.__file__).parent
+    assert all((folder / f"{name}.py").is_file() for name in console.APPS)
