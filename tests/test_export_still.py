@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import struct
 from pathlib import Path
 
@@ -254,8 +255,11 @@ def test_glb_is_what_splat_transform_writes_of_the_same_gaussians(tmp_path):
     turned = rotate(np.array(seen["node"].rotation)[[3, 0, 1, 2]], ours["POSITION"])
     np.testing.assert_allclose(turned * (-1, 1, -1), theirs["POSITION"], atol=1e-6)
     for name in ours:
-        if "SCALE" in name or "OPACITY" in name or "DEGREE" in name:  # half turns change signs of harmonics alone
-            np.testing.assert_allclose(np.abs(ours[name]), np.abs(theirs[name]), atol=2e-6, err_msg=name)
+        if "SCALE" in name or "OPACITY" in name or "DEGREE" in name:
+            # harmonics of odd order m change sign in half a turn about z
+            place = re.search(r"DEGREE_(\d)_COEF_(\d)", name)
+            sign = (-1.0) ** (int(place[2]) - int(place[1])) if place else 1.0
+            np.testing.assert_allclose(sign * ours[name], theirs[name], atol=2e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -293,7 +297,9 @@ def test_damaged_files_are_one_line(tmp_path):
         "other.spz": (gzip.compress(b"x" * 100), "something else"),
         "empty.spz": (b"", "neither"),
         "new.spz": (gzip.compress(plain[:4] + b"\x09" + plain[5:]), "version 9"),
-        "many.spz": (gzip.compress(plain[:8] + b"\xff\xff\xff\x7f" + plain[12:]), "cut short"),
+        "many.spz": (gzip.compress(plain[:8] + b"\xff\xff\xff\x7f" + plain[12:]), "up to 10,000,000"),
+        "some.spz": (gzip.compress(plain[:8] + struct.pack("<I", 301) + plain[12:]), "cut short"),
+        "bomb.spz": (gzip.compress(plain[:8] + struct.pack("<I", 10**7) + plain[12:]), "cannot hold"),
         "stream.spz": (b"NGSP" + struct.pack("<IIBBBBI", 4, 9, 0, 12, 0, 5, 32) + bytes(92), "damaged"),
         "odd.splat": (b"1" * 33, "multiple of 32"),
         "empty.splat": (b"", "multiple of 32"),

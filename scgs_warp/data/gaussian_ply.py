@@ -75,14 +75,16 @@ def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParamete
         UserError: no row is left.
     """
     total, rest = values["sh_rest"].shape[:2]
-    flat = [np.reshape(value, (total, -1)) for value in values.values()]
-    good = np.all([np.isfinite(part).all(axis=1) for part in flat], axis=0) & values["quats"].any(axis=1)
+    good = values["quats"].any(axis=1)
+    for value in values.values():
+        good &= np.isfinite(value.reshape(total, -1)).all(axis=1)
     if not good.any():
         raise UserError(f"{path}: none of its {total} Gaussians is finite; export it again")
     made = GaussianParameters.empty(int(good.sum()), rest, 0, False, "cpu")
     with torch.no_grad():
         for name, value in values.items():
-            getattr(made, name).copy_(torch.from_numpy(np.ascontiguousarray(value[good])))
+            rows = value if good.all() else value[good]  # large files are not copied for nothing
+            getattr(made, name).copy_(torch.from_numpy(np.ascontiguousarray(rows)))
     return made
 
 

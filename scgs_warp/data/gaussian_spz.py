@@ -34,11 +34,15 @@ SCALE_STEPS, SCALE_LEAST = 16.0, 10.0
 FINE = 16
 """Positions are rounded to the size of the scene over 2 to this."""
 LARGEST_SHIFT = 24
+MOST = 10_000_000
+"""Gaussians in a file, as the format's own reader has it."""
 COUNTS = (0, 3, 8, 15)
 """Coefficients above degree 0, for degrees 0 to 3."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """What a half turn about x does to each harmonic of degrees 1 to 3."""
 HALF = math.sqrt(0.5)
+DENSEST = 1040
+"""Bytes that one byte of a gzip stream can stand for, and a little more."""
 REMEDY = "export the .spz again"
 
 
@@ -149,19 +153,23 @@ def read_spz(path: str | Path) -> GaussianParameters:
         version, count, degree, bits, parts = _read_gzip(path, content)
     fixed = np.zeros((count, 3, 4), "u1")
     fixed[:, :, 1:] = parts[0].reshape(count, 3, 3)
-    means = (fixed.view("<i4")[:, :, 0] >> 8) * 2.0**-bits  # shifted down again with the sign
-    opacity = (parts[1].astype(np.float64) / 255.0).clip(1e-6, 1.0 - 1e-6)
+    means = (fixed.view("<i4")[:, :, 0] >> 8).astype(np.float32)  # shifted down again with the sign; 24 bits are exact
+    means *= np.array([1, -1, -1], np.float32) * np.float32(2.0**-bits)
+    opacity = np.linspace(0.0, 1.0, 256).clip(1e-6, 1.0 - 1e-6)  # of every byte
     quats = _three_bytes(parts[4].reshape(count, 3)) if version == 2 else unpack_quats(parts[4].view("<u4"))
-    rest = (parts[5].reshape(count, COUNTS[degree], 3).astype(np.float64) - 128.0) / 128.0
+    rest = parts[5].reshape(count, COUNTS[degree], 3).astype(np.float32)
+    rest -= 128.0
+    rest *= FLIPS[: COUNTS[degree], None] / 128.0
+    steps = np.arange(256)
     values = {
-        "means": means * (1, -1, -1),
-        "sh_dc": (parts[2].reshape(count, 3) / 255.0 - 0.5) / COLOR,
-        "sh_rest": rest * FLIPS[: COUNTS[degree], None],
-        "opacity_logits": np.log(opacity / (1.0 - opacity)),
-        "log_scales": parts[3].reshape(count, 3) / SCALE_STEPS - SCALE_LEAST,
-        "quats": quats,
+        "means": means,
+        "sh_dc": ((steps / 255.0 - 0.5) / COLOR).astype(np.float32)[parts[2].reshape(count, 3)],
+        "sh_rest": rest,
+        "opacity_logits": np.log(opacity / (1.0 - opacity)).astype(np.float32)[parts[1]],
+        "log_scales": (steps / SCALE_STEPS - SCALE_LEAST).astype(np.float32)[parts[3].reshape(count, 3)],
+        "quats": quats.astype(np.float32),
     }
-    return to_parameters(path, {name: np.asarray(value, np.float32) for name, value in values.items()})
+    return to_parameters(path, values)
 
 
 def _sizes(path: Path, version: int, count: int, degree: int) -> list[int]:
@@ -170,6 +178,8 @@ def _sizes(path: Path, version: int, count: int, degree: int) -> list[int]:
         raise UserError(f"{path}: version {version} of .spz; 2 to 4 are read: convert it, for example to .ply")
     if count == 0 or degree >= len(COUNTS):
         raise UserError(f"{path}: {count} Gaussians with harmonics of degree {degree}; at least 1 of degree 0 to 3")
+    if count > MOST:
+        raise UserError(f"{path}: says it holds {count:,} Gaussians; up to {MOST:,} are read: {REMEDY} in parts")
     return [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * COUNTS[degree] * count]
 
 
@@ -183,6 +193,8 @@ def _read_gzip(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.
     if magic != MAGIC:
         raise UserError(f"{path}: a gzip stream of something else than Gaussians; give a .spz")
     sizes = _sizes(path, version, count, degree)
+    if sum(sizes) > DENSEST * len(content):
+        raise UserError(f"{path}: cut short: {len(content):,} bytes cannot hold {count:,} Gaussians; {REMEDY}")
     try:
         rows = stream.decompress(stream.unconsumed_tail, sum(sizes))  # never more than the header promises
     except zlib.error:
