@@ -157,7 +157,7 @@ def _write_skeleton(request: Request, session: EditSession, moments: list[Moment
     if request.kind == "graph":
         write_graph(request.output, skeleton, session.graph.edges, up)
         return f"{length}, {len(session.graph.edges):,} edges"
-    rest, rows, skeleton = _finite(at_rest(scene), skeleton)
+    rest, rows, skeleton = _finite(scene, skeleton)
     if request.kind == "glb":
         colors = mean_colors(session, moments)[rows]
         rest = Gaussians(rest.means, rest.quats, rest.scales, rest.opacities, torch.from_numpy(colors), rest.sh_rest)
@@ -169,8 +169,12 @@ def _write_skeleton(request: Request, session: EditSession, moments: list[Moment
     return f"{len(rest.means):,} Gaussians, {length}"
 
 
-def _finite(rest: Gaussians, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:
+def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:
+    """The Gaussians that files may hold, at rest; which they are, [N] bool; and what they follow."""
+    rest = at_rest(scene)
     rows = finite_rows(rest) & np.isfinite(skeleton.weights).all(axis=1)
+    for part in (scene.gaussians.shading, scene.gaussians.hyper):
+        rows &= part.detach().isfinite().all(dim=1).cpu().numpy()
     if not rows.any():
         raise UserError("no Gaussian of the scene is finite; train again with a lower rate")
     return select(rest, rows), rows, skeleton.select(rows)

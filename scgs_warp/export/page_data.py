@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import UserError
+
 VERSION = 1
 LEVEL = 6
 """Of deflate: the highest takes four times as long, for half a percent."""
@@ -57,8 +59,14 @@ class Column:
 
 def quantise(name: str, values: np.ndarray, step: float, *, most_bits: int = 24, delta: bool = False) -> Column:
     """``values`` [R] as codes no wider than ``step``, the least and the largest exact; wider where ``most_bits`` (1 to
-    24) do not reach."""
+    24) do not reach.
+
+    Raises:
+        UserError: a value is not finite.
+    """
     values = values.astype(np.float64)
+    if not np.isfinite(values).all():
+        raise UserError(f"--format html: {name} is not finite; train again with a lower rate")
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     bits = min(most_bits, max(1, math.ceil(math.log2((high - low) / step + 1.0))))
     width = (high - low) / ((1 << bits) - 1)

@@ -81,7 +81,10 @@ def page_scene(scene: Scene, sh_degree: int) -> PageScene:
 
 def visible(gaussians: GaussianParameters) -> Tensor:
     """[V] int64, the Gaussians that can be drawn at all: finite, and opaque enough to change an 8-bit picture."""
-    parts = gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest.flatten(1)
+    parts = (
+        gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest.flatten(1),
+        gaussians.shading, gaussians.hyper,
+    )  # fmt: skip
     finite = torch.stack([part.isfinite().all(dim=1) for part in parts]).all(dim=0)
     solid = gaussians.opacities() >= float(ALPHA_MIN)
     return (finite & solid & gaussians.quats.any(dim=1)).nonzero()[:, 0]
@@ -177,7 +180,11 @@ def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
 
 def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
     """[T, M, 3] ``translation``, [T, M, 4] ``rotation``, and where the model has them ``shape`` [T, M, 4] and
-    ``log_scale`` [T, M, 3], at T evenly spaced times; quaternions keep to their side from time to time."""
+    ``log_scale`` [T, M, 3], at T evenly spaced times; quaternions keep to their side from time to time.
+
+    Raises:
+        UserError: a pose is not finite.
+    """
     count = FEWEST_SAMPLES
     poses = _poses_at(motion, torch.linspace(0.0, 1.0, count))
     while count < MOST_SAMPLES:
@@ -222,4 +229,10 @@ def _poses_at(motion: ControlPoints, times: Tensor) -> dict[str, np.ndarray]:
             for name, value in zip(POSE_PARTS, fields, strict=True):
                 if value is not None:
                     found.setdefault(name, []).append(_array(value))
-    return {name: np.stack(rows) for name, rows in found.items()}
+    poses = {name: np.stack(rows) for name, rows in found.items()}
+    if not all(np.isfinite(rows).all() for rows in poses.values()):
+        raise UserError(
+            "--format html: the control points' motion is not finite; train again with a lower rate, or put the "
+            "previous checkpoint back"
+        )
+    return poses
