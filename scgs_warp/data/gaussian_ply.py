@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,7 @@ def open_ply(
         UserError: as :func:`~scgs_warp.data.gaussian_files.read_gaussians`.
     """
     from .gaussian_files import read_gaussians  # which knows this file's reader
+    from .gaussian_spz import read_antialiased
 
     gaussians = read_gaussians(path)
     world = gaussians.means.detach().double().numpy()
@@ -135,7 +137,8 @@ def open_ply(
     distance = 1.2 * max(radius, 1e-9) / math.tan(math.radians(fov) / 2)
     x, y, z = centre.tolist()
     overview = Overview((x, y, z), up or (0.0, -1.0, 0.0), distance, fov, elevation)
-    scene = Scene(gaussians, StaticNodes.sample(gaussians, nodes), unit, preset("paper"), overview)
+    config = replace(preset("paper"), antialiased=read_antialiased(path))
+    scene = Scene(gaussians, StaticNodes.sample(gaussians, nodes), unit, config, overview)
     scene.motion.eval()
     return scene
 

@@ -62,7 +62,7 @@ def fraction_bits(means: np.ndarray) -> int:
     return max(0, min(wanted, room, LARGEST_SHIFT))
 
 
-def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
+def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
     """Write activated Gaussians, world units, as version 3.
 
     Rounded: positions to ``2 ** -fraction_bits``, opacities and colours to 8 bits, scales to 6 %, rotations to 10 bits
@@ -70,6 +70,10 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
 
     Args:
         antialiased: whether they were trained with the antialiasing compensation.
+
+    Returns:
+        How many values lay beyond what a byte can say, and are at its end now: scales outside [4.5e-5, 377], harmonics
+        of degrees 1 to 3 outside [-1, 1], those of degree 0 outside [-3.3, 3.3].
 
     Raises:
         UserError: the place cannot be written, or the scene is too large for the format.
@@ -82,16 +86,24 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
     degree = COUNTS.index(rest.shape[1])
     scales = np.log(np.maximum(gaussians.scales.detach().cpu().double().numpy(), 1e-30))
     head = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), degree, bits, ANTIALIASED * antialiased, 0)
+    bytes_ = (
+        255.0 * gaussians.opacities.detach().cpu().double().numpy(),
+        127.5 + 255.0 * COLOR * gaussians.sh_dc.detach().cpu().double().numpy(),
+        SCALE_STEPS * (scales + SCALE_LEAST),
+        128.0 + 128.0 * rest * FLIPS[: rest.shape[1], None],
+    )
+    opacity, color, scale, harmonics = (_byte(values) for values in bytes_)
     parts = (
         np.ascontiguousarray(fixed).view("u1").reshape(-1, 3, 4)[:, :, :3],
-        _byte(255.0 * gaussians.opacities.detach().cpu().double().numpy()),
-        _byte(127.5 + 255.0 * COLOR * gaussians.sh_dc.detach().cpu().double().numpy()),
-        _byte(SCALE_STEPS * (scales + SCALE_LEAST)),
+        opacity,
+        color,
+        scale,
         pack_quats(quats),
-        _byte(128.0 + 128.0 * rest * FLIPS[: rest.shape[1], None]),
+        harmonics,
     )
     content = gzip.compress(head + b"".join(part.tobytes() for part in parts), mtime=0)
     write_atomically(Path(path), content)
+    return sum(int(((values < -0.5) | (values > 256.0)).sum()) for values in bytes_)
 
 
 def _byte(values: np.ndarray) -> np.ndarray:
@@ -170,6 +182,21 @@ def read_spz(path: str | Path) -> GaussianParameters:
         "quats": quats.astype(np.float32),
     }
     return to_parameters(path, values)
+
+
+def read_antialiased(path: str | Path) -> bool:
+    """Whether a file says that its Gaussians were trained with the antialiasing compensation; only a ``.spz`` can."""
+    path = Path(path)
+    if path.suffix.lower() != ".spz":
+        return False
+    try:
+        with open(path, "rb") as file:
+            start = file.read(4096)
+        if start[:4] != struct.pack("<I", MAGIC):
+            start = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(start, 16)
+        return bool(start[14] & ANTIALIASED)
+    except (OSError, zlib.error, IndexError):
+        return False  # whoever reads the Gaussians says what is wrong
 
 
 def _sizes(path: Path, version: int, count: int, degree: int) -> list[int]:
