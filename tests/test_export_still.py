@@ -18,12 +18,13 @@ from scenes import look_at
 
 from scgs_warp.data.gaussian_files import gaussian_points, read_gaussians
 from scgs_warp.data.gaussian_ply import open_ply
-from scgs_warp.data.gaussian_spz import FLIPS, fraction_bits, pack_quats, unpack_quats
+from scgs_warp.data.gaussian_spz import FLIPS, fraction_bits, pack_quats, read_antialiased, unpack_quats
 from scgs_warp.data.points import read_points
 from scgs_warp.edit.rotations import rotate
 from scgs_warp.errors import UserError
 from scgs_warp.export.gltf import upright
-from scgs_warp.export.job import write_still
+from scgs_warp.export.job import export, write_still
+from scgs_warp.export.request import Request
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.ops.harmonics_rotation import rotate_harmonics
 from scgs_warp.render import render
@@ -155,6 +156,28 @@ def test_spz_of_others_is_read(tmp_path, version):
     for name in theirs:  # opaque ones are infinite logits there
         if not name.startswith("rot"):
             np.testing.assert_allclose(ours[name], theirs[name].clip(-13.8155, 13.8155), atol=1e-3, err_msg=name)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_spz_keeps_the_mark_of_antialiasing(tmp_path, antialiased):
+    write_still(tmp_path / "a.spz", cloud(), antialiased=antialiased)
+    export(Request(tmp_path / "b.spz", ply=tmp_path / "a.spz"))
+    assert gzip.decompress((tmp_path / "b.spz").read_bytes())[14] == antialiased
+    assert open_ply(tmp_path / "b.spz", nodes=5).config.antialiased == antialiased
+    (tmp_path / "c.spz").write_bytes(b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, antialiased, 5, 32))
+    assert read_antialiased(tmp_path / "c.spz") == antialiased
+    for content in (b"", b"no Gaussians"):
+        (tmp_path / "d.spz").write_bytes(content)
+        assert not read_antialiased(tmp_path / "d.spz")
+
+
+def test_spz_says_how_much_it_clips(tmp_path):
+    truth = ordered(cloud())
+    truth.sh_rest.clamp_(-1.0, 1.0)
+    assert write_still(tmp_path / "a.spz", truth) == 0
+    truth.sh_rest[4, 2] = torch.tensor([1.5, -1.5, 1.0])
+    truth.scales[6, 1] = 1e-6
+    assert write_still(tmp_path / "a.spz", truth) == 3
 
 
 def test_spz_packs_every_rotation(tmp_path):

@@ -155,11 +155,13 @@ class Parts(HTMLParser):
         return [text for name, _, text in self.found if name == tag]
 
 
-@pytest.mark.parametrize("title", ["</title><script>alert(1)</script>", "{{program}} \"'&<b>", "ein Tänzer\nim Saal"])
+@pytest.mark.parametrize(
+    "title", ["</title><script>alert(1)</script>", "{{program}} \"'&<b>", "ein Tänzer\nim Saal", "caf\udce9"]
+)
 def test_a_title_is_text(title, tmp_path):
     page.write_page(bar_scene(nodes=12, gaussians=20), tmp_path / "page.html", title=title)
     parts = Parts(tmp_path / "page.html")
-    shown = title.replace("\n", " ")
+    shown = title.replace("\n", " ").replace("\udce9", "?")  # a name that is no UTF-8
     assert parts.texts("title") == [shown] and parts.texts("h1") == [shown]
     assert len(parts.texts("script")) == 2 and not parts.texts("b")
 
@@ -191,7 +193,7 @@ def test_a_page_gives_up_degrees_until_it_fits_and_refuses_otherwise(tmp_path):
     smaller = path.read_bytes()
     assert len(smaller) <= 0.8 * full
     assert 0 < read_page(path)[0]["sh_degree"] < 3
-    with pytest.raises(UserError, match=r"takes 0\.\d+ MiB even .* max_mib 0.01"):
+    with pytest.raises(UserError, match=r"takes 0\.\d+ MiB even .* 0\.01 MiB of --max-mib"):
         page.write_page(scene, path, max_mib=0.01)
     assert path.read_bytes() == smaller and [p.name for p in tmp_path.iterdir()] == ["page.html"]
     with pytest.raises(UserError, match="above 0"):
@@ -217,5 +219,5 @@ def test_bad_places_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
         page.write_page(scene, tmp_path / "file" / "page.html")
-    page.write_page(scene, tmp_path / "new" / "page.html")
-    assert (tmp_path / "new" / "page.html").is_file()
+    assert page.write_page(scene, tmp_path / "new" / "page.HTM") == 20
+    assert (tmp_path / "new" / "page.HTM").is_file()
