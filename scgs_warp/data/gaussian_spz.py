@@ -237,7 +237,7 @@ def _read_streams(path: Path, content: bytes) -> tuple[int, int, int, int, list[
         import zstandard
     except ImportError:
         raise UserError(
-            f"{path}: .spz of version 4 needs the package zstandard: pip install 'scgs_warp[export]'"
+            f"{path}: .spz of version 4 needs the package zstandard: pip install -e '.[export]' in a clone"
         ) from None
     parts = []
     try:
