@@ -300,6 +300,18 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         (["--run", run, "--output", "a.ply", "--at", 0.5], "--edit"),
         (["--run", run, "--output", "a.npz", "--frames", 0], "--frames 0"),
         (["--run", run, "--output", "a.npz", "--fps", 0], "--fps 0"),
+        (["--ply", "a.ply", "--output", "b.spz", "--time", 0.5], "--time 0.5: a file of Gaussians has no times"),
+        (["--run", run, "--output", "b.spz", "--frames", 9], "--frames: "),
+        (["--run", run, "--output", "b.glb", "--time", 0.2, "--frames", 10], "leave out --time"),
+        (["--ply", "a.ply", "--output", "b.glb", "--fps", 10], "--fps: "),
+        (["--run", run, "--output", "b.html", "--frames", 9], "--frames: --format html has no frames"),
+        (["--run", run, "--output", "b.htm", "--fps", 9], "--fps: --format html has no frames"),
+        (["--run", run, "--output", "b.json", "--fps", 9], "--fps: --format cameras has no frames"),
+        (["--run", run, "--output", "b", "--format", "ply-sequence", "--fps", 9], "--fps: a ply-sequence"),
+        (["--run", run, "--output", "b.npz", "--title", "x"], "--title: belongs to a page"),
+        (["--run", run, "--output", "b.glb", "--max-mib", 3], "--max-mib: belongs to a page"),
+        (["--run", run, "--output", "b.html", "--max-mib", 0.001], "0.001 MiB of --max-mib"),
+        (["--run", run, "--output", Path.cwd(), "--format", "ply-sequence"], "is the current folder"),
         (["--run", tmp_path / "nowhere", "--output", "a.ply"], "nowhere"),
         (["--ply", "a.ply", "--output", "b.spz"], "no such file"),
         (["--ply", "a.ply", "--output", "b.npz"], "--run"),
@@ -314,6 +326,25 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         lines = capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1 and words in lines[0], lines
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_what_is_said_counts_what_is_written(run, tmp_path, capsys):
+    scene = still_scene()
+    with torch.no_grad():
+        scene.gaussians.opacity_logits[0] = -9.0
+        scene.gaussians.sh_dc[1, 0] = float("nan")
+        scene.gaussians.sh_rest.clamp_(-0.9, 0.9)[2, 4, 1] = 1.5
+        scene.gaussians.log_scales[3] = -20.0
+    still = save(scene, tmp_path / "still")
+    for arguments, words in (
+        (["--run", still, "--output", tmp_path / "a.htm"], "a.htm: 18 Gaussians that stand still,"),
+        (["--run", run, "--output", tmp_path / "a.html"], "a.html: 120 Gaussians and their motion,"),
+        (["--run", still, "--output", tmp_path / "f", "--frames", 2], "f: 2 frames of 19 Gaussians,"),
+        (["--run", still, "--output", tmp_path / "a.spz"], "19 Gaussians at rest (4 values clipped to what .spz can"),
+        (["--run", run, "--output", tmp_path / "b.spz"], "b.spz: 120 Gaussians at rest,"),
+    ):
+        export(*arguments)
+        assert words in capsys.readouterr().out
 
 
 def still_scene() -> Scene:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import struct
 from pathlib import Path
 
@@ -17,12 +18,13 @@ from scenes import look_at
 
 from scgs_warp.data.gaussian_files import gaussian_points, read_gaussians
 from scgs_warp.data.gaussian_ply import open_ply
-from scgs_warp.data.gaussian_spz import FLIPS, fraction_bits, pack_quats, unpack_quats
+from scgs_warp.data.gaussian_spz import FLIPS, fraction_bits, pack_quats, read_antialiased, unpack_quats
 from scgs_warp.data.points import read_points
 from scgs_warp.edit.rotations import rotate
 from scgs_warp.errors import UserError
 from scgs_warp.export.gltf import upright
-from scgs_warp.export.job import write_still
+from scgs_warp.export.job import export, write_still
+from scgs_warp.export.request import Request
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.ops.harmonics_rotation import rotate_harmonics
 from scgs_warp.render import render
@@ -156,6 +158,28 @@ def test_spz_of_others_is_read(tmp_path, version):
             np.testing.assert_allclose(ours[name], theirs[name].clip(-13.8155, 13.8155), atol=1e-3, err_msg=name)
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_spz_keeps_the_mark_of_antialiasing(tmp_path, antialiased):
+    write_still(tmp_path / "a.spz", cloud(), antialiased=antialiased)
+    export(Request(tmp_path / "b.spz", ply=tmp_path / "a.spz"))
+    assert gzip.decompress((tmp_path / "b.spz").read_bytes())[14] == antialiased
+    assert open_ply(tmp_path / "b.spz", nodes=5).config.antialiased == antialiased
+    (tmp_path / "c.spz").write_bytes(b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, antialiased, 5, 32))
+    assert read_antialiased(tmp_path / "c.spz") == antialiased
+    for content in (b"", b"no Gaussians"):
+        (tmp_path / "d.spz").write_bytes(content)
+        assert not read_antialiased(tmp_path / "d.spz")
+
+
+def test_spz_says_how_much_it_clips(tmp_path):
+    truth = ordered(cloud())
+    truth.sh_rest.clamp_(-1.0, 1.0)
+    assert write_still(tmp_path / "a.spz", truth) == 0
+    truth.sh_rest[4, 2] = torch.tensor([1.5, -1.5, 1.0])
+    truth.scales[6, 1] = 1e-6
+    assert write_still(tmp_path / "a.spz", truth) == 3
+
+
 def test_spz_packs_every_rotation(tmp_path):
     generator = np.random.default_rng(3)
     quats = np.concatenate([generator.normal(size=(2000, 4)), np.eye(4), -np.eye(4), np.ones((1, 4))])
@@ -254,8 +278,11 @@ def test_glb_is_what_splat_transform_writes_of_the_same_gaussians(tmp_path):
     turned = rotate(np.array(seen["node"].rotation)[[3, 0, 1, 2]], ours["POSITION"])
     np.testing.assert_allclose(turned * (-1, 1, -1), theirs["POSITION"], atol=1e-6)
     for name in ours:
-        if "SCALE" in name or "OPACITY" in name or "DEGREE" in name:  # half turns change signs of harmonics alone
-            np.testing.assert_allclose(np.abs(ours[name]), np.abs(theirs[name]), atol=2e-6, err_msg=name)
+        if "SCALE" in name or "OPACITY" in name or "DEGREE" in name:
+            # harmonics of odd order m change sign in half a turn about z
+            place = re.search(r"DEGREE_(\d)_COEF_(\d)", name)
+            sign = (-1.0) ** (int(place[2]) - int(place[1])) if place else 1.0
+            np.testing.assert_allclose(sign * ours[name], theirs[name], atol=2e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -293,7 +320,9 @@ def test_damaged_files_are_one_line(tmp_path):
         "other.spz": (gzip.compress(b"x" * 100), "something else"),
         "empty.spz": (b"", "neither"),
         "new.spz": (gzip.compress(plain[:4] + b"\x09" + plain[5:]), "version 9"),
-        "many.spz": (gzip.compress(plain[:8] + b"\xff\xff\xff\x7f" + plain[12:]), "cut short"),
+        "many.spz": (gzip.compress(plain[:8] + b"\xff\xff\xff\x7f" + plain[12:]), "up to 10,000,000"),
+        "some.spz": (gzip.compress(plain[:8] + struct.pack("<I", 301) + plain[12:]), "cut short"),
+        "bomb.spz": (gzip.compress(plain[:8] + struct.pack("<I", 10**7) + plain[12:]), "cannot hold"),
         "stream.spz": (b"NGSP" + struct.pack("<IIBBBBI", 4, 9, 0, 12, 0, 5, 32) + bytes(92), "damaged"),
         "odd.splat": (b"1" * 33, "multiple of 32"),
         "empty.splat": (b"", "multiple of 32"),

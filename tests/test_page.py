@@ -103,6 +103,34 @@ def test_what_cannot_be_seen_is_left_out():
         page_scene.page_scene(scene, 0)
 
 
+def test_one_outlier_does_not_coarsen_the_others():
+    plain, spoilt = (bar_scene(nodes=12, gaussians=3000) for _ in range(2))
+    with torch.no_grad():
+        spoilt.gaussians.sh_rest[7] = 80.0
+        spoilt.gaussians.means[11] = torch.tensor([4e5, -1e7, 3.0])
+    contents = [page_scene.page_scene(scene, 1) for scene in (plain, spoilt)]
+    assert contents[0].facts["gaussians"] == 3000 and contents[1].facts["gaussians"] == 2999  # a stray is left out
+    steps = [{column.name: column.step for column in content.columns} for content in contents]
+    for name, step in steps[0].items():
+        if name.startswith(("mean", "sh")):
+            assert steps[1][name] < 1.7 * step and steps[1][name] <= 1.01 * page_scene.STEPS["sh_rest"], name
+    made = gaussians_of(*unpack(pack(contents[1].facts, contents[1].columns)))
+    assert 0.9 < made.sh_rest.max() < 1.7  # the outlier, clipped
+    with torch.no_grad():
+        spoilt.gaussians.means.add_(1e6)  # all are far: one is a stray
+    assert page_scene.page_scene(spoilt, 0).facts["gaussians"] == 2999
+
+
+def test_scarce_codes_are_for_what_is_common():
+    values = np.random.default_rng(1).normal(size=5000)
+    for outlier in (1e4, -1e4):
+        column = quantise("x", np.append(values, outlier), 1e-3, most_bits=8)
+        most = np.abs(values).max()
+        assert column.step < 3 * most / 255 and np.abs(column.values()[:-1] - values).max() < 0.51 * column.step
+    far = quantise("x", 1e3 + values, 1e-3, most_bits=8)
+    assert np.abs(far.values() - values - 1e3).max() < 0.51 * np.ptp(values) / 255
+
+
 def test_quick_motions_are_sampled_more_often():
     slow, quick = bar_scene(), bar_scene()
     swing = quick.motion.poses
@@ -155,11 +183,13 @@ class Parts(HTMLParser):
         return [text for name, _, text in self.found if name == tag]
 
 
-@pytest.mark.parametrize("title", ["</title><script>alert(1)</script>", "{{program}} \"'&<b>", "ein Tänzer\nim Saal"])
+@pytest.mark.parametrize(
+    "title", ["</title><script>alert(1)</script>", "{{program}} \"'&<b>", "ein Tänzer\nim Saal", "caf\udce9"]
+)
 def test_a_title_is_text(title, tmp_path):
     page.write_page(bar_scene(nodes=12, gaussians=20), tmp_path / "page.html", title=title)
     parts = Parts(tmp_path / "page.html")
-    shown = title.replace("\n", " ")
+    shown = title.replace("\n", " ").replace("\udce9", "?")  # a name that is no UTF-8
     assert parts.texts("title") == [shown] and parts.texts("h1") == [shown]
     assert len(parts.texts("script")) == 2 and not parts.texts("b")
 
@@ -191,7 +221,7 @@ def test_a_page_gives_up_degrees_until_it_fits_and_refuses_otherwise(tmp_path):
     smaller = path.read_bytes()
     assert len(smaller) <= 0.8 * full
     assert 0 < read_page(path)[0]["sh_degree"] < 3
-    with pytest.raises(UserError, match=r"takes 0\.\d+ MiB even .* max_mib 0.01"):
+    with pytest.raises(UserError, match=r"takes 0\.\d+ MiB even .* 0\.01 MiB of --max-mib"):
         page.write_page(scene, path, max_mib=0.01)
     assert path.read_bytes() == smaller and [p.name for p in tmp_path.iterdir()] == ["page.html"]
     with pytest.raises(UserError, match="above 0"):
@@ -217,5 +247,5 @@ def test_bad_places_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
         page.write_page(scene, tmp_path / "file" / "page.html")
-    page.write_page(scene, tmp_path / "new" / "page.html")
-    assert (tmp_path / "new" / "page.html").is_file()
+    assert page.write_page(scene, tmp_path / "new" / "page.HTM") == 20
+    assert (tmp_path / "new" / "page.HTM").is_file()

@@ -19,13 +19,20 @@ def read_gaussians(path: str | Path) -> GaussianParameters:
     """Raw parameters as a ``.ply`` of 3D Gaussian splatting, a ``.splat`` or a ``.spz`` has them, world units.
 
     Raises:
-        UserError: another kind of file, missing, damaged, or without a finite Gaussian.
+        UserError: another kind of file, missing, damaged, too large for the memory, or without a finite Gaussian.
     """
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise UserError(f"{path}: Gaussians are read from {', '.join(READERS)}; give one of these or convert it")
-    return reader(path)
+    try:
+        return reader(path)
+    except MemoryError:
+        raise UserError(f"{path}: holds more Gaussians than fit into memory; export it in parts") from None
+    except RuntimeError as error:  # so PyTorch names it
+        if "allocate memory" not in str(error):
+            raise
+        raise UserError(f"{path}: holds more Gaussians than fit into memory; export it in parts") from None
 
 
 def gaussian_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:

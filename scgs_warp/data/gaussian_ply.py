@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,14 +76,16 @@ def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParamete
         UserError: no row is left.
     """
     total, rest = values["sh_rest"].shape[:2]
-    flat = [np.reshape(value, (total, -1)) for value in values.values()]
-    good = np.all([np.isfinite(part).all(axis=1) for part in flat], axis=0) & values["quats"].any(axis=1)
+    good = values["quats"].any(axis=1)
+    for value in values.values():
+        good &= np.isfinite(value.reshape(total, -1)).all(axis=1)
     if not good.any():
         raise UserError(f"{path}: none of its {total} Gaussians is finite; export it again")
     made = GaussianParameters.empty(int(good.sum()), rest, 0, False, "cpu")
     with torch.no_grad():
         for name, value in values.items():
-            getattr(made, name).copy_(torch.from_numpy(np.ascontiguousarray(value[good])))
+            rows = value if good.all() else value[good]  # large files are not copied for nothing
+            getattr(made, name).copy_(torch.from_numpy(np.ascontiguousarray(rows)))
     return made
 
 
@@ -117,6 +120,7 @@ def open_ply(
         UserError: as :func:`~scgs_warp.data.gaussian_files.read_gaussians`.
     """
     from .gaussian_files import read_gaussians  # which knows this file's reader
+    from .gaussian_spz import read_antialiased
 
     gaussians = read_gaussians(path)
     world = gaussians.means.detach().double().numpy()
@@ -133,7 +137,8 @@ def open_ply(
     distance = 1.2 * max(radius, 1e-9) / math.tan(math.radians(fov) / 2)
     x, y, z = centre.tolist()
     overview = Overview((x, y, z), up or (0.0, -1.0, 0.0), distance, fov, elevation)
-    scene = Scene(gaussians, StaticNodes.sample(gaussians, nodes), unit, preset("paper"), overview)
+    config = replace(preset("paper"), antialiased=read_antialiased(path))
+    scene = Scene(gaussians, StaticNodes.sample(gaussians, nodes), unit, config, overview)
     scene.motion.eval()
     return scene
 

@@ -34,11 +34,15 @@ SCALE_STEPS, SCALE_LEAST = 16.0, 10.0
 FINE = 16
 """Positions are rounded to the size of the scene over 2 to this."""
 LARGEST_SHIFT = 24
+MOST = 10_000_000
+"""Gaussians in a file, as the format's own reader has it."""
 COUNTS = (0, 3, 8, 15)
 """Coefficients above degree 0, for degrees 0 to 3."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """What a half turn about x does to each harmonic of degrees 1 to 3."""
 HALF = math.sqrt(0.5)
+DENSEST = 1040
+"""Bytes that one byte of a gzip stream can stand for, and a little more."""
 REMEDY = "export the .spz again"
 
 
@@ -58,7 +62,7 @@ def fraction_bits(means: np.ndarray) -> int:
     return max(0, min(wanted, room, LARGEST_SHIFT))
 
 
-def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
+def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
     """Write activated Gaussians, world units, as version 3.
 
     Rounded: positions to ``2 ** -fraction_bits``, opacities and colours to 8 bits, scales to 6 %, rotations to 10 bits
@@ -66,6 +70,10 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
 
     Args:
         antialiased: whether they were trained with the antialiasing compensation.
+
+    Returns:
+        How many values lay beyond what a byte can say, and are at its end now: scales outside [4.5e-5, 377], harmonics
+        of degrees 1 to 3 outside [-1, 1], those of degree 0 outside [-3.3, 3.3].
 
     Raises:
         UserError: the place cannot be written, or the scene is too large for the format.
@@ -78,16 +86,24 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
     degree = COUNTS.index(rest.shape[1])
     scales = np.log(np.maximum(gaussians.scales.detach().cpu().double().numpy(), 1e-30))
     head = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), degree, bits, ANTIALIASED * antialiased, 0)
+    bytes_ = (
+        255.0 * gaussians.opacities.detach().cpu().double().numpy(),
+        127.5 + 255.0 * COLOR * gaussians.sh_dc.detach().cpu().double().numpy(),
+        SCALE_STEPS * (scales + SCALE_LEAST),
+        128.0 + 128.0 * rest * FLIPS[: rest.shape[1], None],
+    )
+    opacity, color, scale, harmonics = (_byte(values) for values in bytes_)
     parts = (
         np.ascontiguousarray(fixed).view("u1").reshape(-1, 3, 4)[:, :, :3],
-        _byte(255.0 * gaussians.opacities.detach().cpu().double().numpy()),
-        _byte(127.5 + 255.0 * COLOR * gaussians.sh_dc.detach().cpu().double().numpy()),
-        _byte(SCALE_STEPS * (scales + SCALE_LEAST)),
+        opacity,
+        color,
+        scale,
         pack_quats(quats),
-        _byte(128.0 + 128.0 * rest * FLIPS[: rest.shape[1], None]),
+        harmonics,
     )
     content = gzip.compress(head + b"".join(part.tobytes() for part in parts), mtime=0)
     write_atomically(Path(path), content)
+    return sum(int(((values < -0.5) | (values > 256.0)).sum()) for values in bytes_)
 
 
 def _byte(values: np.ndarray) -> np.ndarray:
@@ -149,19 +165,38 @@ def read_spz(path: str | Path) -> GaussianParameters:
         version, count, degree, bits, parts = _read_gzip(path, content)
     fixed = np.zeros((count, 3, 4), "u1")
     fixed[:, :, 1:] = parts[0].reshape(count, 3, 3)
-    means = (fixed.view("<i4")[:, :, 0] >> 8) * 2.0**-bits  # shifted down again with the sign
-    opacity = (parts[1].astype(np.float64) / 255.0).clip(1e-6, 1.0 - 1e-6)
+    means = (fixed.view("<i4")[:, :, 0] >> 8).astype(np.float32)  # shifted down again with the sign; 24 bits are exact
+    means *= np.array([1, -1, -1], np.float32) * np.float32(2.0**-bits)
+    opacity = np.linspace(0.0, 1.0, 256).clip(1e-6, 1.0 - 1e-6)  # of every byte
     quats = _three_bytes(parts[4].reshape(count, 3)) if version == 2 else unpack_quats(parts[4].view("<u4"))
-    rest = (parts[5].reshape(count, COUNTS[degree], 3).astype(np.float64) - 128.0) / 128.0
+    rest = parts[5].reshape(count, COUNTS[degree], 3).astype(np.float32)
+    rest -= 128.0
+    rest *= FLIPS[: COUNTS[degree], None] / 128.0
+    steps = np.arange(256)
     values = {
-        "means": means * (1, -1, -1),
-        "sh_dc": (parts[2].reshape(count, 3) / 255.0 - 0.5) / COLOR,
-        "sh_rest": rest * FLIPS[: COUNTS[degree], None],
-        "opacity_logits": np.log(opacity / (1.0 - opacity)),
-        "log_scales": parts[3].reshape(count, 3) / SCALE_STEPS - SCALE_LEAST,
-        "quats": quats,
+        "means": means,
+        "sh_dc": ((steps / 255.0 - 0.5) / COLOR).astype(np.float32)[parts[2].reshape(count, 3)],
+        "sh_rest": rest,
+        "opacity_logits": np.log(opacity / (1.0 - opacity)).astype(np.float32)[parts[1]],
+        "log_scales": (steps / SCALE_STEPS - SCALE_LEAST).astype(np.float32)[parts[3].reshape(count, 3)],
+        "quats": quats.astype(np.float32),
     }
-    return to_parameters(path, {name: np.asarray(value, np.float32) for name, value in values.items()})
+    return to_parameters(path, values)
+
+
+def read_antialiased(path: str | Path) -> bool:
+    """Whether a file says that its Gaussians were trained with the antialiasing compensation; only a ``.spz`` can."""
+    path = Path(path)
+    if path.suffix.lower() != ".spz":
+        return False
+    try:
+        with open(path, "rb") as file:
+            start = file.read(4096)
+        if start[:4] != struct.pack("<I", MAGIC):
+            start = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(start, 16)
+        return bool(start[14] & ANTIALIASED)
+    except (OSError, zlib.error, IndexError):
+        return False  # whoever reads the Gaussians says what is wrong
 
 
 def _sizes(path: Path, version: int, count: int, degree: int) -> list[int]:
@@ -170,6 +205,8 @@ def _sizes(path: Path, version: int, count: int, degree: int) -> list[int]:
         raise UserError(f"{path}: version {version} of .spz; 2 to 4 are read: convert it, for example to .ply")
     if count == 0 or degree >= len(COUNTS):
         raise UserError(f"{path}: {count} Gaussians with harmonics of degree {degree}; at least 1 of degree 0 to 3")
+    if count > MOST:
+        raise UserError(f"{path}: says it holds {count:,} Gaussians; up to {MOST:,} are read: {REMEDY} in parts")
     return [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * COUNTS[degree] * count]
 
 
@@ -183,6 +220,8 @@ def _read_gzip(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.
     if magic != MAGIC:
         raise UserError(f"{path}: a gzip stream of something else than Gaussians; give a .spz")
     sizes = _sizes(path, version, count, degree)
+    if sum(sizes) > DENSEST * len(content):
+        raise UserError(f"{path}: cut short: {len(content):,} bytes cannot hold {count:,} Gaussians; {REMEDY}")
     try:
         rows = stream.decompress(stream.unconsumed_tail, sum(sizes))  # never more than the header promises
     except zlib.error:
@@ -198,7 +237,7 @@ def _read_streams(path: Path, content: bytes) -> tuple[int, int, int, int, list[
         import zstandard
     except ImportError:
         raise UserError(
-            f"{path}: .spz of version 4 needs the package zstandard: pip install 'scgs_warp[export]'"
+            f"{path}: .spz of version 4 needs the package zstandard: pip install -e '.[export]' in a clone"
         ) from None
     parts = []
     try:

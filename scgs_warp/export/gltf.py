@@ -84,9 +84,13 @@ class Document:
         """The file.
 
         Raises:
-            UserError: it is larger than the format can be.
+            UserError: it is larger than the format can be, or a number is not finite.
         """
-        text = json.dumps({**self.json, "buffers": [{"byteLength": self._size}]}, separators=(",", ":")).encode()
+        whole = {**self.json, "buffers": [{"byteLength": self._size}]}
+        try:
+            text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
+        except ValueError:
+            raise UserError("the .glb would hold numbers that are not finite; train again with a lower rate") from None
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + self._size
         if total > LARGEST:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from .. import data
 from ..data.gaussian_files import read_gaussians
 from ..data.gaussian_ply import open_ply, write_gaussian_ply
 from ..data.gaussian_splat import write_splat
-from ..data.gaussian_spz import write_spz
+from ..data.gaussian_spz import read_antialiased, write_spz
 from ..edit import EditSession
 from ..errors import UserError
 from ..progress import progress
@@ -50,7 +51,7 @@ def export(request: Request, device: str = "cpu") -> str:
     check(request)
     if request.kind == "ply-sequence":
         check_folder(request.output)
-    if request.still or (request.run is None and request.edit is None):
+    if request.still:
         held = _export_still(request, device)
     elif request.kind == "cameras":
         held = _export_cameras(request, device)
@@ -84,6 +85,7 @@ def _export_still(request: Request, device: str) -> str:
     up, antialiased, when = FILE_UP, False, "at rest"
     if request.run is None and request.edit is None:
         assert request.ply is not None
+        antialiased = read_antialiased(request.ply)
         with torch.no_grad():
             gaussians, when = read_gaussians(request.ply).activate(), f"as in {request.ply}"
     else:
@@ -97,18 +99,22 @@ def _export_still(request: Request, device: str) -> str:
         else:
             gaussians = at_rest(scene)
     gaussians = kept(gaussians)
-    write_still(request.output, gaussians, up=up, antialiased=antialiased)
-    return f"{len(gaussians.means):,} Gaussians {when}"
+    clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased)
+    note = f" ({clipped:,} values clipped to what .spz can hold)" if clipped else ""
+    return f"{len(gaussians.means):,} Gaussians {when}{note}"
 
 
 def write_still(
     path: Path, gaussians: Gaussians, *, up: tuple[float, float, float] = FILE_UP, antialiased: bool = False
-) -> None:
+) -> int:
     """Write activated Gaussians, world units, in the format that the name ends in: .ply, .splat, .spz or .glb.
 
     Args:
         up: unit vector; .glb alone makes use of it.
         antialiased: whether they were trained with the antialiasing compensation; .spz alone says so.
+
+    Returns:
+        How many values were clipped, as a .spz demands it.
 
     Raises:
         UserError: another suffix, or the place cannot be written.
@@ -119,11 +125,12 @@ def write_still(
     elif suffix == ".splat":
         write_splat(path, gaussians)
     elif suffix == ".spz":
-        write_spz(path, gaussians, antialiased=antialiased)
+        return write_spz(path, gaussians, antialiased=antialiased)
     elif suffix == ".glb":
         write_glb(path, gaussians, up)
     else:
         raise UserError(f"{path}: Gaussians are written as .ply, .splat, .spz or .glb; end the name so")
+    return 0
 
 
 def _export_moving(request: Request, device: str) -> str:
@@ -140,13 +147,24 @@ def _export_moving(request: Request, device: str) -> str:
     frames = even_moments(request.frames or FRAMES, request.fps or FPS)
     moments = film_moments(session) if session is not None and request.edit is not None else frames
     if request.kind == "ply-sequence":
-        with progress(len(moments), "export") as shown:
-            count = write_sequence(
-                request.output, (kept(posed(scene, session, moment)) for moment in moments), shown.advance
-            )
-        return f"{count} frames of {scene.gaussian_count:,} Gaussians"
+        return _write_frames(request, scene, session, moments)
     assert session is not None
     return _write_skeleton(request, session, moments)
+
+
+def _write_frames(request: Request, scene: Scene, session: EditSession | None, moments: list[Moment]) -> str:
+    counts = []
+
+    def frames() -> Iterator[Gaussians]:
+        for moment in moments:
+            counts.append(len((found := kept(posed(scene, session, moment))).means))
+            yield found
+
+    with progress(len(moments), "export") as shown:
+        count = write_sequence(request.output, frames(), shown.advance)
+    least, most = min(counts), max(counts)
+    held = f"{most:,}" if least == most else f"{least:,} to {most:,}"
+    return f"{count} frames of {held} Gaussians"
 
 
 def _write_skeleton(request: Request, session: EditSession, moments: list[Moment]) -> str:
@@ -157,7 +175,7 @@ def _write_skeleton(request: Request, session: EditSession, moments: list[Moment
     if request.kind == "graph":
         write_graph(request.output, skeleton, session.graph.edges, up)
         return f"{length}, {len(session.graph.edges):,} edges"
-    rest, rows, skeleton = _finite(at_rest(scene), skeleton)
+    rest, rows, skeleton = _finite(scene, skeleton)
     if request.kind == "glb":
         colors = mean_colors(session, moments)[rows]
         rest = Gaussians(rest.means, rest.quats, rest.scales, rest.opacities, torch.from_numpy(colors), rest.sh_rest)
@@ -169,8 +187,12 @@ def _write_skeleton(request: Request, session: EditSession, moments: list[Moment
     return f"{len(rest.means):,} Gaussians, {length}"
 
 
-def _finite(rest: Gaussians, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:
+def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:
+    """The Gaussians that files may hold, at rest; which they are, [N] bool; and what they follow."""
+    rest = at_rest(scene)
     rows = finite_rows(rest) & np.isfinite(skeleton.weights).all(axis=1)
+    for part in (scene.gaussians.shading, scene.gaussians.hyper):
+        rows &= part.detach().isfinite().all(dim=1).cpu().numpy()
     if not rows.any():
         raise UserError("no Gaussian of the scene is finite; train again with a lower rate")
     return select(rest, rows), rows, skeleton.select(rows)
@@ -212,5 +234,5 @@ def _export_page(request: Request, device: str) -> str:
     assert request.run is not None
     scene = Scene.load(request.run, device=device)
     title = request.title or request.run.resolve().name
-    write_page(scene, request.output, title=title, max_mib=request.max_mib)
-    return f"{scene.gaussian_count:,} Gaussians and their motion"
+    count = write_page(scene, request.output, title=title, max_mib=request.max_mib)
+    return f"{count:,} Gaussians {'and their motion' if scene.motion.moves else 'that stand still'}"

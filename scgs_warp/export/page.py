@@ -23,7 +23,7 @@ TITLE = "Moving scene"
 MIB = 2**20
 
 
-def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | None = None) -> None:
+def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | None = None) -> int:
     """Write one HTML file that plays ``scene``; an existing file is replaced once the new one is complete.
 
     Args:
@@ -32,6 +32,9 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
         title: shown on the page, any text.
         max_mib: the file's largest size in MiB. Colours lose their highest degrees of spherical harmonics, one by one,
             until it fits.
+
+    Returns:
+        Number of Gaussians on the page: those that can be seen.
 
     Raises:
         UserError: the name does not end in .html; the motion model has no control points; the page does not fit; the
@@ -43,27 +46,28 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
     if path.is_dir():
         raise UserError(f"{path}: is a folder; give the page another name")
     if max_mib is not None and not max_mib > 0:
-        raise UserError(f"max_mib is {max_mib:g}; give a size in MiB above 0, or none")
-    page = _fitting(scene, path, title, max_mib)
+        raise UserError(f"--max-mib (max_mib) is {max_mib:g}; give a size in MiB above 0, or none")
+    page, count = _fitting(scene, path, title, max_mib)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{path.parent}: cannot be made ({error.strerror}); give another folder") from None
     write_atomically(path, page)
+    return count
 
 
-def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> bytes:
-    """The page of the highest degree that is small enough."""
+def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> tuple[bytes, int]:
+    """The page of the highest degree that is small enough, and how many Gaussians it holds."""
     page = b""
     for degree in range(min(scene.gaussians.sh_degree, MOST_DEGREE), -1, -1):
         content = page_scene(scene, degree)
         page = assemble(pack(content.facts, content.columns), title)
         if max_mib is None or len(page) <= max_mib * MIB:
-            return page
+            return page, content.facts["gaussians"]
     least = len(page) / MIB
     raise UserError(
-        f"{path}: takes {least:.2f} MiB even with colours that do not depend on the view, more than max_mib "
-        f"{max_mib:g}; allow that much, or train with a smaller --max-gaussians"
+        f"{path}: takes {least:.2f} MiB even with colours that do not depend on the view, more than the "
+        f"{max_mib:g} MiB of --max-mib (max_mib); allow that much, or train with a smaller --max-gaussians"
     )
 
 
@@ -75,6 +79,7 @@ def assemble(data: bytes, title: str = "") -> bytes:
         f"default-src 'none'; script-src {_hash(program)} blob:; worker-src blob:; style-src {_hash(style)}; "
         "base-uri 'none'; form-action 'none'"
     )
+    title = title.encode("utf-8", "replace").decode()  # a file's name may hold what is no text
     parts = {
         "policy": policy,
         "title": html.escape(" ".join(title.split()) or TITLE),

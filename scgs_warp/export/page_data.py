@@ -15,7 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import UserError
+
 VERSION = 1
+COMMON, SPREAD = 0.999, 2.0
+"""Where codes are scarce, values beyond ``SPREAD`` times this quantile of their sizes are clipped: one outlier would
+coarsen all the others."""
 LEVEL = 6
 """Of deflate: the highest takes four times as long, for half a percent."""
 
@@ -56,14 +61,29 @@ class Column:
 
 
 def quantise(name: str, values: np.ndarray, step: float, *, most_bits: int = 24, delta: bool = False) -> Column:
-    """``values`` [R] as codes no wider than ``step``, the least and the largest exact; wider where ``most_bits`` (1 to
-    24) do not reach."""
+    """``values`` [R] as codes no wider than ``step``, the least and the largest exact. Where ``most_bits`` (1 to 24) do
+    not reach, outliers are clipped to the common range, and steps are wider if that is not enough.
+
+    Raises:
+        UserError: a value is not finite.
+    """
     values = values.astype(np.float64)
+    if not np.isfinite(values).all():
+        raise UserError(f"--format html: {name} is not finite; train again with a lower rate")
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    if (room := ((1 << most_bits) - 1) * step) < high - low:
+        reach = max(common_size(values), room / 2)
+        low, high = max(low, -reach), min(high, reach)
+        values = values.clip(low, high)
     bits = min(most_bits, max(1, math.ceil(math.log2((high - low) / step + 1.0))))
     width = (high - low) / ((1 << bits) - 1)
     codes = np.zeros(len(values), np.uint32) if width == 0 else np.rint((values - low) / width).astype(np.uint32)
     return Column(name, codes, bits, low, width, delta)
+
+
+def common_size(values: np.ndarray) -> float:
+    """What no value of a sequence [R] that is not an outlier exceeds in size."""
+    return SPREAD * float(np.quantile(np.abs(values), COMMON))
 
 
 def integers(name: str, values: np.ndarray, *, delta: bool = False) -> Column:

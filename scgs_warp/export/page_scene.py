@@ -15,7 +15,7 @@ from ..kernels.types import ALPHA_MIN
 from ..motion.control_points import ControlPoints
 from ..motion.static_nodes import StaticNodes
 from ..scene import Scene
-from .page_data import Column, integers, quantise
+from .page_data import Column, common_size, integers, quantise
 
 FEWEST_SAMPLES, MOST_SAMPLES = 33, 257
 """Times at which control points are sampled: twice as many, again and again ..."""
@@ -39,6 +39,9 @@ STEPS = {
     "pose": 1e-4,
 }
 """How finely each part is stored; docs/page.md says what that costs."""
+FAR = 200.0
+"""Normalised units, as far as 24 bits reach in steps of a position: what lies farther than this, and more than twice as
+far as 99.9 % of the Gaussians, is left out."""
 BYTE = 8
 """Bits of ``sh_rest`` at most: the page unpacks bytes."""
 
@@ -70,6 +73,7 @@ def page_scene(scene: Scene, sh_degree: int) -> PageScene:
         kept = visible(gaussians)
         if not len(kept):
             raise UserError("--format html: the scene has no Gaussian that can be seen; train it first")
+        kept = kept[near(gaussians.means[kept])]
         kept = kept[morton_order(gaussians.means[kept])]
         columns = _gaussian_columns(gaussians, kept, sh_degree)
         facts = _facts(scene, len(kept), sh_degree)
@@ -81,10 +85,19 @@ def page_scene(scene: Scene, sh_degree: int) -> PageScene:
 
 def visible(gaussians: GaussianParameters) -> Tensor:
     """[V] int64, the Gaussians that can be drawn at all: finite, and opaque enough to change an 8-bit picture."""
-    parts = gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest.flatten(1)
+    parts = (
+        gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest.flatten(1),
+        gaussians.shading, gaussians.hyper,
+    )  # fmt: skip
     finite = torch.stack([part.isfinite().all(dim=1) for part in parts]).all(dim=0)
     solid = gaussians.opacities() >= float(ALPHA_MIN)
     return (finite & solid & gaussians.quats.any(dim=1)).nonzero()[:, 0]
+
+
+def near(points: Tensor) -> Tensor:
+    """[N] bool: all but strays, which would coarsen the places of all others."""
+    sizes = points.abs().amax(dim=1)
+    return sizes <= max(FAR, common_size(_array(sizes)))
 
 
 def morton_order(points: Tensor) -> Tensor:
@@ -177,7 +190,11 @@ def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
 
 def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
     """[T, M, 3] ``translation``, [T, M, 4] ``rotation``, and where the model has them ``shape`` [T, M, 4] and
-    ``log_scale`` [T, M, 3], at T evenly spaced times; quaternions keep to their side from time to time."""
+    ``log_scale`` [T, M, 3], at T evenly spaced times; quaternions keep to their side from time to time.
+
+    Raises:
+        UserError: a pose is not finite.
+    """
     count = FEWEST_SAMPLES
     poses = _poses_at(motion, torch.linspace(0.0, 1.0, count))
     while count < MOST_SAMPLES:
@@ -222,4 +239,10 @@ def _poses_at(motion: ControlPoints, times: Tensor) -> dict[str, np.ndarray]:
             for name, value in zip(POSE_PARTS, fields, strict=True):
                 if value is not None:
                     found.setdefault(name, []).append(_array(value))
-    return {name: np.stack(rows) for name, rows in found.items()}
+    poses = {name: np.stack(rows) for name, rows in found.items()}
+    if not all(np.isfinite(rows).all() for rows in poses.values()):
+        raise UserError(
+            "--format html: the control points' motion is not finite; train again with a lower rate, or put the "
+            "previous checkpoint back"
+        )
+    return poses

@@ -22,6 +22,8 @@ SUFFIXES: dict[Format, str] = {
     "ply-sequence": "",
 }
 """How the output's name ends; the first format of a suffix is what the suffix alone means."""
+OTHER_SUFFIXES = {".htm": ".html"}
+"""Endings that stand for others."""
 STILL = ("ply", "splat", "spz", "glb")
 """Formats that hold Gaussians at one instant; ``glb`` holds the motion where no instant is given."""
 MOST_FRAMES = 100_000
@@ -55,7 +57,8 @@ class Request:
     title: str = ""
     """Of the page; the run's name by default."""
     max_mib: float | None = None
-    """Largest page in MiB; the least important Gaussians are left out beyond it."""
+    """Largest page in MiB; colours lose their highest degrees of spherical harmonics, one by one, until it fits, and a
+    page that still does not is refused."""
 
     @property
     def kind(self) -> Format:
@@ -67,6 +70,7 @@ class Request:
         if self.format is not None:
             return self.format
         suffix = self.output.suffix.lower()
+        suffix = OTHER_SUFFIXES.get(suffix, suffix)
         for name, ending in SUFFIXES.items():
             if ending == suffix:
                 return name
@@ -77,7 +81,9 @@ class Request:
     @property
     def still(self) -> bool:
         """Whether Gaussians at one instant are wanted."""
-        return self.kind in STILL and (self.kind != "glb" or self.time is not None or self.at is not None)
+        if self.kind != "glb":
+            return self.kind in STILL
+        return self.time is not None or self.at is not None or (self.run is None and self.edit is None)
 
 
 def check(request: Request) -> None:
@@ -112,9 +118,28 @@ def check(request: Request) -> None:
         raise UserError(f"--frames {request.frames}: give 1 to {MOST_FRAMES}")
     if request.fps is not None and not 0 < request.fps <= 1000:
         raise UserError(f"--fps {request.fps:g}: give more than 0 and at most 1000 frames a second")
+    _check_unused(request)
     if request.max_mib is not None and not request.max_mib > 0:
         raise UserError(f"--max-mib {request.max_mib:g}: give more than 0 MiB")
     check_place(request.output, kind)
+
+
+def _check_unused(request: Request) -> None:
+    """Refuse options that would change nothing."""
+    kind = request.kind
+    if request.time is not None and request.run is None:
+        raise UserError(f"--time {request.time:g}: a file of Gaussians has no times; leave it out")
+    if kind != "html" and (request.title or request.max_mib is not None):
+        name = "--title" if request.title else "--max-mib"
+        raise UserError(f"{name}: belongs to a page; leave it out, or give --format html")
+    name = "--frames" if request.frames is not None else "--fps" if request.fps is not None else None
+    if name is not None and request.still:
+        remedy = "leave out --time" if kind == "glb" and request.time is not None else "give --format ply-sequence"
+        raise UserError(f"{name}: --output {request.output} is to hold one instant; leave {name} out, or {remedy}")
+    if name is not None and kind in ("html", "cameras"):
+        raise UserError(f"{name}: --format {kind} has no frames; leave it out")
+    if request.fps is not None and kind == "ply-sequence":
+        raise UserError("--fps: a ply-sequence does not say how fast it is; leave it out, and give --frames")
 
 
 def check_place(path: Path, kind: Format) -> None:
@@ -124,10 +149,13 @@ def check_place(path: Path, kind: Format) -> None:
         UserError: the wrong suffix, a folder in the way, a place that cannot be written.
     """
     ending = SUFFIXES[kind]
-    if ending and path.suffix.lower() != ending:
+    suffix = path.suffix.lower()
+    if ending and OTHER_SUFFIXES.get(suffix, suffix) != ending:
         raise UserError(f"--output {path}: end the name in {ending} for --format {kind}")
     if ending and path.is_dir():
         raise UserError(f"--output {path}: is a folder; give another name")
+    if not ending and Path.cwd().is_relative_to(path.resolve()):
+        raise UserError(f"--output {path}: is the current folder or one around it; name a new folder")
     if not ending and path.exists() and not path.is_dir():
         raise UserError(f"--output {path}: is a file; name a folder for --format {kind}")
     try:

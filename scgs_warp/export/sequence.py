@@ -19,8 +19,11 @@ def check_folder(path: Path) -> None:
     """Whether a sequence may be written there.
 
     Raises:
-        UserError: the folder holds anything else than an earlier sequence.
+        UserError: it is the current folder or one around it, or holds anything else than an earlier sequence.
     """
+    path = path.resolve()
+    if Path.cwd().is_relative_to(path):
+        raise UserError(f"--output {path}: is the current folder or one around it; name a new folder")
     if path.is_dir() and not all(re.fullmatch(r"frame_\d{5,}\.ply", entry.name) for entry in path.iterdir()):
         raise UserError(f"{path}: holds other files than a sequence's frames; name a new folder")
 
@@ -35,6 +38,7 @@ def write_sequence(path: Path, frames: Iterable[Gaussians], advance: Callable[[]
     Raises:
         UserError: as :func:`check_folder`, or the place cannot be written.
     """
+    path = path.resolve()  # a link's folder is replaced, not the link
     check_folder(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -46,11 +50,24 @@ def write_sequence(path: Path, frames: Iterable[Gaussians], advance: Callable[[]
             if advance is not None:
                 advance()
         check_folder(path)
-        if path.is_dir():
-            shutil.rmtree(path)
-        os.replace(temporary, path)
+        _replace(path, temporary)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror}); give another folder") from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return count
+
+
+def _replace(path: Path, new: Path) -> None:
+    """Put a folder in the place of another, which is removed once the new one stands there."""
+    old = path.with_name(f".{path.name}.{os.getpid()}.old")
+    if not path.is_dir():
+        os.replace(new, path)
+        return
+    os.replace(path, old)
+    try:
+        os.replace(new, path)
+    except BaseException:
+        os.replace(old, path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)

@@ -122,7 +122,8 @@ def build_skeleton(session: EditSession, moments: list[Moment], advance: Callabl
         advance: called after each moment.
 
     Raises:
-        UserError: an edit of a scene with a mask, whose Gaussians do not simply follow their control points.
+        UserError: an edit of a scene with a mask, whose Gaussians do not simply follow their control points; a motion
+            that is not finite.
     """
     engine, scene = session.engine, session.scene
     masked = bool(scene.config.motion.mask) and engine.rig.moves
@@ -146,12 +147,31 @@ def build_skeleton(session: EditSession, moments: list[Moment], advance: Callabl
         indices,
         weights,
     )
+    _check_finite(skeleton)
     return _with_rest(skeleton, scene.gaussians) if masked else skeleton
+
+
+def _check_finite(skeleton: Skeleton) -> None:
+    tracks = skeleton.positions, skeleton.rotations, skeleton.shape_rotations, skeleton.log_scales
+    for track in tracks:
+        good = track is None or np.isfinite(track).all(axis=(1, 2))
+        if not np.all(good):
+            raise _not_finite(float(skeleton.times[int(np.argmin(good))]))
+
+
+def _not_finite(time: float) -> UserError:
+    return UserError(
+        f"the control points' motion is not finite at time {time:g}; train again with a lower rate, or put the "
+        "previous checkpoint back"
+    )
 
 
 def _pose(session: EditSession, moment: Moment, masked: bool) -> Pose:
     engine, edit = session.engine, session.edit
     motion = engine.motion_at(moment.time)
+    fields = motion.pose.translations, motion.pose.rotations, motion.pose.shape_rotations, motion.pose.log_scales
+    if not all(value is None or value.isfinite().all() for value in fields):
+        raise _not_finite(moment.time)
     bent = engine.bend(edit, moment.time, moment.at, frame=edit.reach)
     if bent is None:
         return motion.pose
