@@ -23,6 +23,7 @@ from scgs_warp.export.gltf import Document
 from scgs_warp.export.request import Format, Request
 from scgs_warp.export.sequence import write_sequence
 from scgs_warp.export.skeleton import at_rest
+from scgs_warp.motion.control_points import ControlPoints
 from scgs_warp.scene import Scene
 from scgs_warp.types import Gaussians, Pose
 
@@ -70,6 +71,7 @@ def spoil(scene: Scene) -> None:
 
 
 def spoil_motion(scene: Scene) -> None:
+    assert isinstance(scene.motion, ControlPoints)
     plain = scene.motion.poses
 
     def poses(times: torch.Tensor) -> list[Pose]:
