@@ -4,7 +4,6 @@ under its final name."""
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .errors import UserError
+from .folders import holds_only, make_parent, replace_folder
 
 SUFFIXES = (".mp4", ".gif", "")
 """What ``film`` can write; no suffix: a folder of PNGs."""
@@ -23,6 +23,7 @@ QUALITY = 18
 PALETTE_PIXELS = 400_000
 """Pixels, spread evenly over the film, that a GIF's one palette is chosen from."""
 FRAME_NAME = "frame_{:05d}.png"
+FRAMES = r"frame_\d{5,}\.png"
 
 
 def check_path(path: str | Path) -> Path:
@@ -40,19 +41,10 @@ def check_path(path: str | Path) -> Path:
     if not suffix and path.exists():
         if not path.is_dir():
             raise UserError(f"{path}: is a file; end the name in .mp4 or .gif, or name a folder")
-        if not _holds_only_frames(path):
+        if not holds_only(path, FRAMES):
             raise UserError(f"{path}: holds other files than a film's frames; name a new folder")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(path.parent, os.W_OK | os.X_OK):
-            raise PermissionError(13, "Permission denied")
-    except OSError as error:
-        raise UserError(f"{path.parent}: cannot be written ({error.strerror}); give another output folder") from None
+    make_parent(path)
     return path
-
-
-def _holds_only_frames(folder: Path) -> bool:
-    return all(re.fullmatch(r"frame_\d{5,}\.png", entry.name) for entry in folder.iterdir())
 
 
 @contextmanager
@@ -205,11 +197,9 @@ class _Folder(FilmWriter):
         write_png(self.temporary / FRAME_NAME.format(self.frames), frame)
 
     def publish(self) -> None:
-        if self.path.is_dir():
-            if not _holds_only_frames(self.path):
-                raise UserError(f"{self.path}: holds other files than a film's frames; name a new folder")
-            shutil.rmtree(self.path)
-        os.replace(self.temporary, self.path)
+        if self.path.is_dir() and not holds_only(self.path, FRAMES):
+            raise UserError(f"{self.path}: holds other files than a film's frames; name a new folder")
+        replace_folder(self.path, self.temporary)
 
 
 def write_png(path: Path, image: np.ndarray) -> None:

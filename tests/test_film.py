@@ -159,3 +159,19 @@ def test_the_same_frames_are_the_same_film_whatever_lay_in_memory(tmp_path):
         subprocess.run([sys.executable, "-c", FRESH_MEMORY, str(path)], env=environ, check=True)
         films.append(path.read_bytes())
     assert films[0] == films[1]
+
+
+def test_earlier_frames_outlive_a_replacement_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "frames"
+    write(folder, frames(2, 16, 24))
+    plain = os.replace
+
+    def refuse(source: Path, target: Path) -> None:
+        if Path(target) == folder and "part" in Path(source).name:
+            raise OSError(5, "Input/output error")
+        plain(source, target)
+
+    monkeypatch.setattr("os.replace", refuse)
+    with pytest.raises(UserError, match="cannot be written"):
+        write(folder, frames(3, 16, 24))
+    assert len(list(folder.iterdir())) == 2 and [entry.name for entry in tmp_path.iterdir()] == ["frames"]

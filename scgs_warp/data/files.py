@@ -76,6 +76,20 @@ def held_out(path: Path, order: Sequence[int], split: str) -> list[int]:
     return chosen
 
 
+def read_bytes(path: Path, remedy: str) -> bytes:
+    """All of a file. ``remedy``: what to do without it.
+
+    Raises:
+        UserError: no such file, or it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; {remedy}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+
+
 def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
     """The JSON object in ``path``. ``needed``: why it is, or what to do, if the file is missing.
 

@@ -11,6 +11,7 @@ from ..checkpoint import write_atomically
 from ..errors import UserError
 from ..gaussians import SH_C0, GaussianParameters
 from ..types import Gaussians
+from .files import read_bytes
 from .gaussian_ply import to_parameters
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
@@ -44,12 +45,7 @@ def read_splat(path: str | Path) -> GaussianParameters:
         UserError: it is missing, empty, cut short, or holds no finite Gaussian.
     """
     path = Path(path)
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; give a .splat") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); give a .splat") from None
+    content = read_bytes(path, "give a .splat")
     if not content or len(content) % ROW.itemsize:
         raise UserError(f"{path}: {len(content)} bytes are no multiple of {ROW.itemsize}; export the .splat again")
     rows = np.frombuffer(content, ROW)

@@ -21,6 +21,7 @@ from ..checkpoint import write_atomically
 from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..types import Gaussians
+from .files import read_bytes
 from .gaussian_ply import to_parameters
 
 MAGIC = 0x5053474E
@@ -153,12 +154,7 @@ def read_spz(path: str | Path) -> GaussianParameters:
         UserError: it is missing, damaged, of another version, or version 4 without the package zstandard.
     """
     path = Path(path)
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; give a .spz") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); give a .spz") from None
+    content = read_bytes(path, "give a .spz")
     if content[:4] == struct.pack("<I", MAGIC):
         version, count, degree, bits, parts = _read_streams(path, content)
     else:

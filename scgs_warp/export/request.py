@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 from ..errors import UserError
+from ..folders import make_parent
 
 Format = Literal["ply", "ply-sequence", "splat", "spz", "glb", "graph", "npz", "cameras", "html"]
 SUFFIXES: dict[Format, str] = {
@@ -154,13 +154,6 @@ def check_place(path: Path, kind: Format) -> None:
         raise UserError(f"--output {path}: end the name in {ending} for --format {kind}")
     if ending and path.is_dir():
         raise UserError(f"--output {path}: is a folder; give another name")
-    if not ending and Path.cwd().is_relative_to(path.resolve()):
-        raise UserError(f"--output {path}: is the current folder or one around it; name a new folder")
     if not ending and path.exists() and not path.is_dir():
         raise UserError(f"--output {path}: is a file; name a folder for --format {kind}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(path.parent, os.W_OK | os.X_OK):
-            raise PermissionError(13, "Permission denied")
-    except OSError as error:
-        raise UserError(f"{path.parent}: cannot be written ({error.strerror}); give another folder") from None
+    make_parent(path)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ..data.gaussian_ply import write_gaussian_ply
 from ..errors import UserError
+from ..folders import holds_only, replace_folder
 from ..types import Gaussians
 
 NAME = "frame_{:05d}.ply"
@@ -24,7 +24,7 @@ def check_folder(path: Path) -> None:
     path = path.resolve()
     if Path.cwd().is_relative_to(path):
         raise UserError(f"--output {path}: is the current folder or one around it; name a new folder")
-    if path.is_dir() and not all(re.fullmatch(r"frame_\d{5,}\.ply", entry.name) for entry in path.iterdir()):
+    if path.is_dir() and not holds_only(path, r"frame_\d{5,}\.ply"):
         raise UserError(f"{path}: holds other files than a sequence's frames; name a new folder")
 
 
@@ -50,24 +50,9 @@ def write_sequence(path: Path, frames: Iterable[Gaussians], advance: Callable[[]
             if advance is not None:
                 advance()
         check_folder(path)
-        _replace(path, temporary)
+        replace_folder(path, temporary)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror}); give another folder") from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return count
-
-
-def _replace(path: Path, new: Path) -> None:
-    """Put a folder in the place of another, which is removed once the new one stands there."""
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
-    if not path.is_dir():
-        os.replace(new, path)
-        return
-    os.replace(path, old)
-    try:
-        os.replace(new, path)
-    except BaseException:
-        os.replace(old, path)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
