@@ -88,11 +88,14 @@ def edge_sums(
         edge = rest_in[i] - rest_in[j]
         wanted = wp.float64(0.5) * ((rotations_in[i] + rotations_in[j]) * edge)
         posed = posed_in[i] - posed_in[j]
-        length = wp.length(posed)
-        if length > wp.float64(0.0):
-            wanted += (stretch * wp.length(edge) / length) * posed
-        else:
-            wanted += stretch * wanted
+        kept = wanted  # what an edge of its old length would be
+        size = wp.length(posed)
+        if size > wp.float64(0.0):
+            # Only as far as it points where it should: a reversed edge would be kept reversed, and a joint folded.
+            cosine = wp.dot(posed, wanted) / wp.max(size * wp.length(wanted), wp.float64(1e-300))
+            along = wp.max(cosine, wp.float64(0.0))
+            kept = (along * wp.length(edge) / size) * posed + (wp.float64(1.0) - along) * wanted
+        wanted += stretch * kept
         total += (weights_in[at] / (wp.float64(1.0) + stretch)) * wanted
         if fixed_in[j] != 0:
             total += weights_in[at] * posed_in[j]

@@ -22,14 +22,18 @@ def turn_nodes(graph: ControlGraph, rest, posed, rotations, smooth: float) -> np
 
 def place_nodes(graph: ControlGraph, rest, posed, rotations, hard, pulls, targets, stretch: float) -> np.ndarray:
     """Minimises, over the nodes not held, sum over edges (i, j) in both directions of
-    w / (1 + s) (|p_ij - (R_i e_ij + R_j e_ij) / 2|^2 + s |p_ij - |e_ij| p0_ij / |p0_ij||^2) / 2 + soft terms."""
+    w / (1 + s) (|p_ij - t_ij|^2 + s |p_ij - (c |e_ij| p0_ij / |p0_ij| + (1 - c) t_ij)|^2) / 2 + soft terms, where
+    t_ij = (R_i e_ij + R_j e_ij) / 2 and c the cosine of the angle between p0_ij and t_ij, at least 0."""
     count = len(graph)
     L, b = np.diag(pulls).astype(float), pulls[:, None] * targets
     for i in range(count):
         for at in range(graph.begin[i], graph.begin[i + 1]):
             j, w = graph.neighbors[at], graph.weights[at]
             e, p = rest[i] - rest[j], posed[i] - posed[j]
-            wanted = 0.5 * (rotations[i] + rotations[j]) @ e + stretch * np.linalg.norm(e) * p / np.linalg.norm(p)
+            turned = 0.5 * (rotations[i] + rotations[j]) @ e
+            along = max(0.0, p @ turned / (np.linalg.norm(p) * np.linalg.norm(turned)))
+            kept = along * np.linalg.norm(e) * p / np.linalg.norm(p) + (1.0 - along) * turned
+            wanted = turned + stretch * kept
             L[i, i] += w
             L[i, j] -= w
             b[i] += w / (1 + stretch) * wanted
