@@ -1,7 +1,7 @@
 """What the acceptance of editing measures: a limb turned about its joint, the rest pinned.
 
-``python tests/limb_bending.py --run runs/figure-quick ... [--picture limbs.png]`` measures runs of the built-in scene, in
-percent; the picture is of the first one.
+``python tests/limb_bending.py --run runs/figure-quick ... [--picture limbs.png]`` measures runs of the built-in scene;
+the picture is of the first one.
 """
 
 from __future__ import annotations
