@@ -121,8 +121,11 @@ class BandCount:
         keys, spare = (torch.empty(self._stretches, dtype=torch.int64) for _ in range(2))
         dealt = torch.empty(self._stretches, 4, dtype=torch.int32)
         before = torch.empty_like(self._begins)
+        begun = self._begins.clone() if debug.enabled() else None
         found = (*self._found, self._first_slots, self._begins, offsets, dealt, keys, before)
         launch(kernels.deal_chunks, self._chunks, *self._geometry[:4], self._chunk_size, *self._size, *found, grain=1)
+        if begun is not None:
+            checks.check_dealt(begun, self._begins)
         ranges = torch.empty(rows * columns, 2, dtype=torch.int32)
         splats, slots = (checks.unwritten(self.pairs) for _ in range(2))
         cursors = torch.empty(rows, columns, dtype=torch.int32)

@@ -72,6 +72,18 @@ def check_tiles(splats: Splats, tiles: Tiles) -> None:
     expect(ordered | (tile[:-1] != tile[1:]), "within a tile, pairs are sorted by depth, then index")
 
 
+def check_dealt(begun: Tensor, ended: Tensor) -> None:
+    """On a CPU, between dealing and sorting, which would follow what was never written.
+
+    Args:
+        begun, ended: [chunks, rows + 1] where each chunk's first stretch of each row goes, and behind its last one.
+
+    Raises:
+        BrokenInvariant: a chunk dealt more or fewer than it counted.
+    """
+    expect(begun.T.flatten()[1:] == ended.T.flatten()[:-1], "each chunk deals as many stretches as it counted")
+
+
 def check_room(tiles: Tiles, capacity: int, count: int) -> None:
     """Lists with room for ``capacity`` pairs of ``count`` splats, whether or not all found room.
 
