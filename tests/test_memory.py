@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import subprocess
 import sys
@@ -86,7 +87,7 @@ def test_the_process_own_limits_count():
         "resource.setrlimit(resource.RLIMIT_AS, (used + 2**29, used + 2**29)); print(m.room())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert 2**28 < int(done.stdout) <= memory.SHARE * 2**29
+    assert 2**28 < int(done.stdout) < 2**29
 
 
 @pytest.mark.parametrize(
@@ -167,7 +168,7 @@ def test_all_frames_of_a_gif_are_planned(monkeypatch: pytest.MonkeyPatch):
     allow(monkeypatch, 100 * 2**20)
     film.require_memory("a.mp4", 512, 512, 10_000, "cpu")
     film.require_memory("a.gif", 512, 512, 10, "cpu")
-    with pytest.raises(NotEnoughMemory, match="a GIF of 10000 frames of 512 x 512.*write an .mp4"):
+    with pytest.raises(NotEnoughMemory, match=r"a GIF of 10000 frames of 512 x 512.*write an \.mp4"):
         film.require_memory("a.gif", 512, 512, 10_000, "cpu")
 
 
@@ -192,7 +193,7 @@ def test_training_says_that_memory_ends_growth(monkeypatch: pytest.MonkeyPatch, 
 
     monkeypatch.setattr(train, "most_that_fit", most)
     fit(tiny_config(60, motion={"model": "static"}), tiny_dataset(6, 32), output=tmp_path / "run")
-    assert len(asked) > 1 and all(later <= first for first, later in zip(asked, asked[1:]))
+    assert len(asked) > 1 and all(later <= first for first, later in itertools.pairwise(asked))
     said = capsys.readouterr()
     assert (said.err + said.out).count("they grow no further") == 1
     assert (tmp_path / "run/log.jsonl").read_text().count("they grow no further") == 1
