@@ -8,6 +8,7 @@ import pytest
 import torch
 from cuda_emulation import COMPILER, build, launcher
 from splats import random_splats
+from tiny import tiny_config, tiny_dataset
 
 from scgs_warp import debug, memory
 from scgs_warp.errors import UserError
@@ -15,7 +16,10 @@ from scgs_warp.ops import bands, binning_cuda, compositing_cuda
 from scgs_warp.ops.bands import Demand
 from scgs_warp.ops.binning import BandCount, bin_splats, bin_window
 from scgs_warp.ops.compositing import composite, demand
-from scgs_warp.types import Splats, Stats
+from scgs_warp.rasterize import rasterization
+from scgs_warp.render import render
+from scgs_warp.train import fit
+from scgs_warp.types import Camera, Gaussians, Splats, Stats
 
 LISTS = ("splats", "slots")
 SIZE = (150, 85)  # 10 x 6 tiles, the last of each row and column cut
@@ -133,6 +137,38 @@ def test_same_bits_in_windows_by_the_native_form(tmp_path, monkeypatch: pytest.M
     cuts = squeeze(monkeypatch, 22_000)
     assert all(torch.equal(got, expected) for got, expected in zip(draw(splats, "cuda"), whole, strict=True))
     assert cuts[0] > 10
+
+
+def test_rasterization_and_render_go_through_windows(device: str, monkeypatch: pytest.MonkeyPatch):
+    g = torch.Generator().manual_seed(9)
+    means = (torch.randn(200, 3, generator=g) + torch.tensor([0.0, 0.0, 4.0])).to(device)
+    quats, scales = torch.randn(200, 4, generator=g).to(device), torch.full((200, 3), 0.2, device=device)
+    opacities, colors = torch.full((200,), 0.5, device=device), torch.rand(200, 3, generator=g).to(device)
+    K = torch.tensor([[90.0, 0.0, 50.0], [0.0, 90.0, 40.0], [0.0, 0.0, 1.0]], device=device)
+    viewmat = torch.eye(4, device=device)
+
+    def results() -> list[torch.Tensor]:
+        leaves = [x.clone().requires_grad_() for x in (means, quats, scales, opacities, colors)]
+        renders, alphas, _ = rasterization(*leaves, viewmat[None], K[None], 100, 80, render_mode="RGB+ED")
+        gradients = torch.autograd.grad(renders.square().sum(), leaves)
+        gaussians = Gaussians(means, quats, scales, opacities, colors, torch.zeros(200, 0, 3, device=device))
+        image = render(gaussians, Camera(viewmat, K, 100, 80))
+        return [renders, alphas, *gradients, image.rgb, image.alpha, image.depth]
+
+    whole = results()
+    cuts = squeeze(monkeypatch, 25_000)
+    assert all(torch.equal(a, b) for a, b in zip(results(), whole, strict=True))
+    assert len(cuts) == 2 and min(cuts) > 1
+
+
+def test_training_in_windows_gives_the_same_checkpoint(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    config, data = tiny_config(24, motion={"model": "static"}), tiny_dataset(4, 32)
+    fit(config, data, output=tmp_path / "whole")
+    cuts = squeeze(monkeypatch, 80_000)
+    fit(config, data, output=tmp_path / "bands")
+    assert len(cuts) >= 24 and max(cuts) > 1
+    files = [(tmp_path / name / "checkpoint.safetensors").read_bytes() for name in ("whole", "bands")]
+    assert files[0] == files[1]
 
 
 def test_without_gradients_fewer_windows_do(monkeypatch: pytest.MonkeyPatch):

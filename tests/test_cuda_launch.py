@@ -43,6 +43,16 @@ def test_other_shapes_and_missing_arrays():
                 assert torch.equal(a, b) and b.any()
 
 
+def test_a_grid_may_begin_later():
+    """As windows of tiles do: what lies before stays as it was."""
+    got, expected = (slot_arguments(10, 3, True) for _ in range(2))
+    ready = recorded(sum_slot_columns, 1, slot_arguments(1, 0, True))
+    ready.launch(16 * 4, got, None, 16 * 6)
+    warp_interop.launch(sum_slot_columns, 16 * 4, *expected, begin=16 * 6)
+    for a, b in zip(got[3:], expected[3:]):
+        assert torch.equal(a, b) and b[6:].any() and not b[:6].any()
+
+
 def projection_arguments(count: int, width: int, eps2d: float) -> tuple[Any, ...]:
     generator = torch.Generator().manual_seed(count)
     means = torch.randn(count, 3, generator=generator) * 0.3 + torch.tensor([0.0, 0.0, 3.0])

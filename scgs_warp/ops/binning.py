@@ -75,7 +75,7 @@ def _count(splats: Splats, size: tuple[int, ...], window: Window) -> BandCount |
     return counted(geometry_of(splats), size, window)
 
 
-def _listed(splats: Splats, size: tuple[int, ...], count: BandCount | RadixCount) -> Tiles:
+def _listed(splats: Splats, size: tuple[int, int, int, int, int], count: BandCount | RadixCount) -> Tiles:
     tiles = Tiles(*count.lists(), *size)
     if debug.enabled():
         checks.check_tiles(splats, tiles)
