@@ -130,7 +130,9 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.ablate_table import build, write
     from scgs_warp.errors import UserError
 
-    cells = [] if options.table_only else make_cells(options, prepare(options.device, options.threads))
+    cells = (
+        [] if options.table_only else make_cells(options, prepare(options.device, options.threads, options.memory_gib))
+    )
     failures: dict[str, str] = {}
     report = build(options.ablation, options.output, cells)
     paths = write(report, options.output)

@@ -32,6 +32,9 @@ class Common:
     """Where to compute; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; by default everything is measured on one and on all."""
+    memory_gib: float | None = None
+    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
+    with the figure. By default what the machine has free."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +203,7 @@ def main(args: list[str] | None) -> None:
 
     options: Common = tyro.extras.subcommand_cli_from_dict(COMMANDS, args=args, prog="bench.py", description=__doc__)
     check(options)
-    device = prepare(options.device, options.threads)
+    device = prepare(options.device, options.threads, options.memory_gib)
 
     from scgs_warp import bench, bench_plot, bench_scaling
     from scgs_warp.bench_scene import camera_size

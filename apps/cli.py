@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -48,9 +49,16 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
     return 0
 
 
-def prepare(device: Device, threads: int | None) -> str:
-    """Set threads and denormals before the first tensor operation, then choose the device."""
+def prepare(device: Device, threads: int | None, memory_gib: float | None = None) -> str:
+    """Set threads, denormals and the memory limit before the first tensor operation, then choose the device."""
     if threads is not None and threads < 1:
         raise UserError(f"--threads {threads}: must be at least 1")
+    if memory_gib is not None and not 0.0 < memory_gib < math.inf:
+        raise UserError(f"--memory-gib {memory_gib:g}: must be greater than 0")
     environment.configure(threads)
+    if memory_gib is not None:
+        from scgs_warp import memory
+
+        memory.set_limit(memory_gib)
+        os.environ[memory.VARIABLE] = str(memory_gib)  # for processes of our own, too
     return choose_device(device)

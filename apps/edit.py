@@ -45,6 +45,9 @@ class Options:
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
+    memory_gib: float | None = None
+    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
+    with the figure. By default what the machine has free."""
 
 
 def check(options: Options) -> None:
@@ -142,7 +145,7 @@ def main(args: list[str] | None) -> None:
         from scgs_warp.editor.app import import_viser
 
         import_viser()  # before the scene: loading may take a while
-    device = prepare(options.device, options.threads)
+    device = prepare(options.device, options.threads, options.memory_gib)
     session = open_session(options, device)
     if browser:
         open_browser(session, options)

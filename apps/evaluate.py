@@ -33,6 +33,9 @@ class Options:
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
+    memory_gib: float | None = None
+    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
+    with the figure. By default what the machine has free."""
 
 
 def load_data(scene: Scene, options: Options) -> Dataset:
@@ -84,7 +87,7 @@ def main(args: list[str] | None) -> None:
     import tyro
 
     options = tyro.cli(Options, args=args, prog="evaluate.py")
-    device = prepare(options.device, options.threads)
+    device = prepare(options.device, options.threads, options.memory_gib)
 
     from scgs_warp.evaluate import metrics_of, write_metrics
     from scgs_warp.progress import progress

@@ -17,6 +17,9 @@ class Options(Request):
     """Where to compute; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
+    memory_gib: float | None = None
+    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
+    with the figure. By default what the machine has free."""
 
 
 def main(args: list[str] | None) -> None:
@@ -24,7 +27,7 @@ def main(args: list[str] | None) -> None:
 
     options = tyro.cli(Options, args=args, prog="export.py")
     check(options)
-    device = prepare(options.device, options.threads)
+    device = prepare(options.device, options.threads, options.memory_gib)
 
     from scgs_warp.export.job import export
 

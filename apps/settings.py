@@ -46,6 +46,9 @@ class Settings:
     """Where to compute; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
+    memory_gib: float | None = None
+    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
+    with the figure. By default what the machine has free."""
 
 
 def configuration(

@@ -52,7 +52,7 @@ def default_output(options: Options) -> Path:
 
 def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="train.py")
-    device = prepare(options.device, options.threads)
+    device = prepare(options.device, options.threads, options.memory_gib)
     output = options.output or default_output(options)
     recorded = output / "config.json"
     file = options.config or (recorded if options.resume and recorded.is_file() else None)

@@ -42,6 +42,9 @@ class Options:
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
+    memory_gib: float | None = None
+    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
+    with the figure. By default what the machine has free."""
 
 
 def check(options: Options) -> None:
@@ -58,7 +61,8 @@ def check(options: Options) -> None:
     if options.frames < 1:
         raise UserError(f"--frames {options.frames}: a film needs at least 1")
     if not 16 <= options.size <= LARGEST:
-        raise UserError(f"--size {options.size}: give 16 to {LARGEST} pixels")
+        taken = f"; a frame of {options.size} x {options.size} would take {film.frame_gib(options.size):,.1f} GiB"
+        raise UserError(f"--size {options.size}: give 16 to {LARGEST} pixels{taken if options.size > LARGEST else ''}")
     if not 0 < options.fps <= 1000:
         raise UserError(f"--fps {options.fps:g}: give more than 0 and at most 1000 frames a second")
     if not 0 <= options.time <= 1:
@@ -83,7 +87,7 @@ def main(args: list[str] | None) -> None:
 
     options = tyro.cli(Options, args=args, prog="view.py")
     check(options)
-    device = prepare(options.device, options.threads)
+    device = prepare(options.device, options.threads, options.memory_gib)
 
     from scgs_warp import cameras, film
     from scgs_warp.overlay import Painter
@@ -98,6 +102,7 @@ def main(args: list[str] | None) -> None:
     if options.mode == "turntable":
         times = [options.time] * options.frames
     views = [(camera.to(device), time) for camera, time in zip(path, times)]
+    film.require_memory(options.output, path[0].width, path[0].height, options.frames, device)
     painter = Painter(scene, options.show, views)
     with film.film(options.output, options.fps) as writer, progress(options.frames, "view") as shown:
         for camera, time in views:

@@ -110,6 +110,19 @@ def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: i
     return touched(e.mean[0] + x_left, e.mean[0] + x_right, tile_size, columns, width)
 
 
+@wp.func
+def rows_within(span: wp.vec2i, tile_begin: int, tile_end: int, columns: int) -> wp.vec2i:
+    """Of the rows of tiles, those that tiles ``tile_begin`` to ``tile_end`` lie in."""
+    return wp.vec2i(wp.max(span[0], tile_begin // columns), wp.min(span[1], (tile_end + columns - 1) // columns))
+
+
+@wp.func
+def columns_within(span: wp.vec2i, row: int, tile_begin: int, tile_end: int, columns: int) -> wp.vec2i:
+    """Of a row's tiles, those from ``tile_begin`` to ``tile_end``."""
+    begin = wp.max(span[0], tile_begin - row * columns)
+    return wp.vec2i(begin, wp.max(begin, wp.min(span[1], tile_end - row * columns)))
+
+
 ELLIPSE_SIMD = f"""
     #pragma clang fp contract(off)
     typedef float vf __attribute__((vector_size(64)));
@@ -122,6 +135,7 @@ ELLIPSE_SIMD = f"""
     const float ALPHA_MIN = {float(ALPHA_MIN)!r}f, REACH_SLACK = {float(REACH_SLACK)!r}f;
     const float LOG2[] = {{{", ".join(f"{c!r}f" for c in LOG2_COEFFICIENTS)}}};
     const int LOG2_COUNT = {len(LOG2_COEFFICIENTS)};
+    const bool part = tile_begin > 0 || tile_end < columns * rows;
 
     auto least = [](vf a, vf b) -> vf {{ return b < a ? b : a; }};
     auto most = [](vf a, vf b) -> vf {{ return b > a ? b : a; }};
@@ -175,6 +189,11 @@ ELLIPSE_SIMD = f"""
     }};
     auto touched_rows = [&](const Ellipse& e) -> Span {{
         Span span = touched(e.y - e.half_height, e.y + e.half_height, rows, height);
+        if (part) {{  // of a whole image nothing lies outside, and the question costs time
+            const int top = tile_begin / columns, bottom = (tile_end + columns - 1) / columns;
+            span.begin = span.begin < top ? ZEROS + top : span.begin;
+            span.end = span.end > bottom ? ZEROS + bottom : span.end;
+        }}
         return {{e.usable ? span.begin : ZEROS, e.usable ? span.end : ZEROS}};
     }};
     auto touched_columns = [&](const Ellipse& e, vi row) -> Span {{
@@ -186,8 +205,16 @@ ELLIPSE_SIMD = f"""
         const vf x_right = e.shear * right
             + __builtin_elementwise_sqrt(most(ZERO, e.spread - e.steepness * right * right));
         const vf x_left = e.shear * left - __builtin_elementwise_sqrt(most(ZERO, e.spread - e.steepness * left * left));
-        return touched(e.x + x_left, e.x + x_right, columns, width);
+        Span span = touched(e.x + x_left, e.x + x_right, columns, width);
+        if (part) {{
+            const vi first = tile_begin - row * columns, last = tile_end - row * columns;
+            span.begin = span.begin < first ? first : span.begin;
+            span.end = span.end > last ? last : span.end;
+            span.end = span.end < span.begin ? span.begin : span.end;
+        }}
+        return span;
     }};
 """
 """The same functions for native bodies on a CPU, of 16 splats, or of 16 rows of one splat, at a time: operation by
-operation, so that they find the same tiles. They see ``tile_size``, ``columns``, ``rows``, ``width`` and ``height``."""
+operation, so that they find the same tiles. They see ``tile_size``, ``columns``, ``rows``, ``width``, ``height``, and
+``tile_begin`` and ``tile_end``, outside of which no tile is found."""

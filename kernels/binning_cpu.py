@@ -233,8 +233,8 @@ _SORT = """
 def count_chunk(
     chunk: int, means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], opacities: wp.array[float],
     depths: wp.array[float], radii: wp.array[wp.vec2i], chunk_size: int, width: int, height: int, columns: int,
-    rows: int, tile_size: int, windows: wp.array[wp.int64], corners: wp.array[wp.vec2i],
-    stretches_of_chunk: wp.array2d[int], pairs_of_chunk: wp.array[wp.int64],
+    rows: int, tile_size: int, tile_begin: int, tile_end: int, windows: wp.array[wp.int64],
+    corners: wp.array[wp.vec2i], stretches_of_chunk: wp.array2d[int], pairs_of_chunk: wp.array[wp.int64],
 ): ...
 
 
@@ -242,9 +242,9 @@ def count_chunk(
 def deal_chunk(
     chunk: int, means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], opacities: wp.array[float],
     depths: wp.array[float], chunk_size: int, width: int, height: int, columns: int, rows: int, tile_size: int,
-    windows: wp.array[wp.int64], corners: wp.array[wp.vec2i], first_slots: wp.array[wp.int64],
-    cursors_of_chunk: wp.array2d[int], offsets: wp.array[wp.int64], stretches: wp.array2d[int],
-    keys: wp.array[wp.int64], pairs_before: wp.array2d[int],
+    tile_begin: int, tile_end: int, windows: wp.array[wp.int64], corners: wp.array[wp.vec2i],
+    first_slots: wp.array[wp.int64], cursors_of_chunk: wp.array2d[int], offsets: wp.array[wp.int64],
+    stretches: wp.array2d[int], keys: wp.array[wp.int64], pairs_before: wp.array2d[int],
 ): ...
 
 
@@ -272,6 +272,8 @@ def count_chunks(
     columns: int,
     rows: int,
     tile_size: int,
+    tile_begin: int,  # no tile before this one is wanted
+    tile_end: int,  # nor this one and those behind it
     # Out:
     windows_out: wp.array[wp.int64],  # [N] tiles touched in a window of 8 x 8, a byte a row; else the last row
     corners_out: wp.array[wp.vec2i],  # [N] first row, first column; column -1: the tiles do not fit into the window
@@ -280,7 +282,7 @@ def count_chunks(
 ):
     count_chunk(
         first + wp.tid(), means2d_in, conics_in, opacities_in, depths_in, radii_in, chunk_size, width, height, columns,
-        rows, tile_size, windows_out, corners_out, stretches_out, pairs_out,
+        rows, tile_size, tile_begin, tile_end, windows_out, corners_out, stretches_out, pairs_out,
     )  # fmt: skip
 
 
@@ -324,6 +326,8 @@ def deal_chunks(
     columns: int,
     rows: int,
     tile_size: int,
+    tile_begin: int,
+    tile_end: int,
     windows_in: wp.array[wp.int64],  # [N]
     corners_in: wp.array[wp.vec2i],  # [N]
     first_slots_in: wp.array[wp.int64],  # [chunks + 2] pairs before the chunk
@@ -336,7 +340,8 @@ def deal_chunks(
 ):
     deal_chunk(
         first + wp.tid(), means2d_in, conics_in, opacities_in, depths_in, chunk_size, width, height, columns, rows,
-        tile_size, windows_in, corners_in, first_slots_in, cursors_out, offsets_out, stretches_out, keys_out, pairs_out,
+        tile_size, tile_begin, tile_end, windows_in, corners_in, first_slots_in, cursors_out, offsets_out,
+        stretches_out, keys_out, pairs_out,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .binning import DEPTH_CULLED, splat_ellipse, touched_columns, touched_rows
+from .binning import DEPTH_CULLED, columns_within, rows_within, splat_ellipse, touched_columns, touched_rows
 
 # Counting and emitting must find the same tiles: no fusing of multiply and add, which may differ between two kernels.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -33,6 +33,8 @@ def count_pairs(
     columns: int,
     rows: int,
     tile_size: int,
+    tile_begin: int,  # no tile before this one is wanted
+    tile_end: int,  # nor this one and those behind it
     # Out:
     counts_out: wp.array[int],  # [N] tiles touched; 0: culled
     depth_keys_out: wp.array[float],  # [2 N] what to sort the splats by, in the first half
@@ -42,9 +44,10 @@ def count_pairs(
     e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
     count = int(0)
     if e.reach >= 0.0:
-        span = touched_rows(e, tile_size, rows, height)
+        span = rows_within(touched_rows(e, tile_size, rows, height), tile_begin, tile_end, columns)
         for row in range(span[0], span[1]):
             reach = touched_columns(e, row, tile_size, columns, width, height)
+            reach = columns_within(reach, row, tile_begin, tile_end, columns)
             count += reach[1] - reach[0]
     key = float(DEPTH_CULLED)
     if count > 0:
@@ -84,6 +87,8 @@ def emit_by_depth(
     columns: int,
     rows: int,
     tile_size: int,
+    tile_begin: int,
+    tile_end: int,
     # Out:
     tiles_out: wp.array[int],  # [2 P] tile of each pair in the first half; the other half is the sort's own
     values_out: wp.array[int],  # [2 P] slot of each pair, or its splat where slots are not wanted
@@ -102,9 +107,10 @@ def emit_by_depth(
         slot = int(offsets_in[i])
         most = owners_out.shape[0] - 1
     e = splat_ellipse(means2d_in[i], conics_in[i], opacities_in[i], depths_in[i], radii_in[i])
-    span = touched_rows(e, tile_size, rows, height)
+    span = rows_within(touched_rows(e, tile_size, rows, height), tile_begin, tile_end, columns)
     for row in range(span[0], span[1]):
         reach = touched_columns(e, row, tile_size, columns, width, height)
+        reach = columns_within(reach, row, tile_begin, tile_end, columns)
         for column in range(reach[0], reach[1]):
             if at < end:
                 tiles_out[at] = row * columns + column

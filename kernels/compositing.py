@@ -189,6 +189,7 @@ def sum_slots(
     # In:
     offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
     v_slots_in: wp.array2d[float],  # [P, S]
+    more: int,  # whether these sums go on from what the outputs hold, else from zero
     # Out:
     v_means2d_out: wp.array[wp.vec2],  # [N]
     v_conics_out: wp.array[wp.vec3],  # [N]
@@ -205,7 +206,14 @@ def sum_slots(
     v_opacity = float(0.0)
     absolute = wp.vec2(0.0)
     for c in range(v_channels_out.shape[1]):
-        v_channels_out[i, c] = 0.0
+        if more == 0:
+            v_channels_out[i, c] = 0.0
+    if more != 0:
+        v_mean = v_means2d_out[i]
+        v_conic = v_conics_out[i]
+        v_opacity = v_opacities_out[i]
+        if absgrad_out.shape[0] > 0:
+            absolute = absgrad_out[i]
     for s in range(begin, end):
         v_mean += wp.vec2(v_slots_in[s, 0], v_slots_in[s, 1])
         v_conic += wp.vec3(v_slots_in[s, 2], v_slots_in[s, 3], v_slots_in[s, 4])
@@ -232,6 +240,7 @@ def sum_line_slots(
     # In:
     offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
     v_slots_in: wp.array[Slot],  # [P, 16]
+    more: int,  # whether these sums go on from what the outputs hold, else from zero
     # Out:
     v_means2d_out: wp.array[wp.vec2],  # [N]
     v_conics_out: wp.array[wp.vec3],  # [N]
@@ -242,6 +251,16 @@ def sum_line_slots(
     """``sum_slots`` of slots that are one vector: the same bits, in half the time on a CPU."""
     i = first + wp.tid()
     total = Slot()
+    if more != 0:
+        for k in range(2):
+            total[k] = v_means2d_out[i][k]
+            if absgrad_out.shape[0] > 0:
+                total[6 + k] = absgrad_out[i][k]
+        for k in range(3):
+            total[2 + k] = v_conics_out[i][k]
+        total[5] = v_opacities_out[i]
+        for c in range(v_channels_out.shape[1]):
+            total[SLOT_GEOMETRY + c] = v_channels_out[i, c]
     for s in range(int(offsets_in[i]), int(offsets_in[i + 1])):
         total += v_slots_in[s]
     v_means2d_out[i] = wp.vec2(total[0], total[1])

@@ -18,6 +18,7 @@ def sum_slot_columns(
     # In:
     offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
     v_slots_in: wp.array2d[float],  # [P, 16]
+    more: int,  # whether these sums go on from what the outputs hold, else from zero
     # Out:
     v_means2d_out: wp.array2d[float],  # [N, 2]
     v_conics_out: wp.array2d[float],  # [N, 3]
@@ -30,6 +31,18 @@ def sum_slot_columns(
     i = t // SLOT_WIDTH
     column = t - i * SLOT_WIDTH
     total = float(0.0)
+    if more != 0:
+        if column < 2:
+            total = v_means2d_out[i, column]
+        elif column < 5:
+            total = v_conics_out[i, column - 2]
+        elif column < 6:
+            total = v_opacities_out[i]
+        elif column < SLOT_GEOMETRY:
+            if absgrad_out.shape[0] > 0:
+                total = absgrad_out[i, column - 6]
+        elif column - SLOT_GEOMETRY < v_channels_out.shape[1]:
+            total = v_channels_out[i, column - SLOT_GEOMETRY]
     for s in range(int(offsets_in[i]), int(offsets_in[i + 1])):
         total += v_slots_in[s, column]
     if column < 2:

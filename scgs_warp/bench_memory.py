@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
 import platform
 from pathlib import Path
 
 import torch
 
+from . import memory
 from .scene import Scene
 
 MIB = 2**20
@@ -22,18 +22,14 @@ def model_mib(scene: Scene) -> float:
 
 def _status(key: str) -> float | None:
     """A line of /proc/self/status in MiB; None where there is none (outside Linux)."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith(f"{key}:"):
-                return int(line.split()[1]) / 2**10
-    return None
+    found = memory.status(key)
+    return None if found is None else found / MIB
 
 
 def hand_back() -> None:
     """Freed memory goes back to the system, so that what is resident is what is used (glibc keeps it otherwise)."""
     gc.collect()
-    with contextlib.suppress(OSError, AttributeError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)
+    memory.hand_back()
 
 
 def resident_mib(device: str) -> float | None:

@@ -35,7 +35,7 @@ _FORMATS = {
 
 
 class RecordedKernel:
-    """A kernel, ready to be launched on one device with one block size. Its first argument, ``first``, is 0."""
+    """A kernel, ready to be launched on one device with one block size."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class RecordedKernel:
             size = ctypes.sizeof(value)
             offset = -(-end // _ALIGNMENT) * _ALIGNMENT
             offsets.append(offset)
-            form = f"{size}x"  # ``first``
+            form = "i"  # ``first``
             if index > 0:
                 form = (
                     f"Q{size - 8}s"
@@ -90,14 +90,14 @@ class RecordedKernel:
             if addresses is not None:
                 addresses[index] = ctypes.c_void_p(ctypes.addressof(params[index]))
 
-    def launch(self, dim: int | tuple[int, int], args: tuple, stream: wp.Stream | None) -> None:
-        """Run the kernel on ``stream`` with other arguments.
+    def launch(self, dim: int | tuple[int, int], args: tuple, stream: wp.Stream | None, begin: int = 0) -> None:
+        """Run the kernel on ``stream`` with other arguments, from grid index ``begin`` on.
 
         Raises:
             ValueError: a tensor's dtype, shape, strides or device is not what the kernel declares.
             TypeError: the number or the kind of an argument is not.
         """
-        values: list[Any] = []
+        values: list[Any] = [begin]
         if len(args) != len(self._parameters):
             raise TypeError(
                 f"kernel {self._kernel.key} takes {len(self._parameters)} arguments after 'first', got {len(args)}"

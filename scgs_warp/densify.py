@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from . import memory
 from .config import DensifyConfig
 from .gaussians import GaussianParameters
 from .optim import Adam
@@ -16,11 +17,27 @@ from .types import Stats
 SPLIT_SHRINK = 1.6
 """A split Gaussian's two halves are this much smaller (3D-GS)."""
 RESET_OPACITY = 0.01
+NUMBERS_PER_PARAMETER = 6
+"""float32 in memory for each parameter: itself, its gradient, two moments, the posed value and its gradient."""
+NUMBERS_OF_A_STEP = 220
+"""float32 in memory for each Gaussian: its splat, its gradients, and what four pairs of splat and tile take."""
 
 
 def threshold(config: DensifyConfig, width: int, height: int) -> float:
     """Gradient threshold at this image size."""
     return config.grad_threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent
+
+
+def most_that_fit(gaussians: GaussianParameters, wanted: int) -> int:
+    """How many Gaussians memory allows, at most ``wanted``: with their gradients, Adam's moments, what a step computes
+    of each, and the pairs of splat and tile that each has on average."""
+    count = len(gaussians)
+    numbers = sum(parameter.numel() for parameter in gaussians.parameters()) / max(count, 1)
+    each = round(4 * (NUMBERS_PER_PARAMETER * numbers + NUMBERS_OF_A_STEP))
+    device = gaussians.means.device
+    if memory.fits(each * max(min(wanted, 2 * count) - count, 0), device):  # no densification more than doubles them
+        return wanted
+    return min(wanted, count + memory.room(device) // each)
 
 
 def mean_gradient(stats: Stats) -> Tensor:

@@ -22,6 +22,10 @@ QUALITY = 18
 """x264's constant rate factor; 18 is hard to tell from the original, 6 more halve the file."""
 PALETTE_PIXELS = 400_000
 """Pixels, spread evenly over the film, that a GIF's one palette is chosen from."""
+PIXEL_BYTES = 64
+"""Memory of a frame while it is made: colour, coverage and depth in float32, their bytes, the encoder's own."""
+GIF_PIXEL_BYTES = 4
+"""Of every frame of a GIF: its bytes, and its places in the palette."""
 FRAME_NAME = "frame_{:05d}.png"
 FRAMES = r"frame_\d{5,}\.png"
 
@@ -45,6 +49,27 @@ def check_path(path: str | Path) -> Path:
             raise UserError(f"{path}: holds other files than a film's frames; name a new folder")
     make_parent(path)
     return path
+
+
+def frame_gib(width: int, height: int | None = None) -> float:
+    """GiB that a frame takes while it is rendered and written; square without ``height``."""
+    return PIXEL_BYTES * width * (height or width) / 2**30
+
+
+def require_memory(path: str | Path, width: int, height: int, frames: int, device: str) -> None:
+    """Refuse, before the first frame, a film that does not fit into memory.
+
+    Raises:
+        NotEnoughMemory: with the figures.
+    """
+    from . import memory
+
+    need, what = PIXEL_BYTES * width * height, f"{path}: a frame of {width} x {height}"
+    memory.require(need, device, what, "give a smaller --size")
+    if Path(path).suffix.lower() == ".gif":
+        need += GIF_PIXEL_BYTES * width * height * frames
+        what = f"{path}: a GIF of {frames} frames of {width} x {height}, all of which it keeps,"
+        memory.require(need, "cpu", what, "give a smaller --size or write an .mp4")
 
 
 @contextmanager

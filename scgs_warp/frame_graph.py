@@ -15,10 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from . import debug, memory
 from .cuda_graph import CudaGraph
 from .gaussians import GaussianParameters
+from .kernels.types import TILE_SIZE
 from .motion.base import Motion
-from .ops.binning_cuda import MAX_ROOM, bin_within
+from .ops.bands import require_image
+from .ops.binning_cuda import MAX_ROOM, bin_within, bytes_within
+from .ops.compositing import image_demand
 from .render import draw, expected_depth
 from .types import Camera, Image, Splats, Tiles
 
@@ -47,6 +51,8 @@ class Pending:
 
 class FrameGraph:
     """Draws frames of one scene. Not differentiable. One frame at a time, or a few under way: ``submit``, ``finish``.
+
+    A frame whose pairs would not fit into memory is not drawn from a recording, but step by step, in windows of tiles.
 
     Attributes: ``capacity`` (pairs there is room for; 0: not known yet), ``recordings`` (how often a graph was
     recorded), ``failure`` (why none could be; None: it could, or was not tried).
@@ -91,7 +97,7 @@ class FrameGraph:
             background: [3] in [0, 1], on any device.
 
         Raises:
-            ValueError: there are more pairs of tile and splat than lists can index.
+            NotEnoughMemory: the image, or a single tile of it, takes more memory than there is.
         """
         return self.finish(self.submit(camera, time, background))
 
@@ -111,8 +117,8 @@ class FrameGraph:
             if pairs <= pending.capacity:
                 return pending.image
             with self._lock:
-                if pairs > self.capacity:
-                    self._make_room(pairs)
+                if pairs > self.capacity and not self._make_room(pairs, pending.size):
+                    return self._drawn(pending.inputs.to(self._inputs.device), pending.size)
             pending = self._start(pending.inputs, pending.size)
 
     @torch.no_grad()
@@ -141,11 +147,14 @@ class FrameGraph:
         """Notice another size or a changed scene, learn how much room is needed, and record when it pays."""
         state = self._scene_state()
         if size != self._size or state != self._state:
+            require_image(image_demand(*size, 4), size, len(self.gaussians), self._inputs.device)
             self._size, self._state, self._recorded, self._frames_of_state = size, state, None, 0
         if self.capacity == 0:
             self.capacity = 1
-            self._make_room(int(self._body()[1]))
+            self._make_room(int(self._body()[1]), size)
         self._frames_of_state += 1
+        if debug.enabled():  # its checks ask the device
+            return
         if self._recorded is None and self.failure is None and self._frames_of_state > RECORD_AFTER:
             self._record()
 
@@ -167,15 +176,18 @@ class FrameGraph:
         tensors = (*self.gaussians.parameters(), *self.motion.parameters())
         return [(x.data_ptr(), x.shape, 0 if x.is_inference() else x._version) for x in tensors]
 
-    def _make_room(self, pairs: int) -> None:
-        if pairs > MAX_ROOM:
-            raise ValueError(f"{pairs} pairs of splat and tile, more than {MAX_ROOM}; reduce the image or the splats")
-        self.capacity = min(-(-int(SPARE * max(pairs, 1)) // GRANULE) * GRANULE, MAX_ROOM)
-        self._recorded = None
+    def _make_room(self, pairs: int, size: tuple[int, int]) -> bool:
+        """Room for so many pairs and some to spare, unless that is more than lists can index or memory can hold."""
+        capacity = min(-(-int(SPARE * max(pairs, 1)) // GRANULE) * GRANULE, MAX_ROOM)
+        tiles = -(-size[0] // TILE_SIZE) * -(-size[1] // TILE_SIZE)
+        need = bytes_within(capacity, len(self.gaussians), tiles)
+        if pairs > capacity or not memory.fits(need, self._inputs.device):
+            return False
+        self.capacity, self._recorded = capacity, None
+        return True
 
     def _body(self) -> tuple[Image, Tensor]:
         """The whole frame, from the inputs' memory; also the number of pairs, [1]."""
-        viewmat, K, time, background = self._inputs.split((16, 9, 1, 3))
         found: list[Tensor] = []
 
         def binned(splats: Splats) -> Tiles:
@@ -183,11 +195,17 @@ class FrameGraph:
             found.append(total)
             return tiles
 
+        return self._drawn(self._inputs, self._size, binned), found[0]
+
+    @torch.no_grad()
+    def _drawn(self, inputs: Tensor, size: tuple[int, int], binned: Callable[[Splats], Tiles] | None = None) -> Image:
+        """The frame that ``inputs`` ask for; without ``binned``, in windows where need be."""
+        viewmat, K, time, background = inputs.split((16, 9, 1, 3))
         posed = self.motion.gaussians_at(self.gaussians, time)
-        camera = Camera(viewmat.view(4, 4), K.view(3, 3), *self._size)
+        camera = Camera(viewmat.view(4, 4), K.view(3, 3), *size)
         image, alpha = draw(posed, camera, background, antialiased=self._antialiased, depth=True, binned=binned)
         depth = self._depth_of(expected_depth(image[3], alpha))
-        return Image(image[:3].permute(1, 2, 0), alpha, depth), found[0]
+        return Image(image[:3].permute(1, 2, 0), alpha, depth)
 
 
 class _Steps:

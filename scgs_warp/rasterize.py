@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .ops.binning import bin_splats
-from .ops.compositing import composite
+from .ops.compositing import composite, demand
 from .ops.harmonics import MAX_DEGREE, spherical_harmonics
 from .ops.projection import project
 from .render import expected_depth
@@ -127,7 +127,8 @@ def rasterization(
         background = None if backgrounds is None else backgrounds[index]
         channels, background = _channels(own, means, camera, splat, sh_degree, render_mode, background)
         buffer = meta["means2d"].absgrad[index] if absgrad else None
-        image, alpha = composite(splat, channels, bin_splats(splat), background, absgrad=buffer)
+        tiles = bin_splats(splat, demand=demand(splat, channels, background))
+        image, alpha = composite(splat, channels, tiles, background, absgrad=buffer)
         if render_mode.endswith("ED"):
             image = torch.cat([image[:-1], expected_depth(image[-1], alpha)[None]])
         renders.append(image.permute(1, 2, 0))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .ops.binning import bin_splats
-from .ops.compositing import composite
+from .ops.compositing import composite, demand
 from .ops.harmonics import MAX_DEGREE, spherical_harmonics
 from .ops.projection import project
 from .types import Camera, Gaussians, Image, Splats, Stats, Tiles
@@ -79,7 +79,8 @@ def draw(
     if depth:
         channels = torch.cat([channels, splats.depths[:, None]], dim=1)
         background = None if background is None else torch.cat([background, background.new_zeros(1)])
-    tiles = bin_splats(splats) if binned is None else binned(splats)
+    beside = demand(splats, channels, background)
+    tiles = bin_splats(splats, demand=beside) if binned is None else binned(splats)
     return composite(splats, channels, tiles, background, stats=stats)
 
 

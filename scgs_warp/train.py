@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import signal
 import threading
@@ -18,10 +19,11 @@ from . import environment
 from .camera_refinement import camera_rate
 from .config import TrainConfig
 from .data.dataset import Dataset
-from .densify import densify, mean_gradient, reset_opacities, threshold
+from .densify import densify, mean_gradient, most_that_fit, reset_opacities, threshold
 from .errors import UserError
 from .frames import Frames
 from .limits import check
+from .memory import NotEnoughMemory
 from .motion.adapt import adapt_control_points
 from .motion.control_points import ControlPoints
 from .motion.spheres import Spheres
@@ -153,13 +155,13 @@ def _bad_gradient(state: TrainState) -> str | None:
     return None if bad is None else f"gradient of {named[bad][0]}"
 
 
-def adapt(state: TrainState, size: tuple[int, int]) -> None:
+def adapt(state: TrainState, size: tuple[int, int]) -> str | None:
     """After the step: what the schedule wants of numbers of Gaussians and control points. ``stage_step`` is the step
-    just done."""
+    just done. Returns what the user should know of it."""
     if state.stage == "pretrain":
         _adapt_spheres(state)
-    else:
-        _adapt_gaussians(state, size)
+        return None
+    return _adapt_gaussians(state, size)
 
 
 def _adapt_spheres(state: TrainState) -> None:
@@ -175,10 +177,10 @@ def _adapt_spheres(state: TrainState) -> None:
         state.reset_stats()
 
 
-def _adapt_gaussians(state: TrainState, size: tuple[int, int]) -> None:
-    config, done = state.config.densify, state.stage_step + 1
+def _adapt_gaussians(state: TrainState, size: tuple[int, int]) -> str | None:
+    config, done, note = state.config.densify, state.stage_step + 1, None
     if done > config.until:
-        return
+        return None
     if done >= config.start and done % config.every == 0:
         limit = threshold(config, *size)
         if _nodes_due(state, done):
@@ -188,6 +190,10 @@ def _adapt_gaussians(state: TrainState, size: tuple[int, int]) -> None:
             adapt_control_points(
                 state.motion, state.motion_optimizer, state.gaussians, gradient, grad_threshold=node_limit
             )
+        most = most_that_fit(state.gaussians, config.max_gaussians)
+        if most < config.max_gaussians:
+            note = f"memory has room for {most:,} Gaussians, not for {config.max_gaussians:,}; they grow no further"
+            config = dataclasses.replace(config, max_gaussians=most)
         densify(
             state.gaussians,
             state.gaussian_optimizer,
@@ -202,6 +208,7 @@ def _adapt_gaussians(state: TrainState, size: tuple[int, int]) -> None:
     # A reset needs time to heal before densification ends.
     if done % config.opacity_reset_every == 0 and done + config.opacity_reset_every // 2 <= config.until:
         reset_opacities(state.gaussians, state.gaussian_optimizer)
+    return note
 
 
 def _nodes_due(state: TrainState, done: int) -> bool:
@@ -262,6 +269,7 @@ def fit(
 
     Raises:
         UserError: a bad configuration, a checkpoint that does not fit, repeated non-finite losses, no TensorBoard.
+        NotEnoughMemory: one tile of an image takes more than there is; the checkpoint is saved.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
     """
     check(config)
@@ -285,17 +293,25 @@ def fit(
 def _loop(
     state: TrainState, frames: Frames, folder: RunFolder, test: Dataset | None, bar: Progress, stop: threading.Event
 ) -> None:
-    config = state.config
+    config, noted = state.config, False
     saved_at = time.monotonic()
     while state.step < config.steps:
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
             state.begin_main()
-        result = training_step(state, frames)
+        try:
+            result = training_step(state, frames)
+        except NotEnoughMemory:  # before anything was changed: the run goes on where there is more
+            state.save(folder.path)
+            raise
         if result.failed is None:
             state.failures = 0
         else:
             _count_failure(state, result.failed, folder, bar)
-        adapt(state, (result.truth.shape[2], result.truth.shape[1]))
+        note = adapt(state, (result.truth.shape[2], result.truth.shape[1]))
+        if note is not None and not noted:
+            noted = True
+            bar.print(f"step {state.step}: {note}")
+            folder.log({"step": state.step, "stage": state.stage, "note": note})
         state.step += 1
         folder.record(state, result, bar)
         if test is not None and (state.step % config.evaluate_every == 0 or state.step == config.steps):

@@ -124,6 +124,9 @@ class Tiles:
     columns: int
     rows: int
     tile_size: int = 16
+    windows: tuple[tuple[int, int], ...] = ()
+    """Where the lists would not fit into memory together they are empty, and these are the tiles, each time from begin
+    to end, that compositing lists and draws at once, in this order."""
 
 
 @dataclass(frozen=True)

@@ -203,12 +203,12 @@ class _CpuKernel:
         layouts[value.shape] = tail
         return tail
 
-    def bind(self, arguments: bytes, tensors: tuple) -> Callable[[int, int], None]:
-        """What runs a part of the grid, given its first index and its size; holds on to the tensors."""
+    def bind(self, arguments: bytes, tensors: tuple, begin: int = 0) -> Callable[[int, int], None]:
+        """What runs a part of the grid, given its first index after ``begin`` and its size; holds on to the tensors."""
         entry, bounds = self._entry, self._bounds
 
         def call(first: int, size: int, _tensors: tuple = tensors) -> None:
-            entry(bounds(size), first.to_bytes(4, "little") + arguments)
+            entry(bounds(size), (begin + first).to_bytes(4, "little") + arguments)
 
         return call
 
@@ -237,8 +237,10 @@ def _parameters_of(kernel: wp.Kernel, args: tuple) -> list[_ArrayParameter | Non
     return parameters
 
 
-def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.Tensor | None = None) -> None:
-    """Run ``kernel`` for the grid indices 0 .. count - 1.
+def launch(
+    kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.Tensor | None = None, begin: int = 0
+) -> None:
+    """Run ``kernel`` for the grid indices begin .. begin + count - 1.
 
     Args:
         kernel: a Warp kernel whose first argument is ``first: int``.
@@ -248,6 +250,7 @@ def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.T
         grain: fewest grid indices worth a chunk of their own on a CPU (1 for kernels whose index is a whole tile).
         load: [count] integers on the CPU that never fall: what the indices up to each cost, itself included. Chunks are
             then cut by cost, and ``grain`` only says from how many indices on threads share the work.
+        begin: the first grid index.
 
     Raises:
         ValueError: a tensor's dtype, shape, strides or device is not what the kernel declares.
@@ -257,7 +260,7 @@ def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.T
     for value in args:
         if isinstance(value, torch.Tensor):
             if value.is_cuda:
-                _launch_on_cuda(kernel, count, args, value.device)
+                _launch_on_cuda(kernel, count, args, value.device, begin=begin)
                 return
             break
     cpu = _cpu_kernels.get(kernel)
@@ -265,7 +268,7 @@ def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.T
         cpu = _cpu_kernels[kernel] = _CpuKernel(kernel, args)
     elif len(args) != len(cpu.parameters):
         _parameters_of(kernel, args)
-    call = cpu.bind(cpu.pack(args), args)
+    call = cpu.bind(cpu.pack(args), args, begin)
     threads = min(environment.thread_count(), -(-count // grain))
     if threads <= 1:
         call(0, count)
@@ -274,7 +277,12 @@ def launch(kernel: wp.Kernel, count: int, *args, grain: int = 512, load: torch.T
 
 
 def _launch_on_cuda(
-    kernel: wp.Kernel, dim: int | tuple[int, int], args: tuple, device: torch.device, block_dim: int = 256
+    kernel: wp.Kernel,
+    dim: int | tuple[int, int],
+    args: tuple,
+    device: torch.device,
+    block_dim: int = 256,
+    begin: int = 0,
 ) -> None:
     """Launch on torch's current stream of ``device``."""
     key = kernel, device.index, block_dim
@@ -283,11 +291,12 @@ def _launch_on_cuda(
         packed, _ = _pack(kernel, args)
         ready = RecordedKernel(kernel, _parameters[kernel], packed, _array, dim, device, block_dim)
         _cuda_kernels[key] = ready
-    ready.launch(dim, args, warp_stream(device))
+    ready.launch(dim, args, warp_stream(device), begin)
 
 
-def launch_blocks(kernel: wp.Kernel, blocks: int, *args, block_dim: int) -> None:
-    """Run a block-cooperative kernel (Warp's tile API): ``block, lane = wp.tid()`` of a grid ``(blocks, block_dim)``.
+def launch_blocks(kernel: wp.Kernel, blocks: int, *args, block_dim: int, begin: int = 0) -> None:
+    """Run a block-cooperative kernel (Warp's tile API): ``block, lane = wp.tid()`` of a grid ``(blocks, block_dim)``,
+    whose first block is ``begin``.
 
     On a CPU it is right only in a process that set ``wp.config.enable_cpu_blocks``; elsewhere it raises instead of
     silently running one lane.
@@ -296,12 +305,12 @@ def launch_blocks(kernel: wp.Kernel, blocks: int, *args, block_dim: int) -> None
         return
     device = next((value.device for value in args if isinstance(value, torch.Tensor)), None)
     if device is not None and device.type == "cuda":
-        _launch_on_cuda(kernel, (blocks, block_dim), args, device, block_dim)
+        _launch_on_cuda(kernel, (blocks, block_dim), args, device, block_dim, begin)
         return
     if not wp.config.enable_cpu_blocks:
         raise RuntimeError(f"kernel {kernel.key} needs a GPU (or wp.config.enable_cpu_blocks, in a test process)")
     packed, _ = _pack(kernel, args)
-    wp.launch(kernel, dim=(blocks, block_dim), inputs=[0, *packed], device="cpu", block_dim=block_dim)
+    wp.launch(kernel, dim=(blocks, block_dim), inputs=[begin, *packed], device="cpu", block_dim=block_dim)
 
 
 def warp_view(tensor: torch.Tensor, dtype: Any = None) -> wp.array:

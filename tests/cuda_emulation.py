@@ -42,9 +42,10 @@ def source() -> str:
                 integers += 1
         parts.append(f"static void {name}_body({', '.join(parameters)}) {{{body}}}\n")
         parts.append(
-            f'extern "C" int {name}(int blocks, unsigned seed, void** data, wp::Shape* shapes, int* numbers) {{\n'
+            f'extern "C" int {name}(int begin, int blocks, unsigned seed,\n'
+            f"    void** data, wp::Shape* shapes, int* numbers) {{\n"
             f"    std::mt19937 random(seed);\n"
-            f"    for (int tile = 0; tile < blocks; ++tile)\n"
+            f"    for (int tile = begin; tile < begin + blocks; ++tile)\n"
             f"        if (!shim::run_block([=] {{ {name}_body({', '.join(values)}); }}, random)) return 1;\n"
             f"    return 0;\n}}\n"
         )
@@ -66,7 +67,7 @@ def build(folder: Path) -> ctypes.CDLL:
 def launcher(library: ctypes.CDLL, seed: int = 0) -> Callable[..., None]:
     """What takes the place of ``ops.compositing_cuda.launch_native``."""
 
-    def launch_native(kernel: wp.Kernel, blocks: int, *args: Any) -> None:
+    def launch_native(kernel: wp.Kernel, blocks: int, *args: Any, begin: int = 0) -> None:
         declared = [argument.type for argument in kernel.adj.args[1:]]
         arrays = [value for kind, value in zip(declared, args, strict=True) if wp.types.is_array(kind)]
         numbers = [value for kind, value in zip(declared, args) if not wp.types.is_array(kind)]
@@ -78,6 +79,6 @@ def launcher(library: ctypes.CDLL, seed: int = 0) -> Callable[..., None]:
                 data[at] = tensor.data_ptr()
                 shapes[at][: tensor.ndim] = list(tensor.shape)
         integers = (ctypes.c_int * len(numbers))(*numbers)
-        assert getattr(library, kernel.key)(blocks, seed, data, shapes, integers) == 0, "threads wait for ever"
+        assert getattr(library, kernel.key)(begin, blocks, seed, data, shapes, integers) == 0, "threads wait for ever"
 
     return launch_native

@@ -27,9 +27,9 @@ def emulate(monkeypatch: pytest.MonkeyPatch, library: ctypes.CDLL, seed: int = 0
     """Native launches go to the shim; those of the portable form, which the native one leaves many channels to, to the
     pixel form."""
 
-    def portable(kernel: Any, blocks: int, *args: Any, block_dim: int) -> None:
+    def portable(kernel: Any, blocks: int, *args: Any, block_dim: int, begin: int = 0) -> None:
         assert kernel.key == "composite_blocks_adjoint"
-        launch(compositing.composite_pixels_adjoint, blocks, *args)
+        launch(compositing.composite_pixels_adjoint, blocks, *args, begin=begin)
 
     monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library, seed))
     monkeypatch.setattr(compositing_cuda, "launch_blocks", portable)

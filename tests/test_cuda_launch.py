@@ -29,7 +29,7 @@ def slot_arguments(count: int, seed: int, absolute: bool) -> tuple[Any, ...]:
     outputs = [torch.zeros(count, *shape) for shape in ((2,), (3,), (), (4,), (2,))]
     if not absolute:
         outputs[4] = None  # type: ignore[call-overload]
-    return offsets, slots, *outputs
+    return offsets, slots, 0, *outputs
 
 
 def test_other_shapes_and_missing_arrays():
@@ -38,9 +38,19 @@ def test_other_shapes_and_missing_arrays():
         got, expected = (slot_arguments(count, seed, absolute) for _ in range(2))
         ready.launch(16 * count, got, None)
         warp_interop.launch(sum_slot_columns, 16 * count, *expected)
-        for a, b in zip(got[2:], expected[2:]):
+        for a, b in zip(got[3:], expected[3:]):
             if a is not None:
                 assert torch.equal(a, b) and b.any()
+
+
+def test_a_grid_may_begin_later():
+    """As windows of tiles do: what lies before stays as it was."""
+    got, expected = (slot_arguments(10, 3, True) for _ in range(2))
+    ready = recorded(sum_slot_columns, 1, slot_arguments(1, 0, True))
+    ready.launch(16 * 4, got, None, 16 * 6)
+    warp_interop.launch(sum_slot_columns, 16 * 4, *expected, begin=16 * 6)
+    for a, b in zip(got[3:], expected[3:]):
+        assert torch.equal(a, b) and b[6:].any() and not b[:6].any()
 
 
 def projection_arguments(count: int, width: int, eps2d: float) -> tuple[Any, ...]:
@@ -73,7 +83,7 @@ def test_mistakes_name_the_argument():
         (0, arguments[0].int(), ValueError),
         (1, arguments[1].T, ValueError),
         (1, arguments[1].flatten(), ValueError),
-        (3, torch.zeros(3, 4, device="meta"), ValueError),
+        (4, torch.zeros(3, 4, device="meta"), ValueError),
     ):
         changed = [*arguments]
         changed[place] = wrong

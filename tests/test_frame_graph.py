@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from scgs_warp import bench_scene, frame_graph
+from scgs_warp import bench_scene, frame_graph, memory
 from scgs_warp.config import MOTIONS
 from scgs_warp.frame_graph import GRANULE, RECORD_AFTER, FrameGraph
 from scgs_warp.kernels import skinning_cpu
@@ -184,12 +184,29 @@ def test_a_single_picture_is_not_recorded(device: str):
     assert scene.frame_graph().recordings == 0
 
 
-def test_room_is_a_multiple_and_has_a_limit():
+def test_room_is_a_multiple_and_has_a_limit(monkeypatch: pytest.MonkeyPatch):
     frames = FrameGraph(*(getattr(scene_of("static", "cpu"), name) for name in ("gaussians", "motion")))
     for pairs in (0, 1, GRANULE, 10 * GRANULE + 1):
-        frames._make_room(pairs)
+        assert frames._make_room(pairs, (64, 48))
         assert frames.capacity % GRANULE == 0 and frames.capacity >= max(1.2 * pairs, 1)
-    frames._make_room(frame_graph.MAX_ROOM)
+    monkeypatch.setattr(memory, "fits", lambda need, device: True)
+    assert frames._make_room(frame_graph.MAX_ROOM, (64, 48))
     assert frames.capacity == frame_graph.MAX_ROOM
-    with pytest.raises(ValueError, match="pairs"):
-        frames._make_room(frame_graph.MAX_ROOM + 1)
+    assert not frames._make_room(frame_graph.MAX_ROOM + 1, (64, 48))
+    monkeypatch.setattr(memory, "fits", lambda need, device: False)
+    assert not frames._make_room(1, (64, 48))
+    assert frames.capacity == frame_graph.MAX_ROOM
+
+
+def test_a_frame_without_room_is_drawn_step_by_step(device: str, monkeypatch: pytest.MonkeyPatch):
+    """And those after it from a recording, once there is room."""
+    scene = scene_of("control-points", device)
+    camera, color = bench_scene.scene_camera(scene, (90, 70)), torch.zeros(3)
+    frames = scene.frame_graph()
+    with monkeypatch.context() as patch:
+        patch.setattr(frame_graph, "bytes_within", lambda *_: 1 << 60)
+        assert_same(frames.render(camera, 0.3, color), truth(scene, camera, 0.3, color))
+    assert frames.capacity == 1
+    for time in (0.4, 0.5, 0.6, 0.7):
+        assert_same(frames.render(camera, time, color), truth(scene, camera, time, color))
+    assert frames.capacity >= GRANULE and frames.recordings == 1

@@ -13,8 +13,11 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from .. import memory
 from ..config_fields import CACHE_MIB
 
+SHARE = 0.5
+"""Part of the memory that is free at the start which images may take."""
 AHEAD = 2
 """Images that are decoded before they are asked for."""
 
@@ -38,7 +41,7 @@ class ImageCache:
     """Shared by the splits of a run, used by several threads."""
 
     def __init__(self, mib: float = CACHE_MIB) -> None:
-        self.budget = int(mib * 2**20)
+        self.budget = min(int(mib * 2**20), int(SHARE * memory.room("cpu")))
         self.used = 0
         self._kept: dict[Hashable, Pixels] = {}
         self._coming: dict[Hashable, Future[Pixels]] = {}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import cameras
-from ..film import film
+from ..film import film, require_memory
 from ..report import to_bytes
 from ..types import Camera
 from .document import Film, View
@@ -93,9 +93,11 @@ def render_film(
         Number of frames.
 
     Raises:
-        UserError: it cannot be written there.
+        UserError: it cannot be written there, or does not fit into memory.
     """
     settings = session.edit.film
+    first = film_camera(session, 0.0)
+    require_memory(output, first.width, first.height, settings.frames, str(session.scene.device))
     with film(output, settings.fps) as writer:
         for at in moments(settings):
             writer.write(compute(functools.partial(film_frame, session, at)))

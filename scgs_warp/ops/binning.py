@@ -5,11 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .. import debug
 from ..kernels import binning_cpu as kernels
 from ..kernels.types import TILE_SIZE
 from ..types import Splats, Tiles
 from ..warp_interop import launch
-from .binning_cuda import MAX_PAIRS, bin_by_radix
+from . import bands, checks
+from .bands import Demand, Window
+from .binning_cuda import MAX_PAIRS, RadixCount, geometry_of
 
 CHUNK_SIZE = 1024
 """Fewest splats worth a chunk on a CPU."""
@@ -17,7 +20,7 @@ MAX_CHUNKS = 128
 """A chunk counts what it has in each row of tiles: with many chunks the counts outweigh the splats."""
 
 
-def bin_splats(splats: Splats, tile_size: int = TILE_SIZE) -> Tiles:
+def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | None = None) -> Tiles:
     """List, for every tile of the image, the splats that reach one of its pixels, sorted by depth.
 
     A splat reaches the pixels where its alpha is at least 1/255. Splats with a radius of 0, non-finite or not positive
@@ -26,55 +29,114 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE) -> Tiles:
     Args:
         splats: N projected Gaussians, on any device.
         tile_size: side of a tile in pixels.
+        demand: what compositing takes beside the lists. Given, an image whose lists do not fit into memory is cut into
+            windows, which ``composite`` draws one after the other. None: the lists have to fit.
 
     Returns:
         Tiles on the same device; ``ranges`` row major, ``slots`` such that splat ``i`` owns ``offsets[i]`` up to
         ``offsets[i + 1]``, in the order rows first, then columns.
 
     Raises:
-        ValueError: a field's shape does not fit, an image side or tile size is not positive, or there are more than
-            2^31 - 1 pairs of splat and tile.
+        ValueError: a field's shape does not fit, an image side or tile size is not positive, there are more than
+            2^31 - 1 tiles or (without ``demand``) pairs of splat and tile.
+        NotEnoughMemory: the lists, or with ``demand`` the image or one single tile, take more memory than there is.
     """
     _validate(splats, tile_size)
     columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
-    device = splats.means2d.device
-    geometry = [
-        getattr(splats, name).detach().contiguous() for name in ("means2d", "conics", "opacities", "depths", "radii")
-    ]
     size = (splats.width, splats.height, columns, rows, tile_size)
+    device, whole = splats.means2d.device, (0, columns * rows)
+    if demand is not None:
+        bands.require_image(demand.fixed, (splats.width, splats.height), len(splats.means2d), device)
+    if columns * rows > MAX_PAIRS:
+        raise ValueError(f"splats: an image of {columns * rows} tiles, more than {MAX_PAIRS}; reduce the image")
+    count = _count(splats, size, whole)
+    if demand is None:
+        bands.require_lists(count, device)
+    elif not bands.fits(count, demand, device):
+        windows = bands.cut(lambda window: _count(splats, size, window), columns, rows, demand, splats)
+        none = torch.empty(0, dtype=torch.int32, device=device)
+        return Tiles(none.view(0, 2), none, none, none.long(), *size, windows=tuple(windows))
+    return _listed(splats, size, count)
 
-    lists = _bin_by_bands if device.type == "cpu" else bin_by_radix
-    ranges, sorted_splats, slots, offsets = lists(geometry, size)
-    return Tiles(ranges, sorted_splats, slots, offsets, splats.width, splats.height, columns, rows, tile_size)
+
+def bin_window(splats: Splats, tiles: Tiles, window: Window) -> Tiles:
+    """The lists of some tiles of an image; those of all others are empty.
+
+    Args:
+        tiles: what ``bin_splats`` returned for the same splats.
+        window: begin and end of the tiles that are wanted.
+    """
+    size = (tiles.width, tiles.height, tiles.columns, tiles.rows, tiles.tile_size)
+    return _listed(splats, size, _count(splats, size, window))
+
+
+def _count(splats: Splats, size: tuple[int, ...], window: Window) -> BandCount | RadixCount:
+    counted = BandCount if splats.means2d.device.type == "cpu" else RadixCount
+    return counted(geometry_of(splats), size, window)
+
+
+def _listed(splats: Splats, size: tuple[int, int, int, int, int], count: BandCount | RadixCount) -> Tiles:
+    tiles = Tiles(*count.lists(), *size)
+    if debug.enabled():
+        checks.check_tiles(splats, tiles)
+    return tiles
+
+
+class BandCount:
+    """On a CPU, a ``bands.Count``: what each splat touches, to be dealt to the rows of tiles, each of which is sorted
+    by itself; see ``kernels.binning_cpu``."""
+
+    most = MAX_PAIRS
+
+    def __init__(self, geometry: list[Tensor], size: tuple[int, ...], window: Window) -> None:
+        count, (_, _, columns, rows, _) = len(geometry[0]), size
+        self._geometry, self._size, self._tiles = geometry, (*size, *window), (rows, columns)
+        self._chunk_size = max(CHUNK_SIZE, -(-count // (16 * MAX_CHUNKS)) * 16)
+        self._chunks = chunks = max(-(-count // self._chunk_size), 1)
+        windows = torch.empty(count, dtype=torch.int64)
+        corners = torch.empty(count, 2, dtype=torch.int32)
+        self._found = (windows, corners)
+        self._begins = torch.empty(chunks, rows + 1, dtype=torch.int32)
+        self._band_begins = torch.empty(rows + 1, dtype=torch.int32)
+        self._first_slots = torch.empty(chunks + 2, dtype=torch.int64)
+        counts = (*self._found, self._begins, self._first_slots)
+        launch(kernels.count_chunks, chunks, *geometry, self._chunk_size, *self._size, *counts, grain=1)
+        launch(kernels.place_chunks, 1, self._begins, self._first_slots, self._band_begins)
+        self.pairs, self._stretches = self._first_slots[chunks:].tolist()
+        self.entries = max(self.pairs, self._stretches)
+
+    @property
+    def kept(self) -> int:
+        rows, columns = self._tiles
+        return 8 * self.pairs + 8 * len(self._geometry[0]) + 8 * rows * columns
+
+    @property
+    def scratch(self) -> int:
+        rows, columns = self._tiles
+        return 32 * self._stretches + 4 * self._begins.numel() + 4 * rows * columns
+
+    def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        count, (rows, columns) = len(self._geometry[0]), self._tiles
+        offsets = torch.empty(count + 1, dtype=torch.int64)
+        keys, spare = (torch.empty(self._stretches, dtype=torch.int64) for _ in range(2))
+        dealt = torch.empty(self._stretches, 4, dtype=torch.int32)
+        before = torch.empty_like(self._begins)
+        begun = self._begins.clone() if debug.enabled() else None
+        found = (*self._found, self._first_slots, self._begins, offsets, dealt, keys, before)
+        launch(kernels.deal_chunks, self._chunks, *self._geometry[:4], self._chunk_size, *self._size, *found, grain=1)
+        if begun is not None:
+            checks.check_dealt(begun, self._begins)
+        ranges = torch.empty(rows * columns, 2, dtype=torch.int32)
+        splats, slots = (checks.unwritten(self.pairs) for _ in range(2))
+        cursors = torch.empty(rows, columns, dtype=torch.int32)
+        tiles, load = (cursors, ranges, splats, slots), self._band_begins[1:]
+        launch(kernels.sort_bands, rows, self._band_begins, dealt, before, keys, spare, *tiles, grain=1, load=load)
+        return ranges, splats, slots, offsets
 
 
 def _bin_by_bands(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Ranges, splats, slots, offsets, on a CPU: what each splat touches is dealt to the rows of tiles, each of which is
-    sorted by itself; see ``kernels.binning_cpu``."""
-    count, (_, _, columns, rows, _) = len(geometry[0]), size
-    chunk_size = max(CHUNK_SIZE, -(-count // (16 * MAX_CHUNKS)) * 16)
-    chunks = max(-(-count // chunk_size), 1)
-    windows, offsets = torch.empty(count, dtype=torch.int64), torch.empty(count + 1, dtype=torch.int64)
-    corners, ranges = torch.empty(count, 2, dtype=torch.int32), torch.empty(rows * columns, 2, dtype=torch.int32)
-    begins, before = (torch.empty(chunks, rows + 1, dtype=torch.int32) for _ in range(2))
-    band_begins = torch.empty(rows + 1, dtype=torch.int32)
-    first_slots = torch.empty(chunks + 2, dtype=torch.int64)
-
-    found = (windows, corners)
-    launch(kernels.count_chunks, chunks, *geometry, chunk_size, *size, *found, begins, first_slots, grain=1)
-    launch(kernels.place_chunks, 1, begins, first_slots, band_begins)
-    pairs, stretches = first_slots[chunks:].tolist()
-    if max(pairs, stretches) > MAX_PAIRS:
-        raise ValueError(f"splats: {pairs} pairs of splat and tile, more than {MAX_PAIRS}; reduce the image or them")
-    keys, spare = (torch.empty(stretches, dtype=torch.int64) for _ in range(2))
-    dealt = torch.empty(stretches, 4, dtype=torch.int32)
-    lists = (offsets, dealt, keys, before)
-    launch(kernels.deal_chunks, chunks, *geometry[:4], chunk_size, *size, *found, first_slots, begins, *lists, grain=1)
-    splats, slots = (torch.empty(pairs, dtype=torch.int32) for _ in range(2))
-    cursors = torch.empty(rows, columns, dtype=torch.int32)
-    tiles = (cursors, ranges, splats, slots)
-    launch(kernels.sort_bands, rows, band_begins, dealt, before, keys, spare, *tiles, grain=1, load=band_begins[1:])
-    return ranges, splats, slots, offsets
+    """Ranges, splats, slots, offsets of all tiles, on a CPU."""
+    return BandCount(geometry, size, (0, size[2] * size[3])).lists()
 
 
 def _validate(splats: Splats, tile_size: int) -> None:

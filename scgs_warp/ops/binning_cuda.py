@@ -13,11 +13,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from .. import debug
 from ..cuda_graph import on_torch_stream
 from ..kernels import binning_cuda as kernels
 from ..kernels.types import TILE_SIZE
 from ..types import Splats, Tiles
 from ..warp_interop import launch, warp_view
+from . import checks
 
 MAX_PAIRS = 2**31 - 1
 MAX_ROOM = MAX_PAIRS // 2
@@ -48,19 +50,49 @@ def bin_within(
     columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
     size = (splats.width, splats.height, columns, rows, tile_size)
     geometry = geometry_of(splats)
-    counts, order = _count(geometry, size)
+    whole = (*size, 0, columns * rows)
+    counts, order = _count(geometry, whole)
     offsets = _running_sums(counts)
     total = offsets[-1:].clone()
-    lists = _list(geometry, size, counts, order, offsets.clamp_(max=capacity), capacity, slots)
-    return Tiles(*lists, offsets, splats.width, splats.height, columns, rows, tile_size), total
+    lists = _list(geometry, whole, counts, order, offsets.clamp_(max=capacity), capacity, slots)
+    tiles = Tiles(*lists, offsets, *size)
+    if debug.enabled():
+        checks.check_room(tiles, capacity, len(counts))
+    return tiles, total
+
+
+class RadixCount:
+    """On a GPU, a ``bands.Count``: as many pairs as there are, which takes one wait."""
+
+    most = MAX_ROOM
+
+    def __init__(self, geometry: list[Tensor], size: tuple[int, ...], window: tuple[int, int]) -> None:
+        self._geometry, self._size = geometry, (*size, *window)
+        self._counts, self._order = _count(geometry, self._size)
+        self._offsets = _running_sums(self._counts)
+        self.pairs = self.entries = int(self._offsets[-1])
+
+    @property
+    def kept(self) -> int:
+        return 12 * self.pairs + 8 * len(self._counts) + 8 * self._size[2] * self._size[3]
+
+    @property
+    def scratch(self) -> int:
+        return 16 * self.pairs + 12 * len(self._counts)
+
+    def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        found = _list(self._geometry, self._size, self._counts, self._order, self._offsets, self.pairs, True)
+        return *found, self._offsets
 
 
 def bin_by_radix(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Ranges, splats, slots, offsets for ``bin_splats``: exactly as many pairs as there are, which takes one wait."""
-    counts, order = _count(geometry, size)
-    offsets = _running_sums(counts)
-    pairs = pair_total(offsets, MAX_ROOM)
-    return *_list(geometry, size, counts, order, offsets, pairs, True), offsets
+    """Ranges, splats, slots, offsets of all tiles."""
+    return RadixCount(geometry, size, (0, size[2] * size[3])).lists()
+
+
+def bytes_within(capacity: int, count: int, tiles: int) -> int:
+    """What ``bin_within`` takes without slots, of ``count`` splats."""
+    return 16 * capacity + 52 * count + 8 * tiles
 
 
 def geometry_of(splats: Splats) -> list[Tensor]:
@@ -89,7 +121,7 @@ def _running_sums(counts: Tensor) -> Tensor:
 
 def _list(
     geometry: list[Tensor],
-    size: tuple[int, ...],
+    size: tuple[int, ...],  # width, height, columns, rows, tile size, begin and end of the tiles wanted
     counts: Tensor,
     order: Tensor,
     offsets: Tensor,
@@ -101,8 +133,8 @@ def _list(
     ranked = torch.empty_like(counts)
     launch(kernels.counts_by_depth, count, order, counts, ranked)
     places = _running_sums(ranked).clamp_(max=room)
-    tiles, values = (torch.empty(2 * room, dtype=torch.int32, device=device) for _ in range(2))
-    owners = torch.empty(room, dtype=torch.int32, device=device) if with_slots else None
+    tiles, values = (checks.unwritten(2 * room, device) for _ in range(2))
+    owners = checks.unwritten(room, device) if with_slots else None
     lists = (order, places, offsets if with_slots else None)
     launch(kernels.fill_rest, room, places, tile_count, tiles, values, owners)
     launch(kernels.emit_by_depth, count, *geometry, *lists, *size, tiles, values, owners)
@@ -114,14 +146,6 @@ def _list(
     splats = torch.empty(room, dtype=torch.int32, device=device)
     launch(kernels.gather_owners, room, values, owners, splats)
     return ranges, splats, values[:room]
-
-
-def pair_total(offsets: Tensor, most: int) -> int:
-    """Pairs in all, or a refusal of more than the lists can index."""
-    pairs = int(offsets[-1])
-    if pairs > most:
-        raise ValueError(f"splats: {pairs} pairs of splat and tile, more than {most}; reduce the image or the splats")
-    return pairs
 
 
 def radix_sort(keys: Tensor, values: Tensor, count: int, bits: int) -> None:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from .. import debug, memory
 from ..kernels import compositing as kernels
 from ..kernels import compositing_cpu as cpu_kernels
 from ..kernels.types import SLOT_GEOMETRY
 from ..types import Splats, Stats, Tiles
 from ..warp_interop import launch
-from . import compositing_cuda
+from . import checks, compositing_cuda
+from .bands import Demand, Window, slot_bytes
+from .binning import bin_window
 
 Form = Literal["auto", "pixel", "cpu", "cuda", "blocks"]
 
@@ -31,6 +35,23 @@ class _Job:
     stats: Stats | None
     absgrad: Tensor | None
     form: str
+
+
+def demand(splats: Splats, channels: Tensor, background: Tensor | None = None) -> Demand:
+    """What :func:`composite` of these arguments takes beside the lists of splats, with what is made of its image."""
+    count, width = channels.shape
+    packed = 4 * (cpu_kernels.PACKED_GEOMETRY + _padded(width)) if channels.device.type == "cpu" else 4
+    tensors = (splats.means2d, splats.conics, splats.opacities, channels)
+    per_pair = slot_bytes(tensors if background is None else (*tensors, background), _slot_width(width))
+    gradients = 4 * (8 + width) if per_pair else 0
+    images = image_demand(splats.width, splats.height, width, per_pair > 0)
+    return Demand(images + (packed + gradients) * count, per_pair)
+
+
+def image_demand(width: int, height: int, channels: int, gradients: bool = False) -> int:
+    """Bytes of an image and its alpha, with depth and colours made of them; of their gradients and a loss' images."""
+    planes = 3 * (channels + 1) + 2 if gradients else channels + 3
+    return 4 * planes * width * height
 
 
 def composite(
@@ -54,7 +75,8 @@ def composite(
     Args:
         splats: N projected Gaussians; ``depths`` is not read.
         channels: [N, C] what is blended: colours, depths, anything.
-        tiles: of ``bin_splats(splats)``.
+        tiles: of ``bin_splats(splats)``. Where they are cut into windows, these are listed and drawn one after the
+            other, in the backward pass as well: the same bits, with the lists of one window in memory.
         background: [C] what shines through. None: zeros.
         stats: if given, the backward pass adds to it what ``Stats`` says.
         absgrad: [N, 2] buffer that the backward pass overwrites with the sum over pixels of the absolute gradients of
@@ -74,7 +96,7 @@ def composite(
     job = _Job(splats, tiles, stats, absgrad, _resolve_form(form, channels.device, tiles.tile_size))
     tensors: tuple[Tensor, ...] = (splats.means2d, splats.conics, splats.opacities, channels, background)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
-        if len(tiles.slots) != len(tiles.splats):
+        if not tiles.windows and len(tiles.slots) != len(tiles.splats):
             raise ValueError("tiles.slots is empty: these tiles were made for an image without gradients")
         return _Composite.apply(*tensors, job)  # type: ignore[return-value]
     image, alpha, *_ = _forward(job, tuple(t.detach().contiguous() for t in tensors), keep=False)
@@ -98,14 +120,19 @@ class _Composite(torch.autograd.Function):
         v_image, v_alpha = v_image.contiguous(), v_alpha.contiguous()
         job: _Job = ctx.job
         absolute = job.absgrad is not None or (job.stats is not None and job.stats.absolute)
-        v_slots = _adjoint(job, tensors, source, transmittance, last, v_image, v_alpha, absolute)
         v_means2d, v_conics, v_opacities, v_channels = (torch.empty_like(t) for t in tensors[:4])
         absgrad = job.absgrad
         if absolute and absgrad is None:
             absgrad = torch.empty_like(v_means2d)
         count = len(v_means2d)
         outputs = (v_means2d, v_conics, v_opacities, v_channels, absgrad)
-        compositing_cuda.sum_slots(job.form, job.tiles.offsets, v_slots, outputs)
+        lists = (transmittance, last, v_image, v_alpha)
+        for number, (tiles, window) in enumerate(_pieces(job)):
+            v_slots = _adjoint(job, tiles, window, tensors, source, lists, absolute)
+            compositing_cuda.sum_slots(job.form, tiles.offsets, v_slots, outputs, more=number > 0)
+            del tiles, v_slots  # before the next ones are made
+        if debug.enabled():
+            checks.check_gradients(outputs, v_image, v_alpha)
         if job.stats is not None:
             norm_of = absgrad if job.stats.absolute else v_means2d
             stats, size = job.stats, (job.tiles.width, job.tiles.height)
@@ -128,78 +155,128 @@ def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
     return form
 
 
+def _pieces(job: _Job) -> Iterator[tuple[Tiles, Window]]:
+    """The lists and the tiles they are of: all at once, or window by window. Whoever asks for the next must have let go
+    of the last."""
+    if not job.tiles.windows:
+        yield job.tiles, (0, len(job.tiles.ranges))
+        return
+    for window in job.tiles.windows:
+        yield bin_window(job.splats, job.tiles, window), window
+        memory.hand_back(str(job.splats.means2d.device))
+
+
 def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, ...]:
     """Image, alpha, and for the adjoint (None unless ``keep``): the form's view of the splats, final transmittance
     and last contributor."""
     means2d, conics, opacities, channels, background = tensors
-    tiles = job.tiles
-    size = (tiles.width, tiles.height, tiles.columns)
     device, count = channels.device, channels.shape[1]
-    image = torch.empty(count, tiles.height, tiles.width, device=device)
-    alpha = torch.empty(tiles.height, tiles.width, device=device)
-    transmittance = torch.empty_like(alpha) if keep else None
-    last = torch.empty(alpha.shape, dtype=torch.int32, device=device) if keep else None
+    image = torch.empty(count, job.tiles.height, job.tiles.width, device=device)
+    alpha = torch.empty(job.tiles.height, job.tiles.width, device=device)
+    checked = debug.enabled()
+    transmittance = torch.empty_like(alpha) if keep or checked else None
+    last = torch.empty(alpha.shape, dtype=torch.int32, device=device) if keep or checked else None
     outputs = (image, alpha, transmittance, last)
     if job.form == "cpu":
         source = _pack(means2d, conics, opacities, channels)
-        lists = (background, tiles.ranges, tiles.splats)
-        launch(
-            cpu_kernels.composite_tiles, len(tiles.ranges), source, *lists, *size, *outputs, grain=1, load=_load(tiles)
-        )
     else:
         source = torch.empty_like(opacities)  # opacities of the splats that may be added
         launch(kernels.finite_opacities, len(opacities), opacities, channels, source)
-        lists = (means2d, conics, source, channels, background, tiles.ranges, tiles.splats)
-        if job.form == "pixel":
-            launch(kernels.composite_pixels, alpha.numel(), *lists, *size, tiles.tile_size, *outputs, grain=256)
-        else:
-            compositing_cuda.forward(job.form, lists, size, outputs)
+    for tiles, window in _pieces(job):
+        _draw(job.form, tiles, window, tensors, source, outputs)
+        if transmittance is not None and last is not None and checked:
+            checks.check_pixels(tiles, window, alpha, transmittance, last)
+        del tiles  # before the next ones are made
+    if checked:
+        checks.check_image(image, channels, background)
     return image, alpha, *((source, transmittance, last) if keep else (None, None, None))
 
 
-def _load(tiles: Tiles) -> Tensor:
-    """[T] what the tiles up to each cost on a CPU, in pairs."""
-    return tiles.ranges[:, 1] + torch.arange(EMPTY_TILE, (len(tiles.ranges) + 1) * EMPTY_TILE, EMPTY_TILE)
+def _draw(
+    form: str,
+    tiles: Tiles,
+    window: Window,
+    tensors: tuple[Tensor, ...],
+    source: Tensor,
+    outputs: tuple[Tensor | None, ...],
+) -> None:
+    """The pixels of some tiles."""
+    means2d, conics, _, channels, background = tensors
+    size, begin, count = (tiles.width, tiles.height, tiles.columns), window[0], window[1] - window[0]
+    if form == "cpu":
+        lists, load = (source, background, tiles.ranges, tiles.splats), _load(tiles, window)
+        launch(cpu_kernels.composite_tiles, count, *lists, *size, *outputs, grain=1, load=load, begin=begin)
+        return
+    lists = (means2d, conics, source, channels, background, tiles.ranges, tiles.splats)
+    if form != "pixel":
+        compositing_cuda.forward(form, lists, size, outputs, window)
+        return
+    for first, pixels in _pixels(tiles, window):
+        arguments = (*lists, *size, tiles.tile_size, *outputs)
+        launch(kernels.composite_pixels, pixels, *arguments, grain=256, begin=first)
+
+
+def _pixels(tiles: Tiles, window: Window) -> list[tuple[int, int]]:
+    """First pixel and number of pixels of the stretches of the image, row major, that a window consists of."""
+    (top, left), (bottom, right) = divmod(window[0], tiles.columns), divmod(window[1], tiles.columns)
+    side, width = tiles.tile_size, tiles.width
+    y_begin = top * side
+    if left == right == 0:
+        return [(y_begin * width, (min(bottom * side, tiles.height) - y_begin) * width)]
+    x_begin = left * side
+    x_end = min((right or tiles.columns) * side, width)
+    return [(y * width + x_begin, x_end - x_begin) for y in range(y_begin, min(y_begin + side, tiles.height))]
+
+
+def _load(tiles: Tiles, window: Window) -> Tensor:
+    """[T] what the window's tiles up to each cost on a CPU, in pairs."""
+    ends = tiles.ranges[window[0] : window[1], 1]
+    return ends + torch.arange(EMPTY_TILE, (len(ends) + 1) * EMPTY_TILE, EMPTY_TILE)
+
+
+def _padded(channels: int) -> int:
+    """Columns that a packed splat's channels take."""
+    return -(-channels // cpu_kernels.CHANNEL_GROUP) * cpu_kernels.CHANNEL_GROUP
+
+
+def _slot_width(channels: int) -> int:
+    """Columns of a gradient slot: of up to 8 channels it is one cache line."""
+    return max(kernels.SLOT_WIDTH, SLOT_GEOMETRY + channels)
 
 
 def _pack(means2d: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor) -> Tensor:
-    group = cpu_kernels.CHANNEL_GROUP
-    width = cpu_kernels.PACKED_GEOMETRY + -(-channels.shape[1] // group) * group
-    packed = torch.empty(len(means2d), width)
+    packed = torch.empty(len(means2d), cpu_kernels.PACKED_GEOMETRY + _padded(channels.shape[1]))
     launch(cpu_kernels.pack_splats, len(means2d), means2d, conics, opacities, channels, packed)
     return packed
 
 
 def _adjoint(
     job: _Job,
+    tiles: Tiles,
+    window: Window,
     tensors: list[Tensor],
     source: Tensor,
-    transmittance: Tensor,
-    last: Tensor,
-    v_image: Tensor,
-    v_alpha: Tensor,
+    pixels: tuple[Tensor, ...],
     absolute: bool,
 ) -> Tensor:
-    """[P, S] gradient of every pair, in its slot."""
+    """[P, S] gradient of every pair listed, in its slot. ``pixels``: final transmittance, last contributor, and the
+    gradients to image and alpha."""
     means2d, conics, _, channels, background = tensors
-    tiles = job.tiles
-    # A slot of up to 8 channels is one cache line.
-    v_slots = torch.empty(
-        len(tiles.splats), max(kernels.SLOT_WIDTH, SLOT_GEOMETRY + channels.shape[1]), device=channels.device
-    )
-    lists = (background, tiles.ranges, tiles.splats, tiles.slots, transmittance, last, v_image, v_alpha)
-    size = (tiles.width, tiles.height, tiles.columns)
-    count = len(tiles.ranges)
+    v_slots = checks.unwritten_slots(len(tiles.splats), _slot_width(channels.shape[1]), channels.device)
+    lists = (background, tiles.ranges, tiles.splats, tiles.slots, *pixels)
+    size, begin, count = (tiles.width, tiles.height, tiles.columns), window[0], window[1] - window[0]
     if job.form == "cpu":
-        rest = (*size, int(absolute), v_slots)
-        launch(cpu_kernels.composite_tiles_adjoint, count, source, *lists, *rest, grain=1, load=_load(tiles))
-        return v_slots
-    lists = (means2d, conics, source, channels, *lists)
-    if job.form == "pixel":
+        rest, load = (*size, int(absolute), v_slots), _load(tiles, window)
+        launch(cpu_kernels.composite_tiles_adjoint, count, source, *lists, *rest, grain=1, load=load, begin=begin)
+    elif job.form == "pixel":
         rest = (*size, tiles.tile_size, int(absolute), v_slots)
-        launch(kernels.composite_pixels_adjoint, count, *lists, *rest, grain=1)
+        lists = (means2d, conics, source, channels, *lists)
+        launch(kernels.composite_pixels_adjoint, count, *lists, *rest, grain=1, begin=begin)
     else:
-        compositing_cuda.adjoint(job.form, lists, size, absolute, v_slots)
+        lists = (means2d, conics, source, channels, *lists)
+        compositing_cuda.adjoint(job.form, lists, size, absolute, v_slots, window)
+    if debug.enabled():
+        checks.check_slots(tiles, v_slots)
     return v_slots
 
 
@@ -227,7 +304,7 @@ def _validate(
         ("conics", splats.conics, (count, 3)),
         ("opacities", splats.opacities, (count,)),
         ("absgrad", absgrad, (count, 2)),
-        ("tiles.offsets", tiles.offsets, (count + 1,)),
+        ("tiles.offsets", None if tiles.windows else tiles.offsets, (count + 1,)),
     ]
     if channels.ndim != 2 or len(channels) != count or channels.shape[1] < 1:
         raise ValueError(f"channels must be [{count}, C] with C >= 1, got {list(channels.shape)}")

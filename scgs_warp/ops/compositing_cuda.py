@@ -12,47 +12,66 @@ from ..kernels import compositing_cuda as native
 from ..warp_interop import launch, launch_blocks
 
 
-def forward(form: str, lists: tuple[Tensor, ...], size: tuple[int, ...], outputs: tuple[Tensor | None, ...]) -> None:
-    """``lists``: the kernels' tensors up to the sorted list; ``size``: width, height, columns."""
-    blocks = len(lists[-2])
+def forward(
+    form: str,
+    lists: tuple[Tensor, ...],
+    size: tuple[int, ...],
+    outputs: tuple[Tensor | None, ...],
+    window: tuple[int, int],
+) -> None:
+    """``lists``: the kernels' tensors up to the sorted list; ``size``: width, height, columns; ``window``: begin and
+    end of the tiles to draw."""
+    begin, blocks = window[0], window[1] - window[0]
     if form == "cuda":
-        launch_native(native.composite_tiles, blocks, *lists, *size, *outputs)
+        launch_native(native.composite_tiles, blocks, *lists, *size, *outputs, begin=begin)
     else:
         launch_blocks(
             compositing_blocks.composite_blocks,
             blocks,
             *(*lists, *size, compositing_blocks.TILE_SIZE, *outputs),
             block_dim=compositing_blocks.BLOCK_DIM,
+            begin=begin,
         )
 
 
-def adjoint(form: str, lists: tuple[Tensor, ...], size: tuple[int, ...], absolute: bool, v_slots: Tensor) -> None:
-    """``lists``: the kernels' tensors up to ``v_alpha``. More channels than the native form's slot holds go to the
-    portable one."""
-    blocks = len(lists[5])
+def adjoint(
+    form: str,
+    lists: tuple[Tensor, ...],
+    size: tuple[int, ...],
+    absolute: bool,
+    v_slots: Tensor,
+    window: tuple[int, int],
+) -> None:
+    """``lists``: the kernels' tensors up to ``v_alpha``; else as ``forward``. More channels than the native form's slot
+    holds go to the portable one."""
+    begin, blocks = window[0], window[1] - window[0]
     if form == "cuda" and lists[3].shape[1] <= native.MAX_CHANNELS:
-        launch_native(native.composite_tiles_adjoint, blocks, *lists, *size, v_slots)
+        launch_native(native.composite_tiles_adjoint, blocks, *lists, *size, v_slots, begin=begin)
     else:
         launch_blocks(
             compositing_blocks.composite_blocks_adjoint,
             blocks,
             *(*lists, *size, compositing_blocks.TILE_SIZE, int(absolute), v_slots),
             block_dim=compositing_blocks.BLOCK_DIM,
+            begin=begin,
         )
 
 
-def sum_slots(form: str, offsets: Tensor, v_slots: Tensor, outputs: tuple[Tensor | None, ...]) -> None:
-    """Sum each splat's slots into the gradients of mean, conic, opacity, channels and the absolute one of the mean."""
-    count = len(offsets) - 1
+def sum_slots(
+    form: str, offsets: Tensor, v_slots: Tensor, outputs: tuple[Tensor | None, ...], more: bool = False
+) -> None:
+    """Sum each splat's slots into the gradients of mean, conic, opacity, channels and the absolute one of the mean;
+    ``more``: onto what they hold."""
+    count, slots = len(offsets) - 1, (offsets, v_slots, int(more))
     if v_slots.shape[1] != slots_cuda.SLOT_WIDTH:
-        launch(compositing.sum_slots, count, offsets, v_slots, *outputs)
+        launch(compositing.sum_slots, count, *slots, *outputs)
     elif form == "cuda":
-        launch(slots_cuda.sum_slot_columns, slots_cuda.SLOT_WIDTH * count, offsets, v_slots, *outputs)
+        launch(slots_cuda.sum_slot_columns, slots_cuda.SLOT_WIDTH * count, *slots, *outputs)
     else:
-        launch(compositing.sum_line_slots, count, offsets, v_slots, *outputs)
+        launch(compositing.sum_line_slots, count, *slots, *outputs)
 
 
-def launch_native(kernel: Any, blocks: int, *args: Any) -> None:
+def launch_native(kernel: Any, blocks: int, *args: Any, begin: int = 0) -> None:
     """Launch a kernel whose body is empty on a CPU.
 
     Raises:
@@ -61,4 +80,4 @@ def launch_native(kernel: Any, blocks: int, *args: Any) -> None:
     device: torch.device = args[0].device
     if device.type != "cuda":
         raise RuntimeError(f"form cuda needs a GPU, got tensors on {device}; form pixel runs everywhere")
-    launch_blocks(kernel, blocks, *args, block_dim=native.BLOCK_DIM)
+    launch_blocks(kernel, blocks, *args, block_dim=native.BLOCK_DIM, begin=begin)
