@@ -188,8 +188,12 @@ def test_refusals(tmp_path):
         fit(config, data, output=tmp_path / "run")
     with pytest.raises(UserError, match="made with steps"):
         fit(with_steps(config, 40), data, output=tmp_path / "run", resume=True)
-    with pytest.raises(UserError, match="no checkpoint"):
+    with pytest.raises(UserError, match="no such run"):
         fit(config, data, output=tmp_path / "new", resume=True)
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "other").mkdir()
+    with pytest.raises(UserError, match="no checkpoint"):
+        fit(config, data, output=tmp_path / "other", resume=True)
     path = tmp_path / "run/checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(UserError, match="damaged"):
