@@ -107,11 +107,11 @@ def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, An
         try:
             _write_through(temporary, content)
         except OSError as error:
-            if error.errno not in NO_ROOM or not path.exists():
+            if error.errno not in NO_ROOM or not os.path.exists(path):
                 raise
             (folder / PREVIOUS).unlink(missing_ok=True)  # room for two, not for three
             _write_through(temporary, content)
-        if path.exists():
+        if os.path.exists(path):
             _name_also(path, folder / PREVIOUS)
         os.replace(temporary, path)
     except OSError as error:
@@ -119,7 +119,7 @@ def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, An
             temporary.unlink(missing_ok=True)
         remedy = (
             "the one before it is intact: when there is room and leave to write, --resume continues from there"
-            if path.exists()
+            if os.path.exists(path)  # pathlib's raises where the folder may not be looked into
             else "nothing is saved yet: make room or choose another --output"
         )
         raise UserError(f"{path}: cannot be written ({error.strerror}); {remedy}") from error
