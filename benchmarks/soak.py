@@ -71,7 +71,8 @@ class Watch:
         """The figures, and what is wrong with them."""
         table = np.array(self.rows)
         warm = table[table[:, 0] >= WARM_UP * self.seconds]
-        slope, _, low, high = (float(value) * 3600.0 for value in theilslopes(warm[:, 1], warm[:, 0]))
+        found = theilslopes(warm[:, 1], warm[:, 0])
+        slope, low, high = (3600.0 * float(rate) for rate in (found.slope, found.low_slope, found.high_slope))
         figures: dict[str, Any] = {
             "seconds": round(self.elapsed, 1),
             "samples": len(table),

@@ -108,7 +108,7 @@ class RandomUser:
     # What a user does
 
     def _target(self) -> Target:
-        reach = 0.3 * self.model.session.scene.overview.distance
+        reach = 0.3 * self.model.session.scene.overview.radius
         turn = [1.0, *(self.random.gauss(0.0, 0.3) for _ in range(3))]
         return Target.of([self.random.gauss(0.0, 0.2 * reach) for _ in range(3)], turn)
 

@@ -6,10 +6,13 @@ from __future__ import annotations
 import errno
 import json
 import os
+import select
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,7 +23,7 @@ from full_disk import FakeDisk, nothing_may_be_written, small_disk
 from tiny import tiny_config, tiny_dataset, write_dnerf
 
 from scgs_warp import checkpoint, film, finish, run_folder, train
-from scgs_warp.config import TrainConfig
+from scgs_warp.config import TrainConfig, to_dict
 from scgs_warp.data import load
 from scgs_warp.errors import UserError
 from scgs_warp.run_folder import RunFolder
@@ -406,6 +409,31 @@ def test_a_terminal_that_is_closed(tmp_path, at_step, whole):
         fit(config(), tiny_dataset(FRAMES), output=tmp_path / "run")
     assert checkpoint.read(tmp_path / "run")[1]["step"] == HERE + 1
     assert go_on(tmp_path / "run") == whole
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals of this kind here")
+def test_a_real_terminal_that_is_closed(tmp_path, images):
+    import fcntl
+    import termios
+
+    def take_it() -> None:
+        os.setsid()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    terminal, inside = os.openpty()
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(tiny_config(4000))))
+    run, script = tmp_path / "run", Path(__file__).parent.parent / "apps/train.py"
+    options = ["--data", str(images), "--config", str(tmp_path / "config.json"), "--output", str(run)]
+    command = [sys.executable, str(script), *options, "--device", "cpu"]
+    process = subprocess.Popen(command, stdin=inside, stdout=inside, stderr=inside, preexec_fn=take_it)
+    os.close(inside)
+    end, log = time.monotonic() + 300, run / "log.jsonl"
+    while time.monotonic() < end and process.poll() is None and not (log.is_file() and log.stat().st_size):
+        if select.select([terminal], [], [], 0.1)[0]:
+            os.read(terminal, 65536)
+    os.close(terminal)
+    assert process.wait(timeout=300) == 130
+    assert checkpoint.read(run)[1]["step"] > 0
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP here")
