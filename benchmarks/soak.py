@@ -71,8 +71,7 @@ class Watch:
         """The figures, and what is wrong with them."""
         table = np.array(self.rows)
         warm = table[table[:, 0] >= WARM_UP * self.seconds]
-        found = theilslopes(warm[:, 1], warm[:, 0])
-        slope, low, high = (3600.0 * float(rate) for rate in (found.slope, found.low_slope, found.high_slope))
+        slope, _, low, high = (3600.0 * np.array(theilslopes(warm[:, 1], warm[:, 0]), np.float64)).tolist()
         figures: dict[str, Any] = {
             "seconds": round(self.elapsed, 1),
             "samples": len(table),

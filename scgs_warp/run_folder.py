@@ -159,7 +159,8 @@ class RunFolder:
         """Write the configuration; drop log lines after ``step``, which a resumed run will write again, and what was
         half written when the process was killed."""
         for left in self.path.glob(".*.tmp"):
-            left.unlink(missing_ok=True)
+            with suppress(OSError):
+                left.unlink()
         self._write_settings()
         entries: list[dict[str, Any]] = []
         for entry in _entries(self.path) if self.resume else []:
