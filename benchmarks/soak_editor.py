@@ -71,6 +71,12 @@ class RandomUser:
         if self.random.random() < 0.1:
             self._wait(lambda: self.worker.idle or self.model.playing)
 
+    def rest(self) -> None:
+        """Until nothing runs."""
+        self.model.play(False)
+        self.jobs.wait(60.0)
+        self._wait(lambda: self.worker.idle)
+
     def stop(self) -> None:
         self.jobs.stop()
         self.worker.stop()
