@@ -6,8 +6,8 @@
     python benchmarks/soak.py --minutes 60 --json soak.json
 
 Memory, open handles and threads are sampled all the time. The first quarter of a part is warm-up. After it what is
-allocated may grow by no more than ``STEEPEST``; what is resident by no more than ``HIGHEST`` (freed memory is kept, so this
-follows the largest film so far); the numbers of handles and threads not at all. Exit status 1 if they do.
+allocated may grow by no more than ``STEEPEST``; what is resident by no more than ``HIGHEST`` (freed memory is kept, so
+it follows the largest film so far); the numbers of handles and threads not at all. Exit status 1 if they do.
 """
 
 from __future__ import annotations
