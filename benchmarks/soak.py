@@ -44,7 +44,7 @@ STEEPEST = 30.0
 HIGHEST = 128.0
 """MiB that the resident memory of a part's last quarter may lie above that of its second."""
 WARM_UP = 0.25
-SAMPLES = 200
+SAMPLES = 40
 """In a part, about."""
 PAGE = os.sysconf("SC_PAGE_SIZE") / 2**20
 
