@@ -6,10 +6,11 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Literal
 
 from scgs_warp import environment
-from scgs_warp.errors import UserError
+from scgs_warp.errors import UserError, one_line
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -30,21 +31,26 @@ def choose_device(device: Device) -> str:
     return "cuda" if present and device != "cpu" else "cpu"
 
 
+def _tell(text: str) -> None:
+    with suppress(OSError):  # the terminal was closed
+        print(text, file=sys.stderr, flush=True)
+
+
 def run(main: Callable[[list[str] | None], None], args: list[str] | None = None) -> int:
     """Run an app; a user's mistake becomes one line on stderr and status 2, Ctrl-C status 130."""
     try:
         main(args)
     except UserError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        _tell(f"error: {one_line(error)}")
         return 2
     except OSError as error:
         if isinstance(error, BrokenPipeError):  # the reader (head, a pager) has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        print(f"error: {error.filename or 'input or output'}: {error.strerror or error}", file=sys.stderr)
+        _tell(f"error: {one_line(error)}")
         return 2
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        _tell("interrupted")
         return 130
     return 0
 

@@ -61,6 +61,7 @@ def main(args: list[str] | None) -> None:
 
     from scgs_warp.advice import advise, survey
     from scgs_warp.finish import summary, train_and_finish
+    from scgs_warp.progress import say
     from scgs_warp.run_folder import refuse_existing
     from scgs_warp.tensorboard import check_installed
 
@@ -70,13 +71,13 @@ def main(args: list[str] | None) -> None:
     folder = options.data or (Path(named) if named else builtin_scene(device))
 
     def look(data: Dataset) -> None:
-        print("\n".join(advise(survey(data), config, device)), flush=True)
+        say("\n".join(advise(survey(data), config, device)))
 
     metrics = train_and_finish(
         config, folder, output, device=device, resume=options.resume, look=look, tensorboard=options.tensorboard
     )
-    print(summary(metrics))
-    print(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
+    say(summary(metrics))
+    say(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
 
 
 def cli(args: list[str] | None = None) -> int:

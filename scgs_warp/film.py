@@ -236,7 +236,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
     import cv2
 
     encoded = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 4])[1]
-    encoded.tofile(path)
+    path.write_bytes(encoded.data)  # numpy's tofile does not say why it failed
 
 
 @contextmanager

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from . import cameras, film
+from .checkpoint import write_atomically
 from .config import TrainConfig, to_dict
 from .data import ImageCache, load
 from .data.dataset import Dataset
+from .errors import UserError, one_line
 from .evaluate import Lpips, metrics_of, write_metrics
 from .overlay import Painter
 from .progress import progress
@@ -82,8 +84,9 @@ def train_and_finish(
         what ``metrics.json`` holds.
 
     Raises:
-        UserError: of the data, the configuration, the run directory or the training.
-        KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
+        UserError: of the data, the configuration, the run directory or the training; or scores and pictures cannot
+            be written after it.
+        KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal, the checkpoint being saved.
     """
     train, test = load_splits(config, data)
     if look is not None:
@@ -98,7 +101,12 @@ def train_and_finish(
         settings=settings_of(config, data),
         tensorboard=tensorboard,
     )
-    return finish(scene, test, output, frames=frames, lpips=lpips)
+    try:
+        return finish(scene, test, output, frames=frames, lpips=lpips)
+    except (UserError, OSError) as error:
+        raise UserError(
+            f"{one_line(error)}; the scene is trained and saved: --resume makes the missing scores and pictures"
+        ) from error
 
 
 def finish(
@@ -130,7 +138,7 @@ def finish(
         )
     sheet = renders / "contact_sheet.png"
     if sheet.is_file():
-        (folder / "contact_sheet.png").write_bytes(sheet.read_bytes())
+        write_atomically(folder / "contact_sheet.png", sheet.read_bytes())
     curves(folder / "log.jsonl", folder / "curves.png")
     if frames > 0:
         turntable(scene, folder / "turntable.mp4", frames)

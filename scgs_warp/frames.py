@@ -10,6 +10,7 @@ from .config import TrainConfig
 from .data.cache import Pixels
 from .data.dataset import Dataset
 from .data.normalise import Normalisation
+from .errors import FrameError, UserError
 from .optim import generator
 from .types import Camera, Frame
 
@@ -85,12 +86,19 @@ class Frames:
     def view(
         self, index: int, step: int, random_background: bool
     ) -> tuple[Frame, Camera, Tensor, Tensor, Tensor | None]:
-        """Frame, normalised camera, truth [3, H, W] on the background of this step, that background [3], mask."""
+        """Frame, normalised camera, truth [3, H, W] on the background of this step, that background [3], mask.
+
+        Raises:
+            FrameError: its file cannot be read any more.
+        """
         camera = self.cameras[index]
-        if step < self.config.half_size and min(camera.width, camera.height) >= SMALLEST:
-            frame, camera = self.halved(index)
-        else:
-            frame = self.frames[index]
+        try:
+            if step < self.config.half_size and min(camera.width, camera.height) >= SMALLEST:
+                frame, camera = self.halved(index)
+            else:
+                frame = self.frames[index]
+        except UserError as error:
+            raise FrameError(str(error)) from error
         truth = frame.image.to(self.device).permute(2, 0, 1).contiguous()
         background = self.background
         if frame.alpha is not None and (random_background or self.random_background):

@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any, TextIO
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TextIO, TypeVar
 
 REDRAW_SECONDS = 0.2
 """A terminal is redrawn this often."""
@@ -22,6 +23,25 @@ LINE_LONGEST = 30.0
 """... and after these in any case."""
 RATE_SECONDS = 15.0
 """The rate is that of the last seconds: training steps become slower as Gaussians are added."""
+
+
+Result = TypeVar("Result")
+
+
+def mute(stream: TextIO) -> None:
+    """Let what is written to ``stream`` go nowhere from now on: its terminal was closed, or nobody reads its pipe."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+
+
+def say(text: str) -> None:
+    """A line on standard output; work does not end because nobody can see it any more."""
+    try:
+        print(text, flush=True)
+    except OSError:
+        mute(sys.stdout)
 
 
 def clock(seconds: float) -> str:
@@ -58,14 +78,29 @@ class Progress:
             self.fields.update(fields)
         now = time.perf_counter()
         if now >= self._next:
-            self._next = self._draw(now)
+            self._next = self._safely(lambda: self._draw(now), now)
 
     def print(self, text: str) -> None:
         """A line that stays, above the bar."""
-        print(text, file=self._stream, flush=True)
+        self._safely(lambda: self._print(text), None)
 
     def finish(self, completed: bool = True) -> None:
         """Draw the last state; called by ``progress``."""
+        self._safely(lambda: self._finish(completed), None)
+
+    def _safely(self, draw: Callable[[], Result], otherwise: Result) -> Result:
+        """A terminal that was closed, or a pipe that nobody reads, ends the drawing and not the work."""
+        try:
+            return draw()
+        except OSError:
+            mute(self._stream)
+            return otherwise
+
+    def _print(self, text: str) -> None:
+        print(text, file=self._stream, flush=True)
+
+    def _finish(self, completed: bool) -> None:
+        raise NotImplementedError
 
     def _draw(self, now: float) -> float:
         """Show the state; returns when to look again."""
@@ -122,9 +157,9 @@ class _Lines(Progress):
     def _line(self, timing: str) -> None:
         share = 100 * self.done / self.total if self.total else 100
         parts = [f"{self.description} {self.done}/{self.total} ({share:.0f} %)", timing, self.describe_fields()]
-        self.print("  ".join(part for part in parts if part))
+        self._print("  ".join(part for part in parts if part))
 
-    def finish(self, completed: bool = True) -> None:
+    def _finish(self, completed: bool) -> None:
         elapsed = self.elapsed
         rate = (self.done - self._start) / elapsed if elapsed > 0 else 0.0
         self._line(f"{rate:.1f} it/s  {'done' if completed else 'stopped'} after {clock(elapsed)}")
@@ -149,7 +184,7 @@ class _Bar(Progress):
             auto_refresh=False,
         )
         self._task = self._rich.add_task(description, total=total, completed=start, timing="", text="")
-        self._rich.start()
+        self._safely(self._rich.start, None)
 
     def _draw(self, now: float) -> float:
         self._mark(now)
@@ -159,10 +194,10 @@ class _Bar(Progress):
         self._rich.update(self._task, completed=self.done, timing=timing, text=text, refresh=True)
         return now + REDRAW_SECONDS
 
-    def print(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         self._rich.console.print(text, markup=False, highlight=False)
 
-    def finish(self, completed: bool = True) -> None:
+    def _finish(self, completed: bool) -> None:
         self._draw(time.perf_counter())
         self._rich.stop()
 
@@ -180,7 +215,7 @@ def progress(total: int, description: str, *, start: int = 0, stream: TextIO | N
     Yields:
         An object whose ``advance(n=1, **fields)`` is to be called as the work proceeds.
     """
-    shown_on: TextIO = stream or sys.stdout
+    shown_on: TextIO = stream or sys.stdout or open(os.devnull, "w")  # a daemon may have no standard output
     shown = (_Bar if shown_on.isatty() else _Lines)(total, description, shown_on, start)
     try:
         yield shown

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .checkpoint import write_atomically
 from .errors import UserError
 
 ERROR_RANGE = 0.2
@@ -127,7 +129,7 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
         UserError: the file cannot be read.
     """
     try:
-        text = Path(path).read_text()
+        text = Path(path).read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give the folder of a run") from None
     lines = []
@@ -215,7 +217,6 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
         if drawn and len(series) > 1:
             axes.legend(frameon=False)
     FigureCanvasAgg(figure)
-    try:
-        figure.savefig(out_png, dpi=110)
-    except OSError as error:
-        raise UserError(f"{out_png}: cannot be written ({error.strerror}); give another folder") from None
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=110, format="png")
+    write_atomically(Path(out_png), picture.getvalue())

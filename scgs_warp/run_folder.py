@@ -6,18 +6,21 @@ import json
 import math
 import os
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from .checkpoint import FILE, write_atomically
+from .checkpoint import FILE, PREVIOUS, write_atomically
 from .config import TrainConfig, to_dict
 from .data.dataset import Dataset
-from .errors import UserError
+from .errors import UserError, one_line
 from .metrics import psnr
-from .progress import Progress
+from .progress import Progress, say
+from .report import read_log
 from .scene import Scene
 from .tensorboard import TensorBoard, check_installed
 
@@ -35,15 +38,16 @@ BOARD_IMAGES = 20
 
 def read_seconds(folder: Path) -> float | None:
     """Seconds of training according to the log; None without one."""
-    log = folder / "log.jsonl"
     newest: float | None = None
-    if log.is_file():
-        for line in log.read_text(encoding="utf-8").splitlines():
-            try:
-                newest = float(json.loads(line)["seconds"])
-            except (ValueError, KeyError, TypeError):
-                continue  # a line that a kill cut short
+    for entry in _entries(folder):
+        with suppress(ValueError, KeyError, TypeError):  # not ours
+            newest = float(entry["seconds"])
     return newest
+
+
+def _entries(folder: Path) -> list[dict[str, Any]]:
+    log = folder / "log.jsonl"
+    return read_log(log) if log.is_file() else []
 
 
 def refuse_existing(path: Path, resume: bool) -> None:
@@ -52,14 +56,15 @@ def refuse_existing(path: Path, resume: bool) -> None:
     Raises:
         UserError: there is a run in ``path`` and ``resume`` was not asked for.
     """
-    if not resume and (path / FILE).exists():
+    if not resume and ((path / FILE).exists() or (path / PREVIOUS).exists()):
         raise UserError(f"{path}: holds a run already; continue it with --resume or choose another --output")
 
 
 class RunFolder:
     """Use as a context manager: holds a lock, so that two trainers cannot share one directory.
 
-    With ``tensorboard`` the log's entries, and a picture now and then, also go to event files.
+    With ``tensorboard`` the log's entries, and a picture now and then, also go to event files. Log, previews, event
+    files and the look at held-out frames are for the eye: where they fail, training says so once and goes on.
 
     Raises:
         UserError: not writable, in use, or there is a run already and ``resume`` was not asked for; ``tensorboard``
@@ -86,9 +91,15 @@ class RunFolder:
         self._began = time.perf_counter()
         self._shown_at = 0.0
         self._psnr: float | None = None
-        self._losses: list[tuple[float, float, float]] = []
+        self._told: set[str] = set()
+        self._torn = False
+        """Whether the log may end in the middle of a line."""
+        self.tell: Callable[[str], None] = say
+        """Shows a line that is no error."""
 
     def __enter__(self) -> RunFolder:
+        if self.resume and not self.path.is_dir():
+            raise UserError(f"{self.path}: no such run directory; give one that apps/train.py wrote, or no --resume")
         try:
             (self.path / "previews").mkdir(parents=True, exist_ok=True)
             self._lock()
@@ -96,6 +107,8 @@ class RunFolder:
             raise UserError(f"{self.path}: cannot be written ({error.strerror}); choose another --output") from error
         try:
             refuse_existing(self.path, self.resume)
+            if not self.resume:
+                self._write_settings()
         except UserError:
             self.__exit__(None, None, None)
             raise
@@ -104,9 +117,21 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._board is not None:
-            self._board.close()
+        with self._optional("the event files for TensorBoard"):
+            board, self._board = self._board, None
+            if board is not None:
+                board.close()
         os.close(self._lock_file)
+
+    @contextmanager
+    def _optional(self, what: str) -> Iterator[None]:
+        """Around what a run can do without."""
+        try:
+            yield
+        except (OSError, UserError) as error:
+            if what not in self._told:
+                self._told.add(what)
+                self.tell(f"warning: {what}: {one_line(error)}; training goes on without")
 
     def _lock(self) -> None:
         self._lock_file = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
@@ -116,33 +141,42 @@ class RunFolder:
             return
         try:
             fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             os.close(self._lock_file)
             raise UserError(
                 f"{self.path}: another trainer is running here; wait for it or choose another --output"
             ) from error
+        except OSError:
+            pass  # a file system without locks: there a second trainer is the user's own care, too
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether a run has begun here that no checkpoint was written of."""
+        names = (FILE, PREVIOUS)
+        return (self.path / "config.json").is_file() and not any((self.path / name).exists() for name in names)
 
     def begin(self, step: int) -> None:
-        """Write the configuration; drop log lines after ``step``, which a resumed run will write again."""
+        """Write the configuration; drop log lines after ``step``, which a resumed run will write again, and what was
+        half written when the process was killed."""
+        for left in self.path.glob(".*.tmp"):
+            with suppress(OSError):
+                left.unlink()
+        self._write_settings()
+        entries: list[dict[str, Any]] = []
+        for entry in _entries(self.path) if self.resume else []:
+            with suppress(ValueError, TypeError):  # not ours
+                if int(entry.get("step", 0)) <= step:
+                    self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
+                    entries.append(entry)
+        write_atomically(self.path / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries).encode())
+        if self.tensorboard:
+            with self._optional("the event files for TensorBoard"):
+                self._board = TensorBoard(self.path, entries, step, self.seconds)
+        self._began = time.perf_counter()
+
+    def _write_settings(self) -> None:
         text = json.dumps(self.settings, indent=2, sort_keys=True)
         write_atomically(self.path / "config.json", text.encode())
-        log = self.path / "log.jsonl"
-        kept: list[str] = []
-        entries: list[dict[str, Any]] = []
-        if self.resume and log.is_file():
-            for line in log.read_text(encoding="utf-8").splitlines():
-                try:
-                    entry = json.loads(line)
-                except ValueError:
-                    continue  # the line that a kill cut short
-                if entry.get("step", 0) <= step:
-                    kept.append(line)
-                    entries.append(entry)
-                    self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
-        write_atomically(log, "".join(line + "\n" for line in kept).encode())
-        if self.tensorboard:
-            self._board = TensorBoard(self.path, entries, step, self.seconds)
-        self._began = time.perf_counter()
 
     @property
     def elapsed(self) -> float:
@@ -150,10 +184,24 @@ class RunFolder:
         return self.seconds + time.perf_counter() - self._began
 
     def log(self, entry: dict[str, Any]) -> None:
-        with open(self.path / "log.jsonl", "a", encoding="utf-8") as file:
-            file.write(json.dumps({**entry, "seconds": round(self.elapsed, 2)}) + "\n")
-        if self._board is not None:
-            self._board.record(entry)
+        line = json.dumps({**entry, "seconds": round(self.elapsed, 2)}) + "\n"
+        with self._optional("log lines"):
+            torn, self._torn = self._torn, True
+            with open(self.path / "log.jsonl", "a", encoding="utf-8") as file:
+                file.write("\n" + line if torn else line)
+            self._torn = False
+        self._on_board(lambda board: board.record(entry))
+
+    def _on_board(self, action: Callable[[TensorBoard], None]) -> None:
+        """For those who watch in TensorBoard, if somebody does."""
+        board, self._board = self._board, None  # one that has failed once fails for good, or waits for ever
+        if board is not None:
+            with self._optional("the event files for TensorBoard"):
+                action(board)
+                self._board = board
+
+    def _show(self, name: str, truth: torch.Tensor, render: torch.Tensor, step: int) -> None:
+        self._on_board(lambda board: board.show(name, truth, render, step))
 
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
         """Progress, a log line every 50 steps, a preview every 15 seconds. ``state.step`` counts the step as done."""
@@ -181,11 +229,12 @@ class RunFolder:
         else:
             bar.advance(1)
         between = max(1, state.config.steps // BOARD_IMAGES)
-        if self._board is not None and state.step % between == 0 and result.failed is None:
-            self._board.show("train", result.truth, result.render, state.step)
+        if state.step % between == 0 and result.failed is None:
+            self._show("train", result.truth, result.render, state.step)
         if time.monotonic() - self._shown_at >= PREVIEW_SECONDS:
             self._shown_at = time.monotonic()
-            self.show(result)
+            with self._optional("previews"):
+                self.show(result)
 
     def show(self, result: StepResult) -> None:
         """``previews/latest.png``: truth beside render."""
@@ -200,6 +249,11 @@ class RunFolder:
     def look_at_test(self, scene: Scene, test: Dataset) -> None:
         """PSNR of a few test images, for the curve."""
         scene.motion.eval()
+        with self._optional("the look at held-out frames"):
+            self._look_at_test(scene, test)
+        scene.motion.train()
+
+    def _look_at_test(self, scene: Scene, test: Dataset) -> None:
         wanted = range(0, len(test), max(1, len(test) // TEST_IMAGES))
         values = []
         for i in wanted:
@@ -207,9 +261,8 @@ class RunFolder:
             image = scene.render(frame.camera, frame.time).rgb.cpu()
             valid = slice(None) if frame.mask is None else frame.mask
             values.append(float(psnr(image[valid], frame.image[valid])))
-            if i == 0 and self._board is not None:
-                self._board.show("held_out", frame.image.permute(2, 0, 1), image.permute(2, 0, 1), scene.step)
-        scene.motion.train()
+            if i == 0:
+                self._show("held_out", frame.image.permute(2, 0, 1), image.permute(2, 0, 1), scene.step)
         values = [value for value in values if math.isfinite(value)]
         if values:
             self.log({"step": scene.step, "test_psnr": sum(values) / len(values)})

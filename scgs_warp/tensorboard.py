@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -50,12 +51,17 @@ class TensorBoard:
         entries: those of ``log.jsonl`` up to ``step``.
         step: the step the run stands at.
         seconds: of training so far.
+
+    Raises:
+        OSError: of each method: the files cannot be written. Such a board is of no further use.
     """
 
     def __init__(self, folder: Path, entries: list[dict[str, Any]], step: int, seconds: float) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         known = newest_steps(folder, step)
+        self._loud = threading.excepthook
+        threading.excepthook = self._thread_ended
         self._writer = SummaryWriter(str(folder), purge_step=step + 1)
         began = time.time() - seconds
         for entry in entries:
@@ -89,7 +95,13 @@ class TensorBoard:
         self._writer.add_image(name, pair.cpu(), step)
 
     def close(self) -> None:
+        threading.excepthook = self._loud
         self._writer.close()
+
+    def _thread_ended(self, ended: threading.ExceptHookArgs) -> None:
+        """The package's own thread writes the files; it prints a traceback of what it also raises at the next call."""
+        if not issubclass(ended.exc_type, OSError) or not type(ended.thread).__module__.startswith("tensorboard."):
+            self._loud(ended)
 
 
 def newest_steps(folder: Path, step: int) -> dict[str, int]:

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from . import environment
+from . import checkpoint, environment
 from .camera_refinement import camera_rate
 from .config import TrainConfig
 from .data.dataset import Dataset
 from .densify import densify, mean_gradient, most_that_fit, reset_opacities, threshold
-from .errors import UserError
+from .errors import FrameError, UserError
 from .frames import Frames
 from .limits import check
 from .memory import NotEnoughMemory
@@ -221,18 +221,23 @@ def _nodes_due(state: TrainState, done: int) -> bool:
 
 @contextmanager
 def stop_signals() -> Iterator[threading.Event]:
-    """Ctrl-C and SIGTERM ask for a stop instead of ending the process; a second one ends it."""
+    """Ctrl-C, SIGTERM and the end of the terminal (SIGHUP) ask for a stop instead of ending the process; a second
+    Ctrl-C ends it. The others come twice of themselves: from the shell and from the system."""
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked
         return
 
     def ask(number: int, frame: Any) -> None:
-        if asked.is_set():
+        if asked.is_set() and number == signal.SIGINT:
             raise KeyboardInterrupt
         asked.set()
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
+    if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:  # nohup: it is to go on
+        numbers.append(hang_up)
+    before = {number: signal.signal(number, ask) for number in numbers}
     try:
         yield asked
     finally:
@@ -260,7 +265,8 @@ def fit(
         output: run directory; made if needed.
         device: where everything is computed, ``cpu`` or ``cuda``.
         test: held-out frames, looked at for the curve and the previews alone; nothing is selected by them.
-        resume: continue from the checkpoint in ``output``, to the same bits as an uninterrupted run.
+        resume: continue from the checkpoint in ``output``, to the same bits as an uninterrupted run; from the one
+            before it where that is damaged, from the beginning where the run was killed before there was any.
         settings: what to write to ``config.json``; default: the configuration.
         tensorboard: also write event files for TensorBoard to ``output``; changes no bit of the scene.
 
@@ -268,9 +274,10 @@ def fit(
         the scene after the last step.
 
     Raises:
-        UserError: a bad configuration, a checkpoint that does not fit, repeated non-finite losses, no TensorBoard.
+        UserError: a bad configuration, a checkpoint that does not fit or cannot be written, an image that is gone,
+            repeated non-finite losses, no TensorBoard. What was saved last is intact.
         NotEnoughMemory: one tile of an image takes more than there is; the checkpoint is saved.
-        KeyboardInterrupt: after Ctrl-C or SIGTERM, the checkpoint being saved.
+        KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal, the checkpoint being saved.
     """
     check(config)
     environment.ensure_configured()
@@ -279,15 +286,27 @@ def fit(
     if len(data) == 0:
         raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
     with RunFolder(output, config, settings, resume=resume, tensorboard=tensorboard) as folder:
-        state = (
-            TrainState.resume(folder.path, config, data, device) if resume else TrainState.begin(config, data, device)
-        )
+        state = _state(folder, config, data, device)
         frames = Frames(data, state.normalisation, config, device)
         folder.begin(state.step)
         with progress(config.steps, "training", start=state.step) as bar, stop_signals() as stop:
+            folder.tell = bar.print
             _loop(state, frames, folder, test, bar, stop)
         state.motion.eval()
         return state.scene()
+
+
+def _state(folder: RunFolder, config: TrainConfig, data: Dataset, device: str) -> TrainState:
+    """Where the run begins, or goes on."""
+    if folder.resume and folder.has_begun:
+        folder.tell(f"{folder.path}: there is no checkpoint yet; training begins again from step 0")
+    elif folder.resume:
+        try:
+            return TrainState.resume(folder.path, config, data, device)
+        except checkpoint.DamagedCheckpoint as error:
+            folder.tell(f"warning: {checkpoint.fall_back(folder.path, error)}")
+        return TrainState.resume(folder.path, config, data, device)
+    return TrainState.begin(config, data, device)
 
 
 def _loop(
@@ -303,6 +322,9 @@ def _loop(
         except NotEnoughMemory:  # before anything was changed: the run goes on where there is more
             state.save(folder.path)
             raise
+        except FrameError as error:
+            state.save(folder.path)
+            raise UserError(f"{error}; step {state.step} is saved: continue with --resume") from error
         if result.failed is None:
             state.failures = 0
         else:

@@ -16,6 +16,7 @@ from scgs_warp.data.gaussian_ply import rig_static
 from scgs_warp.data.normalise import Normalisation
 from scgs_warp.edit import Edit, EditSession, Exaggerate, Hold, Target
 from scgs_warp.edit.rotations import from_axis, rotate
+from scgs_warp.edit.session import HISTORY
 from scgs_warp.errors import UserError
 from scgs_warp.motion import Static
 from scgs_warp.motion.per_gaussian import PerGaussian
@@ -324,3 +325,14 @@ def test_target_is_unit():
     target = Target.of(None, [2.0, 0.0, 0.0, 0.0])
     assert target.rotation == (1.0, 0.0, 0.0, 0.0) and target.is_identity
     assert Target.of(None, [1e300, 0, 0, 1e300]).rotation == pytest.approx((2**-0.5, 0, 0, 2**-0.5))
+
+
+def test_history_has_an_end(session, monkeypatch):
+    """Whoever edits for days can undo the last thousand steps; what is older is forgotten."""
+    fresh = session.fork()
+    for count in range(HISTORY + 5):
+        fresh.apply(dataclasses.replace(fresh.edit, pins=(count % 50,)))
+    undone = 0
+    while fresh.undo():
+        undone += 1
+    assert undone == HISTORY and fresh.edit.pins == (4,)

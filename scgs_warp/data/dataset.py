@@ -12,8 +12,10 @@ from typing import overload
 import torch
 from torch import Tensor
 
+from ..errors import UserError
 from ..types import Camera, Frame
 from .cache import ImageCache, Pixels
+from .files import size_text
 
 BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
 """What RGBA images are composited on when they are read. With ``random`` the trainer composites, once per step."""
@@ -43,7 +45,18 @@ class View:
     """Under which the pixels are kept."""
 
     def frame(self, cache: ImageCache) -> Frame:
+        """With its pixels.
+
+        Raises:
+            UserError: the file is gone, unreadable, or another one than when the data set was read.
+        """
         image, alpha, mask = cache.get(self.key, self.read)
+        size = (self.camera.height, self.camera.width)
+        if image.shape[:2] != size:
+            raise UserError(
+                f"{self.name}: its image has another size than when training began ({size_text(image.shape[1::-1])}, "
+                f"then {size_text(size[::-1])}); restore the file"
+            )
         if self.common_mask is not None:
             mask = self.common_mask if mask is None else mask & self.common_mask
         return Frame(self.camera, self.time, image, alpha if self.has_alpha else None, mask, self.name)

@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import json
 import math
+from collections import deque
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,12 @@ from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
 from .pose import NodePose
 
+HISTORY = 1000
+"""Steps that can be undone: a session that is open for days must not grow for ever."""
+
 
 class EditSession:
-    """A scene, its graph of control points, an :class:`Edit`, and every edit before it.
+    """A scene, its graph of control points, an :class:`Edit`, and the thousand edits before it.
 
     All points, cameras and lengths are in world units; ``time`` is the scene's, in [0, 1]; ``at`` is a moment of the
     film in seconds, which decides what keyframes say; without it handles are where they are now.
@@ -47,7 +51,7 @@ class EditSession:
         self.scene: Scene = self.engine.scene
         self.graph: ControlGraph = self.engine.graph
         self.edit = edit or Edit()
-        self._past: list[Edit] = []
+        self._past: deque[Edit] = deque(maxlen=HISTORY)
         self._future: list[Edit] = []
         self._before_drag: Edit | None = None
 
@@ -59,7 +63,7 @@ class EditSession:
         """Another session on the same scene that begins with this one's edit and without its history. Scene, graph and
         solutions are shared, not copied: the two may not compute at the same time."""
         other = copy.copy(self)
-        other._past, other._future, other._before_drag = [], [], None
+        other._past, other._future, other._before_drag = deque(maxlen=HISTORY), [], None
         return other
 
     # The edit and its history

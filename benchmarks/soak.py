@@ -1,0 +1,201 @@
+"""Does anything grow? The editor under random input, then training in a loop, watched from within the process.
+
+    python benchmarks/soak.py --minutes 60                        # half an hour of each
+    python benchmarks/soak.py --minutes 10 --part editor
+    python benchmarks/soak.py --minutes 60 --run runs/figure-quick # the editor on a scene of yours
+    python benchmarks/soak.py --minutes 60 --json soak.json
+
+Memory, open handles and threads are sampled all the time. The first quarter of a part is warm-up. After it what is
+allocated may grow by no more than ``STEEPEST``; what is resident by no more than ``HIGHEST`` (freed memory is kept, so
+it follows the largest film so far); the numbers of handles and threads not at all. Exit status 1 if they do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import ctypes
+import gc
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
+
+import numpy as np  # isort: skip
+from scipy.stats import theilslopes
+from soak_editor import RandomUser
+
+from scgs_warp import environment
+from scgs_warp.bench_clock import machine, now
+from scgs_warp.config import MOTIONS, TrainConfig, from_dict, preset, with_steps
+from scgs_warp.data.synthetic import make_synthetic
+from scgs_warp.edit import EditSession
+from scgs_warp.finish import train_and_finish
+from scgs_warp.scene import Scene
+
+STEEPEST = 30.0
+"""MiB an hour. An editor that is open for a working day may have a quarter of a gibibyte more at its end."""
+HIGHEST = 128.0
+"""MiB that the resident memory of a part's last quarter may lie above that of its second."""
+WARM_UP = 0.25
+SAMPLES = 40
+"""In a part, about."""
+PAGE = os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+class _Allocated(ctypes.Structure):
+    """glibc's ``struct mallinfo2``."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost".split()
+    ]
+
+
+def allocated() -> float | None:
+    """MiB that the program has asked for and not freed; None where the C library does not say."""
+    try:
+        ask = ctypes.CDLL(None).mallinfo2
+    except (OSError, AttributeError):
+        return None
+    ask.restype = _Allocated
+    found = ask()
+    return (found.uordblks + found.hblkhd) / 2**20
+
+
+class Watch:
+    """What the process has, now and then."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds, self.began = seconds, time.monotonic()
+        self._every, self._due = max(0.2, seconds / SAMPLES), 0.0
+        self.rows: list[tuple[float, float, float, int, int]] = []
+
+    @property
+    def elapsed(self) -> float:
+        return time.monotonic() - self.began
+
+    def look(self, rest: Callable[[], object] = lambda: None) -> bool:
+        """Take a sample if it is time to; whether the part is over. ``rest``: called first, to finish what runs."""
+        if self.elapsed >= self._due:
+            rest()
+            self._due = self.elapsed + self._every
+            gc.collect()  # cycles that wait for the collector are no leak
+            resident = int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+            threads = len(os.listdir("/proc/self/task"))
+            asked = allocated()
+            handles = len(os.listdir("/proc/self/fd"))
+            self.rows.append((self.elapsed, resident, resident if asked is None else asked, handles, threads))
+        return self.elapsed >= self.seconds
+
+    def verdict(self) -> dict[str, Any]:
+        """The figures, and what is wrong with them."""
+        table = np.array(self.rows)
+        warm = table[table[:, 0] >= WARM_UP * self.seconds]
+        slope, _, low, high = (3600.0 * np.array(theilslopes(warm[:, 2], warm[:, 0]), np.float64)).tolist()
+        quarter = max(1, len(warm) // 3)  # of the part
+        early, late = warm[:quarter], warm[-quarter:]
+        figures: dict[str, Any] = {
+            "seconds": round(self.elapsed, 1),
+            "samples": len(table),
+            "allocated_mib": [round(float(np.median(part[:, 2])), 1) for part in (early, late)],
+            "allocated_mib_per_hour": round(slope, 1),
+            "allocated_mib_per_hour_95": [round(low, 1), round(high, 1)],
+            "resident_mib": [round(float(part[:, 1].max()), 1) for part in (early, late)],
+        }
+        wrong = [f"memory grows by {slope:.0f} MiB an hour"] if low > STEEPEST else []
+        if late[:, 1].max() > early[:, 1].max() + HIGHEST:
+            wrong.append(f"resident memory: {early[:, 1].max():.0f} MiB became {late[:, 1].max():.0f}")
+        for column, name in ((3, "handles"), (4, "threads")):
+            figures[name] = [int(part[:, column].max()) for part in (early, late)]
+            if np.median(late[:, column]) > early[:, column].max():
+                wrong.append(f"{name}: {figures[name][0]} became {figures[name][1]}")
+        return {**figures, "wrong": wrong, "rows": np.round(table, 1).tolist()}
+
+
+def small(motion: str) -> TrainConfig:
+    """A run of a second or two."""
+    fields = {
+        "init_points": 300,
+        "checkpoint_seconds": 0.2,
+        "evaluate_every": 20,
+        "motion": {"model": motion, "nodes": 24, "layers": 3, "width": 32, "skip": 2},
+        "data": {"cache_mib": 1},
+    }
+    return from_dict(fields, "soak", with_steps(preset("cpu"), 60))
+
+
+def train_once(place: Path, motion: str, resume: bool = False) -> Path:
+    data = make_synthetic(place / "data", size=96, train=16, test=2)
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        train_and_finish(small(motion), data, place / "run", frames=4, resume=resume)
+    return place / "run"
+
+
+def soak_training(seconds: float, place: Path) -> dict[str, Any]:
+    """Runs from the images to the film, each motion model in turn, each resumed once when it is complete."""
+    watch, runs = Watch(seconds), 0
+    while not watch.look():
+        with tempfile.TemporaryDirectory(dir=place) as folder:
+            inner = Path(folder)
+            (inner / "data").symlink_to(place / "data")
+            for resume in (False, True):
+                train_once(inner, MOTIONS[runs % len(MOTIONS)], resume)
+                watch.look()
+        runs += 1
+    return {"runs": runs, **watch.verdict()}
+
+
+def soak_editor(seconds: float, place: Path, run: Path, seed: int) -> dict[str, Any]:
+    """Every kind of input, at random, as fast as pictures come."""
+    user = RandomUser(EditSession(Scene.load(run)), place / "edits", seed)
+    watch = Watch(seconds)
+    try:
+        while not watch.look(user.rest):
+            user.act()
+    finally:
+        user.stop()
+    return {"actions": dict(sorted(user.done.items())), "refused": user.refused, **watch.verdict()}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=60.0, help="for all parts together")
+    parser.add_argument("--part", choices=("editor", "training", "both"), default="both")
+    parser.add_argument("--run", type=Path, help="the scene to edit; a small one is trained by default")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    if not Path("/proc/self/statm").exists():
+        print("error: memory and handles are read from /proc, which is not here", file=sys.stderr)
+        return 2
+    environment.configure(options.threads)
+    parts = ("editor", "training") if options.part == "both" else (options.part,)
+    seconds = 60.0 * options.minutes / len(parts)
+    found: dict[str, Any] = {"date": now(), "machine": machine("cpu")}
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        run = train_once(place, "control-points")
+        for part in parts:
+            if part == "editor":
+                found[part] = soak_editor(seconds, place, options.run or run, options.seed)
+            else:
+                found[part] = soak_training(seconds, place)
+            shown = {name: value for name, value in found[part].items() if name != "rows"}
+            print(json.dumps({part: shown}, indent=1), flush=True)
+            if options.json is not None:
+                options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    wrong = [f"{part}: {line}" for part in parts for line in found[part]["wrong"]]
+    print("\n".join(wrong) or "nothing grows")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
