@@ -9,6 +9,7 @@ from typing import Literal
 
 from scgs_warp import environment
 from scgs_warp.errors import UserError
+from scgs_warp.job import label
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -34,7 +35,7 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
     try:
         main(args)
     except UserError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"error{label()}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except OSError as error:
         if isinstance(error, BrokenPipeError):  # the reader (head, a pager) has seen enough

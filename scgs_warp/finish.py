@@ -16,6 +16,7 @@ from .data import ImageCache, load
 from .data.dataset import Dataset
 from .evaluate import Lpips, metrics_of, write_metrics
 from .overlay import Painter
+from .parallel import Team
 from .progress import progress
 from .report import curves
 from .run_folder import read_seconds
@@ -66,6 +67,7 @@ def train_and_finish(
     lpips: Lpips | None = None,
     look: Callable[[Dataset], None] | None = None,
     tensorboard: bool = False,
+    team: Team | None = None,
 ) -> dict[str, Any]:
     """Load, train, evaluate: what ``apps/train.py`` does.
 
@@ -77,9 +79,10 @@ def train_and_finish(
         lpips: the perceptual distance, if it is to be measured.
         look: called with the training frames before training begins.
         tensorboard: also write event files for TensorBoard to ``output``.
+        team: the processes that share the work of training; the first does the rest.
 
     Returns:
-        what ``metrics.json`` holds.
+        what ``metrics.json`` holds; nothing in other processes than the first.
 
     Raises:
         UserError: of the data, the configuration, the run directory or the training.
@@ -97,7 +100,10 @@ def train_and_finish(
         resume=resume,
         settings=settings_of(config, data),
         tensorboard=tensorboard,
+        team=team,
     )
+    if team is not None and not team.first:
+        return {}
     return finish(scene, test, output, frames=frames, lpips=lpips)
 
 
