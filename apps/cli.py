@@ -11,6 +11,7 @@ from typing import Literal
 
 from scgs_warp import environment
 from scgs_warp.errors import UserError, one_line
+from scgs_warp.job import label
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -41,7 +42,7 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
     try:
         main(args)
     except UserError as error:
-        _tell(f"error: {one_line(error)}")
+        _tell(f"error{label()}: {one_line(error)}")
         return 2
     except OSError as error:
         if isinstance(error, BrokenPipeError):  # the reader (head, a pager) has seen enough

@@ -108,7 +108,7 @@ def open_browser(session: EditSession, options: Options) -> None:
     import secrets
 
     from scgs_warp.editor import Editor, Proxy
-    from scgs_warp.train import stop_signals
+    from scgs_warp.stopping import stop_signals
 
     source = options.run if options.ply is None else options.ply.parent
     assert source is not None

@@ -32,6 +32,8 @@ class Settings:
     """How images are reduced: area, or bicubic as the official code does it."""
     background: Literal["black", "white", "random"] | None = None
     """What lies behind transparent pixels."""
+    batch: int | None = None
+    """Views per step, whose gradients are averaged; with torchrun as many as processes by default (docs/scaling.md)."""
     steps: int | None = None
     """Steps of both stages together; every milestone scales with it."""
     nodes: int | None = None
@@ -52,7 +54,11 @@ class Settings:
 
 
 def configuration(
-    options: Settings, file: Path | None, flags: dict[str, Any], usual: PresetName | None = None
+    options: Settings,
+    file: Path | None,
+    flags: dict[str, Any],
+    usual: PresetName | None = None,
+    usual_batch: int = 1,
 ) -> tuple[TrainConfig, str | None]:
     """The complete configuration, and the data folder that ``file`` names.
 
@@ -61,6 +67,7 @@ def configuration(
         flags: fields that options of the app's own set, by their dotted names; None: not set.
         usual: the preset where neither options nor ``file`` name one; None: cpu if ``file`` names a data folder, else
             quick.
+        usual_batch: views per step where neither says so.
 
     Raises:
         UserError: naming the option or the file and its field.
@@ -74,6 +81,7 @@ def configuration(
         if values.get("preset", options.preset) != options.preset:
             raise UserError(f"{file}: is of preset {values['preset']}; leave out --preset {options.preset}")
         values["preset"] = options.preset
+    values.setdefault("batch", usual_batch)
     values.setdefault("preset", usual or ("cpu" if folder else "quick"))
     # A complete file says where its milestones lie; a partial one that names the steps wants them scaled.
     steps = values.pop("steps", None) if "pretrain" not in values else None
@@ -89,6 +97,7 @@ def configuration(
         "motion.nodes": options.nodes,
         "pretrain.progressive": options.progressive or None,
         "densify.max_gaussians": options.max_gaussians,
+        "batch": options.batch,
         **flags,
     }
     for name, value in wanted.items():

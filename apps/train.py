@@ -12,6 +12,7 @@ import tyro
 from scgs_warp.apps.cli import prepare, run
 from scgs_warp.apps.settings import BUILTIN, Settings, builtin_scene, configuration
 from scgs_warp.config import MotionName
+from scgs_warp.job import place
 
 if TYPE_CHECKING:
     from scgs_warp.data import Dataset
@@ -52,15 +53,18 @@ def default_output(options: Options) -> Path:
 
 def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="train.py")
-    device = prepare(options.device, options.threads, options.memory_gib)
+    where = place()
+    threads = where.threads if where and options.threads is None else options.threads
+    device = prepare(options.device, threads, options.memory_gib)
     output = options.output or default_output(options)
     recorded = output / "config.json"
     file = options.config or (recorded if options.resume and recorded.is_file() else None)
     flags = {"motion.model": options.motion, "seed": options.seed}
-    config, named = configuration(options, file, flags, "cpu" if options.data else None)
+    config, named = configuration(options, file, flags, "cpu" if options.data else None, where.size if where else 1)
 
     from scgs_warp.advice import advise, survey
     from scgs_warp.finish import summary, train_and_finish
+    from scgs_warp.parallel import team_of
     from scgs_warp.progress import say
     from scgs_warp.run_folder import refuse_existing
     from scgs_warp.tensorboard import check_installed
@@ -68,16 +72,20 @@ def main(args: list[str] | None) -> None:
     if options.tensorboard:
         check_installed()
     refuse_existing(output, options.resume)
-    folder = options.data or (Path(named) if named else builtin_scene(device))
 
     def look(data: Dataset) -> None:
         say("\n".join(advise(survey(data), config, device)))
 
-    metrics = train_and_finish(
-        config, folder, output, device=device, resume=options.resume, look=look, tensorboard=options.tensorboard
-    )
-    say(summary(metrics))
-    say(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
+    with team_of(where, device) as team:
+        folder = options.data or (Path(named) if named else None)
+        if folder is None:  # of several processes one makes it
+            folder = team.in_turn(lambda: builtin_scene(device)) if team else builtin_scene(device)
+        rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "team": team}
+        metrics = train_and_finish(config, folder, output, look=look, **rest)
+        say(summary(metrics))
+        if team:
+            say(team.summary())
+        say(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
 
 
 def cli(args: list[str] | None = None) -> int:

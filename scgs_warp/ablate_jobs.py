@@ -124,7 +124,7 @@ def _in_processes(
     report: Report,
     end: Callable[[str, Cell, str | None], None],
 ) -> None:
-    from .train import stop_signals
+    from .stopping import stop_signals
 
     share = max(1, (threads or environment.available_threads()) // jobs)
     queue, running = list(waiting), []

@@ -213,6 +213,8 @@ class TrainConfig:
     sh_degree: int = 3
     antialiased: bool = False
     seed: int = 0
+    batch: int = 1
+    """Views per step: their gradients are averaged. Several processes share them (docs/scaling.md)."""
     half_size: int = milestone(0)
     """Steps of both stages in which the images are looked at in half their size: coarse first, and twice as fast."""
     evaluate_every: int = milestone(5_000)

@@ -18,6 +18,7 @@ from .data.dataset import Dataset
 from .errors import UserError, one_line
 from .evaluate import Lpips, metrics_of, write_metrics
 from .overlay import Painter
+from .parallel import Team
 from .progress import progress
 from .report import curves
 from .run_folder import read_seconds
@@ -68,6 +69,7 @@ def train_and_finish(
     lpips: Lpips | None = None,
     look: Callable[[Dataset], None] | None = None,
     tensorboard: bool = False,
+    team: Team | None = None,
 ) -> dict[str, Any]:
     """Load, train, evaluate: what ``apps/train.py`` does.
 
@@ -79,9 +81,10 @@ def train_and_finish(
         lpips: the perceptual distance, if it is to be measured.
         look: called with the training frames before training begins.
         tensorboard: also write event files for TensorBoard to ``output``.
+        team: the processes that share the work of training; the first does the rest.
 
     Returns:
-        what ``metrics.json`` holds.
+        what ``metrics.json`` holds; nothing in other processes than the first.
 
     Raises:
         UserError: of the data, the configuration, the run directory or the training; or scores and pictures cannot
@@ -100,7 +103,10 @@ def train_and_finish(
         resume=resume,
         settings=settings_of(config, data),
         tensorboard=tensorboard,
+        team=team,
     )
+    if team is not None and not team.first:
+        return {}
     try:
         return finish(scene, test, output, frames=frames, lpips=lpips)
     except (UserError, OSError) as error:

@@ -27,6 +27,12 @@ def first_frames(data: Dataset) -> Dataset:
     return data.subset(ordered[: max(1, round(PROGRESSIVE_SHARE * len(ordered)))])
 
 
+def view_number(step: int, config: TrainConfig, view: int) -> int:
+    """Counts views as ``step`` counts steps: what the order of frames and a view's random draws depend on, so that they
+    do not depend on which process looks at it."""
+    return step * config.batch + view
+
+
 def _half(frame: Frame) -> Pixels:
     def pool(image: Tensor) -> Tensor:
         return F.avg_pool2d(image[None], 2)[0]
@@ -52,18 +58,18 @@ class Frames:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def index_at(self, step: int, progressive: bool) -> int:
-        """The frame of this step. ``progressive``: at first only the first 20 % of the frames by time, 20 % more every
-        ``progressive_every`` steps (seed S4), one by one rather than all at once; every other step then looks at the
-        newest 20 %, so that a limb is followed before its places of yesterday make it transparent."""
-        first, allowed = 0, len(self.frames)
+    def index_at(self, step: int, progressive: bool, view: int = 0) -> int:
+        """The frame of this step's ``view``. ``progressive``: at first only the first 20 % of the frames by time, 20 %
+        more every ``progressive_every`` steps (seed S4), one by one rather than all at once; every other view is then
+        one of the newest 20 %, so that a limb is followed before its places of yesterday make it transparent."""
+        first, allowed, number = 0, len(self.frames), view_number(step, self.config, view)
         if progressive:
             grown = PROGRESSIVE_SHARE * (1.0 + step / self.config.pretrain.progressive_every)
             allowed = min(allowed, max(1, round(grown * allowed)))
-            if step % 2 and allowed < len(self.frames):
+            if number % 2 and allowed < len(self.frames):
                 first = max(0, allowed - max(1, round(PROGRESSIVE_SHARE * len(self.frames))))
         count = allowed - first
-        epoch, place = divmod(step, count)
+        epoch, place = divmod(number, count)
         if self._order[0] != (epoch, count):
             order = torch.randperm(count, generator=generator(self.config.seed, 41, epoch, count))
             self._order = ((epoch, count), order.tolist())
@@ -77,16 +83,17 @@ class Frames:
         small = Camera(camera.viewmat, intrinsics, half.image.shape[1], half.image.shape[0])
         return Frame(entry.camera, entry.time, *half, name=entry.name), small
 
-    def expect(self, step: int, progressive: bool) -> None:
-        """Begin to read the frame of this step, if it must be read."""
-        index = self.index_at(step, progressive)
+    def expect(self, step: int, progressive: bool, view: int = 0) -> None:
+        """Begin to read the frame of this step's ``view``, if it must be read."""
+        index = self.index_at(step, progressive, view)
         if (self, index) not in self.frames.cache:
             self.frames.expect(index)
 
     def view(
-        self, index: int, step: int, random_background: bool
+        self, index: int, step: int, random_background: bool, view: int = 0
     ) -> tuple[Frame, Camera, Tensor, Tensor, Tensor | None]:
-        """Frame, normalised camera, truth [3, H, W] on the background of this step, that background [3], mask.
+        """Frame, normalised camera, truth [3, H, W] on the background of this step's ``view``, that background [3],
+        mask.
 
         Raises:
             FrameError: its file cannot be read any more.
@@ -102,7 +109,8 @@ class Frames:
         truth = frame.image.to(self.device).permute(2, 0, 1).contiguous()
         background = self.background
         if frame.alpha is not None and (random_background or self.random_background):
-            color = torch.rand(3, generator=generator(self.config.seed, 42, step)).to(self.device)
+            random = generator(self.config.seed, 42, view_number(step, self.config, view))
+            color = torch.rand(3, generator=random).to(self.device)
             gap = 1.0 - frame.alpha.to(self.device)
             truth = truth + gap * (color - background)[:, None, None]
             background = color

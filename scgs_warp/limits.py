@@ -9,7 +9,7 @@ from .config import TrainConfig
 from .errors import UserError
 
 AT_LEAST_ONE = (
-    "init_points evaluate_every data.downscale "
+    "init_points batch evaluate_every data.downscale "
     "motion.layers motion.width motion.time_frequencies motion.position_frequencies "
     "pretrain.densify_every pretrain.progressive_every pretrain.start_ratio pretrain.max_ratio "
     "optim.means_until optim.network_until "

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +14,13 @@ import torch
 from torch import Tensor
 
 from . import checkpoint, environment
+from .batch import all_views, check_replicas, check_share
 from .camera_refinement import camera_rate
 from .config import TrainConfig
 from .data.dataset import Dataset
 from .densify import densify, mean_gradient, most_that_fit, reset_opacities, threshold
 from .errors import FrameError, UserError
-from .frames import Frames
+from .frames import Frames, view_number
 from .limits import check
 from .memory import NotEnoughMemory
 from .motion.adapt import adapt_control_points
@@ -30,21 +29,26 @@ from .motion.spheres import Spheres
 from .ops.adam import first_not_finite
 from .ops.ssim import photometric_loss
 from .optim import generator, log_linear
+from .parallel import Lost, Team
 from .pretrain import densify_spheres, thin_spheres
 from .progress import Progress, progress
 from .render import draw
-from .run_folder import RunFolder
+from .run_folder import Onlooker, RunFolder
 from .scene import Scene
+from .stopping import stop_signals
 from .train_state import TrainState
+from .types import Stats
 
 SETTLED = 0.05
 """What remains of the constant rates at the last step."""
 MOST_FAILURES = 20
 """Non-finite steps in a row after which training stops at the last good state."""
+COMPARE_EVERY = 500
+"""Steps after which processes that train together make sure that they hold the same scene."""
 
 
 class StepResult(NamedTuple):
-    """What a step reports: detached scalars, and the picture for previews."""
+    """What a step reports: detached scalars, the mean over its views, and a picture for previews."""
 
     loss: Tensor
     l1: Tensor
@@ -56,38 +60,18 @@ class StepResult(NamedTuple):
     """[H, W] bool, the pixels that count; None: all."""
     failed: str | None
     """The name of the term that was not finite, if any; the step was dropped."""
+    size: tuple[int, int]
+    """Width and height of the step's first view, in pixels."""
 
 
 def training_step(state: TrainState, frames: Frames) -> StepResult:
-    """One frame: pose, render, compare, go back, step. Changes ``state``, except its ``step``."""
-    config, step = state.config, state.stage_step
-    pretraining = state.stage == "pretrain"
-    index = frames.index_at(step, config.pretrain.progressive and pretraining)
-    random_background = pretraining and config.pretrain.random_background
-    frame, camera, truth, background, mask = frames.view(index, state.step, random_background)
-    frames.expect(step + 1, config.pretrain.progressive and pretraining)
+    """One step: look at each view of the batch, then change the parameters. Changes ``state``, except its ``step``."""
     set_rates(state)
-    if state.refines_cameras:
-        camera = state.cameras.apply(camera, index)
-
-    time = noisy_time(frame.time, state, len(frames))
-    posed, regulariser = state.motion.train_at(state.gaussians, time, step, config, config.seed)
-    collecting = pretraining or step < config.densify.until
-    picture, _ = draw(
-        posed,
-        camera,
-        background,
-        sh_degree=min(state.gaussians.sh_degree, step // config.densify.sh_every),
-        stats=state.stats if collecting else None,
-        antialiased=config.antialiased,
-    )
-    loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim)
-    total = loss if regulariser is None else loss + regulariser
-
-    failed = _not_finite(loss, regulariser)
-    if failed is None:
-        total.backward()
-        failed = _bad_gradient(state)
+    if state.config.batch == 1:
+        result = one_view(state, frames, 0, state.stats)
+    else:
+        result = all_views(state, frames, one_view)
+    failed = result.failed or _bad_gradient(state)
     if failed is None:
         state.gaussian_optimizer.step()
         if state.motion_optimizer is not None and not frozen(state):
@@ -97,8 +81,47 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
             state.cameras.centre()
     for optimizer in state.optimizers():
         optimizer.zero_grad()
+    return result._replace(failed=failed)
+
+
+def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> StepResult:
+    """One frame: pose, render, compare, go back. Adds to the parameters' gradients and to ``stats``; a loss that is not
+    finite adds nothing.
+
+    Args:
+        view: which one of the step's batch.
+    """
+    config, step = state.config, state.stage_step
+    pretraining = state.stage == "pretrain"
+    progressive = config.pretrain.progressive and pretraining
+    index = frames.index_at(step, progressive, view)
+    random_background = pretraining and config.pretrain.random_background
+    frame, camera, truth, background, mask = frames.view(index, state.step, random_background, view)
+    later, next_view = divmod(view + (1 if state.team is None else state.team.size), config.batch)
+    frames.expect(step + later, progressive, next_view)
+    if state.refines_cameras:
+        camera = state.cameras.apply(camera, index)
+
+    time = noisy_time(frame.time, state, len(frames), view)
+    posed, regulariser = state.motion.train_at(state.gaussians, time, step, config, config.seed, view)
+    collecting = pretraining or step < config.densify.until
+    picture, _ = draw(
+        posed,
+        camera,
+        background,
+        sh_degree=min(state.gaussians.sh_degree, step // config.densify.sh_every),
+        stats=stats if collecting else None,
+        antialiased=config.antialiased,
+    )
+    loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim)
+    total = loss if regulariser is None else loss + regulariser
+
+    failed = _not_finite(loss, regulariser)
+    if failed is None:
+        total.backward()
     weighted = 0.0 if regulariser is None else float(regulariser.detach())
-    return StepResult(loss.detach(), l1.detach(), ssim.detach(), weighted, picture.detach(), truth, mask, failed)
+    losses, size = (loss.detach(), l1.detach(), ssim.detach(), weighted), (truth.shape[2], truth.shape[1])
+    return StepResult(*losses, picture.detach(), truth, mask, failed, size)
 
 
 def frozen(state: TrainState) -> bool:
@@ -129,15 +152,15 @@ def settling(step: int, config: TrainConfig) -> float:
     return log_linear(1.0, SETTLED, passed, length) if length > 0 and passed > 0 else 1.0
 
 
-def noisy_time(time: float, state: TrainState, frames: int) -> float:
-    """The step's time with noise, for data whose cameras stand elsewhere at every time: it keeps the motion from
+def noisy_time(time: float, state: TrainState, frames: int, view: int = 0) -> float:
+    """The view's time with noise, for data whose cameras stand elsewhere at every time: it keeps the motion from
     jumping from frame to frame."""
     config = state.config
     fade = max(0.0, 1.0 - state.stage_step / config.optim.network_until)
     spread = config.motion.time_noise * fade / max(frames - 1, 1)
     if spread == 0.0:
         return time
-    noise = torch.randn(1, generator=generator(config.seed, 43, state.step))
+    noise = torch.randn(1, generator=generator(config.seed, 43, view_number(state.step, config, view)))
     return min(max(time + spread * float(noise), 0.0), 1.0)
 
 
@@ -191,6 +214,7 @@ def _adapt_gaussians(state: TrainState, size: tuple[int, int]) -> str | None:
                 state.motion, state.motion_optimizer, state.gaussians, gradient, grad_threshold=node_limit
             )
         most = most_that_fit(state.gaussians, config.max_gaussians)
+        most = most if state.team is None else state.team.least(most)
         if most < config.max_gaussians:
             note = f"memory has room for {most:,} Gaussians, not for {config.max_gaussians:,}; they grow no further"
             config = dataclasses.replace(config, max_gaussians=most)
@@ -219,32 +243,6 @@ def _nodes_due(state: TrainState, done: int) -> bool:
     return done >= config.nodes_every and done % config.nodes_every < config.every
 
 
-@contextmanager
-def stop_signals() -> Iterator[threading.Event]:
-    """Ctrl-C, SIGTERM and the end of the terminal (SIGHUP) ask for a stop instead of ending the process; a second
-    Ctrl-C ends it. The others come twice of themselves: from the shell and from the system."""
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
-
-    def ask(number: int, frame: Any) -> None:
-        if asked.is_set() and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        asked.set()
-
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
-    if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:  # nohup: it is to go on
-        numbers.append(hang_up)
-    before = {number: signal.signal(number, ask) for number in numbers}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def fit(
     config: TrainConfig,
     data: Dataset,
@@ -255,6 +253,7 @@ def fit(
     resume: bool = False,
     settings: dict[str, Any] | None = None,
     tensorboard: bool = False,
+    team: Team | None = None,
 ) -> Scene:
     """Train a scene; the run directory holds a resumable checkpoint at any time.
 
@@ -269,29 +268,39 @@ def fit(
             before it where that is damaged, from the beginning where the run was killed before there was any.
         settings: what to write to ``config.json``; default: the configuration.
         tensorboard: also write event files for TensorBoard to ``output``; changes no bit of the scene.
+        team: the processes that share each step's views (``parallel.team_of``); ``config.batch`` must be a multiple of
+            their number. The first of them writes, ``output`` is read by all.
 
     Returns:
-        the scene after the last step.
+        the scene after the last step, in every process.
 
     Raises:
         UserError: a bad configuration, a checkpoint that does not fit or cannot be written, an image that is gone,
-            repeated non-finite losses, no TensorBoard. What was saved last is intact.
+            repeated non-finite losses, no TensorBoard, a process of the team was lost. What was saved last is intact.
         NotEnoughMemory: one tile of an image takes more than there is; the checkpoint is saved.
         KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal, the checkpoint being saved.
     """
     check(config)
+    check_share(config, team)
     environment.ensure_configured()
     if data.background != config.data.background:
         raise UserError(f"{data.folder}: loaded on {data.background}, but data.background is {config.data.background}")
     if len(data) == 0:
         raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
-    with RunFolder(output, config, settings, resume=resume, tensorboard=tensorboard) as folder:
-        state = _state(folder, config, data, device)
+    folder_type = RunFolder if team is None or team.first else Onlooker
+    with folder_type(output, config, settings, resume=resume, tensorboard=tensorboard) as folder:
+        begin = partial(_state, folder, config, data, device)
+        state = begin() if team is None else team.in_turn(begin)  # the first may have to put a checkpoint in its place
+        state.team = team
         frames = Frames(data, state.normalisation, config, device)
         folder.begin(state.step)
         with progress(config.steps, "training", start=state.step) as bar, stop_signals() as stop:
             folder.tell = bar.print
-            _loop(state, frames, folder, test, bar, stop)
+            try:
+                check_replicas(state)
+                _loop(state, frames, folder, test, bar, stop)
+            except Lost as lost:
+                raise _without_others(state, folder, lost) from lost
         state.motion.eval()
         return state.scene()
 
@@ -329,22 +338,45 @@ def _loop(
             state.failures = 0
         else:
             _count_failure(state, result.failed, folder, bar)
-        note = adapt(state, (result.truth.shape[2], result.truth.shape[1]))
+        state.whole = False
+        note = adapt(state, result.size)
         if note is not None and not noted:
             noted = True
             bar.print(f"step {state.step}: {note}")
             folder.log({"step": state.step, "stage": state.stage, "note": note})
         state.step += 1
+        state.whole = True
+        last = state.step == config.steps
+        stopping = stop.is_set() if state.team is None else state.team.any(stop.is_set())
+        if last or stopping or state.step % COMPARE_EVERY == 0:
+            check_replicas(state)
         folder.record(state, result, bar)
-        if test is not None and (state.step % config.evaluate_every == 0 or state.step == config.steps):
+        if test is not None and (state.step % config.evaluate_every == 0 or last):
             folder.look_at_test(state.scene(), test)
         now = time.monotonic()
-        if now - saved_at >= config.checkpoint_seconds or state.step == config.steps or stop.is_set():
+        if now - saved_at >= config.checkpoint_seconds or last or stopping:
             state.save(folder.path)
             saved_at = time.monotonic()
-        if stop.is_set():
+        if stopping:
+            if state.team is not None:
+                state.team.meet()  # torchrun ends all processes when one has ended: the first must have saved
             bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
             raise KeyboardInterrupt
+
+
+def _without_others(state: TrainState, folder: RunFolder, lost: Lost) -> UserError:
+    """What is left to do when another process is gone: no step can be finished, but mostly none has been begun either,
+    for parameters change when all views are there."""
+    assert state.team is not None
+    if state.step == 0:
+        return UserError(f"{folder.path}: {lost}; no step was done yet")
+    if state.whole:
+        state.save(folder.path)
+    where = f"step {state.step} is saved" if state.team.first and state.whole else f"reached step {state.step}"
+    return UserError(
+        f"{folder.path}: {lost}; {where}, continue from the checkpoint with --resume, on one process or any number "
+        f"that divides batch {state.config.batch}"
+    )
 
 
 def _count_failure(state: TrainState, term: str, folder: RunFolder, bar: Progress) -> None:

@@ -23,6 +23,7 @@ from .hull import likely_points
 from .motion.base import Motion
 from .motion.spheres import Spheres
 from .optim import Adam, generator
+from .parallel import Team
 from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, sphere_base, thin_spheres
 from .scene import Scene, scene_from
 from .types import Stats
@@ -54,6 +55,10 @@ class TrainState:
         self.stage: Stage = stage
         self.step, self.fingerprint = step, fingerprint
         self.failures = 0
+        self.team: Team | None = None
+        """The processes that share each step's views, if this is one of several; no part of a checkpoint."""
+        self.whole = True
+        """Whether ``step`` counts all that has been done to the parameters."""
         self.cameras = CameraRefinement(frames if config.optim.cameras > 0 else 0).to(gaussians.means.device)
         self.camera_optimizer = self.cameras.optimizer()
         self.enter(gaussians, motion)
@@ -130,6 +135,9 @@ class TrainState:
         return Scene(self.gaussians, self.motion, self.normalisation, self.config, self.overview, step=self.step)
 
     def save(self, folder: Path) -> None:
+        """Write the checkpoint; of several processes the first does."""
+        if self.team is not None and not self.team.first:
+            return
         tensors = dict(self.scene().tensors())
         tensors.update(self.gaussian_optimizer.tensors("adam.gaussians"))
         if self.motion_optimizer is not None:

@@ -38,9 +38,10 @@ class Motion(nn.Module):
         raise NotImplementedError
 
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
     ) -> TrainingPose:
-        """As :meth:`gaussians_at`, with what belongs to training: the frozen phase and the regulariser at ``step``."""
+        """As :meth:`gaussians_at`, with what belongs to training: the frozen phase and the regulariser at ``step``.
+        ``view``: which one of the step's batch; random draws differ between them."""
         return TrainingPose(self.gaussians_at(gaussians, time), None)
 
     def control_points_at(self, time: float) -> Tensor:

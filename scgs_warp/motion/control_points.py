@@ -184,14 +184,14 @@ class ControlPoints(Motion):
         return self.apply_pose(gaussians, pose, self._cached)
 
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
     ) -> TrainingPose:
         frozen = step < config.freeze
         weight = 0.0 if frozen else arap_weight(step, config.loss)
         times = [time]
         if weight > 0.0:
             self.refresh_graph(step, config.loss)
-            times += arap_times(config.loss, generator(seed, 21, step))
+            times += arap_times(config.loss, generator(seed, 21, step * config.batch + view))
         with torch.set_grad_enabled(not frozen):
             poses = self.poses(torch.tensor(times))
         posed = self.bind_and_pose(gaussians, poses[0], frozen)

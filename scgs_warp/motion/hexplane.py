@@ -70,7 +70,7 @@ class HexPlane(Motion):
         return self._moved(gaussians, self.features(gaussians.means, time))
 
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
     ) -> TrainingPose:
         if step < config.coarse:  # a static scene first (4D-GS)
             return TrainingPose(gaussians.activate(), None)

@@ -36,7 +36,7 @@ class PerGaussian(Motion):
         )
 
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
     ) -> TrainingPose:
         if step < config.coarse:
             return TrainingPose(gaussians.activate(), None)

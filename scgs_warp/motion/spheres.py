@@ -42,7 +42,7 @@ class Spheres(Motion):
         return self._place(gaussians, moved)
 
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
     ) -> TrainingPose:
         if step < config.pretrain.warm_up:
             return TrainingPose(self._place(gaussians, gaussians.means), None)
@@ -50,7 +50,7 @@ class Spheres(Motion):
         times = [time]
         if rigid:
             self.refresh_graph(gaussians, step, config.loss)
-            times += arap_times(config.loss, generator(seed, 22, step))
+            times += arap_times(config.loss, generator(seed, 22, step * config.batch + view))
         moves = self.translations(gaussians.means, torch.tensor(times))
         posed = self._place(gaussians, gaussians.means + moves[0])
         if not rigid or self.graph is None:
