@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from .types import ALPHA_MAX, ALPHA_MIN, CHANNEL_MAX, GRADIENT_MAX, SLOT_GEOMETRY, TRANSMITTANCE_MIN
+from .gradients import passed
+from .types import ALPHA_MAX, ALPHA_MIN, CHANNEL_MAX, SLOT_GEOMETRY, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -181,23 +182,6 @@ def composite_pixels_adjoint(
                 v_alpha = own * transmittance - behind / (1.0 - alpha)
                 behind += own * alpha * transmittance
                 add_pixel_adjoint(centre, means2d_in[i], conics_in[i], opacities_in[i], v_alpha, slot, v_slots_out)
-
-
-@wp.func
-def passed(gradient: float) -> float:
-    """A gradient to a splat's geometry, and 0 for one that has overflowed. (What comes in as NaN shows in the channels'
-    gradients, which are handed on as they are.)"""
-    return wp.where(wp.abs(gradient) <= GRADIENT_MAX, gradient, 0.0)
-
-
-@wp.func
-def passed(gradient: wp.vec2) -> wp.vec2:  # noqa: F811  (Warp overloads by type)
-    return wp.vec2(passed(gradient[0]), passed(gradient[1]))
-
-
-@wp.func
-def passed(gradient: wp.vec3) -> wp.vec3:  # noqa: F811
-    return wp.vec3(passed(gradient[0]), passed(gradient[1]), passed(gradient[2]))
 
 
 @wp.kernel

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .types import GRADIENT_MAX
+from .gradients import beyond
 
 wp.set_module_options({"enable_backward": False})
 
@@ -179,5 +179,5 @@ def spherical_harmonics_adjoint(
         )
     # The direction is normalised: only what is perpendicular to it moves it.
     v_mean = inverse * (g - wp.dot(g, d) * d)
-    if wp.max(wp.abs(v_mean)) <= GRADIENT_MAX and wp.isfinite(v_mean[0] + v_mean[1] + v_mean[2]):
+    if beyond(v_mean) == 0:
         v_means_out[i] = v_mean  # else it overflows: none

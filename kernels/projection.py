@@ -8,8 +8,9 @@ pass could have stored costs more.
 
 import warp as wp
 
+from .gradients import beyond
 from .quaternion import quat_inverse_norm, quat_matrix, quat_matrix_adjoint, quat_normalise, quat_normalise_adjoint
-from .types import ALPHA_MIN, GRADIENT_MAX
+from .types import ALPHA_MIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -152,12 +153,6 @@ def project(
 
 
 @wp.func
-def beyond(x: float) -> int:
-    """1 for NaN and what is beyond use, else 0."""
-    return wp.where(wp.abs(x) <= GRADIENT_MAX, 0, 1)
-
-
-@wp.func
 def covariance2d_adjoint(
     row_x: wp.vec3, row_y: wp.vec3, eps2d: float, antialiased: int, opacity: float, v_conic: wp.vec3, v_opacity: float
 ):
@@ -273,14 +268,9 @@ def project_adjoint(
 
     # Where usable gradients become others (an overflow), none is passed; what came in as NaN goes out as NaN.
     given = beyond(v_mean2d[0]) + beyond(v_mean2d[1]) + beyond(v_depth) + beyond(v_opacities_in[i])
-    made = beyond(v_opacity)
-    for c in range(3):
-        given += beyond(v_conics_in[i][c])
-        made += beyond(v_mean[c]) + beyond(v_scale[c]) + beyond(v_point[c])
-        for r in range(3):
-            made += beyond(v_rotation[r, c])
-    for c in range(4):
-        made += beyond(v_quat[c])
+    given += beyond(v_conics_in[i])
+    made = beyond(v_opacity) + beyond(v_mean) + beyond(v_scale) + beyond(v_quat) + beyond(v_point)
+    made += beyond(v_rotation[0]) + beyond(v_rotation[1]) + beyond(v_rotation[2])
     if given == 0 and made > 0:
         v_mean = wp.vec3(0.0)
         v_quat = wp.vec4(0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .compositing import passed
+from .gradients import passed
 from .types import SLOT_GEOMETRY
 
 wp.set_module_options({"enable_backward": False})

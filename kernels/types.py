@@ -23,5 +23,8 @@ gradients of what lies behind it."""
 GRADIENT_MAX = wp.constant(1.0e30)
 """A gradient of one Gaussian beyond this counts as none: sums over a hundred million Gaussians are still finite."""
 
+POSITION_MAX = wp.constant(1.0e18)
+"""Gaussians farther from the origin pass their control points no gradient: products with it would overflow."""
+
 SLOT_GEOMETRY = 8
 """Leading columns of a gradient slot: 2D mean (2), conic (3), opacity (1), absolute 2D mean (2); channels follow."""

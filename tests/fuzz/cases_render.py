@@ -212,9 +212,10 @@ def case_draw(d: Draw, device: str) -> None:
     count, size, degree = d.count(), d.size(), int(d.rng.integers(4))
     g, camera = poisoned_gaussians(d, count, degree), camera_of(d, *size).to(device)
     values = [leaf(x) for x in on(device, *vars(g).values())]
-    background = leaf(d.uniform(3).to(device))
+    color = d.uniform(3)
     if d.chance(0.1):
-        d.poison(background.data.cpu())
+        d.poison(color)
+    background = leaf(color.to(device))
     viewmat = leaf(camera.viewmat)
     own = Camera(viewmat, camera.K, *size)
     options = {"antialiased": d.chance(0.3), "depth": d.chance()}

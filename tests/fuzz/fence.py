@@ -57,6 +57,7 @@ class Fence:
 
     def __init__(self) -> None:
         self.regions: list[_Region] = []
+        self.held: list[tuple[int, int]] = []
         self.high = True
         self.launches = 0
 
@@ -64,6 +65,22 @@ class Fence:
         while len(self.regions) <= place:
             self.regions.append(_Region())
         return self.regions[place]
+
+    def hold(self, tensor: Tensor) -> Tensor:
+        """A copy beside a wall, good until :meth:`release`: for tensors that kernels are given by address."""
+        size = tensor.numel() * tensor.element_size()
+        if not 0 < size <= ROOM:
+            return tensor.detach().clone()
+        copy, begin, end = self._region(len(self.held)).put(tensor.detach(), self.high)
+        self.held.append((begin, end))
+        return copy
+
+    def release(self) -> None:
+        """The held copies are no longer needed."""
+        held, self.held = self.held, []
+        for place, (begin, end) in enumerate(held):
+            if bytes(self.regions[place].memory[begin:end]) != b"\xff" * (end - begin):
+                raise OutOfBounds("a kernel writes past the end of a tensor that it was given by address")
 
     def run(self, kernel: Any, parameters: list, args: tuple, go: Callable[[tuple], None]) -> None:
         """``go`` with fenced copies of the tensors among ``args``, and what it wrote back to them."""
@@ -76,7 +93,7 @@ class Fence:
                 continue
             key = (value.data_ptr(), value.numel(), value.dtype)
             if key not in moved:
-                region = self._region(len(moved))
+                region = self._region(len(self.held) + len(moved))
                 moved[key] = (region, value, *region.put(value, self.high))
             fenced[place] = moved[key][2].view(value.shape)
             labels.setdefault(key, []).append(parameter.label if parameter else "")
@@ -92,9 +109,21 @@ class Fence:
                 flat.copy_(copy.view(-1))
 
 
+current: Fence | None = None
+"""The fence that is up, for launches that do not go through ``warp_interop.launch``."""
+
+
+def walled(tensor: Tensor) -> Tensor:
+    """The tensor, beside a wall where a fence is up and it is on a CPU. Not attached to a graph."""
+    if current is None or tensor.device.type != "cpu":
+        return tensor.detach().clone()
+    return current.hold(tensor)
+
+
 @contextmanager
 def fenced() -> Iterator[Fence]:
     """Launches on a CPU are fenced, one thread at a time (the thread count must be 1)."""
+    global current
     fence, kernels = Fence(), warp_interop._CpuKernel
     bind, pack = kernels.bind, kernels.pack
 
@@ -107,8 +136,8 @@ def fenced() -> Iterator[Fence]:
 
         return call
 
-    kernels.bind = bound  # type: ignore[method-assign]
+    kernels.bind, current = bound, fence  # type: ignore[method-assign]
     try:
         yield fence
     finally:
-        kernels.bind = bind  # type: ignore[method-assign]
+        kernels.bind, current = bind, None  # type: ignore[method-assign]

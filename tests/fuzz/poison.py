@@ -54,13 +54,15 @@ class Draw:
 
     def count(self) -> int:
         """0, 1, a register less or more one, a few, and now and then many."""
+        if self.chance(0.01):
+            return int(self.rng.integers(1000, 5000))
         return int(self.pick((0, 1, 2, 3, 15, 16, 17, 31, 32, 33, 40, 64, 65, 100, 200, int(self.rng.integers(1, 600)))))
 
     def size(self) -> tuple[int, int]:
         """Width and height, 1 x 1 to 257 x 257; most are small, tiles' borders are favoured."""
         sides = (1, 2, 3, 7, 15, 16, 17, 31, 32, 33, 47, 48, 49, 64)
         if self.chance(0.05):
-            sides = (100, 127, 128, 129, 255, 256, 257)
+            sides = (100, 127, 128, 129, 255, 256, 257, int(self.rng.integers(1, 258)))
         return int(self.pick(sides)), int(self.pick(sides))
 
     def normal(self, *shape: int, scale: float = 1.0) -> Tensor:
@@ -114,8 +116,3 @@ def finite_rows(*tensors: Tensor) -> Tensor:
     for tensor in tensors:
         found &= tensor.detach().cpu().isfinite().reshape(len(tensor), math.prod(tensor.shape[1:])).all(1)
     return found
-
-
-def same(ours: Tensor, other: Tensor) -> bool:
-    """Equal bits, but for the sign of zero; NaN equals NaN."""
-    return ours.shape == other.shape and bool(((ours == other) | (ours.isnan() & other.isnan())).all())

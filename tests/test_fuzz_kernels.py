@@ -1,0 +1,108 @@
+"""Every kernel with anything in its inputs: a slice of the campaign of ``tests/fuzz``, and that it could fail."""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fuzz import campaign, laws
+from fuzz.poison import finite_rows
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import look_at
+
+from scgs_warp.render import draw
+from scgs_warp.types import Camera, Gaussians
+
+CASES = 700
+"""Of the slice: under a minute on two busy cores."""
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="the fence asks the kernel for walls of memory")
+
+
+def run(folder: Path, *options: object) -> tuple[int, dict]:
+    summary = folder / "summary.json"
+    status = campaign.main([*map(str, options), "--summary", str(summary)])
+    return status, json.loads(summary.read_text())
+
+
+@linux
+def test_a_slice_of_the_campaign(device: str, tmp_path: Path):
+    status, summary = run(tmp_path, "--cases", CASES, "--seed", 1_000_000, "--device", device)
+    assert summary["failures"] == [] and status == 0
+    assert summary["cases"] == CASES and len(summary["cases_of"]) >= 25
+
+
+@linux
+@pytest.mark.slow
+def test_the_campaign(device: str, tmp_path: Path):
+    status, summary = run(tmp_path, "--cases", 20_000, "--device", device)
+    assert summary["failures"] == [] and status == 0 and summary["cases"] == 20_000
+
+
+@linux
+def test_a_campaign_can_fail(tmp_path: Path):
+    """What ends the process, hangs, or breaks a law is named, and the cases after it are run."""
+    options = ("--cases", 40, "--seed", 5, "--modules", "fuzz.cases_broken", "--patience", 8)
+    status, summary = run(tmp_path, *options, "--ops", "read", "write", "input", "unwritten", "abort", "fine")
+    assert status == 1 and summary["cases"] == 40
+    found = {failure["op"]: failure["failure"] for failure in summary["failures"]}
+    assert set(found) == {"read", "write", "input", "unwritten", "abort"}
+    assert len(summary["failures"]) == 40 - summary["cases_of"]["fine"]
+    assert "status -11" in found["read"] and "status -6" in found["abort"]
+    assert "past the end of ['values_out']" in found["write"] and "to its input" in found["input"]
+    assert "not finite" in found["unwritten"]
+
+
+@linux
+def test_a_hanging_case_is_named_and_a_campaign_goes_on_where_it_ended(tmp_path: Path):
+    options = ("--seed", 5, "--modules", "fuzz.cases_broken", "--patience", 5)
+    status, summary = run(tmp_path, *options, "--cases", 1, "--ops", "hang")
+    assert status == 1 and "more than 5 s" in summary["failures"][0]["failure"]
+    status, summary = run(tmp_path, *options, "--cases", 3, "--ops", "fine")
+    assert summary["cases_of"] == {"fine": 2, "hang": 1} and status == 1
+    with pytest.raises(SystemExit, match="another campaign"):
+        run(tmp_path, "--seed", 6)
+
+
+def test_a_case_is_its_number():
+    cases = dict.fromkeys("abc", (None, 1.0))
+    first = [campaign.op_of(number, cases) for number in range(200)]
+    assert first == [campaign.op_of(number, cases) for number in range(200)]
+    assert min(first.count(op) for op in "abc") > 40
+
+
+WIDTHS = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh_dc": 3}
+SPECIAL = (0x7FC00000, 0x7F800000, 0xFF800000, 0x7F7FFFFF, 0xFF7FFFFF, 0x80000000, 1, 0x80000001, 0x00800000,
+           *(struct.unpack("I", struct.pack("f", value))[0] for value in (1 / 255, 0.999, 1e-4, 0.01, -1.0)))  # fmt: skip
+BITS = st.one_of(st.sampled_from(SPECIAL), st.integers(0, 2**32 - 1))
+"""As integers: hypothesis cannot draw floats where denormals are flushed."""
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(sorted(WIDTHS)), st.integers(0, 3), BITS), max_size=12), st.data())
+def test_any_bits_in_a_few_gaussians(hits: list[tuple[str, int, int]], data: st.DataObject):
+    """Found cases shrink to the few values that matter. Four Gaussians, the first of which nobody touches."""
+    rng = np.random.default_rng(0)
+    values = {name: torch.from_numpy(rng.normal(size=(5, n)).astype(np.float32)) for name, n in WIDTHS.items()}
+    values["scales"], values["opacities"] = 0.1 * values["scales"].abs(), values["opacities"].abs().clamp(max=0.9)
+    values["means"][0], values["opacities"][0] = 0.0, 0.9
+    for name, row, bits in hits:
+        column = data.draw(st.integers(0, WIDTHS[name] - 1))
+        values[name].view(torch.int32)[row + 1, column] = bits - (bits >> 31 << 32)
+    leaves = [x.requires_grad_() for x in values.values()]
+    fields = [*leaves[:3], leaves[3][:, 0], leaves[4], torch.zeros(5, 0, 3)]
+    view = look_at(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    camera = Camera(view, torch.tensor([[20.0, 0, 9], [0, 20, 8], [0, 0, 1]]), 18, 16)
+    image, alpha = draw(Gaussians(*fields), camera, depth=True)
+    laws.finite("image, alpha", image, alpha)
+    laws.finite("gradients", *torch.autograd.grad((image.sum(), alpha.sum()), leaves))
+    whole = finite_rows(*leaves)
+    alone = draw(Gaussians(*(x[whole] for x in fields)), camera, depth=True)
+    laws.equal("image of the valid alone", image, alone[0])
+    assert bool(alone[1].any())
