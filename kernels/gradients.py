@@ -1,8 +1,8 @@
 """What becomes of gradients that are beyond use: functions for the ends of adjoint kernels.
 
 Extreme values, though finite, have gradients that overflow. Where that happens a Gaussian (or a control point) passes
-none, and what it shares sums with stays finite. A NaN that comes in from a loss is still seen: it goes out with the
-gradients of colours and opacities, which are handed on as they are.
+none, and what it shares sums with stays finite. A NaN that comes in from a loss is not hidden: it goes out with the
+gradients of colours, which are handed on as they are, and of Gaussians whose incoming gradient is not finite.
 """
 
 import warp as wp

@@ -94,7 +94,10 @@ _ADJOINT = (
             v_u[c] = (v_u[c] - u[c] * along_u) * nq;
             rows_of[12 + c] = (v_b[c] - b[c] * along_b) * nb;
         }
-        for (int c = 0; c < 4; ++c) v_u[c] = usable(v_u[c]) ? v_u[c] : (vf){};
+        // What overflows becomes 0; what came in as NaN goes out as NaN.
+        const vi given = usable(v[0]) & usable(v[1]) & usable(v[2])
+            & usable(t[0]) & usable(t[1]) & usable(t[2]) & usable(t[3]);
+        for (int c = 0; c < 4; ++c) v_u[c] = (usable(v_u[c]) | ~given) ? v_u[c] : (vf){};
         write_vectors(v_quats.data, begin, Four{}, v_u);
         transpose(rows_of);  // row l: what Gaussian l's blended motion row receives
         vf v_weight[16], mean = (vf){};
@@ -145,7 +148,7 @@ _ADJOINT = (
                 add4(reach_sum + 8 + h, K, k, part);
             }
         }
-        for (int c = 0; c < 3; ++c) v_x[c] = usable(v_x[c]) ? v_x[c] : (vf){};
+        for (int c = 0; c < 3; ++c) v_x[c] = (usable(v_x[c]) | ~given) ? v_x[c] : (vf){};
         write_vectors(v_means.data, begin, Any{}, v_x);
         for (int d = 0; d < H; ++d) {
             float lanes[16];

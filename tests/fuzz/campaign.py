@@ -2,8 +2,8 @@
 
 A case is its number: the number chooses the op, the sizes and every value (``--cases 1 --seed 1234`` is that one case).
 Cases run in a process of their own, which writes the number down first: one that ends the process, or that does not
-come back, is reported with its number, and the rest go on. The summary is a JSON file; a campaign that was interrupted
-goes on where its summary ends.
+come back, is reported with its number, and the next ones are run. The summary is a JSON file; a campaign that was
+interrupted goes on where its summary ends.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 HERE = Path(__file__).resolve().parent
 MODULES = ("fuzz.cases_render", "fuzz.cases_motion", "fuzz.cases_training", "fuzz.cases_cuda")
 SAVE_EVERY = 5.0
 """Seconds between two summaries."""
-PATIENCE = 240.0
+PATIENCE = 240
 """Seconds that a case may take; the first ones compile kernels."""
 
 
@@ -48,27 +49,17 @@ def op_of(number: int, cases: dict[str, tuple[Any, float]]) -> str:
     return list(cases)[int(np.searchsorted(weights.cumsum(), drawn, side="right"))]
 
 
-def work(first: int, last: int, device: str, modules: list[str], ops: list[str], folder: Path) -> None:
-    """Cases ``first .. last - 1``; what happened goes to ``folder`` as it happens."""
-    import warnings
-
-    import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
-
-    import torch  # isort: skip
-
+def run_cases(first: int, last: int, device: str, cases: dict[str, tuple[Any, float]], folder: Path, patience: int):
+    """Cases ``first .. last - 1``; what happened is in ``folder`` as soon as it has happened."""
     from fuzz.fence import fenced
     from fuzz.poison import Draw
-    from scgs_warp import environment
 
-    environment.configure(threads=1)
-    torch.utils.deterministic.fill_uninitialized_memory = True  # what no kernel has written is NaN
-    warnings.simplefilter("ignore")
-    cases = cases_of(modules, ops)
     place = os.open(folder / "place", os.O_RDWR | os.O_CREAT)
     with open(folder / "done", "a", encoding="utf-8", buffering=1) as done, fenced() as fence:
         for number in range(first, last):
             op = op_of(number, cases)
             os.pwrite(place, f"{number} {op}".ljust(80).encode(), 0)
+            signal.alarm(patience)  # nobody catches it: the process ends, wherever it is
             fence.high, failure = number % 2 == 0, ""
             try:
                 cases[op][0](Draw(number), device)
@@ -78,6 +69,40 @@ def work(first: int, last: int, device: str, modules: list[str], ops: list[str],
                 failure = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
                 fence.held.clear()
             done.write(json.dumps([number, op, failure]) + "\n")
+
+
+def work(own: argparse.Namespace) -> None:
+    """All cases, in children of this process: one that a case ends is followed by another."""
+    import warnings
+
+    import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
+
+    import torch  # isort: skip
+
+    from scgs_warp import environment
+
+    environment.configure(threads=1)
+    torch.utils.deterministic.fill_uninitialized_memory = True  # what no kernel has written is NaN
+    warnings.simplefilter("ignore")
+    folder: Path = own.worker
+    cases, first, last = cases_of(own.modules, own.ops), own.seed, own.seed + own.cases
+    while first < last:
+        child = os.fork()
+        if child == 0:
+            run_cases(first, last, own.device, cases, folder, own.patience)
+            os._exit(0)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if status == 0:
+            return
+        number, _, op = (folder / "place").read_text(encoding="utf-8").strip().partition(" ")
+        if not number or int(number) < first:
+            sys.exit(f"a worker ended with status {status} outside any case")
+        failure = f"ended the process with status {status}"
+        if status == -signal.SIGALRM:
+            failure = f"took more than {own.patience} s"
+        with open(folder / "done", "a", encoding="utf-8") as done:
+            done.write(json.dumps([int(number), op, failure]) + "\n")
+        first = int(number) + 1
 
 
 class Campaign:
@@ -129,57 +154,47 @@ class Campaign:
             print(f"case {number}, {op}: {failure}", flush=True)
 
 
-def start(campaign: Campaign, folder: Path) -> subprocess.Popen[bytes]:
+def run(campaign: Campaign) -> None:
+    """The rest of the campaign, in a process of its own."""
     own = campaign.arguments
-    command = [sys.executable, str(HERE / "campaign.py"), "--worker", str(folder), "--seed", str(campaign.next)]
-    command += ["--cases", str(campaign.end - campaign.next), "--device", own.device, "--modules", *own.modules]
-    if own.ops:
-        command += ["--ops", *own.ops]
-    path = os.pathsep.join([str(HERE.parent), str(HERE.parent.parent), os.environ.get("PYTHONPATH", "")])
-    (folder / "done").write_text("", encoding="utf-8")
-    (folder / "place").write_text("", encoding="utf-8")
-    with open(folder / "errors", "wb") as errors:
-        return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stderr=errors)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        command = [sys.executable, str(HERE / "campaign.py"), "--worker", name, "--seed", str(campaign.next)]
+        command += ["--cases", str(campaign.end - campaign.next), "--device", own.device]
+        command += ["--patience", str(own.patience), "--modules", *own.modules, "--ops", *own.ops]
+        path = os.pathsep.join([str(HERE.parent), str(HERE.parent.parent), os.environ.get("PYTHONPATH", "")])
+        (folder / "done").touch()
+        with open(folder / "errors", "wb") as errors, open(folder / "done", encoding="utf-8") as done:
+            worker = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stderr=errors)
+            try:
+                follow(campaign, worker, done)
+            finally:
+                worker.kill()
+                worker.wait()
+        if campaign.next < campaign.end:
+            tail = (folder / "errors").read_text(encoding="utf-8", errors="replace")[-2000:]
+            raise SystemExit(f"the worker ended with status {worker.returncode}:\n{tail}")
 
 
-def watch(campaign: Campaign, folder: Path, worker: subprocess.Popen[bytes]) -> None:
-    """Until the worker has ended, by itself or since a case took too long."""
-    begun = moved = saved = time.monotonic()
-    seconds, place, read = campaign.seconds, "", 0
-    while True:
-        ended = worker.poll() is not None
-        with open(folder / "done", encoding="utf-8") as done:
-            done.seek(read)
-            text = done.read()
-        whole = text[: text.rfind("\n") + 1]
-        read += len(whole.encode())
-        campaign.take(whole.splitlines())
-        now, at = time.monotonic(), (folder / "place").read_text(encoding="utf-8").strip()
-        campaign.seconds = seconds + now - begun
-        if at != place:
-            place, moved = at, now
-        hangs = now - moved > (campaign.arguments.patience if place else PATIENCE)  # it starts: imports, a compiler
-        if now - saved > SAVE_EVERY:
-            saved = now
-            campaign.save()
-            print(f"{campaign.next:,} of {campaign.end:,}, {len(campaign.failures)} failures", flush=True)
-        if ended or hangs:
-            break
-        time.sleep(0.05)
-    if hangs and not ended:
-        worker.send_signal(signal.SIGKILL)
-        worker.wait()
-    if campaign.next < campaign.end:
-        _blame(campaign, folder, worker.returncode, place, hangs)
+def follow(campaign: Campaign, worker: subprocess.Popen[bytes], done: TextIO) -> None:
+    """Take what the worker has done until it has ended."""
+    from scgs_warp.progress import progress
 
-
-def _blame(campaign: Campaign, folder: Path, code: int, place: str, hangs: bool) -> None:
-    number, _, op = place.partition(" ")
-    if not number or int(number) < campaign.next:
-        tail = (folder / "errors").read_text(encoding="utf-8", errors="replace")[-2000:]
-        raise SystemExit(f"the worker ended with status {code} outside any case:\n{tail}")
-    how = f"took more than {campaign.arguments.patience:g} s" if hangs else f"ended the process with status {code}"
-    campaign.add(int(number), op, how)
+    begun = saved = time.monotonic()
+    seconds, rest = campaign.seconds, ""
+    with progress(campaign.arguments.cases, "fuzzing", start=campaign.next - campaign.arguments.seed) as bar:
+        ended = False
+        while not ended:
+            ended = worker.poll() is not None
+            lines = (rest + done.read()).split("\n")
+            rest, before = lines.pop(), campaign.next
+            campaign.take(lines)
+            bar.advance(campaign.next - before, failures=len(campaign.failures))
+            campaign.seconds = seconds + time.monotonic() - begun
+            if time.monotonic() - saved > SAVE_EVERY:
+                saved = time.monotonic()
+                campaign.save()
+            time.sleep(0.0 if ended else 0.1)
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -189,7 +204,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--device", default="cpu", help="cpu, where memory is fenced, or cuda")
     parser.add_argument("--ops", nargs="*", default=[], help="only these")
     parser.add_argument("--summary", type=Path, default=Path("fuzz-kernels.json"), help="where the summary goes")
-    parser.add_argument("--patience", type=float, default=PATIENCE, help="seconds a case may take")
+    parser.add_argument("--patience", type=int, default=PATIENCE, help="seconds a case may take")
     parser.add_argument("--modules", nargs="*", default=list(MODULES), help=argparse.SUPPRESS)
     parser.add_argument("--worker", type=Path, default=None, help=argparse.SUPPRESS)
     return parser.parse_args(arguments)
@@ -198,16 +213,14 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> int:
     own = parse(arguments)
     if own.worker is not None:
-        work(own.seed, own.seed + own.cases, own.device, own.modules, own.ops, own.worker)
+        work(own)
         return 0
-    import tempfile
-
     campaign = Campaign(own)
-    with tempfile.TemporaryDirectory() as folder:
-        while campaign.next < campaign.end:
-            watch(campaign, Path(folder), start(campaign, Path(folder)))
-            campaign.save()
-    summary = campaign.save()
+    try:
+        if campaign.next < campaign.end:
+            run(campaign)
+    finally:
+        summary = campaign.save()
     print(f"{summary['cases']:,} cases, {len(summary['failures'])} failures, {summary['seconds']:g} s; {own.summary}")
     return 1 if summary["failures"] else 0
 

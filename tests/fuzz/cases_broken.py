@@ -42,8 +42,7 @@ def write_input(first: int, values_in: wp.array[float]):
 
 
 def case_read(d: Draw, device: str) -> None:
-    """A page further than the array: where it ends at the wall that is beyond it."""
-    d.chance()
+    """Beyond the array, on the side of the wall that is up."""
     launch(read_beyond, 16, 16 if d.seed % 2 == 0 else -16, torch.ones(16), torch.empty(16))
 
 
@@ -73,12 +72,17 @@ def case_fine(d: Draw, device: str) -> None:
     laws.finite("values", d.normal(5))
 
 
+# Compiled before there is anything to be in time for.
+launch(write_beyond, 1, 0, torch.ones(1))
+launch(read_beyond, 1, 0, torch.ones(1), torch.ones(1))
+launch(write_input, 1, torch.ones(1))
+
 CASES = {
-    "read": (case_read, 1),
+    "read": (case_read, 0.15),
     "write": (case_write, 1),
     "input": (case_input, 1),
     "unwritten": (case_unwritten, 1),
-    "abort": (case_abort, 1),
-    "hang": (case_hang, 1),
+    "abort": (case_abort, 0.15),
+    "hang": (case_hang, 0.15),
     "fine": (case_fine, 1),
 }

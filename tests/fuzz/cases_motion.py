@@ -1,4 +1,4 @@
-"""Cases of what moves: neighbours, weights, skinning, rigidity, planes, networks, and the densification of what moved."""
+"""Cases of what moves: neighbours, weights, skinning, rigidity, sampling, planes and networks."""
 
 from __future__ import annotations
 

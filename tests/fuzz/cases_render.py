@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from splats import random_splats
 from torch import Tensor
 
 import scgs_warp
@@ -17,7 +18,6 @@ from scgs_warp.ops.projection import project
 from scgs_warp.render import draw as draw_image
 from scgs_warp.render import render
 from scgs_warp.types import Camera, Gaussians, Splats, Stats
-from splats import random_splats
 
 from . import laws
 from .poison import Draw, finite_rows
@@ -161,8 +161,9 @@ def case_binning(d: Draw, device: str) -> None:
     broken = ~finite_rows(*(getattr(splats, name) for name in FIELDS[:4]))
     assert not bool(broken[tiles.splats.cpu().long()].any()), "a broken splat is in a tile"
     size = (splats.width, splats.height, tiles.columns, tiles.rows, tile_size)
+    ours_of = (tiles.ranges, tiles.splats, tiles.slots, tiles.offsets)
     for lists in (_bin_by_bands, bin_by_radix) if device == "cpu" else (bin_by_radix,):
-        for ours, other in zip((tiles.ranges, tiles.splats, tiles.slots, tiles.offsets), lists(geometry_of(splats), size)):
+        for ours, other in zip(ours_of, lists(geometry_of(splats), size)):
             assert torch.equal(ours, other), f"{lists.__name__} differs"
     if tile_size == 16:
         room = max(1, len(tiles.splats) + int(d.rng.integers(-3, 4)))

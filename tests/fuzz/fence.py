@@ -1,5 +1,5 @@
-"""Memory with walls: inside :func:`fenced` every array that a CPU kernel is given ends (or begins) at a page that nobody
-may touch, so that an access out of bounds ends the process at once, wherever it leads.
+"""Memory with walls: inside :func:`fenced` every array that a CPU kernel is given ends (or begins) at a page that
+nobody may touch, so that an access out of bounds ends the process at once, wherever it leads.
 
 What lies between an array's last byte and the wall (it is less than a cache line, as kernels may rely on torch's
 alignment) is filled with ones, which read as NaN or -1, and looked at afterwards. Arrays that a kernel calls ``*_in``

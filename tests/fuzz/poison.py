@@ -56,7 +56,8 @@ class Draw:
         """0, 1, a register less or more one, a few, and now and then many."""
         if self.chance(0.01):
             return int(self.rng.integers(1000, 5000))
-        return int(self.pick((0, 1, 2, 3, 15, 16, 17, 31, 32, 33, 40, 64, 65, 100, 200, int(self.rng.integers(1, 600)))))
+        few = (0, 1, 2, 3, 15, 16, 17, 31, 32, 33, 40, 64, 65, 100, 200, int(self.rng.integers(1, 600)))
+        return int(self.pick(few))
 
     def size(self) -> tuple[int, int]:
         """Width and height, 1 x 1 to 257 x 257; most are small, tiles' borders are favoured."""
