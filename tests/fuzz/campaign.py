@@ -77,6 +77,11 @@ def work(own: argparse.Namespace) -> None:
 
     import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
 
+    if own.debug:
+        import warp as wp
+
+        wp.config.mode = "debug"  # Warp checks every index; the first that is out of range ends the process
+
     import torch  # isort: skip
 
     from scgs_warp import environment
@@ -162,6 +167,7 @@ def run(campaign: Campaign) -> None:
         command = [sys.executable, str(HERE / "campaign.py"), "--worker", name, "--seed", str(campaign.next)]
         command += ["--cases", str(campaign.end - campaign.next), "--device", own.device]
         command += ["--patience", str(own.patience), "--modules", *own.modules, "--ops", *own.ops]
+        command += ["--debug"] if own.debug else []
         path = os.pathsep.join([str(HERE.parent), str(HERE.parent.parent), os.environ.get("PYTHONPATH", "")])
         (folder / "done").touch()
         with open(folder / "errors", "wb") as errors, open(folder / "done", encoding="utf-8") as done:
@@ -205,6 +211,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--ops", nargs="*", default=[], help="only these")
     parser.add_argument("--summary", type=Path, default=Path("fuzz-kernels.json"), help="where the summary goes")
     parser.add_argument("--patience", type=int, default=PATIENCE, help="seconds a case may take")
+    parser.add_argument("--debug", action="store_true", help="compile kernels with checked indices (takes minutes)")
     parser.add_argument("--modules", nargs="*", default=list(MODULES), help=argparse.SUPPRESS)
     parser.add_argument("--worker", type=Path, default=None, help=argparse.SUPPRESS)
     return parser.parse_args(arguments)
