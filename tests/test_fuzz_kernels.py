@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 import sys
 from pathlib import Path
@@ -10,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from edit_scenes import bar_scene
 from fuzz import campaign, laws
 from fuzz.poison import finite_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import look_at, random_camera, random_gaussians
 
+from scgs_warp.errors import UserError
 from scgs_warp.ops.projection import project
 from scgs_warp.ops.skinning import skin, skin_rbf
 from scgs_warp.render import draw
@@ -103,6 +106,18 @@ def test_a_nan_from_the_loss_is_not_hidden(device: str):
         v_means[7] = torch.nan
         v_rest = torch.autograd.grad(means_t, leaves[0], v_means)[0]
         assert bool(v_rest[7].isnan().all()) and not bool(v_rest[:7].any() | v_rest[8:].any())
+
+
+@pytest.mark.parametrize("time", [math.nan, math.inf, -math.inf])
+def test_a_time_that_is_none_is_refused_in_one_line(time: float):
+    scene, camera = bar_scene(nodes=8, gaussians=20), random_camera(0, 9, 8)
+    for call in (scene.gaussians_at, scene.control_points_at, lambda t: scene.render(camera, t)):
+        with pytest.raises(UserError, match=f"time is {time}; give a number from 0") as caught:
+            call(time)
+        assert "\n" not in str(caught.value)
+    for outside, inside in ((-3.0, 0.0), (1e38, 1.0)):
+        assert torch.equal(scene.gaussians_at(outside).means, scene.gaussians_at(inside).means)
+        assert torch.equal(scene.control_points_at(outside), scene.control_points_at(inside))
 
 
 WIDTHS = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh_dc": 3}
