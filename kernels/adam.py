@@ -15,10 +15,15 @@ wp.set_module_options({"enable_backward": False})
 
 CHUNK = 4096
 """Elements of a chunk."""
+LARGEST = wp.constant(1.0e19)
+"""A gradient beyond this counts as this: its square would overflow, and the value never move again."""
 _CHUNK = wp.constant(CHUNK)
 
 _STEP = """
         vf g = load(gradient + at, n), m = load(average + at, n), v = load(square + at, n);
+        const vi finite = __builtin_elementwise_abs(g) < __builtin_inff();  // what is not is the caller's to find
+        g = (finite & (g > LARGEST)) ? ZERO + LARGEST : g;
+        g = (finite & (g < -LARGEST)) ? ZERO - LARGEST : g;
         m = m + one_beta1 * (g - m);
         v = beta2 * v + one_beta2 * (g * g);
         vf p = load(value + at, n);
@@ -31,6 +36,7 @@ _STEP = """
 _ADAM = f"""
 #if !defined(__CUDA_ARCH__)
     {SIMD}
+    const float LARGEST = {float(LARGEST)!r}f;
     const long long tensor = chunks.data[2 * chunk], begin = chunks.data[2 * chunk + 1];
     float* value = (float*)addresses.data[4 * tensor];
     const float* gradient = (const float*)addresses.data[4 * tensor + 1];
@@ -133,6 +139,8 @@ def adam(
     averages = wp.array(ptr=wp.uint64(addresses_in[tensor, 2]), shape=(size,), dtype=float)
     squares = wp.array(ptr=wp.uint64(addresses_in[tensor, 3]), shape=(size,), dtype=float)
     g = gradients[at]
+    if wp.isfinite(g):  # what is not is the caller's to find
+        g = wp.clamp(g, -LARGEST, LARGEST)
     m = averages[at] + one_beta1 * (g - averages[at])
     v = beta2 * squares[at] + one_beta2 * (g * g)
     averages[at] = m

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from .gradients import beyond
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -95,7 +97,8 @@ def arap_energy_adjoint(
     v_rest_out: wp.array[wp.vec3],  # [M]
     v_posed_out: wp.array[wp.vec3],  # [M]
 ):
-    """Gradients of one node: over the edges that leave it, then over those that lead to it."""
+    """Gradients of one node: over the edges that leave it, then over those that lead to it. Edges whose gradient would
+    overflow, or is none as an end is not finite, are left out."""
     m = first + wp.tid()
     J = neighbors_in.shape[1]
     v_rest = wp.vec3(0.0)
@@ -105,14 +108,16 @@ def arap_energy_adjoint(
         if n >= 0:
             e = residual(rest_in[m], posed_in[m], rest_in[n], posed_in[n], rotations_in[m])
             v = 2.0 * v_energies_in[m] * weights_in[m, j] * e
-            v_posed -= v
-            v_rest += wp.transpose(rotations_in[m]) * v
+            if beyond(v) == 0:
+                v_posed -= v
+                v_rest += wp.transpose(rotations_in[m]) * v
     for at in range(begin_in[m], begin_in[m + 1]):
         edge = order_in[at]
         i = edge // J
         e = residual(rest_in[i], posed_in[i], rest_in[m], posed_in[m], rotations_in[i])
         v = 2.0 * v_energies_in[i] * weights_in[i, edge - i * J] * e
-        v_posed += v
-        v_rest -= wp.transpose(rotations_in[i]) * v
+        if beyond(v) == 0:
+            v_posed += v
+            v_rest -= wp.transpose(rotations_in[i]) * v
     v_rest_out[m] = v_rest
     v_posed_out[m] = v_posed

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from .types import ALPHA_MAX, ALPHA_MIN, SLOT_GEOMETRY, TRANSMITTANCE_MIN
+from .gradients import passed
+from .types import ALPHA_MAX, ALPHA_MIN, CHANNEL_MAX, SLOT_GEOMETRY, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,12 +32,12 @@ def finite_opacities(
     opacities_in: wp.array[float],  # [N]
     channels_in: wp.array2d[float],  # [N, C]
     # Out:
-    opacities_out: wp.array[float],  # [N] zero where a channel is not finite, so that no form ever adds it
+    opacities_out: wp.array[float],  # [N] zero where a channel is not usable, so that no form ever adds it
 ):
     i = first + wp.tid()
     finite = bool(True)
     for c in range(channels_in.shape[1]):
-        finite = finite and wp.isfinite(channels_in[i, c])
+        finite = finite and wp.abs(channels_in[i, c]) <= CHANNEL_MAX
     opacity = float(0.0)
     if finite:
         opacity = opacities_in[i]
@@ -221,11 +222,11 @@ def sum_slots(
         absolute += wp.vec2(v_slots_in[s, 6], v_slots_in[s, 7])
         for c in range(v_channels_out.shape[1]):
             v_channels_out[i, c] = v_channels_out[i, c] + v_slots_in[s, SLOT_GEOMETRY + c]
-    v_means2d_out[i] = v_mean
-    v_conics_out[i] = v_conic
-    v_opacities_out[i] = v_opacity
+    v_means2d_out[i] = passed(v_mean)
+    v_conics_out[i] = passed(v_conic)
+    v_opacities_out[i] = passed(v_opacity)
     if absgrad_out.shape[0] > 0:
-        absgrad_out[i] = absolute
+        absgrad_out[i] = passed(absolute)
 
 
 SLOT_WIDTH = 16
@@ -263,11 +264,11 @@ def sum_line_slots(
             total[SLOT_GEOMETRY + c] = v_channels_out[i, c]
     for s in range(int(offsets_in[i]), int(offsets_in[i + 1])):
         total += v_slots_in[s]
-    v_means2d_out[i] = wp.vec2(total[0], total[1])
-    v_conics_out[i] = wp.vec3(total[2], total[3], total[4])
-    v_opacities_out[i] = total[5]
+    v_means2d_out[i] = passed(wp.vec2(total[0], total[1]))
+    v_conics_out[i] = passed(wp.vec3(total[2], total[3], total[4]))
+    v_opacities_out[i] = passed(total[5])
     if absgrad_out.shape[0] > 0:
-        absgrad_out[i] = wp.vec2(total[6], total[7])
+        absgrad_out[i] = passed(wp.vec2(total[6], total[7]))
     for c in range(v_channels_out.shape[1]):
         v_channels_out[i, c] = total[SLOT_GEOMETRY + c]
 
@@ -291,7 +292,9 @@ def add_stats(
         return
     v = v_means2d_in[i]
     ndc = wp.vec2(v[0] * 0.5 * float(width), v[1] * 0.5 * float(height))
-    grad_norm_out[i] = grad_norm_out[i] + wp.length(ndc)
+    norm = wp.length(ndc)
+    if wp.isfinite(norm):  # else its square overflows
+        grad_norm_out[i] = grad_norm_out[i] + norm
     count_out[i] = count_out[i] + 1.0
     max_radii_out[i] = wp.max(max_radii_out[i], float(radius) / float(wp.max(width, height)))
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from .simd import LANE_SUMS, SIMD
-from .types import ALPHA_MAX, TRANSMITTANCE_MIN
+from .types import ALPHA_MAX, CHANNEL_MAX, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,7 +49,7 @@ def pack_splats(
     factor = float(-0.5 * _LOG2_E)
     count = channels_in.shape[1]
     for c in range(count):
-        if not wp.isfinite(channels_in[i, c]):
+        if not wp.abs(channels_in[i, c]) <= CHANNEL_MAX:
             opacity = float(0.0)  # never added: see compositing.finite_opacities
         packed_out[i, PACKED_GEOMETRY + c] = channels_in[i, c]
     for c in range(PACKED_GEOMETRY + count, packed_out.shape[1]):
@@ -156,7 +156,7 @@ _FORWARD = (
                     const int k = __builtin_ctz(hits);
                     const Splat& g = chunk[k];
                     const vf power = power_of(LANE - g.mx, g.a, ((const float*)&g.bdy)[r], ((const float*)&g.cdy2)[r]);
-                    const vi skip = (power > 0.0f) | (power < g.floor);
+                    const vi skip = ~((power <= 0.0f) & (power >= g.floor));  // NaN too: infinities may cancel
                     vf alpha = exp2v(power + g.log2_opacity);
                     alpha = alpha > ALPHA_MAX ? ZERO + ALPHA_MAX : alpha;
                     alpha = skip ? ZERO : alpha;
@@ -251,7 +251,7 @@ _ADJOINT = (
                 rows &= rows - 1u;
                 const float dy = dys[r];
                 const vf power = power_of(dx, g.a, bdy[r], cdy2[r]);
-                const vi skip = (power > 0.0f) | (power < g.floor) | (ends[r] <= p);
+                const vi skip = ~((power <= 0.0f) & (power >= g.floor)) | (ends[r] <= p);
                 const vf raw = exp2v(power + g.log2_opacity);
                 vf alpha = raw > ALPHA_MAX ? ZERO + ALPHA_MAX : raw;
                 alpha = skip ? ZERO : alpha;

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from .gradients import beyond
+
 wp.set_module_options({"enable_backward": False})
 
 C0 = wp.constant(0.28209479177387814)
@@ -29,6 +31,18 @@ def view_ray(mean: wp.vec3, camera: wp.vec3):
     return direction, inverse
 
 
+@wp.func
+def not_negative(color: float) -> float:
+    """A negative colour is 0; what is not finite stays so, as a mark: compositing leaves such a splat out."""
+    return wp.where(color > 0.0, color, color - color)
+
+
+@wp.func
+def passed(color: float, v: float) -> float:
+    """The gradient that a colour lets through: none where it was clamped or is not finite."""
+    return wp.where(color > 0.0 and wp.isfinite(color), v, 0.0)
+
+
 @wp.kernel
 def spherical_harmonics(
     first: int,
@@ -40,7 +54,7 @@ def spherical_harmonics(
     camera_in: wp.array[wp.vec3],  # [1] centre of projection
     degree: int,
     # Out:
-    colors_out: wp.array[wp.vec3],  # [N] >= 0
+    colors_out: wp.array[wp.vec3],  # [N] >= 0, or not finite where a coefficient is not
 ):
     i = first + wp.tid()
     k = i * rest
@@ -72,12 +86,7 @@ def spherical_harmonics(
                     + (C3Z * z * (xx - yy)) * sh_rest_in[k + 13]
                     + (C33 * x * (3.0 * yy - xx)) * sh_rest_in[k + 14]
                 )
-    # A comparison with NaN is false: a broken coefficient is black.
-    colors_out[i] = wp.vec3(
-        wp.where(color[0] > 0.0, color[0], 0.0),
-        wp.where(color[1] > 0.0, color[1], 0.0),
-        wp.where(color[2] > 0.0, color[2], 0.0),
-    )
+    colors_out[i] = wp.vec3(not_negative(color[0]), not_negative(color[1]), not_negative(color[2]))
 
 
 @wp.kernel
@@ -102,11 +111,7 @@ def spherical_harmonics_adjoint(
     k = i * rest
     color = colors_in[i]
     v = v_colors_in[i]
-    v = wp.vec3(
-        wp.where(color[0] > 0.0, v[0], 0.0),
-        wp.where(color[1] > 0.0, v[1], 0.0),
-        wp.where(color[2] > 0.0, v[2], 0.0),
-    )
+    v = wp.vec3(passed(color[0], v[0]), passed(color[1], v[1]), passed(color[2], v[2]))
     v_sh_dc_out[i] = C0 * v
     if has_means != 0:
         v_means_out[i] = wp.vec3(0.0)
@@ -173,4 +178,6 @@ def spherical_harmonics_adjoint(
             s10 * x * y - 10.0 * z * (s11 * y + s13 * x) + s12 * (5.0 * zz - 1.0) + s14 * (xx - yy),
         )
     # The direction is normalised: only what is perpendicular to it moves it.
-    v_means_out[i] = inverse * (g - wp.dot(g, d) * d)
+    v_mean = inverse * (g - wp.dot(g, d) * d)
+    if beyond(v_mean) == 0:
+        v_means_out[i] = v_mean  # else it overflows: none

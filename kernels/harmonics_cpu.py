@@ -11,6 +11,7 @@ import warp as wp
 
 from . import harmonics
 from .skinning_simd import SIMD
+from .types import GRADIENT_MAX
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,7 +25,7 @@ _CONSTANTS = ", ".join(
 _PRELUDE = f"""
 #if !defined(__CUDA_ARCH__)
     {SIMD}
-    const float {_CONSTANTS};
+    const float {_CONSTANTS}, GRADIENT_MAX = {float(GRADIENT_MAX)!r}f;
     const vf ZERO = {{}};
     const int total = means.shape.dims[0], n = total - begin < 16 ? total - begin : 16;
     const int used = degree == 0 ? 0 : degree == 1 ? 9 : degree == 2 ? 24 : 45;  // floats of a Gaussian's coefficients
@@ -61,7 +62,7 @@ _PRELUDE = f"""
     read3(means.data, mean);
     const vf ox = mean[0] - camera.data[0][0], oy = mean[1] - camera.data[0][1], oz = mean[2] - camera.data[0][2];
     const vf squared = ox * ox + oy * oy + oz * oz;
-    const vf inverse = (squared > 0.0f) & (squared < infinity) ? 1.0f / __builtin_elementwise_sqrt(squared) : ZERO;
+    const vf inverse = ((squared > 0.0f) & (squared < infinity)) ? 1.0f / __builtin_elementwise_sqrt(squared) : ZERO;
     const vi seen = inverse > 0.0f;
     const vf x = seen ? inverse * ox : ZERO, y = seen ? inverse * oy : ZERO, z = seen ? inverse * oz : ZERO;
     const vf xx = x * x, yy = y * y, zz = z * z;
@@ -92,7 +93,7 @@ _FORWARD = (
         transpose(sums);
         for (int c = 0; c < 3; ++c) color[c] += sums[c] + sums[3 + c] + sums[6 + c] + sums[9 + c] + sums[12 + c];
     }
-    for (int c = 0; c < 3; ++c) color[c] = color[c] > 0.0f ? color[c] : ZERO;  // NaN: black
+    for (int c = 0; c < 3; ++c) color[c] = color[c] > 0.0f ? color[c] : color[c] - color[c];  // 0; NaN stays NaN
     write3(colors.data, color);
 #endif
 """
@@ -105,7 +106,7 @@ _ADJOINT = (
     read3(colors.data, color);
     read3(v_colors.data, v);
     for (int c = 0; c < 3; ++c) {
-        v[c] = color[c] > 0.0f ? v[c] : ZERO;
+        v[c] = ((color[c] > 0.0f) & (color[c] < infinity)) ? v[c] : ZERO;
         v_dc[c] = C0 * v[c];
     }
     write3(v_sh_dc.data, v_dc);
@@ -152,6 +153,9 @@ _ADJOINT = (
     v_mean[0] = live ? inverse * (gx - along * x) : ZERO;
     v_mean[1] = live ? inverse * (gy - along * y) : ZERO;
     v_mean[2] = live ? inverse * (gz - along * z) : ZERO;
+    auto usable = [&](vf v) INLINE -> vi { return __builtin_elementwise_abs(v) <= GRADIENT_MAX; };
+    const vi whole = usable(v_mean[0]) & usable(v_mean[1]) & usable(v_mean[2]);  // else it overflows: none
+    for (int c = 0; c < 3; ++c) v_mean[c] = whole ? v_mean[c] : ZERO;
     write3(v_means.data, v_mean);
 #endif
 """
@@ -186,7 +190,7 @@ def spherical_harmonics_lanes(
     camera_in: wp.array[wp.vec3],  # [1] centre of projection
     degree: int,
     # Out:
-    colors_out: wp.array[wp.vec3],  # [N] >= 0
+    colors_out: wp.array[wp.vec3],  # [N] >= 0, or not finite where a coefficient is not
 ):
     """Gaussians ``16 i .. 16 i + 15``."""
     _harmonics((first + wp.tid()) * LANES, sh_dc_in, sh_rest_in, rest, means_in, camera_in, degree, colors_out)

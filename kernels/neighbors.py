@@ -7,6 +7,8 @@ same with SIMD.
 
 import warp as wp
 
+from .gradients import passed
+
 wp.set_module_options({"enable_backward": False})
 
 MAX_NEIGHBORS = 16
@@ -128,6 +130,8 @@ def rbf_weights_adjoint(
             v = v / (r * r)
             for d in range(nodes_in.shape[1]):
                 v_points_out[i, d] = v_points_out[i, d] - v * (points_in[i, d] - nodes_in[m, d])
+    for d in range(nodes_in.shape[1]):
+        v_points_out[i, d] = passed(v_points_out[i, d])
 
 
 @wp.func
@@ -198,17 +202,17 @@ def rbf_finish(
     v_radius = float(0.0)
     if v_d2 != 0.0:
         v_radius = v_d2 / (r * r * r)
-    v_radii_out[m] = v_radius
+    v_radii_out[m] = passed(v_radius)
     for d in range(v_nodes_out.shape[1]):
         v_x = float(0.0)
         for c in range(chunks):
             v_x += sums_in[c * M + m, 2 + d]
         if v_x != 0.0:
             v_x = v_x / (r * r)
-        v_nodes_out[m, d] = v_x
+        v_nodes_out[m, d] = passed(v_x)
     if has_strengths != 0:
         s = strengths_in[m]
         v_strength = float(0.0)
         if s > MIN_STRENGTH:
             v_strength = v / s
-        v_strengths_out[m] = v_strength
+        v_strengths_out[m] = passed(v_strength)

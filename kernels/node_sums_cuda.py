@@ -77,7 +77,7 @@ def skin_segments(
             blend = wp.vec4(0.0)
             scale = wp.vec3(0.0)
         x = means_in[i]
-        if finite(x) and finite(quats_in[i]):
+        if finite(v_blends_in[i]):
             w = weights_in[i, k]
             v = w * v_means_in[i]
             G += wp.outer(v, x - nodes_in[m])

@@ -8,6 +8,7 @@ pass could have stored costs more.
 
 import warp as wp
 
+from .gradients import beyond
 from .quaternion import quat_inverse_norm, quat_matrix, quat_matrix_adjoint, quat_normalise, quat_normalise_adjoint
 from .types import ALPHA_MIN
 
@@ -227,7 +228,6 @@ def project_adjoint(
     v_xx, v_xy, v_yy, v_opacity = covariance2d_adjoint(
         fp.row_x, fp.row_y, eps2d, antialiased, opacities_in[i], v_conics_in[i], v_opacities_in[i]
     )
-    v_opacities_out[i] = v_opacity
     v_row_x = 2.0 * v_xx * fp.row_x + v_xy * fp.row_y
     v_row_y = 2.0 * v_yy * fp.row_y + v_xy * fp.row_x
 
@@ -236,7 +236,7 @@ def project_adjoint(
     axis_y = fp.scale[1] * v_row_y
     forward = -fp.slope[0] * axis_x - fp.slope[1] * axis_y
     v_scaled = wp.matrix_from_rows(axis_x, axis_y, forward)
-    v_scales_out[i] = wp.vec3(
+    v_scale = wp.vec3(
         axis_x[0] * fp.axes[0, 0] + axis_y[0] * fp.axes[1, 0] + forward[0] * fp.axes[2, 0],
         axis_x[1] * fp.axes[0, 1] + axis_y[1] * fp.axes[1, 1] + forward[1] * fp.axes[2, 1],
         axis_x[2] * fp.axes[0, 2] + axis_y[2] * fp.axes[1, 2] + forward[2] * fp.axes[2, 2],
@@ -244,7 +244,7 @@ def project_adjoint(
     v_axes = v_scaled * wp.diag(scale)
     rotation = view_rotation(view)
     v_unit = quat_matrix_adjoint(unit, wp.transpose(rotation) * v_axes)
-    v_quats_out[i] = quat_normalise_adjoint(quat, v_unit)
+    v_quat = quat_normalise_adjoint(quat, v_unit)
 
     # slope = point.xy / z (clamped), scale = f / z, mean2d = scale point.xy + centre
     near = 1.0 / fp.point[2]
@@ -256,12 +256,33 @@ def project_adjoint(
     v_y = v_mean2d[1] * fp.scale[1] + v_slope_y * near
     # Every term but depth falls with 1 / z. (row / scale) scale' = -row / z.
     v_z = -near * (v_x * fp.point[0] + v_y * fp.point[1] + wp.dot(v_row_x, fp.row_x) + wp.dot(v_row_y, fp.row_y))
+    v_depth = float(0.0)
     if v_depths_in:
-        v_z += v_depths_in[i]
+        v_depth = v_depths_in[i]
+    v_z += v_depth
     v_point = wp.vec3(v_x, v_y, v_z)
-    v_means_out[i] = wp.transpose(rotation) * v_point
+    v_mean = wp.transpose(rotation) * v_point
+    v_rotation = wp.mat33(0.0)
     if has_view != 0:
         v_rotation = wp.outer(v_point, mean) + v_axes * wp.transpose(quat_matrix(unit))
+
+    # Where usable gradients become others (an overflow), none is passed; what came in as NaN goes out as NaN.
+    given = beyond(v_mean2d[0]) + beyond(v_mean2d[1]) + beyond(v_depth) + beyond(v_opacities_in[i])
+    given += beyond(v_conics_in[i])
+    made = beyond(v_opacity) + beyond(v_mean) + beyond(v_scale) + beyond(v_quat) + beyond(v_point)
+    made += beyond(v_rotation[0]) + beyond(v_rotation[1]) + beyond(v_rotation[2])
+    if given == 0 and made > 0:
+        v_mean = wp.vec3(0.0)
+        v_quat = wp.vec4(0.0)
+        v_scale = wp.vec3(0.0)
+        v_opacity = 0.0
+        v_point = wp.vec3(0.0)
+        v_rotation = wp.mat33(0.0)
+    v_means_out[i] = v_mean
+    v_quats_out[i] = v_quat
+    v_scales_out[i] = v_scale
+    v_opacities_out[i] = v_opacity
+    if has_view != 0:
         for column in range(3):
             v_views_out[i, column] = wp.vec3(v_rotation[0, column], v_rotation[1, column], v_rotation[2, column])
         v_views_out[i, 3] = v_point

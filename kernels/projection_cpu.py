@@ -6,7 +6,7 @@ import warp as wp
 
 from .projection import FRUSTUM_MARGIN, RADIUS_MAX
 from .simd import SIMD
-from .types import ALPHA_MIN
+from .types import ALPHA_MIN, GRADIENT_MAX
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,6 +17,7 @@ _PRELUDE = f"""
     {SIMD}
     const float ALPHA_MIN = {float(ALPHA_MIN)!r}f, MARGIN = {float(FRUSTUM_MARGIN)!r}f;
     const float RADIUS_MAX = {float(RADIUS_MAX)!r}f, INFINITE = __builtin_inff();
+    const float GRADIENT_MAX = {float(GRADIENT_MAX)!r}f;
     const vf ONE = ZERO + 1.0f;
     const int total = means.shape.dims[0], n = total - begin < 16 ? total - begin : 16;
     // Rows of C floats to C vectors with a Gaussian a lane, and back; lanes past the end are 0.
@@ -204,12 +205,24 @@ _ADJOINT = (
     const vf v_x = v_mean2d[0] * scale_x + v_slope_x * near, v_y = v_mean2d[1] * scale_y + v_slope_y * near;
     // Every term but depth falls with 1 / z. (row / scale) scale' = -row / z.
     const vf v_z = v_depth[0] - near * (v_x * point[0] + v_y * point[1] + dot(v_row_x, row_x) + dot(v_row_y, row_y));
-    vf v_mean[3], v_opacity_in[1] = {visible ? v_opacity : ZERO};
+    vf v_mean[3];
+    for (int k = 0; k < 3; ++k) v_mean[k] = view[k] * v_x + view[4 + k] * v_y + view[8 + k] * v_z;
+    // Where usable gradients become others (an overflow), none is passed; what came in as NaN goes out as NaN.
+    auto usable = [&](vf v) -> vi { return __builtin_elementwise_abs(v) <= GRADIENT_MAX; };
+    vi given = usable(v_mean2d[0]) & usable(v_mean2d[1]) & usable(v_depth[0]) & usable(v_seen[0]);
+    vi made = usable(v_opacity);
     for (int k = 0; k < 3; ++k) {
-        v_mean[k] = visible ? view[k] * v_x + view[4 + k] * v_y + view[8 + k] * v_z : ZERO;
-        v_scale[k] = visible ? v_scale[k] : ZERO;
+        given &= usable(v_conic[k]);
+        made &= usable(v_mean[k]) & usable(v_scale[k]);
     }
-    for (int k = 0; k < 4; ++k) v_quat[k] = visible ? v_quat[k] : ZERO;
+    for (int k = 0; k < 4; ++k) made &= usable(v_quat[k]);
+    const vi passes = visible & (made | ~given);
+    const vf v_opacity_in[1] = {passes ? v_opacity : ZERO};
+    for (int k = 0; k < 3; ++k) {
+        v_mean[k] = passes ? v_mean[k] : ZERO;
+        v_scale[k] = passes ? v_scale[k] : ZERO;
+    }
+    for (int k = 0; k < 4; ++k) v_quat[k] = passes ? v_quat[k] : ZERO;
     scatter((float*)v_means.data, v_mean, Three());
     scatter((float*)v_quats.data, v_quat, Four());
     scatter((float*)v_scales.data, v_scale, Three());

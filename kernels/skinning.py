@@ -8,6 +8,7 @@ node.
 
 import warp as wp
 
+from .gradients import beyond, near, passed
 from .quaternion import (
     quat_conjugate,
     quat_matrix_adjoint,
@@ -105,17 +106,18 @@ def skin_adjoint(
     v_means_out: wp.array[wp.vec3],  # [N]
     v_quats_out: wp.array[wp.vec4],  # [N]
     v_weights_out: wp.array2d[float],  # [N, K]
-    v_blends_out: wp.array[wp.vec4],  # [N] gradient to the blended rotation before it is normalised
+    v_blends_out: wp.array[wp.vec4],  # [N] gradient to the blended rotation before it is normalised; NaN: passes none
 ):
-    """Gradients of one Gaussian's own values. One that is not finite passes none."""
+    """Gradients of one Gaussian's own values. One that is not finite, or that a broken control point moves, passes
+    none."""
     i = first + wp.tid()
     x = means_in[i]
     v = v_means_in[i]
     K = indices_in.shape[1]
-    if not (finite(x) and finite(quats_in[i])):
+    if not (near(x) and finite(quats_in[i])):
         v_means_out[i] = wp.vec3(0.0)
         v_quats_out[i] = wp.vec4(0.0)
-        v_blends_out[i] = wp.vec4(0.0)
+        v_blends_out[i] = wp.vec4(wp.nan)
         for k in range(K):
             v_weights_out[i, k] = 0.0
         return
@@ -127,21 +129,34 @@ def skin_adjoint(
     b = quat_normalise(blend)
     q = quat_normalise(quats_in[i])
     v_q = v_quats_in[i]
-    v_quats_out[i] = quat_normalise_adjoint(quats_in[i], quat_multiply(quat_conjugate(b), v_q))
+    v_quat = quat_normalise_adjoint(quats_in[i], quat_multiply(quat_conjugate(b), v_q))
     v_blend = quat_normalise_adjoint(blend, quat_multiply(v_q, quat_conjugate(q)))
-    v_blends_out[i] = v_blend
     v_mean = wp.vec3(0.0)
+    lost = beyond(v_quat) + beyond(v_blend)
     for k in range(K):
         m = indices_in[i, k]
         r = quat_normalise(rotations_in[m])
         p = nodes_in[m]
         shape = quat_normalise(shape_rotations_in[m])
-        v_w = wp.dot(v, quat_rotate(r, x - p) + p + translations_in[m]) + wp.dot(v_blend, aligned(shape, reference))
+        moved = quat_rotate(r, x - p) + p + translations_in[m]
+        v_w = wp.dot(v, moved) + wp.dot(v_blend, aligned(shape, reference))
         if has_log_scales != 0:
             v_w += wp.dot(v_log_scales_in[i], log_scales_in[m])
         v_weights_out[i, k] = v_w
         v_mean += weights_in[i, k] * quat_rotate(quat_conjugate(r), v)
+        if not near(moved):
+            lost += 1
+        lost += beyond(v_w)
+    lost += beyond(v_mean)
+    if lost > 0 and beyond(v) + beyond(v_q) == 0:  # what comes in as NaN goes out as NaN
+        v_mean = wp.vec3(0.0)
+        v_quat = wp.vec4(0.0)
+        v_blend = wp.vec4(wp.nan)
+        for k in range(K):
+            v_weights_out[i, k] = 0.0
     v_means_out[i] = v_mean
+    v_quats_out[i] = v_quat
+    v_blends_out[i] = v_blend
 
 
 @wp.func
@@ -163,7 +178,7 @@ def _add(
 ):
     """Add pair (i, k) to its node's sums."""
     x = means[i]
-    if not (finite(x) and finite(quats[i])):
+    if not finite(v_blends[i]):
         return
     m = indices[i, k]
     w = weights[i, k]
@@ -250,13 +265,13 @@ def skin_finish(
             for a in range(3):
                 v_log_scales[a] = v_log_scales[a] + sums_in[row, 16 + a]
     r = quat_normalise(rotations_in[m])
-    v_translations_out[m] = v
-    v_nodes_out[m] = v - quat_rotate(quat_conjugate(r), v)
+    v_translations_out[m] = passed(v)
+    v_nodes_out[m] = passed(v - quat_rotate(quat_conjugate(r), v))
     v_r = quat_matrix_adjoint(r, G)
     if has_shape_rotations != 0:
-        v_shape_rotations_out[m] = quat_normalise_adjoint(shape_rotations_in[m], v_blend)
+        v_shape_rotations_out[m] = passed(quat_normalise_adjoint(shape_rotations_in[m], v_blend))
     else:
         v_r += v_blend
-    v_rotations_out[m] = quat_normalise_adjoint(rotations_in[m], v_r)
+    v_rotations_out[m] = passed(quat_normalise_adjoint(rotations_in[m], v_r))
     if has_log_scales != 0:
-        v_log_scales_out[m] = v_log_scales
+        v_log_scales_out[m] = passed(v_log_scales)

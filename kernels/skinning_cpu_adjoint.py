@@ -7,6 +7,7 @@ gradient of the blended rotation lie as the palette's motion row does.
 import warp as wp
 
 from .skinning_simd import BLOCK, SIMD
+from .types import GRADIENT_MAX, POSITION_MAX
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,6 +17,9 @@ _ADJOINT = (
 {
 """
     + SIMD
+    + f"""
+    constexpr float GRADIENT_MAX = {float(GRADIENT_MAX)!r}f, POSITION_MAX = {float(POSITION_MAX)!r}f;
+"""
     + BLOCK
     + """
     const int M = motion.shape[0];
@@ -33,6 +37,8 @@ _ADJOINT = (
             *(v4u*)sum = *(const v4u*)sum + *(const v4u*)(from + 16 * (l % 4) + 4 * (l / 4));
         }
     };
+    auto usable = [](vf v) INLINE -> vi { return __builtin_elementwise_abs(v) <= GRADIENT_MAX; };
+    auto near = [](vf v) INLINE -> vi { return __builtin_elementwise_abs(v) <= POSITION_MAX; };
     auto run = [&](auto kc, int begin) INLINE {
         const int K = decltype(kc)::value ? decltype(kc)::value : indices.shape[1];
         read(begin, K);
@@ -42,11 +48,17 @@ _ADJOINT = (
         read_vectors(v_means_t.data, begin, Any{}, v);
         read_vectors(v_quats_t.data, begin, Four{}, t);
         if (has_log_scales) read_vectors(v_log_scales_t.data, begin, Any{}, v_scales);
-        // Gaussians that are not finite, and lanes past the end, pass nothing: they become zeros with zero weights.
-        vf probe = x[0] * 0.0f + x[1] * 0.0f + x[2] * 0.0f + q[0] * 0.0f + q[1] * 0.0f + q[2] * 0.0f + q[3] * 0.0f;
+        vf B[16], side[16], b[4], u[4], v_x[3], rows_of[16];
+        blend(weight, w, K, side, B);
+        // Gaussians that are not finite, or that a broken control point moves, and lanes past the end, pass nothing:
+        // they become zeros with zero weights.
+        vf probe = q[0] * 0.0f + q[1] * 0.0f + q[2] * 0.0f + q[3] * 0.0f;
         for (int d = 0; d < H; ++d) probe = probe + hyper_point[d] * 0.0f;
-        const vi alive = (probe == 0.0f) & (number < rows);
+        vi alive = (probe == 0.0f) & (number < rows);
+        for (int c = 0; c < 3; ++c) alive = alive & near(x[c]);
+        for (int c = 0; c < 16; ++c) alive = alive & near(B[c]);
         if (!__builtin_reduce_and(alive)) {
+            for (int c = 0; c < 16; ++c) B[c] = alive ? B[c] : (vf){};
             for (int k = 0; k < K; ++k) w[k] = alive ? w[k] : (vf){};
             for (int c = 0; c < 3; ++c) { x[c] = alive ? x[c] : (vf){}; v[c] = alive ? v[c] : (vf){}; }
             for (int c = 0; c < 4; ++c) { q[c] = alive ? q[c] : (vf){}; t[c] = alive ? t[c] : (vf){}; }
@@ -55,8 +67,6 @@ _ADJOINT = (
             weight_rows(w, K, spare_weights);
             weight = spare_weights;
         }
-        vf B[16], side[16], b[4], u[4], v_x[3], rows_of[16];
-        blend(weight, w, K, side, B);
         vf nb = inverse_norm(B[12], B[13], B[14], B[15]), nq = inverse_norm(q[0], q[1], q[2], q[3]);
         for (int c = 0; c < 4; ++c) {
             vf identity = (vf){} + (c == 0 ? 1.0f : 0.0f);
@@ -84,6 +94,10 @@ _ADJOINT = (
             v_u[c] = (v_u[c] - u[c] * along_u) * nq;
             rows_of[12 + c] = (v_b[c] - b[c] * along_b) * nb;
         }
+        // What overflows becomes 0; what came in as NaN goes out as NaN.
+        const vi given = usable(v[0]) & usable(v[1]) & usable(v[2])
+            & usable(t[0]) & usable(t[1]) & usable(t[2]) & usable(t[3]);
+        for (int c = 0; c < 4; ++c) v_u[c] = (usable(v_u[c]) | ~given) ? v_u[c] : (vf){};
         write_vectors(v_quats.data, begin, Four{}, v_u);
         transpose(rows_of);  // row l: what Gaussian l's blended motion row receives
         vf v_weight[16], mean = (vf){};
@@ -103,6 +117,7 @@ _ADJOINT = (
                 gather4(reach.data + 4, K, k, node);
                 for (int c = 0; c < 3; ++c) v_weight[k] = v_weight[k] + v_scales[c] * node[1 + c];
             }
+            v_weight[k] = (alive & usable(v_weight[k])) ? v_weight[k] : (vf){};
             mean = mean + w[k] * v_weight[k];
         }
         vf v_hyper_point[8] = {};
@@ -133,10 +148,11 @@ _ADJOINT = (
                 add4(reach_sum + 8 + h, K, k, part);
             }
         }
+        for (int c = 0; c < 3; ++c) v_x[c] = (usable(v_x[c]) | ~given) ? v_x[c] : (vf){};
         write_vectors(v_means.data, begin, Any{}, v_x);
         for (int d = 0; d < H; ++d) {
             float lanes[16];
-            put(lanes, v_hyper_point[d]);
+            put(lanes, usable(v_hyper_point[d]) ? v_hyper_point[d] : (vf){});
             for (int l = 0; l < rows; ++l) v_hyper.data[(begin + l) * (long long)H + d] = lanes[l];
         }
     };

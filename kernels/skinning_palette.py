@@ -6,6 +6,7 @@
 
 import warp as wp
 
+from .gradients import passed
 from .neighbors import MIN_STRENGTH
 from .quaternion import quat_matrix, quat_matrix_adjoint, quat_normalise, quat_normalise_adjoint
 
@@ -118,11 +119,11 @@ def palette_adjoint(
     v_r = quat_matrix_adjoint(r, G - wp.outer(v_t, p))
     v_shape = wp.vec4(motion[12], motion[13], motion[14], motion[15])
     if has_shape_rotations != 0:
-        v_shape_rotations_out[m] = quat_normalise_adjoint(shape_rotations_in[m], v_shape)
+        v_shape_rotations_out[m] = passed(quat_normalise_adjoint(shape_rotations_in[m], v_shape))
     else:
         v_r += v_shape
-    v_rotations_out[m] = quat_normalise_adjoint(rotations_in[m], v_r)
-    v_translations_out[m] = v_t
+    v_rotations_out[m] = passed(quat_normalise_adjoint(rotations_in[m], v_r))
+    v_translations_out[m] = passed(v_t)
     inverse = 1.0 / (radii_in[m] * radii_in[m])
     v_p = v_t - wp.transpose(quat_matrix(r)) * v_t
     v_radius = float(0.0)
@@ -131,18 +132,18 @@ def palette_adjoint(
     for d in range(3):
         if reach[d] != 0.0:
             v_p[d] = v_p[d] + reach[d] * inverse
-    v_nodes_out[m] = v_p
-    v_radii_out[m] = v_radius
+    v_nodes_out[m] = passed(v_p)
+    v_radii_out[m] = passed(v_radius)
     if has_hyper != 0:
         for d in range(v_hyper_out.shape[1]):
             v_h = float(0.0)
             if reach[8 + d] != 0.0:
                 v_h = reach[8 + d] * inverse
-            v_hyper_out[m, d] = v_h
+            v_hyper_out[m, d] = passed(v_h)
     if has_strengths != 0:
         v_strength = float(0.0)
         if strengths_in[m] > MIN_STRENGTH:
             v_strength = reach[4] / strengths_in[m]
-        v_strengths_out[m] = v_strength
+        v_strengths_out[m] = passed(v_strength)
     if has_log_scales != 0:
-        v_log_scales_out[m] = wp.vec3(reach[5], reach[6], reach[7])
+        v_log_scales_out[m] = passed(wp.vec3(reach[5], reach[6], reach[7]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from .gradients import passed
 from .types import SLOT_GEOMETRY
 
 wp.set_module_options({"enable_backward": False})
@@ -45,6 +46,8 @@ def sum_slot_columns(
             total = v_channels_out[i, column - SLOT_GEOMETRY]
     for s in range(int(offsets_in[i]), int(offsets_in[i + 1])):
         total += v_slots_in[s, column]
+    if column < SLOT_GEOMETRY:
+        total = passed(total)
     if column < 2:
         v_means2d_out[i, column] = total
     elif column < 5:

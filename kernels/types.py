@@ -16,5 +16,15 @@ ALPHA_MAX = wp.constant(0.999)
 TRANSMITTANCE_MIN = wp.constant(1.0e-4)
 """A pixel ends for good before the splat that would leave no more than this: what follows is invisible."""
 
+CHANNEL_MAX = wp.constant(1.0e18)
+"""A splat with a channel beyond this is left out, as one with a NaN is: its square is still a float32, and so are the
+gradients of what lies behind it."""
+
+GRADIENT_MAX = wp.constant(1.0e30)
+"""A gradient of one Gaussian beyond this counts as none: sums over a hundred million Gaussians are still finite."""
+
+POSITION_MAX = wp.constant(1.0e18)
+"""Gaussians farther from the origin pass their control points no gradient: products with it would overflow."""
+
 SLOT_GEOMETRY = 8
 """Leading columns of a gradient slot: 2D mean (2), conic (3), opacity (1), absolute 2D mean (2); channels follow."""

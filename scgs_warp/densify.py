@@ -109,12 +109,13 @@ def _worth_keeping(
     extent: float,
     prune_large: bool,
 ) -> Tensor:
-    keep = gaussians.opacities() >= config.min_opacity
+    keep, scales = gaussians.opacities() >= config.min_opacity, gaussians.scales()
     if prune_large:
         keep &= (max_radii <= config.max_screen) | fresh
-        keep &= gaussians.scales().amax(1) <= config.max_scale * extent
-    for parameter in (gaussians.means, gaussians.log_scales, gaussians.quats):
-        keep &= torch.isfinite(parameter).all(dim=1)
+        keep &= scales.amax(1) <= config.max_scale * extent
+    # What is not finite is never drawn, so it would have no gradient that could mend it.
+    for values in (*(getattr(gaussians, name) for name in GaussianParameters.NAMES), scales):
+        keep &= torch.isfinite(values).flatten(1).all(dim=1) if values.ndim > 1 else torch.isfinite(values)
     return keep
 
 
@@ -122,7 +123,7 @@ def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> None:
     """Keep the rows marked in ``keep`` [N]; if that would leave none, keep the most opaque one."""
     if not bool(keep.any()):
         keep = keep.clone()
-        keep[int(gaussians.opacity_logits.argmax())] = True
+        keep[int(gaussians.opacity_logits.nan_to_num(-torch.inf, neginf=-torch.inf).argmax())] = True
     if bool(keep.all()):
         return
     index = torch.where(keep)[0]

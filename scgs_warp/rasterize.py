@@ -11,7 +11,7 @@ from .ops.binning import bin_splats
 from .ops.compositing import composite, demand
 from .ops.harmonics import MAX_DEGREE, spherical_harmonics
 from .ops.projection import project
-from .render import expected_depth
+from .render import centre_of, expected_depth
 from .types import Camera, Splats
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -150,7 +150,7 @@ def _channels(
     if not render_mode.startswith("RGB"):
         return depths, None
     if sh_degree is not None:
-        colors = spherical_harmonics(colors[:, 0], colors[:, 1:], means, camera.position, sh_degree)
+        colors = spherical_harmonics(colors[:, 0], colors[:, 1:], means, centre_of(camera), sh_degree)
     if render_mode == "RGB":
         return colors, background
     if background is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import isqrt
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -75,13 +76,33 @@ def draw(
     shape = gaussians.quats, gaussians.scales, gaussians.opacities
     size = camera.width, camera.height
     splats = project(means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased)
-    channels = spherical_harmonics(gaussians.sh_dc, gaussians.sh_rest, means, camera.position, sh_degree)
+    channels = spherical_harmonics(gaussians.sh_dc, gaussians.sh_rest, means, centre_of(camera), sh_degree)
     if depth:
         channels = torch.cat([channels, splats.depths[:, None]], dim=1)
         background = None if background is None else torch.cat([background, background.new_zeros(1)])
     beside = demand(splats, channels, background)
     tiles = bin_splats(splats, demand=beside) if binned is None else binned(splats)
     return composite(splats, channels, tiles, background, stats=stats)
+
+
+class _FiniteGradient(torch.autograd.Function):
+    """The value as it is; of its gradient what is finite, elsewhere 0."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+        return gradient.nan_to_num(0.0, 0.0, 0.0)
+
+
+def centre_of(camera: Camera) -> Tensor:
+    """[3] ``camera.position``, whose gradient is 0 where a broken viewmat (zero times NaN) would make it NaN."""
+    if not camera.viewmat.requires_grad:
+        return camera.position
+    viewmat: Tensor = _FiniteGradient.apply(camera.viewmat)  # type: ignore[assignment]
+    return Camera(viewmat, camera.K, camera.width, camera.height).position
 
 
 def expected_depth(accumulated: Tensor, alpha: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,17 @@ from .motion import build_motion
 from .motion.base import Motion
 from .render import render
 from .types import Camera, Gaussians, Image
+
+
+def moment(time: float) -> float:
+    """``time`` clamped to [0, 1].
+
+    Raises:
+        UserError: it is not finite.
+    """
+    if not math.isfinite(time):
+        raise UserError(f"time is {time}; give a number from 0 (the first moment) to 1 (the last)")
+    return min(max(float(time), 0.0), 1.0)
 
 
 class Scene:
@@ -116,13 +128,16 @@ class Scene:
         """The Gaussians at one moment, activated: as other renderers take them.
 
         Args:
-            time: in [0, 1].
+            time: clamped to [0, 1].
 
         Returns:
             N Gaussians in world units on the scene's device. The order is the same at every time: row i is one point
             of the surface, followed through the motion.
+
+        Raises:
+            UserError: the time is not finite.
         """
-        posed = self.motion.gaussians_at(self.gaussians, float(time))
+        posed = self.motion.gaussians_at(self.gaussians, moment(time))
         undo = self.normalisation
         return Gaussians(
             undo.undo(posed.means),
@@ -147,8 +162,11 @@ class Scene:
         Returns:
             ``rgb`` [H, W, 3], ``alpha`` and ``depth`` [H, W], float32 on the scene's device; ``rgb`` may leave [0, 1] a
             little.
+
+        Raises:
+            UserError: the time is not finite.
         """
-        time = min(max(float(time), 0.0), 1.0)
+        time = moment(time)
         color = torch.as_tensor(self.background_color if background is None else background, dtype=torch.float32)
         view = self.normalisation.apply_camera(camera)
         if self.device.type == "cuda" and self.motion.takes_time_tensor:
@@ -172,8 +190,12 @@ class Scene:
 
     @torch.no_grad()
     def control_points_at(self, time: float) -> Tensor:
-        """[M, 3] control points at ``time`` in [0, 1], world; [0, 3] for motion models without."""
-        return self.normalisation.undo(self.motion.control_points_at(float(time)))
+        """[M, 3] control points at ``time``, clamped to [0, 1], world; [0, 3] for motion models without.
+
+        Raises:
+            UserError: the time is not finite.
+        """
+        return self.normalisation.undo(self.motion.control_points_at(moment(time)))
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that makes the scene, by name, for a checkpoint."""

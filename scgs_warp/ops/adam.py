@@ -35,7 +35,8 @@ class Update(NamedTuple):
 def adam_step(
     updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15, form: Form = "auto"
 ) -> None:
-    """Adam (Kingma and Ba 2015, algorithm 1) with bias correction as in ``torch.optim.Adam``, in one launch.
+    """Adam (Kingma and Ba 2015, algorithm 1) with bias correction as in ``torch.optim.Adam``, in one launch. Finite
+    gradients beyond 1e19, whose squares would overflow, count as 1e19.
 
     Args:
         updates: tensors on one device; those without elements, and no updates at all, are fine.

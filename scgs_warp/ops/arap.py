@@ -95,8 +95,9 @@ def arap_energy(
         reverse: ``reverse_edges(neighbors)``, to build it once for many calls.
 
     Returns:
-        [M] energies, in squared units of the positions. Gradients flow to rest and posed; the rotations are held
-        constant (at the minimum their own gradient vanishes).
+        [M] energies, in squared units of the positions; one is not finite where an edge's end is not. Gradients flow to
+        rest and posed, but not along such edges; the rotations are held constant (at the minimum their own gradient
+        vanishes).
 
     Raises:
         ValueError: shapes do not fit.
@@ -137,8 +138,10 @@ def trajectory_graph(trajectories: Tensor, count: int = 8) -> tuple[Tensor, Tens
         return neighbors, weights
     tracks = trajectories.detach().permute(1, 0, 2).reshape(nodes, 3 * times) / times**0.5
     found, distances = nearest(tracks, tracks, available + 1)
-    # A node among its duplicates need not come first in its own list; if it does not appear at all, the last goes.
+    # A node among its duplicates need not come first in its own list; if it does not appear at all, the last goes. One
+    # that is not finite may appear twice: lists then end with placeholders.
     own = found == torch.arange(nodes, device=device, dtype=torch.int32)[:, None]
+    own &= own.cumsum(dim=1) == 1
     own[:, -1] |= ~own.any(dim=1)
     found, distances = found[~own].reshape(nodes, -1), distances[~own].reshape(nodes, -1).double()
     finite = distances.isfinite()

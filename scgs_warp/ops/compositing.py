@@ -68,16 +68,17 @@ def composite(
 
     3D Gaussian Splatting (Kerbl et al. 2023), equation 3, with gsplat 1.5.3's thresholds: alpha is at most 0.999 (and
     passes no gradient there), is skipped under 1/255, and a pixel ends for good before the splat that would leave a
-    transmittance of 1e-4 or less. A splat with a channel that is not finite is left out.
+    transmittance of 1e-4 or less. A splat with a channel that is not finite, or beyond 1e18, is left out.
 
-    Gradients go to ``splats.means2d``, ``conics`` and ``opacities``, to ``channels`` and to ``background``.
+    Gradients go to ``splats.means2d``, ``conics`` and ``opacities``, to ``channels`` and to ``background``. One to the
+    geometry that overflows counts as none.
 
     Args:
         splats: N projected Gaussians; ``depths`` is not read.
         channels: [N, C] what is blended: colours, depths, anything.
         tiles: of ``bin_splats(splats)``. Where they are cut into windows, these are listed and drawn one after the
             other, in the backward pass as well: the same bits, with the lists of one window in memory.
-        background: [C] what shines through. None: zeros.
+        background: [C] what shines through. None: zeros, as what is not finite.
         stats: if given, the backward pass adds to it what ``Stats`` says.
         absgrad: [N, 2] buffer that the backward pass overwrites with the sum over pixels of the absolute gradients of
             ``means2d``.
@@ -93,6 +94,8 @@ def composite(
     _validate(splats, channels, tiles, background, stats, absgrad)
     if background is None:
         background = channels.new_zeros(channels.shape[1])
+    else:
+        background = background.nan_to_num(0.0, 0.0, 0.0)
     job = _Job(splats, tiles, stats, absgrad, _resolve_form(form, channels.device, tiles.tile_size))
     tensors: tuple[Tensor, ...] = (splats.means2d, splats.conics, splats.opacities, channels, background)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):

@@ -37,7 +37,8 @@ def covariance(quats: Tensor, scales: Tensor) -> Tensor:
         scales: [N, 3] float32, standard deviations along the Gaussian's own axes, world units.
 
     Returns:
-        [N, 3, 3] symmetric, world units squared. Gradients reach both inputs.
+        [N, 3, 3] symmetric, world units squared; zero where it would not be finite. Gradients reach both inputs, but
+        where they or the inputs are not finite.
 
     Raises:
         ValueError: a shape is wrong.

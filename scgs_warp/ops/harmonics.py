@@ -71,7 +71,9 @@ def spherical_harmonics(
         form: which of the kernels runs: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the device's own.
 
     Returns:
-        [N, 3] colours >= 0. Gradients reach all four tensors; a clamped channel passes none.
+        [N, 3] colours >= 0; where a coefficient that counts is not finite the colour is not either, and ``composite``
+        leaves such a Gaussian out. Gradients reach all four tensors; a channel that is clamped or not finite passes
+        none, nor does one to the mean that would overflow.
 
     Raises:
         ValueError: a shape is wrong, or the degree is not 0 to 3 or more than ``sh_rest`` has.

@@ -118,8 +118,8 @@ def plane_features(positions: Tensor, time: float | Tensor, planes: list[Tensor]
         positions: [N, 3]; the planes span [-1, 1], first and last texels at the ends. Outside, the border's value
             counts and has no gradient to the position, nor has it on the border itself. A coordinate that is not a
             number counts as -1.
-        time: in [0, 1], or such a tensor [1] on the positions' device (no gradient; on CUDA the host does not read it);
-            the time planes span that.
+        time: clamped to [0, 1] (not a number: 0), or such a tensor [1] on the positions' device (no gradient; on CUDA
+            the host does not read it); the time planes span that.
         planes: six a level, in the order of :data:`PAIRS`: [second axis, first axis, 32], float32, two texels a side
             at least. The planes of a level have the same extent along the same axis.
 
@@ -161,6 +161,10 @@ def _run(
 def _features_in_torch(positions: Tensor, time: float | Tensor, planes: list[Tensor]) -> Tensor:
     """On CUDA; torch's kernel adds the planes' gradients atomically."""
     kept = positions.nan_to_num(nan=-1.0)  # no gradient there, as on a CPU
+    if isinstance(time, Tensor):
+        time = time.nan_to_num(nan=0.0).clamp(0.0, 1.0)
+    else:
+        time = time if 0.0 <= time <= 1.0 else float(time > 1.0)
     when = 2.0 * time - 1.0
     last = when.detach().expand(len(kept)) if isinstance(when, Tensor) else kept.new_full((len(kept),), when)
     axes = [*kept.unbind(1), last]

@@ -133,7 +133,7 @@ def project(
 
     Returns:
         Splats of this image. Gradients reach means, quats, scales, opacities and viewmat; the clamp of the Jacobian to
-        the frustum widened by 0.3 tan(fov / 2) passes none.
+        the frustum widened by 0.3 tan(fov / 2) passes none, nor does a Gaussian one of whose gradients overflows.
 
     Raises:
         ValueError: a shape or a size is wrong.

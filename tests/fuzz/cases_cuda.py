@@ -1,0 +1,67 @@
+"""The native CUDA bodies of compositing, run on the CPU by ``cuda_emulation``, under the laws of compositing."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cuda_emulation import COMPILER, build, launcher
+
+from scgs_warp.kernels import compositing
+from scgs_warp.ops import compositing_cuda
+from scgs_warp.warp_interop import _parameters_of, launch
+
+from . import fence
+from .cases_render import check_composite, splats_of
+from .poison import Draw
+
+
+@functools.lru_cache(maxsize=1)
+def library() -> ctypes.CDLL:
+    with tempfile.TemporaryDirectory() as folder:
+        return build(Path(folder))
+
+
+@contextmanager
+def emulated(seed: int) -> Iterator[None]:
+    native, blocks_of = compositing_cuda.launch_native, compositing_cuda.launch_blocks
+    run = launcher(library(), seed)
+
+    def fenced_native(kernel: Any, blocks: int, *args: Any) -> None:
+        if fence.current is None:
+            run(kernel, blocks, *args)
+        else:
+            fence.current.run(kernel, _parameters_of(kernel, args), args, lambda own: run(kernel, blocks, *own))
+
+    def portable(kernel: Any, blocks: int, *args: Any, block_dim: int) -> None:
+        launch(compositing.composite_pixels_adjoint, blocks, *args)
+
+    compositing_cuda.launch_native, compositing_cuda.launch_blocks = fenced_native, portable  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        compositing_cuda.launch_native, compositing_cuda.launch_blocks = native, blocks_of
+
+
+def case_native_compositing(d: Draw, device: str) -> None:
+    """Finite images and gradients, and the broken are as if they were not there; on a GPU the real thing."""
+    splats, channels_count = splats_of(d, device), int(d.pick((1, 3, 4, 8, 9)))
+    count = len(splats.means2d)
+    if device == "cpu" and (splats.width * splats.height > 1100 or count > 100):
+        return  # a second or more, thread by thread
+    channels, background = d.normal(count, channels_count), d.uniform(channels_count)
+    if d.chance():
+        d.poison(channels, d.rows(count))
+    if device != "cpu":
+        check_composite(d, splats, channels.to(device), background.to(device), "cuda")
+        return
+    with emulated(d.seed % 1000):
+        check_composite(d, splats, channels, background, "cuda")
+
+
+CASES = {"cuda bodies": (case_native_compositing, 1)} if COMPILER is not None else {}

@@ -1,0 +1,143 @@
+"""Memory with walls: inside :func:`fenced` every array that a CPU kernel is given ends (or begins) at a page that
+nobody may touch, so that an access out of bounds ends the process at once, wherever it leads.
+
+What lies between an array's last byte and the wall (it is less than a cache line, as kernels may rely on torch's
+alignment) is filled with ones, which read as NaN or -1, and looked at afterwards. Arrays that a kernel calls ``*_in``
+must come back as they were.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from scgs_warp import warp_interop
+
+PAGE = mmap.PAGESIZE
+ROOM = 1 << 23
+"""Bytes of the largest array that is fenced; larger ones are left where they are."""
+LINE = 64
+
+
+class OutOfBounds(AssertionError):
+    """A kernel wrote where it must not."""
+
+
+class _Region:
+    """Some pages between two walls."""
+
+    def __init__(self) -> None:
+        self.memory = mmap.mmap(-1, ROOM + 2 * PAGE)
+        self.base = ctypes.addressof(ctypes.c_char.from_buffer(self.memory))
+        libc = ctypes.CDLL(None, use_errno=True)
+        for wall in (self.base, self.base + PAGE + ROOM):
+            if libc.mprotect(ctypes.c_void_p(wall), ctypes.c_size_t(PAGE), 0):
+                raise OSError(ctypes.get_errno(), "mprotect")
+
+    def put(self, tensor: Tensor, high: bool) -> tuple[Tensor, int, int]:
+        """A copy of the tensor beside a wall, and where the bytes between its end and the wall (or line) lie."""
+        size = tensor.numel() * tensor.element_size()
+        begin = PAGE + (ROOM - -(-size // LINE) * LINE if high else 0)
+        rest = PAGE + ROOM if high else begin + -(-size // LINE) * LINE
+        ctypes.memset(self.base + begin + size, 0xFF, rest - begin - size)
+        kind = tensor.dtype
+        copy = torch.frombuffer(self.memory, dtype=kind, count=tensor.numel(), offset=begin).view(tensor.shape)
+        copy.copy_(tensor)
+        return copy, begin + size, rest
+
+
+class Fence:
+    """Regions for the arrays of one launch after another."""
+
+    def __init__(self) -> None:
+        self.regions: list[_Region] = []
+        self.held: list[tuple[int, int]] = []
+        self.high = True
+        self.launches = 0
+
+    def _region(self, place: int) -> _Region:
+        while len(self.regions) <= place:
+            self.regions.append(_Region())
+        return self.regions[place]
+
+    def hold(self, tensor: Tensor) -> Tensor:
+        """A copy beside a wall, good until :meth:`release`: for tensors that kernels are given by address."""
+        size = tensor.numel() * tensor.element_size()
+        if not 0 < size <= ROOM:
+            return tensor.detach().clone()
+        copy, begin, end = self._region(len(self.held)).put(tensor.detach(), self.high)
+        self.held.append((begin, end))
+        return copy
+
+    def release(self) -> None:
+        """The held copies are no longer needed."""
+        held, self.held = self.held, []
+        for place, (begin, end) in enumerate(held):
+            if bytes(self.regions[place].memory[begin:end]) != b"\xff" * (end - begin):
+                raise OutOfBounds("a kernel writes past the end of a tensor that it was given by address")
+
+    def run(self, kernel: Any, parameters: list, args: tuple, go: Callable[[tuple], None]) -> None:
+        """``go`` with fenced copies of the tensors among ``args``, and what it wrote back to them."""
+        self.launches += 1
+        moved: dict[tuple, tuple] = {}
+        fenced = list(args)
+        labels: dict[tuple, list[str]] = {}
+        for place, (parameter, value) in enumerate(zip(parameters, args)):
+            if not isinstance(value, Tensor) or not 0 < value.numel() * value.element_size() <= ROOM:
+                continue
+            key = (value.data_ptr(), value.numel(), value.dtype)
+            if key not in moved:
+                region = self._region(len(self.held) + len(moved))
+                moved[key] = (region, value, *region.put(value, self.high))
+            fenced[place] = moved[key][2].view(value.shape)
+            labels.setdefault(key, []).append(parameter.label if parameter else "")
+        go(tuple(fenced))
+        for key, (region, value, copy, begin, end) in moved.items():
+            names = labels[key]
+            if bytes(region.memory[begin:end]) != b"\xff" * (end - begin):
+                raise OutOfBounds(f"kernel {kernel.key} writes past the end of {names}")
+            flat = value.as_strided((value.numel(),), (1,))  # contiguous, but strides of single rows may be anything
+            if not torch.equal(flat.view(torch.uint8), copy.view(-1).view(torch.uint8)):
+                if all(name.endswith("_in") for name in names):
+                    raise OutOfBounds(f"kernel {kernel.key} writes to its input {names}")
+                flat.copy_(copy.view(-1))
+
+
+current: Fence | None = None
+"""The fence that is up, for launches that do not go through ``warp_interop.launch``."""
+
+
+def walled(tensor: Tensor) -> Tensor:
+    """The tensor, beside a wall where a fence is up and it is on a CPU. Not attached to a graph."""
+    if current is None or tensor.device.type != "cpu":
+        return tensor.detach().clone()
+    return current.hold(tensor)
+
+
+@contextmanager
+def fenced() -> Iterator[Fence]:
+    """Launches on a CPU are fenced, one thread at a time (the thread count must be 1)."""
+    global current
+    fence, kernels = Fence(), warp_interop._CpuKernel
+    bind, pack = kernels.bind, kernels.pack
+
+    def bound(self: Any, arguments: bytes, tensors: tuple) -> Callable[[int, int], None]:
+        def call(first: int, size: int) -> None:
+            def go(args: tuple) -> None:
+                bind(self, pack(self, args), args)(first, size)
+
+            fence.run(self.kernel, self.parameters, tensors, go)
+
+        return call
+
+    kernels.bind, current = bound, fence  # type: ignore[method-assign]
+    try:
+        yield fence
+    finally:
+        kernels.bind, current = bind, None  # type: ignore[method-assign]
