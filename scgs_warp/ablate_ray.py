@@ -9,11 +9,11 @@ from __future__ import annotations
 import json
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from . import ray_cluster
 from .ablate import LOG, Cell, cell_to_json
@@ -31,7 +31,7 @@ MOST_LOSSES = 3
 POLL_SECONDS = 0.5
 LOOK_SECONDS = 60.0
 """For a machine to import the package and answer."""
-STOP_SECONDS = 60.0
+STOP_SECONDS = 30.0
 """For running cells to save their checkpoints."""
 VISIBLE_SECONDS = 60.0
 """For a file that another machine wrote to be seen here: file systems of networks remember what was not there."""
@@ -64,14 +64,19 @@ def on_cluster(
 
         def run(waiting: list[tuple[str, Cell]], report: Report, end: End) -> None:
             count = ray_cluster.places(useful, share, cuda)
-            room = f"{count} cells at a time, each with {share} thread{'s' if share > 1 else ''}"
-            report(f"Ray cluster of {len(useful)} machine{'s' if len(useful) > 1 else ''}: {room}")
+            size, room = _some(len(useful), "machine"), f"{_some(count, 'cell')} at a time"
+            report(f"Ray cluster of {size}: {room}, each with {_some(share, 'thread')}")
             if len(processors) > 1:
                 report(f"processors differ, and so may the last digits of results: {', '.join(processors)}")
             placed = [(place, replace(cell, device="cuda" if cuda else "cpu")) for place, cell in waiting]
-            _Sweep(ray, expected, share, cuda, report, end).run(placed)
+            head = ray_cluster.Head(ray, address)
+            _Sweep(ray, expected, share, cuda, report, end, head.check).run(placed)
 
         yield run
+
+
+def _some(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _look(ray: Any, useful: Sequence[Machine], cells: Sequence[Cell], output: Path) -> tuple[dict[str, str], list[str]]:
@@ -115,22 +120,30 @@ def _token(output: Path) -> Iterator[tuple[Path, str]]:
     made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with open(file, "w", encoding="utf-8") as opened:
-            try:
-                import fcntl
-
-                fcntl.flock(opened, fcntl.LOCK_EX)
-            except ImportError:
-                pass
+        opened = open(file, "w", encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"--output {output}: {error.strerror}; name a folder that all machines can write") from error
+    try:
+        with opened:
+            _lock(opened)
             opened.write(token)
             opened.flush()
             yield file, token
-    except OSError as error:
-        raise UserError(f"--output {output}: {error.strerror}; name a folder that all machines can write") from error
     finally:
         file.unlink(missing_ok=True)
-        if made and folder.is_dir() and not any(folder.iterdir()):
+        if made and not any(folder.iterdir()):
             folder.rmdir()
+
+
+def _lock(opened: IO[str]) -> None:
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX)
+    except OSError as error:
+        raise UserError(f"{opened.name}: cannot be locked ({error.strerror}); mount it with locks (NFS 4)") from error
 
 
 def _ask_all(ray: Any, useful: Sequence[Machine], question: dict[str, Any]) -> list[tuple[Machine, dict[str, Any]]]:
@@ -200,6 +213,8 @@ class _Sweep:
     cuda: bool
     report: Report
     end: End
+    check: Callable[[], None] = lambda: None
+    """Raises a UserError when the cluster is lost."""
     sweep: str = field(default_factory=lambda: uuid.uuid4().hex)
     running: dict[Any, _Task] = field(default_factory=dict)
     """By what Ray calls their results."""
@@ -215,6 +230,7 @@ class _Sweep:
 
         Raises:
             KeyboardInterrupt: after Ctrl-C or SIGTERM, the running cells' checkpoints being saved.
+            UserError: the cluster is lost.
         """
         tasks = [_Task(place, cell) for place, cell in waiting]
         for task in tasks:
@@ -225,12 +241,15 @@ class _Sweep:
                 for task in tasks:
                     self._submit(task)
                 while self.running:
+                    self.check()
                     ready, _ = self.ray.wait(list(self.running), num_returns=1, timeout=POLL_SECONDS)
                     for ref in ready:
                         self._collect(ref, bar)
                     if stop.is_set():
                         raise KeyboardInterrupt
                     self._look(bar, len(tasks))
+            except ConnectionError as error:
+                raise UserError(f"--ray: the connection is lost ({error}); the same command continues") from error
             finally:
                 if self.running:
                     self._stop()
@@ -297,9 +316,12 @@ class _Sweep:
     def _stop(self) -> None:
         """Ask all that run to save and end; forget those that wait."""
         self.report("stopping: cells that run save their checkpoints")
-        for ref in self.running:
-            self.ray.cancel(ref, force=False)
-        self.ray.wait(list(self.running), num_returns=len(self.running), timeout=STOP_SECONDS)
+        try:
+            for ref in self.running:
+                self.ray.cancel(ref, force=False)
+            self.ray.wait(list(self.running), num_returns=len(self.running), timeout=STOP_SECONDS)
+        except ConnectionError:
+            pass  # then the cluster ends them
 
 
 def _loss(error: Exception) -> str:

@@ -12,6 +12,7 @@ import re
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,9 @@ CONNECT_SECONDS = 5.0
 """For a connection to be accepted."""
 ANSWER_SECONDS = 45.0
 """For Ray to be imported, and to answer."""
+PULSE_SECONDS = 2.0
+GONE_SECONDS = 20.0
+"""Without an answer of the head the sweep ends, and says so: Ray itself ends the process after 60 s."""
 STORE_BYTES = 100 << 20
 """Of shared memory for a local cluster's objects: ours are lines of text."""
 START = "start a cluster with 'ray start --head', or give --ray local"
@@ -129,6 +133,36 @@ def _reason(text: str) -> str:
     """The last line that says something: of a traceback, the error."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return re.sub(r"^[\w.]+Error: ", "", lines[-1]) if lines else "Ray gave no reason"
+
+
+class Head:
+    """Whether the cluster's head is there; not known of a connection from outside, which ends with it."""
+
+    def __init__(self, ray: Any, address: str) -> None:
+        self.address = address
+        self._place = None if address.startswith("ray://") else str(ray.get_runtime_context().gcs_address)
+        self._answered = self._asked = time.monotonic()
+
+    def check(self) -> None:
+        """To be called often; asks now and then.
+
+        Raises:
+            UserError: there was no answer for a while.
+        """
+        now = time.monotonic()
+        if self._place is None or now - self._asked < PULSE_SECONDS:
+            return
+        host, _, port = self._place.rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
+            self._answered = now
+        except OSError as error:
+            if now - self._answered > GONE_SECONDS:
+                raise UserError(
+                    f"--ray {self.address}: the head of the cluster is gone; what is trained is kept, and the same "
+                    "command continues"
+                ) from error
+        self._asked = time.monotonic()
 
 
 def machines(ray: Any) -> list[Machine]:

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import socket
-import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -177,7 +177,7 @@ def test_a_stopped_worker_is_no_failure(blobs, tmp_path, monkeypatch, all_thread
 
 
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no such locks")
-def test_a_lost_workers_lock_is_waited_for(blobs, tmp_path, all_threads):
+def test_a_lost_workers_lock_is_waited_for(blobs, tmp_path, monkeypatch, all_threads):
     """The one that lost it may not be gone yet; the first attempt of a sweep is refused at once, as anywhere."""
     import fcntl
 
@@ -187,10 +187,9 @@ def test_a_lost_workers_lock_is_waited_for(blobs, tmp_path, all_threads):
     with open(folder / ".lock", "w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         assert "another trainer" in ablate_worker.work(order(cell))["failure"]
-        release = threading.Timer(0.5, fcntl.flock, (held, fcntl.LOCK_UN))
-        release.start()
+        clock = SimpleNamespace(monotonic=time.monotonic, sleep=lambda seconds: fcntl.flock(held, fcntl.LOCK_UN))
+        monkeypatch.setattr(ablate_worker, "time", clock)
         assert ablate_worker.work(order(cell, attempt=2, wait=30.0)) == {"failure": None, "stopped": False}
-        release.join()
     assert "waiting for the lock" in (folder / "train.log").read_text()
 
 
@@ -308,6 +307,25 @@ def test_results_that_are_not_seen_are_a_failure(blobs, tmp_path, monkeypatch):
     monkeypatch.setattr(ablate_ray, "_appears", lambda path: False)
     _, ends = sweep(FakeRay(), plan(blobs, tmp_path, "8"))
     assert ends["8"] is not None and "is the folder shared?" in ends["8"]
+
+
+def test_a_lost_cluster_ends_the_sweep(blobs, tmp_path, monkeypatch):
+    monkeypatch.setattr(ray_cluster, "PULSE_SECONDS", 0.0)
+    monkeypatch.setattr(ray_cluster, "GONE_SECONDS", 0.3)
+    monkeypatch.setattr(FakeRay, "wait", lambda self, refs, num_returns, timeout: ([], refs))
+    with socket.create_server(("127.0.0.1", 0)) as gcs:
+        place = f"127.0.0.1:{gcs.getsockname()[1]}"
+        ray = FakeRay()
+        ray.get_runtime_context = lambda: SimpleNamespace(gcs_address=place)
+        head = ray_cluster.Head(ray, "auto")
+        until = time.monotonic() + 0.6
+        while time.monotonic() < until:
+            head.check()  # it answers
+            gcs.accept()[0].close()
+    running = ablate_ray._Sweep(ray, {}, 1, False, print, lambda *end: None, head.check)
+    with pytest.raises(UserError, match="head of the cluster is gone"):
+        running.run([(cell.name, cell) for cell in plan(blobs, tmp_path, "8", "16")])
+    assert ray.cancelled == [0, 1]
 
 
 def test_an_interrupt_cancels_what_is_left(blobs, tmp_path):
