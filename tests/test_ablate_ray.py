@@ -211,3 +211,23 @@ def test_something_else_listens(scheme, blobs, tmp_path, capsys, monkeypatch):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and f"--ray {address}: no Ray cluster answered within 8 s" in lines[0]
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_lost_head_ends_the_sweep(blobs, tmp_path, cluster):
+    """One line and status 2, before Ray ends the process without either; the cell that ran has saved."""
+    cluster.add_node(num_cpus=1)
+    output = tmp_path / "out"
+    arguments = ["nodes", *options(blobs, output, "--values", "8,16", "--threads", "1", steps=5_000)]
+    command = [sys.executable, str(ROOT / "apps/ablate.py"), *arguments, "--ray", cluster.address]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    log = output / "blobs/8/log.jsonl"
+    while not (log.is_file() and log.stat().st_size > 300):
+        assert process.poll() is None
+        time.sleep(0.05)
+    cluster.head_node.kill_gcs_server()
+    _, errors = process.communicate(timeout=120)
+    lines = errors.strip().splitlines()
+    assert process.returncode == 2 and len(lines) == 1, errors
+    assert "the head of the cluster is gone" in lines[0]
+    assert (output / "blobs/8/checkpoint.safetensors").is_file()
