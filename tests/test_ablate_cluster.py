@@ -282,6 +282,12 @@ def test_a_lost_cell_is_begun_again(how, blobs, tmp_path, capsys):
     assert "steps of all cells 90/90 (100 %)" in capsys.readouterr().out
 
 
+def test_a_gpu_for_each_cell(blobs, tmp_path):
+    ray = FakeRay()
+    ablate_ray._Sweep(ray, {}, 4, True, print, lambda *end: None).run([("1", plan(blobs, tmp_path, "8")[0])])
+    assert ray.options["num_gpus"] == 1 and ray.options["num_cpus"] == 4
+
+
 def test_a_cell_that_kills_its_workers_fails(blobs, tmp_path):
     ray = FakeRay(cell8=["lost"] * 10)
     _, ends = sweep(ray, plan(blobs, tmp_path, "8", "16"))

@@ -22,10 +22,7 @@ from tiny import write_dnerf
 from scgs_warp import ray_cluster
 from scgs_warp.apps import ablate as app
 
-pytestmark = [
-    pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra: cluster)"),
-    pytest.mark.timeout(540),
-]
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra: cluster)")
 ROOT = Path(__file__).parent.parent
 OFTEN = ["--set", "checkpoint_seconds=0.05", "--threads", "2"]
 STEPS = 120
