@@ -163,11 +163,13 @@ def _ask_all(ray: Any, useful: Sequence[Machine], question: dict[str, Any]) -> l
     for ref in done:
         try:
             answers.append((refs[ref], ray.get(ref)))
-        except ray.exceptions.RayError as error:
+        except ray.exceptions.RayTaskError as error:
             raise UserError(
                 f"--ray: {refs[ref].host} cannot run this version ({_cause(error)}); install the same scgs-warp there, "
                 "in the Python that runs 'ray start'"
             ) from error
+        except ray.exceptions.RayError as error:
+            raise UserError(f"--ray: {refs[ref].host} was lost when it was asked ({type(error).__name__})") from error
     return answers
 
 
