@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -34,7 +35,10 @@ class Place:
     seeds: tuple[str, ...] = ()
     """Train every cell once for each; with commas or spaces between. The table then has standard deviations."""
     jobs: int = 1
-    """Cells at a time, each in a process of its own with its share of the threads."""
+    """Cells at a time, each in a process of its own with its share of the threads; with --ray, on each machine."""
+    ray: str | None = None
+    """Train the cells on a Ray cluster: local (one of this machine's, for this sweep), auto (the one that runs here),
+    HOST:PORT, or ray://HOST:PORT from outside. --threads are those of each machine. By default, processes here."""
     lpips_weights: Path | None = None
     """VGG16 and LPIPS weights; without them LPIPS is not measured."""
     table_only: bool = False
@@ -66,6 +70,10 @@ def check(options: Options) -> None:
 
     if options.jobs < 1:
         raise UserError(f"--jobs {options.jobs}: must be at least 1")
+    if options.ray is not None and not options.table_only:
+        from scgs_warp.ray_cluster import check_address
+
+        check_address(options.ray)
     if options.ablation == "nodes" and options.nodes is not None:
         raise UserError(f"--nodes {options.nodes}: that is what is varied; choose rows with --values")
     for text in options.set:
@@ -122,33 +130,50 @@ def make_cells(options: Options, device: str) -> list[Cell]:
     )
 
 
-def main(args: list[str] | None) -> None:
-    options = tyro.cli(Options, args=args, prog="ablate.py", description=__doc__)
+def train(options: Options, cells: list[Cell]) -> dict[str, str]:
+    """All cells, here or on a cluster; the table is there from the first, and renewed with each.
 
+    Returns:
+        what went wrong, by the cells' names.
+    """
+    from scgs_warp.ablate import is_done
     from scgs_warp.ablate_jobs import run_cells
-    from scgs_warp.ablate_markdown import markdown
     from scgs_warp.ablate_table import build, write
-    from scgs_warp.errors import UserError
 
-    cells = (
-        [] if options.table_only else make_cells(options, prepare(options.device, options.threads, options.memory_gib))
-    )
-    failures: dict[str, str] = {}
-    report = build(options.ablation, options.output, cells)
-    paths = write(report, options.output)
-    if cells:
+    def renew() -> None:
+        write(build(options.ablation, options.output, cells), options.output)
 
-        def renew() -> None:
-            write(build(options.ablation, options.output, cells), options.output)
+    with ExitStack() as stack:
+        elsewhere = None
+        if options.ray is not None and not all(map(is_done, cells)):
+            from scgs_warp.ablate_ray import on_cluster
 
-        failures = run_cells(
+            limits = {"jobs": options.jobs, "threads": options.threads, "device": options.device}
+            elsewhere = stack.enter_context(on_cluster(options.ray, cells, options.output, **limits))
+        renew()
+        return run_cells(
             cells,
             jobs=options.jobs,
             threads=options.threads,
             report=lambda text: print(text, flush=True),
             finished=renew,
+            elsewhere=elsewhere,
         )
-        report = build(options.ablation, options.output, cells)
+
+
+def main(args: list[str] | None) -> None:
+    options = tyro.cli(Options, args=args, prog="ablate.py", description=__doc__)
+
+    from scgs_warp.ablate_markdown import markdown
+    from scgs_warp.ablate_table import build, write
+    from scgs_warp.errors import UserError
+
+    # What a cluster has need not be here.
+    here = options.device if options.ray is None else "auto"
+    cells = [] if options.table_only else make_cells(options, prepare(here, options.threads, options.memory_gib))
+    failures = train(options, cells) if cells else {}
+    report = build(options.ablation, options.output, cells)
+    paths = write(report, options.output)
     print(markdown(report))
     print(f"{', '.join(map(str, paths))}")
     if failures:

@@ -11,7 +11,7 @@ import json
 import re
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -36,6 +36,8 @@ VARIED = {
 """Fields in which the cells of an ablation may differ."""
 ERROR = "error.txt"
 """In a cell's folder: why it failed."""
+LOG = "train.log"
+"""In a cell's folder: what training printed, where it had a process of its own."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,16 @@ class Cell:
     @property
     def name(self) -> str:
         return f"{self.scene}/{cell_folder(self.value, self.seed)}"
+
+
+def cell_to_json(cell: Cell) -> str:
+    """For a process elsewhere."""
+    return json.dumps(asdict(cell))
+
+
+def cell_from_json(text: str) -> Cell:
+    """What :func:`cell_to_json` made."""
+    return Cell(**json.loads(text))
 
 
 def cell_folder(value: str, seed: int) -> str:

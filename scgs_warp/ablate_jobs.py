@@ -1,10 +1,8 @@
-"""Running the cells of an ablation: one after the other in this process, or several at a time in processes of their
-own. ``python -m scgs_warp.ablate_jobs`` is such a process: it reads one cell as JSON from its input."""
+"""Running the cells of an ablation: one after the other in this process, several at a time in processes of their own,
+or elsewhere (``ablate_ray``). ``python -m scgs_warp.ablate_jobs`` is such a process: it reads one cell as JSON."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import os
 import signal
 import subprocess
@@ -12,18 +10,20 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 from . import environment
-from .ablate import ERROR, Cell, attempt, is_done, read_metrics
+from .ablate import ERROR, LOG, Cell, attempt, cell_from_json, cell_to_json, is_done, read_metrics
 from .progress import clock
 
-LOG = "train.log"
-"""What a process of its own printed."""
 POLL_SECONDS = 0.1
 INTERRUPTED = 130
 
 Report = Callable[[str], None]
+End = Callable[[str, Cell, "str | None"], None]
+"""Told of a cell that has ended: its place in the queue, the cell, and why it failed, if it did."""
+Runner = Callable[[list[tuple[str, Cell]], Report, End], None]
+"""Runs cells, and tells of each as it ends."""
 
 
 def run_cells(
@@ -33,6 +33,7 @@ def run_cells(
     threads: int | None = None,
     report: Report = print,
     finished: Callable[[], None] = lambda: None,
+    elsewhere: Runner | None = None,
 ) -> dict[str, str]:
     """Run all cells that are not done.
 
@@ -41,6 +42,7 @@ def run_cells(
         threads: of all jobs together; default: all cores.
         report: gets one line when a cell begins and one when it ends.
         finished: called after each cell.
+        elsewhere: runs the cells instead of this machine, where ``jobs`` and ``threads`` are its own concern.
 
     Returns:
         what went wrong, by the cells' names.
@@ -63,7 +65,9 @@ def run_cells(
         report(f"{place}: {_score(cell)}" if failure is None else f"{place}: failed: {failure}")
         finished()
 
-    if jobs > 1:
+    if elsewhere is not None:
+        elsewhere(waiting, report, end)
+    elif jobs > 1:
         _in_processes(waiting, jobs, threads, report, end)
     else:
         for place, cell in waiting:
@@ -100,7 +104,7 @@ def _start(place: str, cell: Cell, threads: int, report: Report) -> _Job:
         start_new_session=True,
     )
     assert process.stdin is not None
-    process.stdin.write(json.dumps(dataclasses.asdict(cell)).encode())
+    process.stdin.write(cell_to_json(cell).encode())
     process.stdin.close()
     return _Job(place, cell, process, log)
 
@@ -122,7 +126,7 @@ def _in_processes(
     jobs: int,
     threads: int | None,
     report: Report,
-    end: Callable[[str, Cell, str | None], None],
+    end: End,
 ) -> None:
     from .stopping import stop_signals
 
@@ -150,16 +154,11 @@ def _in_processes(
                 job.log.close()
 
 
-def _read_cell(text: str) -> Cell:
-    values: dict[str, Any] = json.loads(text)
-    return Cell(**values)
-
-
 def main() -> int:
     """Status 0: done; 2: failed, the reason is in the cell's folder; 130: stopped."""
     environment.configure(int(sys.argv[1]))
     try:
-        return 0 if attempt(_read_cell(sys.stdin.read())) is None else 2
+        return 0 if attempt(cell_from_json(sys.stdin.read())) is None else 2
     except KeyboardInterrupt:
         return INTERRUPTED
 

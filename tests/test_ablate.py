@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 import signal
@@ -79,7 +78,7 @@ def test_known_motion_asks_for_the_baseline(blobs, tmp_path):
 
 def test_a_cell_is_plain_data(blobs, tmp_path):
     cell = ablate.plan("nodes", config.preset("cpu"), {"blobs": blobs}, tmp_path)[0]
-    assert ablate_jobs._read_cell(json.dumps(dataclasses.asdict(cell))) == cell
+    assert ablate.cell_from_json(ablate.cell_to_json(cell)) == cell
     assert Path(cell.folder).is_absolute() and Path(cell.settings["data"]["folder"]).is_absolute()
 
 
