@@ -14,6 +14,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from .errors import UserError
+from .json_text import parse_json
 
 FILE = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
@@ -71,14 +72,18 @@ def read(folder: Path, prefixes: tuple[str, ...] = ("",)) -> tuple[dict[str, Ten
         raise UserError(f"{folder}: no {FILE} here; give a run directory that apps/train.py wrote")
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = json.loads((file.metadata() or {})[METADATA_KEY])
+            metadata = parse_json((file.metadata() or {})[METADATA_KEY])
             tensors = {name: file.get_tensor(name) for name in file.keys() if name.startswith(prefixes)}
     except (SafetensorError, KeyError, ValueError, OSError) as error:
         raise UserError(
             f"{path}: damaged or not ours ({error}); {PREVIOUS} beside it may be intact: rename it"
         ) from error
+    if not isinstance(metadata, dict):
+        raise UserError(f"{path}: damaged or not ours (no metadata); {PREVIOUS} beside it may be intact: rename it")
     if metadata.get("format") != FORMAT:
-        raise UserError(f"{path}: format {metadata.get('format')} is not {FORMAT}; use the version that wrote it")
+        raise UserError(
+            f"{path}: format {str(metadata.get('format'))[:20]} is not {FORMAT}; use the version that wrote it"
+        )
     return tensors, metadata
 
 

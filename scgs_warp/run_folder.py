@@ -6,6 +6,7 @@ import json
 import math
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from .data.dataset import Dataset
 from .errors import UserError
 from .metrics import psnr
 from .progress import Progress
+from .report import read_log
 from .scene import Scene
 from .tensorboard import TensorBoard, check_installed
 
@@ -35,15 +37,16 @@ BOARD_IMAGES = 20
 
 def read_seconds(folder: Path) -> float | None:
     """Seconds of training according to the log; None without one."""
-    log = folder / "log.jsonl"
     newest: float | None = None
-    if log.is_file():
-        for line in log.read_text(encoding="utf-8").splitlines():
-            try:
-                newest = float(json.loads(line)["seconds"])
-            except (ValueError, KeyError, TypeError):
-                continue  # a line that a kill cut short
+    for entry in _entries(folder):
+        with suppress(ValueError, KeyError, TypeError):  # not ours
+            newest = float(entry["seconds"])
     return newest
+
+
+def _entries(folder: Path) -> list[dict[str, Any]]:
+    log = folder / "log.jsonl"
+    return read_log(log) if log.is_file() else []
 
 
 def refuse_existing(path: Path, resume: bool) -> None:
@@ -126,20 +129,13 @@ class RunFolder:
         """Write the configuration; drop log lines after ``step``, which a resumed run will write again."""
         text = json.dumps(self.settings, indent=2, sort_keys=True)
         write_atomically(self.path / "config.json", text.encode())
-        log = self.path / "log.jsonl"
-        kept: list[str] = []
         entries: list[dict[str, Any]] = []
-        if self.resume and log.is_file():
-            for line in log.read_text(encoding="utf-8").splitlines():
-                try:
-                    entry = json.loads(line)
-                except ValueError:
-                    continue  # the line that a kill cut short
-                if entry.get("step", 0) <= step:
-                    kept.append(line)
-                    entries.append(entry)
+        for entry in _entries(self.path) if self.resume else []:
+            with suppress(ValueError, TypeError):  # not ours
+                if int(entry.get("step", 0)) <= step:
                     self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
-        write_atomically(log, "".join(line + "\n" for line in kept).encode())
+                    entries.append(entry)
+        write_atomically(self.path / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries).encode())
         if self.tensorboard:
             self._board = TensorBoard(self.path, entries, step, self.seconds)
         self._began = time.perf_counter()
