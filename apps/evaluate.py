@@ -62,7 +62,8 @@ def training_seconds(folder: Path) -> float | None:
         value = parse_json((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return as_number(value)
+    seconds = as_number(value)
+    return None if seconds is None or seconds < 0 else seconds
 
 
 def show(metrics: dict[str, Any]) -> None:

@@ -22,7 +22,7 @@ from .limits import check_sizes
 from .motion import build_motion
 from .motion.base import Motion
 from .render import render
-from .scene_checks import check_metadata, check_motion, check_tensors, reason
+from .scene_checks import check_metadata, check_motion, check_settings, check_tensors, reason
 from .types import Camera, Gaussians, Image
 
 
@@ -74,8 +74,7 @@ class Scene:
                 scene.settings = parse_json(settings_path.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
                 raise UserError(f"{settings_path}: cannot be read ({error}); restore it or train again") from error
-        if not isinstance(scene.settings, dict):
-            raise UserError(f"{settings_path}: must hold a JSON object; restore it or train again")
+        check_settings(scene.settings, str(settings_path))
         scene.motion.eval()
         if metadata.get("stage") != "main":
             raise UserError(f"{folder}: training stopped in stage 1; continue it with apps/train.py --resume")

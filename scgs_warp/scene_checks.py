@@ -24,6 +24,8 @@ LARGEST = 1e12
 """Of centre and scale, of the overview and of steps: beyond it float32 leaves no scene."""
 PLANE = "planes.3"
 MOST_TIMES = 4096
+WHOLE = ("extra.graph.neighbors",)
+"""Tensors of whole numbers."""
 MOMENTS = (0.0, 0.5, 1.0)
 """When a scene is looked at once it is loaded."""
 
@@ -41,8 +43,9 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise _wrong(source, f"{name} holds numbers that are not finite")
-        if value.is_complex() or (not value.is_floating_point() and not name.endswith((".neighbors", ".max_radii"))):
-            raise _wrong(source, f"{name} is of type {value.dtype}, not float")
+        wanted = torch.int32 if name in WHOLE else torch.float32
+        if value.dtype != wanted:
+            raise _wrong(source, f"{name} is of {value.dtype}, not of {wanted}")
     rows = {name: tuple(tensors[name].shape) for name in tensors if name.startswith("gaussians.")}
     means, rest, hyper = (rows.get(f"gaussians.{name}", ()) for name in ("means", "sh_rest", "hyper"))
     if len(means) != 2 or means[0] < 1 or means[1] != 3:
@@ -89,6 +92,20 @@ def check_metadata(metadata: Mapping[str, Any], source: str) -> None:
         raise _wrong(source, "metadata.step is no whole number")
     if not isinstance(metadata.get("motion"), str):
         raise _wrong(source, "metadata.motion names no motion model")
+
+
+def check_settings(settings: Any, source: str) -> None:
+    """What of ``config.json`` is used beside the checkpoint: where the data lie, and how they are looked at.
+
+    Raises:
+        UserError: naming the field.
+    """
+    data = settings.get("data", {}) if isinstance(settings, dict) else None
+    if not isinstance(data, dict):
+        raise UserError(f"{source}: must hold a JSON object, and data another; restore it or train again")
+    for name in ("folder", "resample", "background"):
+        if not isinstance(data.get(name, ""), (str, type(None))):
+            raise UserError(f"{source}: data.{name} is no text; restore it or train again")
 
 
 def _number(value: Any, low: float, high: float) -> bool:

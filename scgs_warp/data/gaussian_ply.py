@@ -82,7 +82,7 @@ def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParamete
         UserError: no row is left.
     """
     total, rest = values["sh_rest"].shape[:2]
-    good = values["quats"].any(axis=1)
+    good = (values["quats"] != 0).any(axis=1)
     for name, value in values.items():
         with np.errstate(invalid="ignore"):
             good &= (np.abs(value.reshape(total, -1)) <= LARGEST.get(name, 1e6)).all(axis=1)  # NaN: no

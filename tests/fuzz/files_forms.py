@@ -52,7 +52,7 @@ def odd_array(array: np.ndarray, random: Random) -> np.ndarray:
     if kind == 3:
         return array.reshape(-1)[: max(int(random.integers(array.size)), 0)]
     if kind == 4:
-        shapes = [array[None], array.T, array[:0], array[..., :1] if array.ndim else array, np.zeros(())]
+        shapes = [array[None], array.T, array.reshape(-1)[:0], array[..., :1] if array.ndim else array, np.zeros(())]
         return shapes[random.integers(len(shapes))]
     kinds = ("f2", "f4", "f8", ">f8", "i1", "u8", "?", "c16", "U4", "S3", "M8[s]")
     with np.errstate(all="ignore"):
