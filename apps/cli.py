@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from scgs_warp import environment
-from scgs_warp.errors import UserError
+from scgs_warp.errors import UserError, is_shortage
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -41,6 +41,11 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         print(f"error: {error.filename or 'input or output'}: {error.strerror or error}", file=sys.stderr)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not is_shortage(error):
+            raise
+        print("error: there is not enough memory for this; free some, or give less at once", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

@@ -18,3 +18,8 @@ class UserError(Exception):
         if not text.isprintable():
             text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
         super().__init__(text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}")
+
+
+def is_shortage(error: BaseException) -> bool:
+    """Whether it says that there is no more memory: Python and NumPy have an error for it, PyTorch has a text."""
+    return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)

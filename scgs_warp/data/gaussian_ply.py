@@ -126,10 +126,18 @@ def open_ply(
     Raises:
         UserError: as :func:`~scgs_warp.data.gaussian_files.read_gaussians`.
     """
-    from .gaussian_files import read_gaussians  # which knows this file's reader
-    from .gaussian_spz import read_antialiased
+    from .gaussian_files import fitting, read_gaussians  # which knows this file's reader
 
     gaussians = read_gaussians(path)
+    with fitting(Path(path)):
+        return _as_scene(Path(path), gaussians, device, nodes, up)
+
+
+def _as_scene(
+    path: Path, gaussians: GaussianParameters, device: str, nodes: int, up: tuple[float, float, float] | None
+) -> Scene:
+    from .gaussian_spz import read_antialiased
+
     world = gaussians.means.detach().double().numpy()
     solid = world[(gaussians.opacities() > OPAQUE).numpy()]
     low, high = np.quantile(solid if len(solid) else world, BULK, axis=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import struct
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -29,6 +30,9 @@ SMALLEST_SIDE = 8
 
 ALWAYS_FINE, THINNEST = 2**25, 64
 """Images of more pixels have at least a byte for so many of them: a megabyte of zeros unpacks to a gigabyte."""
+
+# What a camera wrote beside the picture is of no interest, and a warning about it goes to everybody's terminal.
+warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -107,7 +107,7 @@ class Worker:
         Path("/proc/self/clear_refs").write_text("5")
         before, began = _status("VmRSS"), time.monotonic()
         with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
+            warnings.simplefilter("always", RuntimeWarning)
             outcome, detail = self._outcome(name)
         took, grown = time.monotonic() - began, _status("VmHWM") - before
         if outcome in ("loaded", "refused"):
