@@ -17,8 +17,8 @@ from .errors import UserError
 FILE = "ground_truth.npz"
 OPAQUE = 0.5
 """A Gaussian of at most this opacity carries no surface point."""
-LARGEST = 1e15
-"""Of a coordinate: its square is a float32."""
+SMALLEST, LARGEST = 1e-15, 1e15
+"""Of a height or a coordinate: their squares are float32."""
 CHUNK = 128
 """Surface points whose distances to all Gaussians are held at once."""
 
@@ -61,7 +61,7 @@ def load_ground_truth(folder: str | Path) -> GroundTruth | None:
         raise UserError(f"{path}: points {points.shape} and times {times.shape} must be [T, P, 3] and [T]")
     if visible.ndim != 2 or visible.shape[1] != points.shape[1] or visible.dtype != bool:
         raise UserError(f"{path}: visible {visible.shape} must be [V, P] of booleans with P = {points.shape[1]}")
-    if height.shape != () or not 0 < float(height) < LARGEST or not (np.abs(points) < LARGEST).all():
+    if height.shape != () or not SMALLEST < float(height) < LARGEST or not (np.abs(points) < LARGEST).all():
         raise UserError(f"{path}: height must be one positive number and points finite; make the file again")
     if not ((times >= 0) & (times <= 1)).all() or (np.diff(times) <= 0).any():
         raise UserError(f"{path}: times must increase within [0, 1]; make the file again")

@@ -146,7 +146,7 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
 
 def _sound(value: Any) -> bool:
     """A number that a log has, or nothing."""
-    return value is None or (as_number(value) is not None and abs(value) <= LARGEST)
+    return value is None or (as_number(value) is not None and 0 <= value <= LARGEST)
 
 
 def _placed(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], list[tuple[str, float]]]:

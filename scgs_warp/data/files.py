@@ -164,4 +164,5 @@ def _numbers(file: IO[bytes], size: int, flags: bool) -> np.ndarray:
         raise ValueError("size")
     data = file.read(count * kind.itemsize)
     array = np.frombuffer(data, kind, count).reshape(shape, order="F" if fortran else "C")
-    return array.copy() if flags else array.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of signalling NaN
+        return array.copy() if flags else array.astype(np.float64)

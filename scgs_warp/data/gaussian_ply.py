@@ -102,7 +102,8 @@ def _vertices(path: Path) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a .ply of 3D Gaussian splatting")
     try:
-        elements = PlyData.read(str(path))
+        with np.errstate(over="ignore"):  # of text: infinite, and left out
+            elements = PlyData.read(str(path))
         data = np.asarray(elements["vertex"].data)
     except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise UserError(f"{path}: no PLY file with vertices ({type(error).__name__}); export it again") from None

@@ -66,7 +66,8 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         if not is_regular(path):
             raise UserError(f"{path}: is no file; give a PLY of points")
-        elements = PlyData.read(str(path))
+        with np.errstate(over="ignore"):  # of text: infinite, and left out
+            elements = PlyData.read(str(path))
         vertices = elements["vertex"].data
         points = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
         colors = unit_colors(vertices)

@@ -20,7 +20,7 @@ from typing import Any
 
 TESTS = Path(__file__).resolve().parent.parent
 GOOD = ("loaded", "refused")
-PATIENCE = 30.0
+PATIENCE = 60.0
 """Seconds for a case; the first one of a format is prepared beforehand."""
 START = 300.0
 """Seconds for a worker to make the formats' folders."""
@@ -29,8 +29,8 @@ START = 300.0
 class WorkerProcess:
     """The process that runs cases; another takes its place when it dies or hangs."""
 
-    def __init__(self, formats: Sequence[str]) -> None:
-        self.formats = list(formats)
+    def __init__(self, formats: Sequence[str], modules: Sequence[str] = ()) -> None:
+        self.formats, self.modules = list(formats), list(modules)
         self._process: subprocess.Popen[bytes] | None = None
         self._heard = b""
 
@@ -60,7 +60,7 @@ class WorkerProcess:
         paths = os.pathsep.join([str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")])
         environment = {**os.environ, "PYTHONPATH": paths, "OPENCV_LOG_LEVEL": "SILENT", "MPLBACKEND": "agg"}
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "fuzz.files_worker"],
+            [sys.executable, "-m", "fuzz.files_worker", *self.modules],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL if not os.environ.get("FUZZ_LOUD") else None,
@@ -112,9 +112,9 @@ def campaign(counts: dict[str, int], first: int = 0, worker: WorkerProcess | Non
 def formats() -> dict[str, float]:
     """Names and shares, from the modules that define them."""
     sys.path[:0] = [str(TESTS), str(TESTS.parent)]
-    from fuzz.files_worker import FORMATS
+    from fuzz.files_worker import load_formats
 
-    return {name: item.share for name, item in FORMATS.items()}
+    return {name: item.share for name, item in load_formats().items()}
 
 
 def summary(rows: list[dict[str, Any]], seconds: float) -> dict[str, Any]:

@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from scgs_warp.data import Dataset
+if TYPE_CHECKING:
+    from scgs_warp.data import Dataset
 
 
 class Broken(AssertionError):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import importlib
 import json
 import os
 import resource
@@ -17,19 +18,27 @@ import tempfile
 import time
 import traceback
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz import files_data, files_edits, files_gaussians, files_runs
 from fuzz.files_cases import Broken, Format
 from fuzz.files_forms import mutate
 
 from scgs_warp.errors import UserError
 
-FORMATS: dict[str, Format] = {
-    item.name: item for module in (files_data, files_gaussians, files_runs, files_edits) for item in module.FORMATS
-}
+MODULES = ("files_data", "files_gaussians", "files_runs", "files_edits")
+FORMATS: dict[str, Format] = {}
+
+
+def load_formats(modules: Sequence[str] = MODULES) -> dict[str, Format]:
+    """Those of some modules of this package, by name, from now on in ``FORMATS``."""
+    for module in modules:
+        FORMATS.update({item.name: item for item in importlib.import_module(f"fuzz.{module}").FORMATS})
+    return FORMATS
+
+
 HEADROOM = 3 << 30
 """Bytes of address space beyond what the process needs to stand: threads alone take 8 MiB each."""
 MOST_RESIDENT = 700 << 20
@@ -171,4 +180,5 @@ if __name__ == "__main__":
     from scgs_warp import environment
 
     environment.configure(1)
+    load_formats(sys.argv[1:] or MODULES)
     main()
