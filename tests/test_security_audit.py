@@ -92,3 +92,17 @@ def test_dependencies_are_bounded():
     listed = re.findall(r'"([^"]+)"', re.sub(r"#.*", "", needed[1] + extras[1]))
     assert len(listed) > 20
     assert [item for item in listed if not re.search(r"<|==", item)] == []
+
+
+def test_secrets_are_compared_in_constant_time():
+    """``==`` takes longer the more letters are right."""
+    tree = ast.parse((ROOT / "scgs_warp/editor/proxy.py").read_text(encoding="utf-8"))
+    compared = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Compare)]
+    secrets = [text for text in compared if re.search(r"\b(token|given|key)\b", text)]
+    assert {
+        text
+        for text in secrets
+        if not re.fullmatch(r".* is (not )?None|'token' in .*|key == name|name not in \(KEY.*", text)
+    } == set()
+    called = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    assert sum(text.startswith("hmac.compare_digest(") for text in called) == 2

@@ -76,8 +76,9 @@ class Worker:
         """Damage one file, rarely two; returns which, and how in general."""
         files = list(self.files[name])
         told = []
-        for _ in range(1 if random.random() < 0.9 else 2):
-            path = files[random.integers(len(files))]
+        count = min(len(files), 1 if random.random() < 0.9 else 2)
+        for index in random.choice(len(files), count, replace=False):
+            path = files[index]
             kind = random.random()
             if kind < 0.02:
                 path.unlink(missing_ok=True)
@@ -90,7 +91,7 @@ class Worker:
                 path.unlink(missing_ok=True)
                 path.symlink_to(path.name)
                 told.append(f"{path.name} is a link to itself")
-            elif not path.is_dir() and not path.is_symlink():
+            else:
                 before = self.files[name][path]
                 after = mutate(path.name, before, random)
                 path.write_bytes(after)
