@@ -93,18 +93,19 @@ def data() -> Dataset:
 
 
 @functools.cache
-def config_of_run() -> TrainConfig:
-    rest = {"steps": 0, "densify_until": 0, "warm_up": 0}
-    return tiny_config(60, optim={"cameras": 1e-3}, init_points=60, freeze=0, pretrain=rest)
+def config_of_run(stage: str) -> TrainConfig:
+    """In ``pretrain`` the first step is one with the ARAP term, which makes the graph."""
+    short = {"steps": 0 if stage == "main" else 30, "densify_until": 0 if stage == "main" else 20, "warm_up": 0}
+    return tiny_config(60, optim={"cameras": 1e-3}, init_points=60, freeze=0, pretrain=short)
 
 
 def frames_of(state: TrainState) -> Frames:
     return Frames(data(), state.normalisation, state.config, "cpu")
 
 
-def write_resumable(folder: Path) -> None:
-    """A run in its main stage that learns poses, too, as training leaves it."""
-    config = config_of_run()
+def write_resumable(folder: Path, stage: str = "main") -> None:
+    """A run that learns poses, too, as training leaves it after two steps."""
+    config = config_of_run(stage)
     with RunFolder(folder, config, None, resume=False) as run:
         state = TrainState.begin(config, data(), "cpu")
         frames = frames_of(state)
@@ -112,14 +113,14 @@ def write_resumable(folder: Path) -> None:
         for _ in range(2):
             training_step(state, frames)
             state.step += 1
-            entry = {"step": state.step, "stage": "main", "loss": 0.5, "l1": 0.4, "ssim": 0.1, "psnr": 12.0}
+            entry = {"step": state.step, "stage": stage, "loss": 0.5, "l1": 0.4, "ssim": 0.1, "psnr": 12.0}
             run.log({**entry, "gaussians": 60})
         state.save(folder)
 
 
-def load_resumed(folder: Path) -> None:
+def load_resumed(folder: Path, stage: str = "main") -> None:
     """As ``--resume`` does: the state, the log, and one step from there."""
-    config = config_of_run()
+    config = config_of_run(stage)
     with RunFolder(folder, config, None, resume=True) as run:
         state = TrainState.resume(folder, config, data(), "cpu")
         run.begin(state.step)
@@ -197,6 +198,13 @@ FORMATS = (
     Format("checkpoint-network", functools.partial(write_model, "per-gaussian"), load_scene, named(RUN[:1])),
     Format("checkpoint-static", functools.partial(write_model, "static"), load_scene, named((*RUN, "metrics.json"))),
     Format("resume", write_resumable, load_resumed, named(("checkpoint.safetensors", "log.jsonl")), share=2.0),
+    Format(
+        "resume-stage-1",
+        functools.partial(write_resumable, stage="pretrain"),
+        functools.partial(load_resumed, stage="pretrain"),
+        named(("checkpoint.safetensors",)),
+        share=0.7,
+    ),
     Format("log", write_log, load_log, named(("log.jsonl",)), share=0.3),
     Format("config", write_config, load_config, share=1.5),
     Format("ablation", write_cells, load_table),
