@@ -191,8 +191,11 @@ def read_metrics(folder: Path) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError):
         values = None
-    sound = isinstance(values, dict) and all(_sound(values.get(name)) for name in NUMBERS)
-    if not sound or not isinstance(values.get("device", ""), (str, type(None))):
+    if (
+        not isinstance(values, dict)
+        or not all(_sound(values.get(name)) for name in NUMBERS)
+        or not isinstance(values.get("device", ""), (str, type(None)))
+    ):
         raise UserError(f"{path}: damaged; remove it, and the cell is measured again")
     return values
 

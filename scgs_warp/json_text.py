@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from typing import Any
 
 
-def parse_json(text: str | bytes, **hooks: Callable[..., Any]) -> Any:
+def parse_json(text: str | bytes, **hooks: Any) -> Any:
     """As ``json.loads``, which gives up on brackets that are nested too deeply in an error of its own.
 
     Raises:
