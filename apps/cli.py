@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Literal
 
 from scgs_warp import environment
-from scgs_warp.errors import UserError, one_line
+from scgs_warp.errors import UserError, is_shortage, one_line
 from scgs_warp.job import label
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -49,6 +49,11 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         _tell(f"error: {one_line(error)}")
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not is_shortage(error):
+            raise
+        _tell(f"error{label()}: there is not enough memory for this; free some, or give less at once")
         return 2
     except KeyboardInterrupt:
         _tell("interrupted")

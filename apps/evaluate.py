@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,11 +58,15 @@ def load_data(scene: Scene, options: Options) -> Dataset:
 
 def training_seconds(folder: Path) -> float | None:
     """What ``metrics.json`` of the run says; None if it does not."""
+    from scgs_warp.data.files import as_number
+    from scgs_warp.json_text import parse_json
+
     try:
-        value = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]
+        value = parse_json((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return float(value) if isinstance(value, (int, float)) else None
+    seconds = as_number(value)
+    return None if seconds is None or seconds < 0 else seconds
 
 
 def show(metrics: dict[str, Any]) -> None:

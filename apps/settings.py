@@ -108,7 +108,13 @@ def configuration(
         if not sign:
             raise UserError(f"--set {text}: write NAME=VALUE, for example motion.hyper_dim=8")
         made = config.with_field(made, name.strip(), config.parse_value(value.strip()), f"--set {text}")
-    return limits.check(made), folder
+    try:
+        limits.check(made)
+    except UserError as error:
+        raise UserError(f"{error} (in {file}, or an option beside it)" if file else str(error)) from None
+    if folder is not None and not isinstance(folder, str):
+        raise UserError(f"{file}: data.folder is no text; name the folder of a data set")
+    return made, folder
 
 
 def builtin_scene(device: str) -> Path:

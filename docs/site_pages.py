@@ -1,4 +1,4 @@
-"""MkDocs hook: pages of the site that the repository keeps elsewhere: README, changelog, examples."""
+"""MkDocs hook: pages of the site that the repository keeps elsewhere: README, security, changelog, examples."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages."""
     pages = {
         "index.md": from_docs((ROOT / "README.md").read_text(encoding="utf-8")),
+        "security.md": from_docs((ROOT / "SECURITY.md").read_text(encoding="utf-8")),
         "changelog.md": from_docs((ROOT / "CHANGELOG.md").read_text(encoding="utf-8")),
         "examples.md": examples_page(),
     }
@@ -37,7 +38,7 @@ def on_page_content(html: str, **known: Any) -> str:
 
 def from_docs(text: str) -> str:
     """Links that lead from the repository's root, as the site has them: what is wrong then is found by --strict."""
-    text = re.sub(r"(\]\()docs/", r"\1", text)
+    text = re.sub(r"(\]\()docs/", r"\1", text).replace("](SECURITY.md)", "](security.md)")
     return re.sub(r"(\]\()examples/?(?=\))", r"\1examples.md", text)
 
 

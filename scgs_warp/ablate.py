@@ -17,7 +17,9 @@ from typing import Any, Literal, get_args
 
 from .checkpoint import FILE as CHECKPOINT
 from .config import FREE_TO_CHANGE, TrainConfig, from_dict, read_config, to_dict, with_field
+from .data.files import as_number
 from .errors import UserError
+from .json_text import parse_json
 from .limits import check
 
 AblationName = Literal["nodes", "motion", "arap"]
@@ -34,6 +36,8 @@ VARIED = {
     "arap": ("motion.model", "loss.arap", "pretrain.arap_weight"),
 }
 """Fields in which the cells of an ablation may differ."""
+NUMBERS, LARGEST = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds"), 1e12
+"""What of ``metrics.json`` stands in tables, and what no such number reaches."""
 ERROR = "error.txt"
 """In a cell's folder: why it failed."""
 LOG = "train.log"
@@ -67,7 +71,7 @@ def cell_to_json(cell: Cell) -> str:
 
 def cell_from_json(text: str) -> Cell:
     """What :func:`cell_to_json` made."""
-    return Cell(**json.loads(text))
+    return Cell(**parse_json(text))
 
 
 def cell_folder(value: str, seed: int) -> str:
@@ -195,14 +199,24 @@ def read_metrics(folder: Path) -> dict[str, Any] | None:
     """
     path = folder / "metrics.json"
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
     except (OSError, ValueError):
         values = None
-    if not isinstance(values, dict):
+    if (
+        not isinstance(values, dict)
+        or not all(_sound(values.get(name)) for name in NUMBERS)
+        or not isinstance(values.get("device", ""), (str, type(None)))
+    ):
         raise UserError(f"{path}: damaged; remove it, and the cell is measured again")
     return values
+
+
+def _sound(value: Any) -> bool:
+    """A number of a table, or nothing."""
+    number = as_number(value)
+    return value is None or (number is not None and abs(number) < LARGEST)
 
 
 def is_done(cell: Cell) -> bool:

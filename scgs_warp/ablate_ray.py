@@ -6,7 +6,6 @@ seen: a cell that came further since the last loss is given another chance, as o
 
 from __future__ import annotations
 
-import json
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +21,7 @@ from .ablate_worker import LOCK_SECONDS, PACKAGES, WORKER, difference, fingerpri
 from .checkpoint import FILE as CHECKPOINT
 from .environment import available_threads
 from .errors import UserError
+from .json_text import parse_json
 from .progress import Progress, progress
 from .ray_cluster import Machine
 from .stopping import stop_signals
@@ -349,7 +349,7 @@ def _changed(folder: Path) -> int:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return values if isinstance(values, dict) else {}
@@ -365,7 +365,7 @@ def _steps_done(folder: Path) -> int:
         return 0
     for line in reversed(lines):
         try:
-            return int(json.loads(line)["step"])
+            return int(parse_json(line)["step"])
         except (ValueError, KeyError, TypeError):
             continue  # a line that is being written, or was cut
     return 0

@@ -18,6 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from .errors import UserError
+from .json_text import parse_json
 
 FILE = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
@@ -55,7 +56,8 @@ def _write_through(path: Path, content: bytes) -> None:
         OSError: it cannot be written.
     """
     try:
-        with open(path, "wb") as file:
+        path.unlink(missing_ok=True)  # in a stranger's folder it may be a link to somewhere else
+        with open(path, "xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -158,8 +160,10 @@ def read(
         raise UserError(f"{folder}: no {name} here; give a run directory that apps/train.py wrote")
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = json.loads((file.metadata() or {})[METADATA_KEY])
+            metadata = parse_json((file.metadata() or {})[METADATA_KEY])
             tensors = {key: file.get_tensor(key) for key in file.keys() if key.startswith(prefixes)}
+        if not isinstance(metadata, dict):
+            raise ValueError("no metadata")
         sums = metadata.get("crc32", {})  # runs from before there were any have none
         for key, tensor in tensors.items():
             if key in sums and sums[key] != _sum(tensor):
@@ -167,7 +171,9 @@ def read(
     except (SafetensorError, KeyError, ValueError, TypeError, AttributeError, OSError) as error:
         raise DamagedCheckpoint(f"{path}: damaged or not ours ({error}); {remedy}") from error
     if metadata.get("format") != FORMAT:
-        raise UserError(f"{path}: format {metadata.get('format')} is not {FORMAT}; use the version that wrote it")
+        raise UserError(
+            f"{path}: format {str(metadata.get('format'))[:20]} is not {FORMAT}; use the version that wrote it"
+        )
     return tensors, metadata
 
 

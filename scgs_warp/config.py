@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import types
 import typing
 from pathlib import Path
@@ -25,6 +24,7 @@ from .config_fields import (
     TrainConfig,
 )
 from .errors import UserError
+from .json_text import parse_json
 
 __all__ = [
     "DataConfig",
@@ -90,6 +90,8 @@ def with_steps(config: TrainConfig, steps: int) -> TrainConfig:
     """
     if steps < 10:
         raise UserError(f"--steps {steps}: a run needs at least 10 steps")
+    if config.steps < 1:
+        raise UserError(f"steps is {config.steps}; a run needs at least 10 steps")
     ratio = steps / config.steps
     return dataclasses.replace(_scale(config, ratio), steps=steps)
 
@@ -156,7 +158,10 @@ def _checked(value: Any, hint: Any, label: str) -> Any:
             raise UserError(f"{label} is {value!r}; choose one of {', '.join(map(str, get_args(hint)))}")
         return value
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise UserError(f"{label} is {str(value)[:20]}...; give a smaller number") from None
     if not isinstance(value, hint if not isinstance(hint, types.UnionType) else get_args(hint)) or (
         isinstance(value, bool) and hint is not bool
     ):
@@ -189,7 +194,7 @@ def whole_number(value: Any, label: str) -> int:
 def parse_value(text: str) -> Any:
     """A JSON value, else the text itself."""
     try:
-        return json.loads(text)
+        return parse_json(text)
     except ValueError:
         return text
 
@@ -201,11 +206,11 @@ def read_config(path: Path) -> dict[str, Any]:
         UserError: it is missing, not JSON, or not an object.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give a config.json of an earlier run") from error
     except ValueError as error:
-        raise UserError(f"{path}: not valid JSON ({error})") from error
+        raise UserError(f"{path}: not valid JSON ({error}); correct it or give another file") from None
     if not isinstance(values, dict):
-        raise UserError(f"{path}: must hold a JSON object")
+        raise UserError(f"{path}: must hold a JSON object; give a config.json of an earlier run")
     return values

@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+LONGEST = 1000
+"""Letters of a message: names and reasons in it may come from anywhere."""
+
 
 class UserError(Exception):
-    """A mistake in the user's input: the message names the file, the field and the remedy, without a line break."""
+    """A mistake in the user's input: the message names the file, the field and the remedy, in one line.
+
+    What it quotes may come from a stranger's file: line breaks become spaces, and what a terminal might obey
+    (escape sequences, marks that turn the direction of writing) is shown as Python would write it.
+    """
+
+    def __init__(self, message: str) -> None:
+        text = " ".join(str(message).split())
+        if not text.isprintable():
+            text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+        super().__init__(text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}")
 
 
 def one_line(error: Exception) -> str:
@@ -16,3 +29,8 @@ def one_line(error: Exception) -> str:
 
 class FrameError(UserError):
     """The pixels of a frame cannot be read any more. The step that asked for them has changed nothing."""
+
+
+def is_shortage(error: BaseException) -> bool:
+    """Whether it says that there is no more memory: Python and NumPy have an error for it, PyTorch has a text."""
+    return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Iterator
 from typing import Any
 
 from .config import TrainConfig
@@ -23,6 +25,27 @@ NOT_NEGATIVE = (
     "optim.cameras optim.shading optim.settle motion.time_noise motion.hyper_dim motion.hyper_dim_filled "
     "loss.hexplane_tv loss.hexplane_smooth loss.hexplane_rest"
 ).split()
+AT_MOST = {
+    "steps": 100_000_000,
+    "init_points": 10_000_000,
+    "data.downscale": 1_000,
+    "motion.nodes": 1_000_000,
+    "motion.layers": 64,
+    "motion.width": 2_048,
+    "motion.time_frequencies": 32,
+    "motion.position_frequencies": 32,
+    "motion.hyper_dim": 64,
+    "motion.hyper_dim_filled": 64,
+    "motion.time_noise": 1e6,
+    "pretrain.start_ratio": 1e4,
+    "pretrain.max_ratio": 1e4,
+    "pretrain.clone_share": 1,
+    "loss.arap_times": 10_000,
+    "densify.max_gaussians": 100_000_000,
+}
+"""Of what takes memory; a configuration may come from anywhere."""
+LARGEST = 1e9
+"""Of any number."""
 
 
 def check(config: TrainConfig) -> TrainConfig:
@@ -32,6 +55,7 @@ def check(config: TrainConfig) -> TrainConfig:
         UserError: naming the field and the remedy.
     """
     motion = config.motion
+    check_sizes(config)
     for names, lowest in ((AT_LEAST_ONE, 1), (NOT_NEGATIVE, 0)):
         for name in names:
             value = _field(config, name)
@@ -58,6 +82,37 @@ def check(config: TrainConfig) -> TrainConfig:
     if config.densify.max_gaussians < 100:
         raise UserError(f"--max-gaussians {config.densify.max_gaussians}: needs at least 100")
     return config
+
+
+def check_sizes(config: TrainConfig, place: str = "") -> None:
+    """Refuse numbers that no run has, before they are made into arrays: of a file's configuration, too.
+
+    Args:
+        place: what the message begins with.
+
+    Raises:
+        UserError: naming the field and the remedy.
+    """
+    for name, value in _numbers(config):
+        most = AT_MOST.get(name, LARGEST)
+        if not -LARGEST <= value <= most:  # NaN fails, too
+            shown = str(value) if isinstance(value, float) else str(value)[:20]
+            raise UserError(f"{place}{name} is {shown}; it must be at most {most:g}")
+    motion = config.motion
+    if not 0 <= motion.skip < motion.layers or min(motion.width, motion.layers) < 1:
+        raise UserError(f"{place}motion.skip is {motion.skip}; it must be below motion.layers, {motion.layers}")
+    if min(motion.time_frequencies, motion.position_frequencies) < 1 or motion.hyper_dim < 0:
+        raise UserError(f"{place}motion.time_frequencies, position_frequencies or hyper_dim are too small; restore it")
+
+
+def _numbers(config: Any, prefix: str = "") -> Iterator[tuple[str, int | float]]:
+    """Dotted names and values of all that are numbers."""
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            yield from _numbers(value, f"{prefix}{item.name}.")
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield f"{prefix}{item.name}", value
 
 
 def _field(config: Any, name: str) -> Any:

@@ -11,11 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .data.files import read_npy
 from .errors import UserError
 
 FILE = "ground_truth.npz"
 OPAQUE = 0.5
 """A Gaussian of at most this opacity carries no surface point."""
+SMALLEST, LARGEST = 1e-15, 1e15
+"""Of a height or a coordinate: their squares are float32."""
 CHUNK = 128
 """Surface points whose distances to all Gaussians are held at once."""
 
@@ -52,20 +55,16 @@ def load_ground_truth(folder: str | Path) -> GroundTruth | None:
     path = Path(folder) / FILE
     if not path.is_file():
         return None
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            content = {name: archive[name] for name in ("points", "times", "visible", "height")}
-    except KeyError as error:
-        raise UserError(f"{path}: field {str(error).split()[0][1:]} is missing; make the file again") from None
-    except Exception as error:  # zipfile, zlib and NumPy each raise their own
-        raise UserError(f"{path}: cannot be read ({type(error).__name__}); make the file again") from None
-    points, times, visible, height = (content[name] for name in ("points", "times", "visible", "height"))
+    points, times, height = (read_npy(path, name) for name in ("points", "times", "height"))
+    visible = read_npy(path, "visible", flags=True)
     if points.ndim != 3 or points.shape[2] != 3 or len(points) < 1 or times.shape != points.shape[:1]:
         raise UserError(f"{path}: points {points.shape} and times {times.shape} must be [T, P, 3] and [T]")
     if visible.ndim != 2 or visible.shape[1] != points.shape[1] or visible.dtype != bool:
         raise UserError(f"{path}: visible {visible.shape} must be [V, P] of booleans with P = {points.shape[1]}")
-    if height.shape != () or not float(height) > 0 or not np.isfinite(points).all():
+    if height.shape != () or not SMALLEST < float(height) < LARGEST or not (np.abs(points) < LARGEST).all():
         raise UserError(f"{path}: height must be one positive number and points finite; make the file again")
+    if not ((times >= 0) & (times <= 1)).all() or (np.diff(times) <= 0).any():
+        raise UserError(f"{path}: times must increase within [0, 1]; make the file again")
     return GroundTruth(
         torch.from_numpy(points).float(), torch.from_numpy(times).float(), torch.from_numpy(visible), float(height)
     )

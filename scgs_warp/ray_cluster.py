@@ -117,9 +117,14 @@ def _ask(address: str) -> None:
     Raises:
         UserError: it does not.
     """
-    command = [sys.executable, "-m", "scgs_warp.ray_cluster", address]
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_SECONDS, check=False)
+        answer = subprocess.run(
+            [sys.executable, "-m", "scgs_warp.ray_cluster", address],
+            capture_output=True,
+            text=True,
+            timeout=ANSWER_SECONDS,
+            check=False,
+        )
     except subprocess.TimeoutExpired as error:
         raise UserError(
             f"--ray {address}: no Ray cluster answered within {ANSWER_SECONDS:.0f} s; {START}; from a machine outside "

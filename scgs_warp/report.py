@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,8 +13,12 @@ import torch
 from torch import Tensor
 
 from .checkpoint import write_atomically
+from .data.files import as_number
 from .errors import UserError
+from .json_text import parse_json
 
+NUMBERS, LARGEST = ("step", "seconds"), 1e9
+"""Fields of a log line without which it cannot be placed, and the largest value that they can have."""
 ERROR_RANGE = 0.2
 """The mean absolute error over the channels that gets the brightest colour of an error map."""
 CAPTION = 22
@@ -123,7 +126,7 @@ def contact_sheet(
 
 
 def read_log(path: str | Path) -> list[dict[str, Any]]:
-    """The lines of a run's ``log.jsonl``; one that is no JSON object (cut off when a run was killed) is left out.
+    """The lines of a run's ``log.jsonl``; one that is not what a log has (cut off when a run was killed) is left out.
 
     Raises:
         UserError: the file cannot be read.
@@ -135,19 +138,24 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
     lines = []
     for line in text.splitlines():
         try:
-            value = json.loads(line)
+            value = parse_json(line)
         except ValueError:
             continue
-        if isinstance(value, dict):
+        if isinstance(value, dict) and all(_sound(value.get(key)) for key in NUMBERS):
             lines.append(value)
     return lines
+
+
+def _sound(value: Any) -> bool:
+    """A number that a log has, or nothing."""
+    return value is None or (as_number(value) is not None and 0 <= value <= LARGEST)
 
 
 def _placed(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], list[tuple[str, float]]]:
     """Where each (stage, step) lies on one axis, stage behind stage, and where each stage begins."""
     steps: dict[str, list[int]] = {}
     for line in lines:
-        if _number(line.get("step")) is not None:
+        if as_number(line.get("step")) is not None:
             steps.setdefault(str(line.get("stage", "")), []).append(int(line["step"]))
     positions, starts, end = {}, [], 0.0
     for stage, found in steps.items():
@@ -159,18 +167,12 @@ def _placed(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], 
     return positions, starts
 
 
-def _number(value: Any) -> float | None:
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
-    return None
-
-
 def _series(lines: list[dict[str, Any]], key: str, positions: dict[tuple[str, int], float]) -> dict[float, float]:
     """Position to value, in order; of lines for the same step (a resumed run) the last one counts."""
     found = {}
     for line in lines:
-        value = _number(line.get(key))
-        if value is not None and _number(line.get("step")) is not None:
+        value = as_number(line.get(key))
+        if value is not None and as_number(line.get("step")) is not None:
             found[positions[str(line.get("stage", "")), int(line["step"])]] = value
     return dict(sorted(found.items()))
 

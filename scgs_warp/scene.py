@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,12 @@ from .data.normalise import Normalisation
 from .errors import UserError
 from .frame_graph import FrameGraph
 from .gaussians import GaussianParameters
+from .json_text import parse_json
+from .limits import check_sizes
 from .motion import build_motion
 from .motion.base import Motion
 from .render import render
+from .scene_checks import check_metadata, check_motion, check_settings, check_tensors, reason
 from .types import Camera, Gaussians, Image
 
 
@@ -81,15 +83,15 @@ class Scene:
         settings_path = folder / "config.json"
         if settings_path.is_file():
             try:
-                scene.settings = json.loads(settings_path.read_text(encoding="utf-8"))
+                scene.settings = parse_json(settings_path.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
                 raise UserError(f"{settings_path}: cannot be read ({error}); restore it or train again") from error
-        if not isinstance(scene.settings, dict):
-            raise UserError(f"{settings_path}: must hold a JSON object; restore it or train again")
+        check_settings(scene.settings, str(settings_path))
         scene.motion.eval()
         if metadata.get("stage") != "main":
             raise UserError(f"{folder}: training stopped in stage 1; continue it with apps/train.py --resume")
         scene.freeze_binding()
+        check_motion(scene, str(folder / checkpoint.FILE))
         return scene
 
     def freeze_binding(self) -> None:
@@ -219,8 +221,11 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
     Raises:
         UserError: tensors are missing or do not fit each other.
     """
+    check_tensors(tensors, source)
+    check_metadata(metadata, source)
     try:
         config = from_dict(metadata["config"], source)
+        check_sizes(config, f"{source}: ")
         rows = checkpoint.strip(tensors, "gaussians.")
         rows.setdefault("shading", torch.zeros(len(rows["means"]), 0))  # runs from before there was any
         shaded = rows["shading"].shape[1] > 0
@@ -235,8 +240,8 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
         normalisation = Normalisation(np.asarray(unit["centre"], dtype=np.float64), float(unit["scale"]))
         overview = Overview.from_dict(metadata["overview"])
         step = int(metadata["step"])
-    except (KeyError, RuntimeError, ValueError, TypeError) as error:
+    except (KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
         raise UserError(
-            f"{source}: not a complete checkpoint ({error}); train again or use the previous one"
+            f"{source}: not a complete checkpoint ({reason(error)}); train again or use the previous one"
         ) from error
     return Scene(gaussians.to(device), motion.to(device), normalisation, config, overview, step=step)

@@ -26,6 +26,7 @@ from .optim import Adam, generator
 from .parallel import Team
 from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, sphere_base, thin_spheres
 from .scene import Scene, scene_from
+from .scene_checks import check_metadata, check_resumed, check_tensors, reason
 from .types import Stats
 
 Stage = Literal["pretrain", "main"]
@@ -169,9 +170,12 @@ class TrainState:
         config = suited(config, data)
         tensors, metadata = checkpoint.read(folder)
         source = str(folder / checkpoint.FILE)
+        check_metadata(metadata, source)
         _same_configuration(metadata["config"], to_dict(config), source)
         if metadata.get("frames") != data.fingerprint:
             raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
+        check_tensors(tensors, source)
+        check_resumed(tensors, metadata, source)
         tensors = checkpoint.to_device(tensors, device)
         scene = scene_from(tensors, metadata, device, source)
         nothing = torch.zeros(0, 3, device=device)
@@ -200,8 +204,8 @@ class TrainState:
             stats = checkpoint.strip(tensors, "stats.")
             state.stats = Stats(stats["grad_norm"], stats["count"], stats["max_radii"], absolute=state.stats.absolute)
             state.failures = int(metadata["failures"])
-        except (KeyError, ValueError, RuntimeError) as error:
-            raise UserError(f"{source}: cannot be resumed ({error}); train again without --resume") from error
+        except (KeyError, IndexError, ValueError, RuntimeError, TypeError) as error:
+            raise UserError(f"{source}: cannot be resumed ({reason(error)}); train again without --resume") from error
         return state
 
 
@@ -255,7 +259,8 @@ def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = ""
         if f"{prefix}{name}" in FREE_TO_CHANGE:
             continue
         if isinstance(value, dict):
-            _same_configuration(saved.get(name, {}), value, source, f"{prefix}{name}.")
+            inner = saved.get(name, {})
+            _same_configuration(inner if isinstance(inner, dict) else {}, value, source, f"{prefix}{name}.")
         elif name not in saved:  # what that version did instead cannot be asked for
             raise UserError(
                 f"{source}: made by another version, which had no {prefix}{name}; train again with another --output"

@@ -16,14 +16,18 @@ from page_reader import read_page
 from plyfile import PlyData
 from test_export_still import gltf_arrays
 
+from scgs_warp.apps.cli import run
 from scgs_warp.data import gaussian_files
+from scgs_warp.data.gaussian_ply import open_ply
 from scgs_warp.errors import UserError
 from scgs_warp.export import job
 from scgs_warp.export.gltf import Document
 from scgs_warp.export.request import Format, Request
 from scgs_warp.export.sequence import write_sequence
 from scgs_warp.export.skeleton import at_rest
+from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.motion.control_points import ControlPoints
+from scgs_warp.motion.static_nodes import StaticNodes
 from scgs_warp.scene import Scene
 from scgs_warp.types import Gaussians, Pose
 
@@ -56,6 +60,27 @@ def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, error)
     monkeypatch.setitem(gaussian_files.READERS, ".spz", refuse)
     with pytest.raises(UserError, match=r"a\.spz: .*fit into memory; export"):
         gaussian_files.read_gaussians(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+def test_what_does_not_fit_after_reading_is_one_line_too(tmp_path, monkeypatch, error, capsys):
+    """The file fits, but nothing beside it."""
+
+    def refuse(*_: object) -> None:
+        raise error
+
+    path = zeros_spz(tmp_path / "a.spz", 100)
+    with monkeypatch.context() as patch:
+        patch.setattr(StaticNodes, "sample", refuse)
+        with pytest.raises(UserError, match=r"a\.spz: .*fit into memory; export"):
+            open_ply(path)
+    monkeypatch.setattr(GaussianParameters, "activate", refuse)
+    with pytest.raises(UserError, match=r"a\.spz: .*fit into memory; export"):
+        job.export(Request(tmp_path / "b.ply", ply=path))
+    assert run(refuse) == 2
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "b.ply").exists()
+    with pytest.raises(RuntimeError, match="another"):
+        run(lambda _: (_ for _ in ()).throw(RuntimeError("another")))
 
 
 @pytest.fixture
@@ -106,13 +131,13 @@ def test_glb_leaves_out_gaussians_that_are_not_finite(scene, tmp_path, monkeypat
 
 
 def test_sequences_leave_out_gaussians_that_are_not_finite(scene, tmp_path, monkeypatch):
-    spoil(scene)  # shades nothing where Gaussians are posed
+    spoil(scene)
     with torch.no_grad():
         scene.gaussians.sh_dc[5, 1] = float("nan")
     write(scene, tmp_path / "frames", "ply-sequence", monkeypatch)
     for path in sorted((tmp_path / "frames").iterdir()):
         data = PlyData.read(str(path))["vertex"].data
-        assert len(data) == 49 and all(np.isfinite(data[name]).all() for name in data.dtype.names)
+        assert len(data) == 47 and all(np.isfinite(data[name]).all() for name in data.dtype.names)
 
 
 def test_pages_leave_out_gaussians_that_are_not_finite(scene, tmp_path, monkeypatch):

@@ -171,7 +171,10 @@ COLMAP = {
     "quaternion": (model_text("images.txt", words(0, 2, "7.0")), "images.txt: the pose of 'frame_1.png'"),
     "no number": (model_text("images.txt", words(0, 2, "x")), "images.txt: truncated or damaged"),
     "camera": (model_text("images.txt", words(0, 8, "3")), "frame_1.png is of camera 3, which cameras.txt does"),
-    "outside": (model_text("images.txt", words(0, 9, "../f.png")), "an image is called '../f.png'"),
+    "outside": (
+        model_text("images.txt", words(0, 9, "../f.png")),
+        "name of an image is '../f.png', which leads out",
+    ),
     "truncated": (model_text("images.txt", lambda lines: lines[:-1]), "its line of observations is missing"),
     "empty": (text("sparse/0/images.txt", "# nothing\n"), "no image is registered"),
     "model": (model_text("cameras.txt", words(0, 1, "PLATE")), "camera '7' is of no model that is known"),

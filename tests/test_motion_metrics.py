@@ -130,5 +130,5 @@ def test_ground_truth_file(tmp_path):
     with pytest.raises(UserError, match="times"):
         load_ground_truth(tmp_path)
     (tmp_path / "ground_truth.npz").write_bytes(b"not a zip")
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match="no sound numpy file"):
         load_ground_truth(tmp_path)

@@ -71,7 +71,15 @@ def test_the_source_distribution_has_everything(unpacked):
     for name in (*PLACES, "tests", "docs", "examples", "benchmarks"):
         missing = {n for n in files(ROOT / name) - files(unpacked / name) if not n.startswith("results/.")}
         assert not missing, f"{name}: MANIFEST.in leaves out {sorted(missing)}"
-    for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "pyproject.toml", "mkdocs.yml"):
+    for name in (
+        "README.md",
+        "CHANGELOG.md",
+        "CONTRIBUTING.md",
+        "SECURITY.md",
+        "LICENSE",
+        "pyproject.toml",
+        "mkdocs.yml",
+    ):
         assert (unpacked / name).is_file(), name
 
 

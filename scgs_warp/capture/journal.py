@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..json_text import parse_json
 from .writing import FILE, write_text
 
 WORK = "work"
@@ -42,7 +43,9 @@ class Journal:
                 raise UserError(
                     f"{folder}: holds the capture of another video; give another --output, or remove the folder"
                 )
-            self._stages = content["stages"]
+            self._stages = {
+                name: found for name, found in content["stages"].items() if isinstance(found, dict) and "key" in found
+            }
         self.finished = (folder / FILE).exists()
 
     def start(self) -> None:
@@ -88,6 +91,10 @@ class Journal:
         """Of a stage that is done."""
         return self._stages[name]["result"]
 
+    def damaged(self, name: str) -> UserError:
+        """The error to raise where the result of a stage is not what ``make`` returns."""
+        return UserError(f"{self.file}: what it says of {name} is damaged; remove {self.folder}, and capture again")
+
     def _save(self) -> None:
         content = {"source": self._source, "stages": self._stages}
         write_text(self.file, json.dumps(content, indent=1) + "\n")
@@ -95,7 +102,7 @@ class Journal:
 
 def _read(file: Path) -> dict[str, Any] | None:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = parse_json(file.read_text(encoding="utf-8"))
         return content if isinstance(content["stages"], dict) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..data.files import as_number
 from ..errors import UserError
 from ..film import write_png
 from ..progress import progress
@@ -170,7 +171,24 @@ def _frames(request: Request, source: Source, journal: Journal, show: Show) -> F
 
     settings = {key: getattr(request, key) for key in ("frames", "start", "end", "size")}
     found = journal.stage("frames", settings, make, lambda: shutil.rmtree(place, ignore_errors=True))
-    return Frames(**{**found, "span": tuple(found["span"]), "size": tuple(found["size"])})
+    frames = _frames_of(found)
+    if frames is None:
+        raise journal.damaged("frames")
+    return frames
+
+
+def _frames_of(found: Any) -> Frames | None:
+    """What a journal holds of them; None where it is none of what ``_frames`` writes there."""
+    try:
+        frames = Frames(**{**found, "span": tuple(found["span"]), "size": tuple(found["size"])})
+        counts = (*frames.indices, *frames.size, frames.seen, frames.blurred, frames.alike)
+        whole = all(isinstance(count, int) and 0 <= count < 2**31 for count in counts)
+        times = all(as_number(second) is not None for second in (*frames.seconds, *frames.span))
+        names = len(frames.names) in (0, len(frames.indices)) and all(isinstance(name, str) for name in frames.names)
+        lengths = len(frames.seconds) == len(frames.indices) and len(frames.span) == len(frames.size) == 2
+    except (KeyError, TypeError):
+        return None
+    return frames if whole and times and names and lengths else None
 
 
 def _until(stills: Iterator[Still], last: int) -> Iterator[Still]:
@@ -264,9 +282,18 @@ def _solve(
     journal.stage("matches", [request.matching, request.seed], compare, lambda: features.forget(database))
     journal.stage("cameras", request.seed, place, lambda: shutil.rmtree(model, ignore_errors=True))
     solved = mapping.read_solution(model, shots)
-    masked = 0.0 if shots.masks is None else float(journal.result("masks")["share"])
+    masked = 0.0 if shots.masks is None else _share(journal)
     registered, arc = (len(solved.places), solved.arc) if solved else (0, 0.0)
     return Outcome(count, registered, arc, features.links(database, shots), masked), solved
+
+
+def _share(journal: Journal) -> float:
+    """Of the pixels that move, as the journal has it."""
+    found = journal.result("masks")
+    share = as_number(found.get("share")) if isinstance(found, dict) else None
+    if share is None:
+        raise journal.damaged("masks")
+    return share
 
 
 def _lines(frames: Frames, outcome: Outcome) -> list[str]:

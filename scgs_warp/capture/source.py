@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from ..data.files import natural, size_text
+from ..data.images import bomb
 from ..errors import UserError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -90,7 +91,7 @@ class Video:
 
         try:
             container = av.open(str(self.path))
-        except (FFmpegError, OSError) as error:
+        except (FFmpegError, OSError, ValueError) as error:  # ValueError: what it says of itself is no text
             reason = getattr(error, "strerror", None) or type(error).__name__
             raise UserError(
                 f"{self.path}: is no video that can be decoded ({reason}); save it as .mp4, or give a folder of images"
@@ -179,6 +180,9 @@ def read_rgb(file: Path) -> np.ndarray:
     """[H, W, 3] uint8 RGB, turned as its EXIF tags say; UserError where it is no image."""
     try:
         data = np.fromfile(file, np.uint8)
+        claim = bomb(data.data)
+        if claim is not None:
+            raise UserError(f"{file}: says it is {claim} in {data.size} bytes; save it again, smaller")
         image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None

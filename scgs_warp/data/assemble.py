@@ -143,8 +143,10 @@ def _facts(shot: Shot, decoded: Decoded, border: np.ndarray | None) -> _Facts:
     lens, source = decoded.lens, decoded.source_size
     sx, sy = width / source[0], height / source[1]
     numbers = np.abs([lens.fx, lens.fy, lens.cx, lens.cy, *shot.viewmat.ravel()])
-    if not (numbers < LARGEST).all():
-        raise UserError(f"{shot.file}: its camera has numbers beyond {LARGEST:g}; correct its pose and intrinsics")
+    if not (numbers < LARGEST).all() or min(lens.fx * sx, lens.fy * sy) * LARGEST < 1.0:
+        raise UserError(
+            f"{shot.file}: its camera has numbers beyond {LARGEST:g}, or none; correct its pose and intrinsics"
+        )
     K = np.array([[lens.fx * sx, 0.0, lens.cx * sx], [0.0, lens.fy * sy, lens.cy * sy], [0.0, 0.0, 1.0]])
     camera = Camera(torch.from_numpy(shot.viewmat).float(), torch.from_numpy(K).float(), width, height)
     valid = mask is None or bool(mask.any())

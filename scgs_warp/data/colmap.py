@@ -14,6 +14,7 @@ from .dataset import Dataset
 from .files import held_out, natural, size_text
 from .images import Look, header_size
 from .lens import Lens, make_lens
+from .paths import inside
 
 
 def recognises(folder: Path) -> bool:
@@ -61,10 +62,7 @@ def _image_folder(folder: Path, place: Path) -> Path:
 
 
 def _file(base: Path, image: ModelImage, place: Path) -> Path:
-    name = PurePosixPath(image.name.replace("\\", "/"))
-    if name.is_absolute() or ".." in name.parts or not name.parts or re.match(r"[A-Za-z]:", image.name):
-        raise UserError(f"{place}: an image is called {image.name[:60]!r}, which leads out of {base}; rename it")
-    return base / name
+    return inside(base, image.name, f"{place}: the name of an image", "image")
 
 
 def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Lens]]) -> None:

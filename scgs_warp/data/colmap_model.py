@@ -208,7 +208,8 @@ def _text_images(data: bytes) -> list[ModelImage]:
 def _text_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     rows = [[float(word) for word in line.split(maxsplit=8)[1:7]] for line in _lines(data) if line.strip()]
     table = np.array(rows, np.float64).reshape(len(rows), 6)
-    return table[:, :3], table[:, 3:] / 255.0
+    colors = table[:, 3:] / 255.0
+    return table[:, :3], np.where(np.isfinite(colors), colors, 0.5).clip(0.0, 1.0)
 
 
 _BINARY: tuple[Callable[[bytes], Any], ...] = (_binary_cameras, _binary_images, _binary_points)

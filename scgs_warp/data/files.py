@@ -13,12 +13,14 @@ from typing import IO, Any
 import numpy as np
 
 from ..errors import UserError
+from ..json_text import parse_json
+from .paths import is_regular
 
 HELD_OUT_EVERY = 8
 HELD_OUT_FIRST = 4
 """Where the data list no splits, frames 4, 12, 20, ... are held out: never the first, so that nothing has to be
 extrapolated."""
-MOST_BYTES = 2**31
+MOST_BYTES = 2**28
 """An array of a data set is smaller than this; beyond, its header is damaged, or a small archive unpacks to it."""
 RIGID_TOLERANCE = 1e-3
 """Largest entry of R^T R - I that passes as rounding."""
@@ -50,6 +52,8 @@ def as_array(value: Any, *shapes: tuple[int, ...]) -> np.ndarray | None:
 
 def is_rotation(matrix: np.ndarray) -> bool:
     """Whether [3, 3] turns without scaling, shearing or mirroring, but for rounding."""
+    if not np.abs(matrix).max() < 2.0:  # also NaN, and what would overflow
+        return False
     return float(np.abs(matrix.T @ matrix - np.eye(3)).max()) <= RIGID_TOLERANCE and float(np.linalg.det(matrix)) > 0
 
 
@@ -83,6 +87,8 @@ def read_bytes(path: Path, remedy: str) -> bytes:
         UserError: no such file, or it cannot be read.
     """
     try:
+        if not is_regular(path):
+            raise UserError(f"{path}: is no file; {remedy}")
         return path.read_bytes()
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; {remedy}") from None
@@ -103,47 +109,50 @@ def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: cannot be read as UTF-8 text ({type(error).__name__}); restore the file") from None
     try:
-        content = json.loads(text)
+        content = parse_json(text)
     except json.JSONDecodeError as error:
         raise UserError(
             f"{path}: not valid JSON, line {error.lineno} column {error.colno}: {error.msg}; restore or correct it"
         ) from None
-    except ValueError:  # of Python, not of JSON: it converts no more than 4,300 digits
-        raise UserError(f"{path}: holds a number of more than 4,300 digits; restore or correct the file") from None
-    except RecursionError:
-        raise UserError(f"{path}: JSON nested too deeply; restore the file") from None
+    except ValueError as error:  # nested too deeply, or of Python: it converts no more than 4,300 digits
+        reason = "JSON nested too deeply" if "nested" in str(error) else "holds a number of more than 4,300 digits"
+        raise UserError(f"{path}: {reason}; restore or correct the file") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: holds no JSON object; restore the file")
     return content
 
 
-def read_npy(path: Path, member: str | None = None) -> np.ndarray:
-    """A numeric array of a .npy file, or of the ``member`` of a .npz file; float64.
+def read_npy(path: Path, member: str | None = None, flags: bool = False) -> np.ndarray:
+    """A numeric array of a .npy file, or of the ``member`` of a .npz file; float64. ``flags``: of booleans instead.
 
     Raises:
         UserError: the file is missing, damaged, or claims to hold more than it does.
     """
     try:
+        if not is_regular(path):
+            raise UserError(f"{path}: is no file; restore it")
         if member is None:
             with path.open("rb") as file:
-                array = _numbers(file, path.stat().st_size)
+                array = _numbers(file, path.stat().st_size, flags)
         else:
             with zipfile.ZipFile(path) as archive:
                 info = archive.getinfo(f"{member}.npy")
                 with archive.open(info) as file:
-                    array = _numbers(file, info.file_size)
+                    array = _numbers(file, info.file_size, flags)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; restore it") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or 'damaged'}); restore the file") from None
     except KeyError:
         raise UserError(f"{path}: holds no array named {member!r}; restore the file") from None
+    except UserError:
+        raise
     except Exception as error:  # damaged headers and archives fail in many ways
         raise UserError(f"{path}: no sound numpy file ({type(error).__name__}); restore the file") from None
     return array
 
 
-def _numbers(file: IO[bytes], size: int) -> np.ndarray:
+def _numbers(file: IO[bytes], size: int, flags: bool) -> np.ndarray:
     """Read as numpy would, but nothing before the header is known to be true."""
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -151,8 +160,9 @@ def _numbers(file: IO[bytes], size: int) -> np.ndarray:
         raise ValueError("version")
     shape, fortran, kind = readers[version](file)
     count = math.prod(shape)
-    if kind.kind not in "fiu" or not 0 <= count * kind.itemsize <= min(size, MOST_BYTES):
+    if kind.kind not in ("b" if flags else "fiu") or not 0 <= count * kind.itemsize <= min(size, MOST_BYTES):
         raise ValueError("size")
     data = file.read(count * kind.itemsize)
     array = np.frombuffer(data, kind, count).reshape(shape, order="F" if fortran else "C")
-    return array.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of signalling NaN
+        return array.copy() if flags else array.astype(np.float64)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import UserError
+from ..errors import UserError, is_shortage
 from ..gaussians import SH_C0, GaussianParameters
 from .gaussian_ply import read_gaussian_ply
 from .gaussian_splat import read_splat
@@ -25,12 +27,21 @@ def read_gaussians(path: str | Path) -> GaussianParameters:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise UserError(f"{path}: Gaussians are read from {', '.join(READERS)}; give one of these or convert it")
-    try:
+    with fitting(path):
         return reader(path)
-    except MemoryError:
-        raise UserError(f"{path}: holds more Gaussians than fit into memory; export it in parts") from None
-    except RuntimeError as error:  # so PyTorch names it
-        if "allocate memory" not in str(error):
+
+
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Around what needs memory for all Gaussians of a file.
+
+    Raises:
+        UserError: there is not enough.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_shortage(error):
             raise
         raise UserError(f"{path}: holds more Gaussians than fit into memory; export it in parts") from None
 

@@ -26,6 +26,10 @@ VIEW = (40.0, 10.0)
 BULK = (0.02, 0.98)
 """Quantiles of the opaque Gaussians' coordinates that count as the scene."""
 OPAQUE = 0.1
+LARGEST = {"means": 1e15, "log_scales": 80.0, "quats": 1e15}
+"""Of parameters: their squares, and what they activate to, are float32. The others are colours."""
+OPAQUE_LOGIT = 80.0
+"""Opaque beyond rounding: some programs write infinity."""
 
 
 def read_gaussian_ply(path: str | Path) -> GaussianParameters:
@@ -56,18 +60,20 @@ def read_gaussian_ply(path: str | Path) -> GaussianParameters:
         return np.stack([np.asarray(data[name], np.float32) for name in wanted], axis=1)
 
     means, dc = columns("x", "y", "z"), columns("f_dc_0", "f_dc_1", "f_dc_2")
+    opacity = columns("opacity")[:, 0].clip(-OPAQUE_LOGIT, OPAQUE_LOGIT)
     sh_rest = np.zeros((len(data), 0, 3), np.float32)
     if rest:  # channel by channel in the file
         sh_rest = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, rest // 3).transpose(0, 2, 1)
     values = {
-        "means": means, "sh_dc": dc, "sh_rest": sh_rest, "opacity_logits": columns("opacity")[:, 0],
+        "means": means, "sh_dc": dc, "sh_rest": sh_rest, "opacity_logits": opacity,
         "log_scales": columns("scale_0", "scale_1", "scale_2"), "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
     }  # fmt: skip
     return to_parameters(path, values)
 
 
 def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParameters:
-    """Rows that a file held as parameters, without those that are not finite or have no rotation.
+    """Rows that a file held as parameters, without those that are not finite, beyond what can be drawn, or without a
+    rotation.
 
     Args:
         values: float32, by the names of :class:`GaussianParameters`, [N, ...]; harmonics [N, K - 1, 3].
@@ -76,9 +82,10 @@ def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParamete
         UserError: no row is left.
     """
     total, rest = values["sh_rest"].shape[:2]
-    good = values["quats"].any(axis=1)
-    for value in values.values():
-        good &= np.isfinite(value.reshape(total, -1)).all(axis=1)
+    good = (values["quats"] != 0).any(axis=1)
+    for name, value in values.items():
+        with np.errstate(invalid="ignore"):
+            good &= (np.abs(value.reshape(total, -1)) <= LARGEST.get(name, 1e6)).all(axis=1)  # NaN: no
     if not good.any():
         raise UserError(f"{path}: none of its {total} Gaussians is finite; export it again")
     made = GaussianParameters.empty(int(good.sum()), rest, 0, False, "cpu")
@@ -95,7 +102,8 @@ def _vertices(path: Path) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a .ply of 3D Gaussian splatting")
     try:
-        elements = PlyData.read(str(path))
+        with np.errstate(over="ignore"):  # of text: infinite, and left out
+            elements = PlyData.read(str(path))
         data = np.asarray(elements["vertex"].data)
     except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise UserError(f"{path}: no PLY file with vertices ({type(error).__name__}); export it again") from None
@@ -119,10 +127,18 @@ def open_ply(
     Raises:
         UserError: as :func:`~scgs_warp.data.gaussian_files.read_gaussians`.
     """
-    from .gaussian_files import read_gaussians  # which knows this file's reader
-    from .gaussian_spz import read_antialiased
+    from .gaussian_files import fitting, read_gaussians  # which knows this file's reader
 
     gaussians = read_gaussians(path)
+    with fitting(Path(path)):
+        return _as_scene(Path(path), gaussians, device, nodes, up)
+
+
+def _as_scene(
+    path: Path, gaussians: GaussianParameters, device: str, nodes: int, up: tuple[float, float, float] | None
+) -> Scene:
+    from .gaussian_spz import read_antialiased
+
     world = gaussians.means.detach().double().numpy()
     solid = world[(gaussians.opacities() > OPAQUE).numpy()]
     low, high = np.quantile(solid if len(solid) else world, BULK, axis=0)

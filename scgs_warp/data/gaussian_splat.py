@@ -51,7 +51,8 @@ def read_splat(path: str | Path) -> GaussianParameters:
     rows = np.frombuffer(content, ROW)
     color = rows["color"].astype(np.float64) / 255.0
     opacity = color[:, 3].clip(1e-6, 1.0 - 1e-6)
-    scales = np.maximum(rows["scale"].astype(np.float64), 1e-30)
+    with np.errstate(invalid="ignore"):  # of signalling NaN; such rows are left out
+        scales = np.maximum(rows["scale"].astype(np.float64), 1e-30)
     values = {
         "means": rows["mean"],
         "sh_dc": (color[:, :3] - 0.5) / SH_C0,

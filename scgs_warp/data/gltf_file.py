@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
-import json
 import logging
 import struct
 import warnings
@@ -21,6 +20,11 @@ import cv2
 import numpy as np
 
 from ..errors import UserError
+from ..json_text import parse_json
+from .files import read_bytes
+from .gltf_schema import problem
+from .images import bomb
+from .paths import inside, is_regular
 
 UNDERSTOOD = {
     "KHR_mesh_quantization",
@@ -51,10 +55,10 @@ class GltfFile:
                 parser is not installed.
         """
         self.path = Path(path)
+        self._json = _checked(self.path)
         self.document = _parse(self.path)
         self._buffers: dict[int, bytes] = {}
         self._digest = hashlib.sha256(self.path.read_bytes())
-        self._json: list[dict[str, Any]] | None = None
         version = str(getattr(self.document.asset, "version", "") or "")
         if not version.startswith("2."):
             raise self.error("asset.version", f"is {version or 'missing'}; export it again as glTF 2.0")
@@ -81,12 +85,7 @@ class GltfFile:
 
     def node_weights(self, index: int) -> list[float] | None:
         """``nodes[index].weights`` of morph targets, which the parser leaves out; None where there are none."""
-        if self._json is None:
-            data = self.path.read_bytes()
-            if data[:4] == b"glTF":
-                data = data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
-            self._json = json.loads(data)["nodes"]
-        return self._json[index].get("weights") if self._json else None
+        return self._json["nodes"][index].get("weights")
 
     def array(self, index: Any, field: str, components: int | None = None) -> np.ndarray:
         """[count, components] of an accessor; matrices [count, 4, 4] row-major, as mathematicians write them.
@@ -174,8 +173,10 @@ class GltfFile:
                 return base64.b64decode(uri.partition(",")[2], validate=False)
             except (binascii.Error, ValueError):
                 raise self.error(field, "is no valid base64; export the file again") from None
-        path = self.path.parent / unquote(uri)
+        path = inside(self.path.parent, unquote(uri), f"{self.path}: {field}")
         try:
+            if not is_regular(path):
+                raise OSError(None, "it is no file")
             data = path.read_bytes()
             self._digest.update(data)
             return data
@@ -190,6 +191,9 @@ class GltfFile:
         image = self.item("images", index, field)
         where = f"images[{index}]"
         data = self.resource(image.uri, f"{where}.uri") if image.uri else self.view(image.bufferView, where)[0]
+        claim = bomb(data)
+        if claim is not None:
+            raise self.error(where, f"says it is {claim} in {len(data)} bytes; export the file with smaller textures")
         try:
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
         except cv2.error:
@@ -206,16 +210,34 @@ class GltfFile:
         return np.ascontiguousarray(cv2.cvtColor(pixels, code))
 
 
+def _checked(path: Path) -> dict[str, Any]:
+    """The document as JSON, whose fields have the types that they should have."""
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give a .glb or .gltf with --mesh")
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        raise UserError(f"{path}: is no glTF by its name; give a .glb or .gltf (Blender exports them)")
+    data = read_bytes(path, "give a .glb or .gltf with --mesh")
+    try:
+        if path.suffix.lower() == ".glb":
+            magic, _, _, length = struct.unpack_from("<4sIII", data)
+            if magic != b"glTF" or 20 + length > len(data):
+                raise ValueError("cut short, or no GLB")
+            data = data[20 : 20 + length]
+        content = parse_json(data.decode("utf-8-sig"))
+    except (ValueError, struct.error) as error:
+        raise UserError(f"{path}: is no glTF that can be read ({str(error)[:80]}); export it again") from None
+    found = problem(content)
+    if found is not None:
+        raise UserError(f"{path}: {found[0]} {found[1]}; export the file again")
+    return content
+
+
 def _parse(path: Path) -> Any:
     """pygltflib's document."""
     try:
         import pygltflib
     except ImportError:
         raise UserError(f'{path}: reading glTF needs pygltflib; pip install "scgs-warp[gltf]"') from None
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; give a .glb or .gltf with --mesh")
-    if path.suffix.lower() not in (".glb", ".gltf"):
-        raise UserError(f"{path}: is no glTF by its name; give a .glb or .gltf (Blender exports them)")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import math
+import struct
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,10 +22,17 @@ from .cache import ImageCache, Pixels
 from .dataset import BACKGROUND_COLORS
 from .files import size_text
 from .lens import Lens, seen, undistort
+from .paths import is_regular
 
 RESAMPLES = ("area", "bicubic")
 SMALLEST_SIDE = 8
 """Pixels; a smaller image is smaller than SSIM's window and surely a mistake."""
+
+ALWAYS_FINE, THINNEST = 2**25, 64
+"""Images of more pixels have at least a byte for so many of them: a megabyte of zeros unpacks to a gigabyte."""
+
+# What a camera wrote beside the picture is of no interest, and a warning about it goes to everybody's terminal.
+warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -153,11 +163,16 @@ def is_transparent(pixels: np.ndarray) -> bool:
 def decode(path: Path) -> np.ndarray:
     """[H, W, 3 or 4] RGB(A), uint8 or uint16; UserError where the file is missing or no image."""
     try:
+        if not is_regular(path):
+            raise UserError(f"{path}: is no file; give an image, or drop the frame")
         data = np.fromfile(path, np.uint8)
     except FileNotFoundError:
         raise UserError(f"{path}: no such image, though a frame names it; restore the file or drop the frame") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
+    claim = bomb(data.data)
+    if claim is not None:
+        raise UserError(f"{path}: says it is {claim} in {data.size} bytes; save it again, smaller")
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if _whole(data) else None
     except cv2.error:
@@ -169,6 +184,21 @@ def decode(path: Path) -> np.ndarray:
     if code is None:
         raise UserError(f"{path}: has {channels} channels; save it as grey, RGB or RGBA")
     return cv2.cvtColor(pixels, code)
+
+
+def bomb(data: bytes | memoryview) -> str | None:
+    """The size that an image file claims, where so few bytes can be no such picture; None for all others."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "WEBP", "TIFF", "BMP")) as image:
+            size = image.size
+    except Image.DecompressionBombError:
+        return "hundreds of megapixels"
+    except (OSError, ValueError, SyntaxError, TypeError, struct.error):
+        return None  # whoever decodes it says what is wrong
+    count = size[0] * size[1]
+    return size_text(size) if count > ALWAYS_FINE and count > THINNEST * len(data) else None
 
 
 def _whole(data: np.ndarray) -> bool:

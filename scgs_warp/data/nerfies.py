@@ -82,7 +82,7 @@ def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
             raise UserError(f"{path}: {key} is no list of names; list the frames there")
         lists[key] = list(dict.fromkeys(str(item) for item in values))
         for item in lists[key]:
-            if not re.fullmatch(r"[\w.+=@, -]{1,200}", item) or item.startswith("."):
+            if not re.fullmatch(r"[\w.+=@, -]{1,200}", item) or item.strip() != item or item[0] == ".":
                 raise UserError(f"{path}: {key} holds {item[:40]!r}, which names no file; correct the id")
     everything = list(dict.fromkeys([*lists["ids"], *lists["train_ids"], *lists["val_ids"]]))
     if not everything:

@@ -21,6 +21,7 @@ from .assemble import Shot, assemble, video_border, with_points
 from .dataset import Dataset
 from .files import by_name, held_out
 from .images import Look
+from .paths import inside
 from .points import read_points
 from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
 
@@ -61,7 +62,7 @@ def _shot(path: Path, folder: Path, content: dict[str, Any], index: int, file: P
     entry = content["frames"][index]
     fields = {**content, **entry}
     mask = entry.get("mask_path")
-    if mask is not None and (not isinstance(mask, str) or not mask or "\0" in mask):
+    if mask is not None and not (isinstance(mask, str) and mask):
         raise UserError(f"{path}: frames[{index}].mask_path is no text; name the mask's file or leave it out")
     return Shot(
         file,
@@ -69,7 +70,7 @@ def _shot(path: Path, folder: Path, content: dict[str, Any], index: int, file: P
         time,
         partial(read_lens, path, fields, index),
         file.stem,
-        None if mask is None else folder / mask.replace("\\", "/"),
+        None if mask is None else inside(folder, mask, f"{path}: frames[{index}].mask_path", "mask"),
     )
 
 
@@ -115,9 +116,9 @@ def _points(
     name = content.get("ply_file_path")
     if name is None:
         return None, None
-    if not isinstance(name, str) or not name or "\0" in name:
+    if not isinstance(name, str) or not name:
         raise UserError(f"{path}: ply_file_path is no text; name the file of points or leave it out")
-    points, colors = read_points(folder / name.replace("\\", "/"))
+    points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
     moved = _applied(path, content, points)
     # Writers disagree whether the transform that was applied to the poses was applied to the points, too.
     if moved is not None and _seen(moved, cameras) > _seen(points, cameras):

@@ -20,6 +20,7 @@ from .dataset import Dataset
 from .files import as_array, as_number, is_rotation, read_json, read_npy, size_text
 from .images import Look
 from .lens import Lens
+from .paths import inside
 
 TRAIN, TEST = "train_meta.json", "test_meta.json"
 POINTS = "init_pt_cld.npz"
@@ -49,7 +50,7 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
                 raise UserError(f"{path}: {key} and fn list different numbers of frames; give every image one of each")
         for place, name in enumerate(names):
             where = f"[{instant}][{place}]"
-            if not isinstance(name, str) or not name or "\0" in name:
+            if not isinstance(name, str) or not name:
                 raise UserError(f"{path}: fn{where} is no text; name the image file")
             viewmat = as_array(rows["w2c"][instant][place], (4, 4), (3, 4))
             if viewmat is None or not is_rotation(viewmat[:3, :3]):
@@ -57,7 +58,7 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
             K = as_array(rows["k"][instant][place], (3, 3))
             if K is None or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - (0, 0, 1)).max() > 1e-6:
                 raise UserError(f"{path}: k{where} is no 3 x 3 matrix of intrinsics in pixels; correct the camera")
-            file = folder / "ims" / name.replace("\\", "/")
+            file = inside(folder / "ims", name, f"{path}: fn{where}", "image")
             pose = np.vstack([viewmat[:3], (0.0, 0.0, 0.0, 1.0)])
             label = Path(name).with_suffix("").as_posix().replace("/", "_").strip("._")
             shots.append(Shot(file, pose, instant / last, partial(_lens, path, content, K), label))

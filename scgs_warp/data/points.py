@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..gaussians import SH_C0
+from .paths import is_regular
 
 
 def finite(points: np.ndarray) -> np.ndarray:
@@ -63,7 +64,10 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     from plyfile import PlyData, PlyParseError
 
     try:
-        elements = PlyData.read(path)
+        if not is_regular(path):
+            raise UserError(f"{path}: is no file; give a PLY of points")
+        with np.errstate(over="ignore"):  # of text: infinite, and left out
+            elements = PlyData.read(str(path))
         vertices = elements["vertex"].data
         points = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
         colors = unit_colors(vertices)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ..errors import UserError
+from ..json_text import parse_json
 from .gltf_scene import GltfScene, read_scene
 from .synthesis import SURFACE_POINTS, Background, Optics, Subject, write_pictures, write_png, write_whole
 from .synthesis_cameras import Filming, Shot, shots
@@ -227,6 +228,6 @@ def _recipe(request: Request, found: dict[str, Any]) -> dict[str, Any]:
 
 def _recipe_of(folder: Path) -> dict[str, Any] | None:
     try:
-        return json.loads((folder / MARKER).read_text())
+        return parse_json((folder / MARKER).read_text())
     except (OSError, ValueError):
         return None

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UserError
+from ..json_text import parse_json
 from ..types import Camera
 from .synthesis import SURFACE_POINTS, Optics, pick_on_triangles, write_pictures, write_whole
 from .synthesis_cameras import Shot, camera_of, instants, on_sphere
@@ -72,7 +73,7 @@ def make_synthetic(
 
 def _recipe_of(folder: Path) -> dict[str, Any] | None:
     try:
-        return json.loads((folder / MARKER).read_text())
+        return parse_json((folder / MARKER).read_text())
     except (OSError, ValueError):
         return None
 

@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import UserError
 from .files import as_number, is_rotation, read_json, size_text
 from .lens import Lens, make_lens
+from .paths import inside
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
@@ -85,9 +86,9 @@ def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
 def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path:
     """The frame's image; a name without suffix is completed."""
     name = entry.get("file_path")
-    if not isinstance(name, str) or not name or "\0" in name:
+    if not isinstance(name, str) or not name:
         raise UserError(f"{path}: frames[{index}].file_path is missing or no text; name the image file")
-    base = folder / name.replace("\\", "/")
+    base = inside(folder, name, f"{path}: frames[{index}].file_path", "image")
     if base.suffix.lower() in SUFFIXES or base.is_file():
         return base
     candidates = [base.with_name(base.name + suffix) for suffix in SUFFIXES]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..json_text import parse_json
 
 MAX_BYTES = 64 << 20
 """A larger file is no edit."""
@@ -40,11 +41,11 @@ def parse_object(text: str, path: str) -> dict[str, Any]:
         UserError: it is no JSON, or no object.
     """
     try:
-        content = json.loads(text, parse_constant=_no_constant, object_pairs_hook=_unique)
+        content = parse_json(text, parse_constant=_no_constant, object_pairs_hook=_unique)
     except json.JSONDecodeError as error:
         where = f"line {error.lineno} column {error.colno}"
         raise UserError(f"{path}: not valid JSON, {where}: {error.msg}; correct it") from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise UserError(f"{path}: not valid JSON ({str(error)[:80] or 'nested too deeply'}); correct it") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: must hold a JSON object; give an edit's JSON")

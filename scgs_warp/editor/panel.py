@@ -12,6 +12,7 @@ from .panel_film import FilmSection, TimeSection
 from .panel_motion import MotionSection
 from .panel_shape import ShapeSection
 from .panel_view import ViewSection
+from .text import plain
 
 if TYPE_CHECKING:
     from .app import Editor
@@ -94,7 +95,7 @@ class Panel:
     def _said(self) -> str:
         model = self.editor.model
         edit = model.session.edit
-        chosen = f"**{model.active}**" if model.active else f"{len(model.selection)} control points chosen"
+        chosen = f"**{plain(model.active)}**" if model.active else f"{len(model.selection)} control points chosen"
         counts = f"handles: {len(edit.handles)}, pinned: {len(edit.pins)}, keyframes: {len(edit.keyframes)}"
         return f"{chosen}; {counts}"
 
@@ -105,7 +106,7 @@ class Panel:
         self.work.visible = self.bar.visible = self.stop.visible = busy
         if progress is not None:
             doing = "stopping" if progress.stopping else f"{progress.done} of {progress.total}"
-            self.work.content = f"**{progress.name}**: {doing}"
+            self.work.content = f"**{plain(progress.name)}**: {doing}"
             self.bar.value = progress.percent
             self.stop.disabled = progress.stopping
 

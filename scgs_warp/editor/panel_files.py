@@ -13,6 +13,7 @@ from ..errors import UserError
 from ..film import write_png
 from . import files
 from .jobs import Jobs
+from .text import plain
 
 if TYPE_CHECKING:
     from .app import Editor
@@ -28,7 +29,7 @@ class FilesSection:
     def __init__(self, editor: Editor, jobs: Jobs) -> None:
         self.editor, self.model, self.jobs = editor, editor.model, jobs
         gui, click = editor.server.gui, self._click
-        gui.add_markdown(f"Files go to `{editor.folder.name}/` and to the browser.")
+        gui.add_markdown(f"Files go to **{plain(editor.folder.name)}** and to the browser.")
         with gui.add_folder("The edit"):
             self.name = gui.add_text("Name", "edit")
             self.replace = gui.add_checkbox(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from .. import data
-from ..data.gaussian_files import read_gaussians
+from ..data.gaussian_files import fitting, read_gaussians
 from ..data.gaussian_ply import open_ply, write_gaussian_ply
 from ..data.gaussian_splat import write_splat
 from ..data.gaussian_spz import read_antialiased, write_spz
@@ -87,7 +87,9 @@ def _export_still(request: Request, device: str) -> str:
         assert request.ply is not None
         antialiased = read_antialiased(request.ply)
         with torch.no_grad():
-            gaussians, when = read_gaussians(request.ply).activate(), f"as in {request.ply}"
+            found = read_gaussians(request.ply)
+            with fitting(request.ply):
+                gaussians, when = kept(found.activate()), f"as in {request.ply}"
     else:
         scene = _open(request, device)
         up, antialiased = scene.overview.up, scene.config.antialiased
@@ -153,11 +155,11 @@ def _export_moving(request: Request, device: str) -> str:
 
 
 def _write_frames(request: Request, scene: Scene, session: EditSession | None, moments: list[Moment]) -> str:
-    counts = []
+    counts, rows = [], _usable(scene)  # the same in every frame: row i is one Gaussian
 
     def frames() -> Iterator[Gaussians]:
         for moment in moments:
-            counts.append(len((found := kept(posed(scene, session, moment))).means))
+            counts.append(len((found := kept(select(posed(scene, session, moment), rows))).means))
             yield found
 
     with progress(len(moments), "export") as shown:
@@ -189,13 +191,18 @@ def _write_skeleton(request: Request, session: EditSession, moments: list[Moment
 
 def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:
     """The Gaussians that files may hold, at rest; which they are, [N] bool; and what they follow."""
-    rest = at_rest(scene)
-    rows = finite_rows(rest) & np.isfinite(skeleton.weights).all(axis=1)
-    for part in (scene.gaussians.shading, scene.gaussians.hyper):
-        rows &= part.detach().isfinite().all(dim=1).cpu().numpy()
+    rows = _usable(scene) & np.isfinite(skeleton.weights).all(axis=1)
     if not rows.any():
         raise UserError("no Gaussian of the scene is finite; train again with a lower rate")
-    return select(rest, rows), rows, skeleton.select(rows)
+    return select(at_rest(scene), rows), rows, skeleton.select(rows)
+
+
+def _usable(scene: Scene) -> np.ndarray:
+    """[N] bool: Gaussians all of whose parameters are finite."""
+    rows = finite_rows(at_rest(scene))
+    for part in (scene.gaussians.shading, scene.gaussians.hyper):
+        rows &= part.detach().isfinite().all(dim=1).cpu().numpy()
+    return rows
 
 
 def mean_colors(session: EditSession, moments: list[Moment]) -> np.ndarray:

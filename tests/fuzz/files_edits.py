@@ -1,0 +1,167 @@
+"""Edits, and the files that long work leaves so as to go on: journals, markers; films to capture."""
+
+from __future__ import annotations
+
+import functools
+import json
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from edit_scenes import bar_scene
+from fuzz.files_cases import Format, check_gaussians, check_numbers, expect, finite, named, within
+
+from scgs_warp.capture import pipeline
+from scgs_warp.capture.journal import Journal
+from scgs_warp.capture.source import open_source
+from scgs_warp.data import synthesize, synthetic
+from scgs_warp.edit import EditSession
+from scgs_warp.edit.filming import film_camera
+from scgs_warp.film import film, write_png
+from scgs_warp.scene import Scene
+
+EDIT = {
+    "format": "scgs-warp edit", "version": 1, "comment": "all there is",
+    "scene": {"control_points": 20},
+    "handles": [
+        {"name": "tip", "nodes": {"point": [1.0, -1.0, 0.25], "rings": 1}, "time": 0.0, "pivot": [0.9, -1.0, 0.25]},
+        {"name": "end", "nodes": [0, 1, 2], "time": 0.5, "lasts": "frame", "window": 0.2, "stiffness": 2.0,
+         "turns": True},
+    ],
+    "pins": {"beyond": 2},
+    "targets": {"tip": {"translation": [0.1, 0.0, 0.2]}},
+    "keyframes": [
+        {"at": 0.0, "easing": "ease", "targets": {"tip": {}}},
+        {"at": 0.5, "targets": {"tip": {"axis": [0, 1, 0], "degrees": 60}, "end": {"rotation": [1, 0.1, 0, 0]}}},
+        {"at": 1.0, "easing": "step", "targets": {"tip": {"translation": [0, 0, 0.3]}}},
+    ],
+    "playback": {"seconds": 1.5, "speed": -1.0, "start": 0.2, "repeat": "swing", "map": [[0, 0.1], [1, 0.9]]},
+    "hold": [{"nodes": {"sphere": [0.0, -1.0, 0.25], "radius": 0.3, "time": 0.1}, "time": 0.2, "frame": "world",
+              "rings": 1}],
+    "exaggerate": {"factor": 1.5, "about": 0.3, "nodes": {"box": [[0, -2, -2], [2, 2, 2]]}},
+    "film": {
+        "seconds": 1.0, "fps": 8, "size": 64, "background": [1, 1, 1],
+        "shot": {"kind": "orbit", "up": [0, 0, 1], "fov": 50, "turns": 0.5, "views": [
+            {"at": 0, "azimuth": 230, "elevation": 10, "distance": 3.2, "target": [0, 0, 0]},
+            {"at": 0.9, "azimuth": 310}]},
+    },
+}  # fmt: skip
+
+
+@functools.cache
+def scene() -> Scene:
+    return bar_scene(nodes=20, gaussians=60)
+
+
+def write_edit(folder: Path) -> None:
+    EditSession(scene())
+    folder.mkdir()
+    (folder / "edit.json").write_text(json.dumps(EDIT))
+
+
+def load_edit(folder: Path) -> None:
+    """As ``apps/edit.py --script`` does: read, save again, pose, and stand the camera."""
+    session = EditSession(scene())
+    session.load(folder / "edit.json")
+    check_numbers(session.edit, "edit", 1e9)
+    expect(1 <= session.edit.film.frames <= 4_000_000, f"{session.edit.film.frames} frames")
+    session.save(folder / ".saved.json")
+    (folder / ".saved.json").unlink()
+    for at in (0.0, 0.4, 0.9):
+        time = session.scene_time(at)
+        within("time", time)
+        check_gaussians(session.gaussians_at(time, at))
+        finite("control points", session.node_positions(time, at))
+        camera = film_camera(session, at, 32)
+        finite("camera", camera.viewmat, camera.K)
+
+
+def silent(total: int, text: str) -> Any:
+    return nullcontext(SimpleNamespace(advance=lambda count=1: None))
+
+
+def _result() -> dict[str, Any]:
+    return pipeline.Frames([0, 3, 5], [0.0, 0.3, 0.5], ["a", "b", "c"], (0.0, 1.0), (64, 48), 9, 1, 1)._asdict()
+
+
+def write_journal(folder: Path) -> None:
+    journal = Journal(folder, "a film")
+    journal.start()
+    settings = dict.fromkeys(("frames", "start", "end"), None) | {"size": 1280}
+    journal.stage("frames", settings, _result, lambda: None)
+    journal.stage("masks", "auto", lambda: {"share": 0.2}, lambda: None)
+    journal.stage("cameras", 0, lambda: 3, lambda: None)
+
+
+def load_journal(folder: Path) -> None:
+    """As ``apps/capture.py`` goes on; what cannot be used is made again."""
+    journal = Journal(folder, "a film")
+    journal.start()
+    source = SimpleNamespace(count=9, video=True, path=Path("film.mp4"))
+    before, pipeline._choose = pipeline._choose, lambda *_: (_ for _ in ()).throw(_Again)  # type: ignore[assignment]
+    try:
+        frames = pipeline._frames(pipeline.Request(Path("film.mp4")), source, journal, silent)  # type: ignore[arg-type]
+        check_numbers(frames._asdict(), "frames")
+        expect(len(frames.indices) == len(frames.seconds), "frames without a time")
+        expect(all(name.endswith(".png") for name in frames.files), "names")
+    except _Again:
+        return
+    finally:
+        pipeline._choose = before
+    journal.stage("masks", "auto", lambda: {"share": 0.0}, lambda: None)
+    within("share", pipeline._share(journal), -1e300, 1e300)
+
+
+class _Again(Exception):
+    """The stage is done anew."""
+
+
+MARKERS = (synthesize, synthetic)
+
+
+def write_markers(folder: Path) -> None:
+    folder.mkdir()
+    for module in MARKERS:
+        (folder / module.MARKER).write_text(json.dumps({"version": 1, "size": 400, "seed": 0, "list": [1, {"a": 2}]}))
+
+
+def load_markers(folder: Path) -> None:
+    for module in MARKERS:
+        found = module._recipe_of(folder)
+        expect(found is None or found is not NotImplemented, "marker")
+
+
+def write_video(folder: Path) -> None:
+    folder.mkdir()
+    random = np.random.default_rng(0)
+    with film(folder / "film.mp4", 10) as frames:
+        for _ in range(8):
+            frames.write(random.integers(0, 256, (48, 64, 3), np.uint8))
+
+
+def write_folder(folder: Path) -> None:
+    folder.mkdir()
+    random = np.random.default_rng(0)
+    for index in range(3):
+        write_png(folder / f"{index}.png", random.integers(0, 256, (24, 32, 3), np.uint8))
+
+
+def load_source(folder: Path) -> None:
+    """As ``apps/capture.py`` looks at a film."""
+    videos = sorted(folder.glob("*.mp4"))
+    source = open_source(videos[0] if videos else folder)
+    for still in source.frames(640):
+        expect(still.image.dtype == np.uint8 and still.image.ndim == 3 and still.image.size > 0, "image")
+        finite("seconds", still.seconds)
+    expect(bool(source.digest()), "digest")
+
+
+FORMATS = (
+    Format("edit", write_edit, load_edit, share=2.5),
+    Format("journal", write_journal, load_journal, named(("work/journal.json",))),
+    Format("marker", write_markers, load_markers, share=0.3),
+    Format("film", write_video, load_source, share=0.7),
+    Format("images", write_folder, load_source, share=0.7),
+)

@@ -1,0 +1,124 @@
+"""Files of Gaussians: PLY in text and binary, .splat, .spz of versions 2, 3 and 4; and glTF."""
+
+from __future__ import annotations
+
+import functools
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from edit_scenes import bar_points, dress
+from fuzz.files_cases import Format, check_gaussians, expect, finite, within
+from gltf_files import bar, box, quad
+
+from scgs_warp.data.gaussian_files import gaussian_points
+from scgs_warp.data.gaussian_ply import open_ply, write_gaussian_ply
+from scgs_warp.data.gaussian_splat import write_splat
+from scgs_warp.data.gaussian_spz import write_spz
+from scgs_warp.data.synthesize import Request, load_subject
+from scgs_warp.types import Gaussians
+
+COUNT = 40
+
+
+@torch.no_grad()
+def cloud(degree: int = 1) -> Gaussians:
+    return dress(bar_points(COUNT, 0), degree=degree).activate()
+
+
+def write_text_ply(path: Path) -> None:
+    from plyfile import PlyData
+
+    write_gaussian_ply(path, cloud())
+    found = PlyData.read(str(path), mmap=False)
+    PlyData(list(found.elements), text=True).write(str(path))
+
+
+def write_old_spz(path: Path) -> None:
+    """Version 2: three bytes a rotation."""
+    import gzip
+
+    random = np.random.default_rng(0)
+    head = struct.pack("<IIIBBBB", 0x5053474E, 2, COUNT, 1, 12, 0, 0)
+    path.write_bytes(gzip.compress(head + random.integers(0, 256, COUNT * (9 + 1 + 3 + 3 + 3 + 9), np.uint8).tobytes()))
+
+
+def write_new_spz(path: Path) -> None:
+    """Version 4: a plain header, a table, a zstd stream for each array."""
+    import zstandard
+
+    random = np.random.default_rng(0)
+    plain = [random.integers(0, 256, COUNT * size, np.uint8).tobytes() for size in (9, 1, 3, 3, 4, 9)]
+    packed = [zstandard.ZstdCompressor().compress(part) for part in plain]
+    table = b"".join(struct.pack("<QQ", len(p), len(raw)) for p, raw in zip(packed, plain))
+    head = struct.pack("<IIIBBBBI", 0x5053474E, 4, COUNT, 1, 12, 0, len(plain), 32)
+    path.write_bytes(head + bytes(32 - len(head)) + table + b"".join(packed))
+
+
+def maker(name: str, write: Any) -> Any:
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        write(folder / name)
+
+    return make
+
+
+def load_gaussians(name: str, folder: Path) -> None:
+    """As ``apps/export.py --ply``, ``apps/edit.py --ply`` and training from points do."""
+    path = folder / name
+    scene = open_ply(path, nodes=8)
+    check_gaussians(scene.gaussians_at(0.3))
+    check_gaussians(scene.gaussians.activate())
+    finite("overview", scene.overview.radius, *scene.overview.centre)
+    finite("normalisation", scene.normalisation.centre, scene.normalisation.scale)
+    points, colors = gaussian_points(path)
+    finite("points", points)
+    within("colours", colors)
+
+
+def write_gltf(folder: Path) -> None:
+    """The bar as JSON beside its bytes."""
+    folder.mkdir()
+    made, _ = bar(4)
+    made.document["buffers"] = [{"byteLength": len(made.binary), "uri": "scene.bin"}]
+    (folder / "scene.bin").write_bytes(bytes(made.binary))
+    (folder / "scene.gltf").write_text(json.dumps(made.document))
+
+
+def load_mesh(name: str, folder: Path) -> None:
+    """As ``apps/synthesize.py --mesh`` does."""
+    path = folder / name
+    subject, _, lines = load_subject(Request(mesh=path), "cpu")
+    expect(all("\n" not in line for line in lines), "a line of several")
+    points = subject.sample(64, np.random.default_rng(0))
+    finite("tracks", subject.track(points, (0.0, 0.3, 1.0)))
+
+
+def write_textured(path: Path) -> None:
+    quad(np.random.default_rng(1).integers(0, 256, (4, 3, 3), np.uint8)).save(path)
+
+
+def _gaussians(name: str, suffix: str, write: Any, share: float = 1.0) -> Format:
+    file = f"scene{suffix}"
+    return Format(name, maker(file, write), functools.partial(load_gaussians, file), share=share)
+
+
+def _mesh(name: str, write: Any, share: float = 1.0) -> Format:
+    return Format(name, maker("scene.glb", write), functools.partial(load_mesh, "scene.glb"), share=share)
+
+
+FORMATS = (
+    _gaussians("ply", ".ply", lambda path: write_gaussian_ply(path, cloud()), 2.0),
+    _gaussians("ply-text", ".ply", write_text_ply),
+    _gaussians("splat", ".splat", lambda path: write_splat(path, cloud())),
+    _gaussians("spz-2", ".spz", write_old_spz, 0.7),
+    _gaussians("spz-3", ".spz", lambda path: write_spz(path, cloud())),
+    _gaussians("spz-4", ".spz", write_new_spz),
+    _mesh("glb-moving", lambda path: box().save(path)),
+    _mesh("glb-skinned", lambda path: bar(4)[0].save(path), 1.5),
+    _mesh("glb-textured", write_textured),
+    Format("gltf", write_gltf, functools.partial(load_mesh, "scene.gltf")),
+)
