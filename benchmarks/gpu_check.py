@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import scgs_warp
 
 import torch  # isort: skip
+import gpu_trust
 from gpu_rules import compare_gradients, compare_images, time_of
 from torch import Tensor
 
@@ -343,7 +344,11 @@ def tests(s: Setting) -> Report:
 
 
 PARTS: dict[str, Callable[[Setting], Report]] = {
-    part.__name__: part for part in (agreement, frames, forms, raster, dynamic, step, gsplat, tests)
+    **{part.__name__: part for part in (agreement, frames, forms, raster, dynamic, step, gsplat)},
+    "fuzz": lambda s: gpu_trust.fuzz(s.device, s.quick),
+    "crowded": lambda s: gpu_trust.crowded(s.device, s.quick),
+    "share": lambda s: gpu_trust.share(s.device),
+    "tests": tests,
 }
 
 

@@ -23,7 +23,7 @@ def run(*options: str | Path) -> subprocess.CompletedProcess[str]:
 
 def test_quick_run_on_the_cpu(tmp_path: Path):
     output = tmp_path / "report.json"
-    parts = "agreement,frames,forms,raster,dynamic,step,gsplat"
+    parts = "agreement,frames,forms,raster,dynamic,step,gsplat,fuzz,crowded"
     result = run("--parts", parts, "--output", output)
     assert result.returncode == 0, result.stdout + result.stderr
     report = json.loads(output.read_text())
@@ -40,6 +40,15 @@ def test_quick_run_on_the_cpu(tmp_path: Path):
     assert len(report["dynamic"]["table_s2"]) == len(report["dynamic"]["rows"]) == 4
     assert 0 < report["dynamic"]["motion_share"] < 1
     assert {"step", "step/arap"} <= {row["name"] for row in report["step"]["rows"]}
+    assert report["fuzz"]["cases"] == 40 and report["crowded"]["passed"]
+
+
+@pytest.mark.slow
+def test_torchrun_on_the_cpu(tmp_path: Path):
+    output = tmp_path / "report.json"
+    result = run("--parts", "share", "--output", output)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert json.loads(output.read_text())["share"]["same_bits"]
 
 
 def test_out_of_time_is_a_failure_that_says_so(tmp_path: Path):

@@ -127,10 +127,10 @@ def fenced() -> Iterator[Fence]:
     fence, kernels = Fence(), warp_interop._CpuKernel
     bind, pack = kernels.bind, kernels.pack
 
-    def bound(self: Any, arguments: bytes, tensors: tuple) -> Callable[[int, int], None]:
+    def bound(self: Any, arguments: bytes, tensors: tuple, begin: int) -> Callable[[int, int], None]:
         def call(first: int, size: int) -> None:
             def go(args: tuple) -> None:
-                bind(self, pack(self, args), args)(first, size)
+                bind(self, pack(self, args), args, begin)(first, size)
 
             fence.run(self.kernel, self.parameters, tensors, go)
 
