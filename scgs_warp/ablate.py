@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from .checkpoint import FILE as CHECKPOINT
+from .checkpoint import PREVIOUS
 from .config import FREE_TO_CHANGE, TrainConfig, from_dict, read_config, to_dict, with_field
 from .data.files import as_number
-from .errors import UserError
+from .errors import UserError, printable
 from .json_text import parse_json
 from .limits import check
 
@@ -178,7 +179,7 @@ def check_cell(cell: Cell) -> None:
         UserError: it was not; names cell and field.
     """
     folder = Path(cell.folder)
-    if not ((folder / "metrics.json").is_file() or (folder / CHECKPOINT).is_file()):
+    if not any((folder / name).is_file() for name in ("metrics.json", CHECKPOINT, PREVIOUS)):
         return  # nothing that could be lost
     settings = recorded(folder)
     if settings is None:
@@ -250,7 +251,7 @@ def run_cell(cell: Cell) -> Path:
             settings = copy.deepcopy(cell.settings)
             data = Path(settings["data"].pop("folder"))
             config = from_dict(settings, cell.name)
-            resume = (folder / CHECKPOINT).is_file()
+            resume = any((folder / name).is_file() for name in (CHECKPOINT, PREVIOUS))
             train_and_finish(config, data, folder, device=cell.device, resume=resume, frames=0, lpips=lpips)
     return folder / "metrics.json"
 
@@ -286,7 +287,7 @@ def attempt(cell: Cell, run: Callable[[Cell], Path] = run_cell) -> str | None:
         message, detail = " ".join(str(error).split()), ""
     except Exception as error:  # a queue of hours does not end because of one cell
         reason = (str(error) or "no reason given").splitlines()[0]
-        message, detail = f"{type(error).__name__}: {reason}", traceback.format_exc()
+        message, detail = printable(f"{type(error).__name__}: {reason}"), traceback.format_exc()
     else:
         return None
     try:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from . import environment
+from . import environment, memory
 from .ablate import ERROR, LOG, Cell, attempt, cell_from_json, cell_to_json, is_done, read_metrics
 from .progress import clock
 
@@ -90,7 +90,7 @@ class _Job(NamedTuple):
     log: IO[bytes]
 
 
-def _start(place: str, cell: Cell, threads: int, report: Report) -> _Job:
+def _start(place: str, cell: Cell, threads: int, jobs: int, report: Report) -> _Job:
     folder = Path(cell.folder)
     folder.mkdir(parents=True, exist_ok=True)
     report(f"{place}: {folder / LOG}")
@@ -102,6 +102,7 @@ def _start(place: str, cell: Cell, threads: int, report: Report) -> _Job:
         stdout=log,
         stderr=log,
         start_new_session=True,
+        env={**os.environ, memory.SIBLINGS: str(jobs)},
     )
     assert process.stdin is not None
     process.stdin.write(cell_to_json(cell).encode())
@@ -136,7 +137,7 @@ def _in_processes(
         try:
             while queue or running:
                 while queue and len(running) < jobs and not stop.is_set():
-                    running.append(_start(*queue.pop(0), share, report))
+                    running.append(_start(*queue.pop(0), share, jobs, report))
                 for job in [job for job in running if job.process.poll() is not None]:
                     running.remove(job)
                     job.log.close()

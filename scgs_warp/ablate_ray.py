@@ -70,7 +70,7 @@ def on_cluster(
                 report(f"processors differ, and so may the last digits of results: {', '.join(processors)}")
             placed = [(place, replace(cell, device="cuda" if cuda else "cpu")) for place, cell in waiting]
             head = ray_cluster.Head(ray, address)
-            _Sweep(ray, expected, share, cuda, report, end, head.check).run(placed)
+            _Sweep(ray, expected, share, cuda, report, end, head.check, jobs).run(placed)
 
         yield run
 
@@ -217,6 +217,8 @@ class _Sweep:
     end: End
     check: Callable[[], None] = lambda: None
     """Raises a UserError when the cluster is lost."""
+    jobs: int = 1
+    """Cells at a time on each machine."""
     sweep: str = field(default_factory=lambda: uuid.uuid4().hex)
     running: dict[Any, _Task] = field(default_factory=dict)
     """By what Ray calls their results."""
@@ -265,6 +267,7 @@ class _Sweep:
             "attempt": task.attempt,
             "wait": LOCK_SECONDS if task.attempt > 1 else 0.0,
             "memory": memory.limit(),
+            "siblings": self.jobs,
         }
         self.running[self._work.remote(order)] = task
         task.seen = False

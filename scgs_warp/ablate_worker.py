@@ -173,12 +173,13 @@ def work(order: dict[str, Any]) -> dict[str, Any]:
     Args:
         order: ``cell`` as JSON; ``threads``; ``identity`` that this machine must have; ``sweep`` and ``attempt``, by
             which the asker knows ``worker.json``; ``wait``, seconds for a lost worker's lock; ``memory``, bytes that
-            the cell may take, or None.
+            the cell may take, or None; ``siblings``, cells at a time on this machine.
 
     Returns:
         ``failure``, one line, or None; and ``stopped``: whether a signal ended it, the checkpoint being saved.
     """
     environment.configure(order["threads"])
+    os.environ[memory.SIBLINGS] = str(order["siblings"])
     if order["memory"] is not None:
         memory.set_limit(order["memory"] / memory.GIB)
     cell = cell_from_json(order["cell"])

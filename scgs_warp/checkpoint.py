@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -28,6 +29,10 @@ METADATA_KEY = "scgs_warp"
 """All metadata is one key of sorted JSON: safetensors writes several keys in random order."""
 FORMAT = 1
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+NOT_NOW = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ESTALE)
+"""A file that cannot be read for these reasons may be sound."""
+WORDS = ""
+"""What the check sum of the metadata is called, among those of the tensors."""
 
 
 class DamagedCheckpoint(UserError):
@@ -85,15 +90,21 @@ def write_atomically(path: Path, content: bytes) -> None:
     sync_folder(path.parent)
 
 
+def _sum_of_words(metadata: Mapping[str, Any]) -> int:
+    """Of all that the metadata says beside the sums themselves."""
+    rest = {name: value for name, value in metadata.items() if name != "crc32"}
+    return zlib.crc32(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode())
+
+
 def _sum(tensor: Tensor) -> int:
-    return zlib.crc32(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return zlib.crc32(np.ascontiguousarray(tensor.numpy()).data)
 
 
 def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
     """Write ``checkpoint.safetensors``; the one before becomes ``checkpoint.previous.safetensors``.
 
     Whenever the process ends, the folder holds a sound checkpoint under one of the two names. The metadata holds a
-    check sum of each tensor.
+    check sum of each tensor and one of itself.
 
     Raises:
         UserError: it cannot be written; the checkpoint before it is intact.
@@ -101,7 +112,9 @@ def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, An
     # A clone, since safetensors refuses tensors that share memory.
     saved = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
     sums = {name: _sum(tensor) for name, tensor in saved.items()}
-    text = json.dumps({**metadata, "format": FORMAT, "crc32": sums}, sort_keys=True, separators=(",", ":"))
+    words = parse_json(json.dumps({**metadata, "format": FORMAT}))
+    sums[WORDS] = _sum_of_words(words)
+    text = json.dumps({**words, "crc32": sums}, sort_keys=True, separators=(",", ":"))
     content = save(saved, {METADATA_KEY: text})
     path = folder / FILE
     temporary = temporary_of(path)
@@ -165,10 +178,14 @@ def read(
         if not isinstance(metadata, dict):
             raise ValueError("no metadata")
         sums = metadata.get("crc32", {})  # runs from before there were any have none
+        if WORDS in sums and sums[WORDS] != _sum_of_words(metadata):
+            raise ValueError("its metadata is not what was written")
         for key, tensor in tensors.items():
             if key in sums and sums[key] != _sum(tensor):
                 raise ValueError(f"{key} is not what was written")
     except (SafetensorError, KeyError, ValueError, TypeError, AttributeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno in NOT_NOW:
+            raise UserError(f"{path}: cannot be read ({error.strerror}); try again, or make it readable") from error
         raise DamagedCheckpoint(f"{path}: damaged or not ours ({error}); {remedy}") from error
     if metadata.get("format") != FORMAT:
         raise UserError(
@@ -192,6 +209,9 @@ def fall_back(folder: Path, error: DamagedCheckpoint) -> str:
         _, metadata = read(folder, name=PREVIOUS)
     except UserError:
         raise error from None
+    step = metadata.get("step")
+    if not isinstance(step, int):
+        raise error
     try:
         if path.exists():
             os.replace(path, folder / DAMAGED)
@@ -200,7 +220,7 @@ def fall_back(folder: Path, error: DamagedCheckpoint) -> str:
     except OSError as failure:
         raise UserError(f"{path}: cannot be replaced ({failure.strerror}); make the folder writable") from error
     sync_folder(folder)
-    return f"{path}: damaged (kept as {DAMAGED}); training goes on from {PREVIOUS}, step {metadata.get('step')}"
+    return f"{path}: damaged (kept as {DAMAGED}); training goes on from {PREVIOUS}, step {step}"
 
 
 def strip(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

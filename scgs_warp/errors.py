@@ -14,17 +14,22 @@ class UserError(Exception):
     """
 
     def __init__(self, message: str) -> None:
-        text = " ".join(str(message).split())
-        if not text.isprintable():
-            text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-        super().__init__(text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}")
+        super().__init__(printable(message))
+
+
+def printable(text: object) -> str:
+    """In one line of a bearable length, without what a terminal might obey."""
+    line = " ".join(str(text).split())
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
 def one_line(error: Exception) -> str:
     """What went wrong; of the system's errors the file and the reason."""
     if isinstance(error, OSError):
-        return f"{error.filename or 'input or output'}: {error.strerror or error}"
-    return " ".join(str(error).split())
+        return printable(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    return printable(error)
 
 
 class FrameError(UserError):

@@ -25,6 +25,10 @@ SHARE = 0.9
 """Of what is free: beside what is planned, threads, libraries and small tensors grow too."""
 SECONDS = 1.0
 """How long a reading serves for what is small beside it."""
+UNKNOWN = 2.0**60
+"""Bytes, where the system says nothing (outside Linux)."""
+SIBLINGS = "SCGS_SIBLINGS"
+"""Variable: how many processes of one job share the machine; torchrun says it in one of its own."""
 SMALL = 0.25
 """Part of a reading that may be taken without another one."""
 
@@ -99,7 +103,8 @@ def room(device: torch.device | str = "cpu") -> int:
 
 def measure(name: str) -> int:
     """Bytes that may be taken, as the system counts; remembered for ``fits``."""
-    found = int(SHARE * max(0.0, min(_free_on_gpu(name) if name.startswith("cuda") else _free_on_host())))
+    bounds = _free_on_gpu(name) if name.startswith("cuda") else _free_on_host()
+    found = int(SHARE * max(0.0, min(*bounds, UNKNOWN)))
     with _lock:
         _readings[name] = time.monotonic(), found
     return found
@@ -145,6 +150,12 @@ def status(key: str) -> int | None:
     return None
 
 
+def siblings() -> int:
+    """Processes of this job on this machine, itself included."""
+    found = [os.environ.get(name, "") for name in (SIBLINGS, "LOCAL_WORLD_SIZE")]
+    return max([1, *(int(text) for text in found if text.isascii() and text.isdigit() and len(text) < 6)])
+
+
 def _free_on_gpu(name: str) -> Iterator[float]:
     device = torch.device(name)
     allocated = torch.cuda.memory_allocated(device)
@@ -155,15 +166,17 @@ def _free_on_gpu(name: str) -> Iterator[float]:
 
 
 def _free_on_host() -> Iterator[float]:
-    """Every bound there is; infinite where nothing is said."""
+    """Every bound there is; infinite where nothing is said. What is the machine's is shared with processes of the same
+    job, which plan at the same moment."""
     yield math.inf
     own = limit()
     if own is not None:
         yield own - (status("VmRSS") or 0)
+    shares = siblings()
     with contextlib.suppress(OSError, ValueError, IndexError):
         text = Path("/proc/meminfo").read_text(encoding="ascii")
-        yield 1024 * int(text.split("MemAvailable:")[1].split(maxsplit=1)[0])
-    yield from _free_in_groups()
+        yield 1024 * int(text.split("MemAvailable:")[1].split(maxsplit=1)[0]) / shares
+    yield from (free / shares for free in _free_in_groups())
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 

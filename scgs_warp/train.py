@@ -290,7 +290,8 @@ def fit(
     folder_type = RunFolder if team is None or team.first else Onlooker
     with folder_type(output, config, settings, resume=resume, tensorboard=tensorboard) as folder:
         begin = partial(_state, folder, config, data, device)
-        state = begin() if team is None else team.in_turn(begin)  # the first may have to put a checkpoint in its place
+        # The first of several processes may have to put a checkpoint in its place before the others read it.
+        state = team.in_turn(begin) if team is not None and resume else begin()
         state.team = team
         frames = Frames(data, state.normalisation, config, device)
         folder.begin(state.step)
@@ -313,6 +314,8 @@ def _state(folder: RunFolder, config: TrainConfig, data: Dataset, device: str) -
         try:
             return TrainState.resume(folder.path, config, data, device)
         except checkpoint.DamagedCheckpoint as error:
+            if isinstance(folder, Onlooker):
+                raise UserError(f"{error}; the first process could read it") from error
             folder.tell(f"warning: {checkpoint.fall_back(folder.path, error)}")
         return TrainState.resume(folder.path, config, data, device)
     return TrainState.begin(config, data, device)
@@ -333,7 +336,8 @@ def _loop(
             raise
         except FrameError as error:
             state.save(folder.path)
-            raise UserError(f"{error}; step {state.step} is saved: continue with --resume") from error
+            saved = f"step {state.step} is saved: " if state.team is None or state.team.first else ""
+            raise UserError(f"{error}; {saved}continue with --resume") from error
         if result.failed is None:
             state.failures = 0
         else:

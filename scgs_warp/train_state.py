@@ -26,7 +26,7 @@ from .optim import Adam, generator
 from .parallel import Team
 from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, sphere_base, thin_spheres
 from .scene import Scene, scene_from
-from .scene_checks import check_metadata, check_resumed, check_tensors, reason
+from .scene_checks import check_metadata, check_motion, check_resumed, check_tensors, reason
 from .types import Stats
 
 Stage = Literal["pretrain", "main"]
@@ -206,6 +206,9 @@ class TrainState:
             state.failures = int(metadata["failures"])
         except (KeyError, IndexError, ValueError, RuntimeError, TypeError) as error:
             raise UserError(f"{source}: cannot be resumed ({reason(error)}); train again without --resume") from error
+        state.motion.eval()
+        check_motion(state.scene(), source)
+        state.motion.train()
         return state
 
 

@@ -43,7 +43,7 @@ class FakeDisk:
 
     def open(self, file: Any, mode: str = "r", *arguments: Any, **fields: Any) -> Any:
         handle = self._open(file, mode, *arguments, **fields)
-        refused = self.full and mode[0] in "wa" and any(name in Path(file).name for name in self.names)
+        refused = self.full and mode[0] in "wax" and any(name in Path(file).name for name in self.names)
         return RefusingFile(handle, self.number) if refused else handle
 
 

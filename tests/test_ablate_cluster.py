@@ -141,7 +141,7 @@ def test_the_code_is_the_same_wherever_it_is_installed(tmp_path, monkeypatch):
 
 def order(cell: ablate.Cell, **more) -> dict:
     usual = {"cell": ablate.cell_to_json(cell), "threads": 1, "identity": ablate_worker.identity()}
-    return {**usual, "sweep": "s", "attempt": 1, "wait": 0.0, "memory": None, **more}
+    return {**usual, "sweep": "s", "attempt": 1, "wait": 0.0, "memory": None, "siblings": 1, **more}
 
 
 def test_a_worker_trains_a_cell(blobs, tmp_path, all_threads):

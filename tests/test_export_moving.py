@@ -332,15 +332,15 @@ def test_what_is_said_counts_what_is_written(run, tmp_path, capsys):
     scene = still_scene()
     with torch.no_grad():
         scene.gaussians.opacity_logits[0] = -9.0
-        scene.gaussians.sh_dc[1, 0] = float("nan")
+        scene.gaussians.opacity_logits[1] = -9.0
         scene.gaussians.sh_rest.clamp_(-0.9, 0.9)[2, 4, 1] = 1.5
         scene.gaussians.log_scales[3] = -20.0
     still = save(scene, tmp_path / "still")
     for arguments, words in (
         (["--run", still, "--output", tmp_path / "a.htm"], "a.htm: 18 Gaussians that stand still,"),
         (["--run", run, "--output", tmp_path / "a.html"], "a.html: 120 Gaussians and their motion,"),
-        (["--run", still, "--output", tmp_path / "f", "--frames", 2], "f: 2 frames of 19 Gaussians,"),
-        (["--run", still, "--output", tmp_path / "a.spz"], "19 Gaussians at rest (4 values clipped to what .spz can"),
+        (["--run", still, "--output", tmp_path / "f", "--frames", 2], "f: 2 frames of 20 Gaussians,"),
+        (["--run", still, "--output", tmp_path / "a.spz"], "20 Gaussians at rest (4 values clipped to what .spz can"),
         (["--run", run, "--output", tmp_path / "b.spz"], "b.spz: 120 Gaussians at rest,"),
     ):
         export(*arguments)

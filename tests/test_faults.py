@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -187,6 +188,21 @@ def test_the_previous_checkpoint_is_kept(links, tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.glob(".*")) == [".lock"]
 
 
+def test_what_cannot_be_read_now_may_be_sound(tmp_path, monkeypatch):
+    """A read error is no damage: the newest checkpoint stays where it is."""
+    fit(often(), tiny_dataset(FRAMES), output=tmp_path)
+    before = bits(tmp_path)
+
+    def stale(*_, **__):
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "safe_open", stale)
+        with pytest.raises(UserError, match="cannot be read"):
+            go_on(tmp_path)
+    assert bits(tmp_path) == before and not (tmp_path / checkpoint.DAMAGED).exists()
+
+
 def test_what_is_renamed_is_on_the_disk_before_and_after(tmp_path, monkeypatch):
     done: list[str] = []
     fsync, replace = os.fsync, os.replace
@@ -219,6 +235,9 @@ def damage(path: Path, how: str) -> None:
         length = int.from_bytes(content[:8], "little")
         begin, _ = json.loads(content[8 : 8 + length])["gaussians.means"]["data_offsets"]
         content[8 + length + begin + 100] ^= 4
+    elif how == "a digit":
+        at = next(m.start() for m in re.finditer(rb"[0-8]", content) if m.start() > content.index(b"extent"))
+        content[at] += 1
     elif how == "the end":
         content = content[: len(content) // 2]
     elif how == "zeros":
@@ -227,7 +246,7 @@ def damage(path: Path, how: str) -> None:
         path.write_bytes(content)
 
 
-@pytest.mark.parametrize("how", ["a bit", "the end", "zeros", "all of it"])
+@pytest.mark.parametrize("how", ["a bit", "a digit", "the end", "zeros", "all of it"])
 def test_a_damaged_checkpoint(how, tmp_path, at_step, whole, capsys):
     run = tmp_path / "run"
     at_step(HERE, lambda: (_ for _ in ()).throw(MemoryError))
@@ -405,8 +424,12 @@ def test_a_real_disk_that_is_full_after_training(done, tmp_path):
 def test_a_terminal_that_is_closed(tmp_path, at_step, whole):
     """The shell and the system both say so."""
     at_step(HERE, lambda: [os.kill(os.getpid(), signal.SIGHUP) for _ in range(2)])
-    with pytest.raises(KeyboardInterrupt):
-        fit(config(), tiny_dataset(FRAMES), output=tmp_path / "run")
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests themselves may run under nohup
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            fit(config(), tiny_dataset(FRAMES), output=tmp_path / "run")
+    finally:
+        signal.signal(signal.SIGHUP, before)
     assert checkpoint.read(tmp_path / "run")[1]["step"] == HERE + 1
     assert go_on(tmp_path / "run") == whole
 
@@ -418,6 +441,7 @@ def test_a_real_terminal_that_is_closed(tmp_path, images):
 
     def take_it() -> None:
         os.setsid()
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
         fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
     terminal, inside = os.openpty()

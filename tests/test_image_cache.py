@@ -145,13 +145,13 @@ def test_truncated_images_are_told(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(data)
     assert images.decode(path).shape == (40, 60, 3)
-    assert images._whole(np.frombuffer(data + b"appended", np.uint8))
+    assert images.whole(np.frombuffer(data + b"appended", np.uint8))
     for share in (0.0, 0.1, 0.5, 0.99):
         path.write_bytes(data[: int(share * len(data))])
         with pytest.raises(UserError, match=rf"a\{suffix}: not an image"):
             images.decode(path)
         if suffix == ".jpg":
-            assert not images._whole(np.fromfile(path, np.uint8))
+            assert not images.whole(np.fromfile(path, np.uint8))
 
 
 def test_long_reading_shows_how_far_it_is(tmp_path, monkeypatch, capsys):

@@ -219,3 +219,23 @@ def test_training_that_runs_out_of_memory_can_be_resumed(monkeypatch: pytest.Mon
     fit(config, data, output=tmp_path / "run", resume=True)
     files = [(tmp_path / name / "checkpoint.safetensors").read_bytes() for name in ("whole", "run")]
     assert files[0] == files[1]
+
+
+def test_a_system_that_says_nothing(monkeypatch):
+    """As on macOS and Windows: what is asked for is granted."""
+    monkeypatch.setattr(memory, "_free_on_host", lambda: iter([math.inf]))
+    assert memory.measure("cpu") > 2**50 and memory.fits(2**40)
+
+
+@pytest.mark.skipif(not Path("/proc/meminfo").is_file(), reason="the system says nothing")
+def test_processes_of_a_job_share_the_machine(monkeypatch):
+    for name in (memory.SIBLINGS, "LOCAL_WORLD_SIZE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(memory, "_free_in_groups", lambda: iter([]))
+    monkeypatch.setattr(memory, "_limit", None)
+    monkeypatch.setattr(memory, "_limit_known", True)
+    alone = min(memory._free_on_host())
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "8")
+    assert memory.siblings() == 8 and min(memory._free_on_host()) < alone / 6
+    monkeypatch.setenv(memory.SIBLINGS, "nonsense")
+    assert memory.siblings() == 8

@@ -23,6 +23,8 @@ from .features import CameraModel, Matching, Shots
 from .journal import Journal
 from .source import Source, Still, open_source, read_rgb
 
+LONGEST = 1e9
+"""Seconds; no film is as long."""
 FEWEST = 6
 """Frames from which nothing can be learnt of a motion."""
 SHEET, CAMERAS = "contact_sheet.png", "cameras.png"
@@ -183,7 +185,8 @@ def _frames_of(found: Any) -> Frames | None:
         frames = Frames(**{**found, "span": tuple(found["span"]), "size": tuple(found["size"])})
         counts = (*frames.indices, *frames.size, frames.seen, frames.blurred, frames.alike)
         whole = all(isinstance(count, int) and 0 <= count < 2**31 for count in counts)
-        times = all(as_number(second) is not None for second in (*frames.seconds, *frames.span))
+        numbers = [as_number(second) for second in (*frames.seconds, *frames.span)]
+        times = all(number is not None and abs(number) <= LONGEST for number in numbers)
         names = len(frames.names) in (0, len(frames.indices)) and all(isinstance(name, str) for name in frames.names)
         lengths = len(frames.seconds) == len(frames.indices) and len(frames.span) == len(frames.size) == 2
     except (KeyError, TypeError):

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from ..data.files import natural, size_text
-from ..data.images import bomb
+from ..data.images import bomb, whole
 from ..errors import UserError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -183,7 +183,7 @@ def read_rgb(file: Path) -> np.ndarray:
         claim = bomb(data.data)
         if claim is not None:
             raise UserError(f"{file}: says it is {claim} in {data.size} bytes; save it again, smaller")
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if whole(data) else None
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
     except cv2.error:

@@ -23,7 +23,7 @@ from ..errors import UserError
 from ..json_text import parse_json
 from .files import read_bytes
 from .gltf_schema import problem
-from .images import bomb
+from .images import bomb, whole
 from .paths import inside, is_regular
 
 UNDERSTOOD = {
@@ -195,7 +195,8 @@ class GltfFile:
         if claim is not None:
             raise self.error(where, f"says it is {claim} in {len(data)} bytes; export the file with smaller textures")
         try:
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+            raw = np.frombuffer(data, np.uint8)
+            pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if whole(raw) else None
         except cv2.error:
             pixels = None
         if pixels is None or pixels.dtype not in (np.uint8, np.uint16):

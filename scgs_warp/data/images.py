@@ -174,7 +174,7 @@ def decode(path: Path) -> np.ndarray:
     if claim is not None:
         raise UserError(f"{path}: says it is {claim} in {data.size} bytes; save it again, smaller")
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if _whole(data) else None
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if whole(data) else None
     except cv2.error:
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
@@ -201,12 +201,20 @@ def bomb(data: bytes | memoryview) -> str | None:
     return size_text(size) if count > ALWAYS_FINE and count > THINNEST * len(data) else None
 
 
-def _whole(data: np.ndarray) -> bool:
-    """False where a file ends too soon. Older versions of OpenCV fill up what is missing of a JPEG with grey."""
-    if data[:2].tobytes() != b"\xff\xd8":
-        return data.size > 0
+def whole(data: np.ndarray) -> bool:
+    """Whether a JPEG or PNG ends where it should, given as bytes. Older versions of OpenCV fill up what is missing of a
+    JPEG with grey; all make room for as many bytes as a PNG says will follow."""
     content = data.tobytes()
-    return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # the end of the image, after its last scan
+    if content.startswith(b"\xff\xd8"):
+        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # the end of the image, after its last scan
+    if content.startswith(b"\x89PNG\r\n\x1a\n"):
+        at = 8
+        while at + 8 <= len(content):
+            if content[at + 4 : at + 8] == b"IEND":
+                return True
+            at += 12 + int.from_bytes(content[at : at + 4], "big")
+        return False
+    return len(content) > 0
 
 
 def header_size(path: Path) -> tuple[int, int] | None:
