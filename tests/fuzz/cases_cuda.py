@@ -32,14 +32,15 @@ def emulated(seed: int) -> Iterator[None]:
     native, blocks_of = compositing_cuda.launch_native, compositing_cuda.launch_blocks
     run = launcher(library(), seed)
 
-    def fenced_native(kernel: Any, blocks: int, *args: Any) -> None:
+    def fenced_native(kernel: Any, blocks: int, *args: Any, begin: int = 0) -> None:
         if fence.current is None:
-            run(kernel, blocks, *args)
+            run(kernel, blocks, *args, begin=begin)
         else:
-            fence.current.run(kernel, _parameters_of(kernel, args), args, lambda own: run(kernel, blocks, *own))
+            parameters = _parameters_of(kernel, args)
+            fence.current.run(kernel, parameters, args, lambda own: run(kernel, blocks, *own, begin=begin))
 
-    def portable(kernel: Any, blocks: int, *args: Any, block_dim: int) -> None:
-        launch(compositing.composite_pixels_adjoint, blocks, *args)
+    def portable(kernel: Any, blocks: int, *args: Any, block_dim: int, begin: int = 0) -> None:
+        launch(compositing.composite_pixels_adjoint, blocks, *args, begin=begin)
 
     compositing_cuda.launch_native, compositing_cuda.launch_blocks = fenced_native, portable  # type: ignore[assignment]
     try:
