@@ -176,6 +176,8 @@ class TrainState:
             raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
         check_tensors(tensors, source)
         check_resumed(tensors, metadata, source)
+        if metadata["step"] > config.steps:
+            raise UserError(f"{source}: is at step {metadata['step']} of {config.steps}; train again without --resume")
         tensors = checkpoint.to_device(tensors, device)
         scene = scene_from(tensors, metadata, device, source)
         nothing = torch.zeros(0, 3, device=device)

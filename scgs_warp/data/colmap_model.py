@@ -103,7 +103,8 @@ def _read(file: Path, reader: Callable[[bytes], Any]) -> Any:
 
 def _pose(quaternion: np.ndarray, translation: np.ndarray, name: str) -> np.ndarray:
     """[4, 4] from wxyz and the translation of world-to-camera."""
-    length = float(np.linalg.norm(quaternion))
+    with np.errstate(over="ignore"):  # infinite, and refused
+        length = float(np.linalg.norm(quaternion))
     if not (np.isfinite(translation).all() and 0.99 < length < 1.01):  # NaN: no
         raise _Damaged(f"the pose of {name[:60]!r} is no unit quaternion and translation of finite numbers")
     w, x, y, z = quaternion / length

@@ -166,3 +166,19 @@ def _numbers(file: IO[bytes], size: int, flags: bool) -> np.ndarray:
     array = np.frombuffer(data, kind, count).reshape(shape, order="F" if fortran else "C")
     with np.errstate(invalid="ignore"):  # of signalling NaN
         return array.copy() if flags else array.astype(np.float64)
+
+
+def check_ply_counts(path: Path) -> None:
+    """Refuse a PLY file whose header counts more than its bytes can hold, before anybody makes room for them.
+
+    Raises:
+        ValueError: it does.
+        OSError: it cannot be read.
+    """
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        head = file.read(1 << 16).split(b"end_header")[0]
+    for line in head.splitlines():
+        words = line.split()
+        if len(words) == 3 and words[0] == b"element" and words[2].isdigit() and int(words[2][:20]) > size:
+            raise ValueError(f"counts {words[2][:20].decode()} rows in {size} bytes")

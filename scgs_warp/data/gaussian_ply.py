@@ -17,6 +17,7 @@ from ..gaussians import GaussianParameters
 from ..motion.static_nodes import COUNT, StaticNodes
 from ..scene import Scene
 from ..types import Gaussians
+from .files import check_ply_counts
 from .normalise import COMMON_RADIUS, Normalisation
 
 REST_COUNTS = (0, 9, 24, 45)
@@ -103,6 +104,7 @@ def _vertices(path: Path) -> np.ndarray:
         raise UserError(f"{path}: no such file; give a .ply of 3D Gaussian splatting")
     try:
         with np.errstate(over="ignore"):  # of text: infinite, and left out
+            check_ply_counts(path)
             elements = PlyData.read(str(path))
         data = np.asarray(elements["vertex"].data)
     except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..gaussians import SH_C0
+from .files import check_ply_counts
 from .paths import is_regular
 
 
@@ -67,6 +68,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         if not is_regular(path):
             raise UserError(f"{path}: is no file; give a PLY of points")
         with np.errstate(over="ignore"):  # of text: infinite, and left out
+            check_ply_counts(path)
             elements = PlyData.read(str(path))
         vertices = elements["vertex"].data
         points = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
