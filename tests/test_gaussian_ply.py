@@ -140,7 +140,13 @@ def test_tiny_files_open(tmp_path, count):
 def test_a_header_that_counts_more_than_there_is(tmp_path):
     """Of any element: room for it is made before it is read."""
     path = tmp_path / "scene.ply"
-    head = ["ply", "format binary_little_endian 1.0", "element vertex 1", "property float x", "element other 1000000000"]
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "element vertex 1",
+        "property float x",
+        "element other 1000000000",
+    ]
     path.write_bytes("\n".join([*head, "property list uint float y", "end_header", ""]).encode() + bytes(12))
     with pytest.raises(UserError, match="no PLY file with vertices"):
         read_gaussian_ply(path)
