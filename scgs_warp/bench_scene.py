@@ -201,7 +201,8 @@ def _background(scene: Scene) -> str:
 
 
 def training_state(scene: Scene, arap: bool) -> TrainState:
-    """The scene in the joint phase of training, at full harmonics, statistics for densification on; rates near 0.
+    """The scene in the joint phase of training, at full harmonics, statistics for densification on; rates near 0. With
+    ``arap`` every step carries that term, where training does so in one of five: a median over a mixture shows neither.
     The scene's motion is in training mode from here on."""
     own = scene.config
     base = TrainConfig(seed=own.seed, data=own.data, motion=own.motion, antialiased=own.antialiased)
@@ -211,7 +212,7 @@ def training_state(scene: Scene, arap: bool) -> TrainState:
         for item in dataclasses.fields(rates)
         if not item.metadata.get("milestone")
     }
-    loss = base.loss if arap else dataclasses.replace(base.loss, arap=0.0)
+    loss = dataclasses.replace(base.loss, arap_every=1) if arap else dataclasses.replace(base.loss, arap=0.0)
     config = dataclasses.replace(base, optim=dataclasses.replace(rates, **slow), loss=loss)
     step = config.pretrain_steps + max(config.rest_steps, 3 * config.densify.sh_every)
     scene.motion.train()

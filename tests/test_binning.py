@@ -13,8 +13,8 @@ from splats import random_splats
 from reference.binning import needed_pairs, usable
 from scgs_warp import environment
 from scgs_warp.ops import binning
-from scgs_warp.ops.binning import _bin_by_bands, bin_splats
-from scgs_warp.ops.binning_cuda import bin_by_radix
+from scgs_warp.ops.binning import BandCount, bin_splats
+from scgs_warp.ops.binning_cuda import RadixCount
 from scgs_warp.types import Splats, Tiles
 
 
@@ -130,8 +130,9 @@ def assert_both_sorts_agree(splats: Splats, device: str = "cpu", tile_size: int 
     geometry = [getattr(splats, name) for name in FIELDS]
     columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
     size = (splats.width, splats.height, columns, rows, tile_size)
-    by_radix = bin_by_radix([t.to(device) for t in geometry], size)
-    for name, got, expected in zip(LISTS, _bin_by_bands(geometry, size), by_radix, strict=True):
+    whole = (0, columns * rows)
+    by_radix = RadixCount([t.to(device) for t in geometry], size, whole).lists()
+    for name, got, expected in zip(LISTS, BandCount(geometry, size, whole).lists(), by_radix, strict=True):
         assert torch.equal(got, expected.cpu()), name
     return len(by_radix[1])
 

@@ -116,6 +116,7 @@ class BandCount:
         return 32 * self._stretches + 4 * self._begins.numel() + 4 * rows * columns
 
     def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Ranges, splats, slots, offsets."""
         count, (rows, columns) = len(self._geometry[0]), self._tiles
         offsets = torch.empty(count + 1, dtype=torch.int64)
         keys, spare = (torch.empty(self._stretches, dtype=torch.int64) for _ in range(2))
@@ -132,11 +133,6 @@ class BandCount:
         tiles, load = (cursors, ranges, splats, slots), self._band_begins[1:]
         launch(kernels.sort_bands, rows, self._band_begins, dealt, before, keys, spare, *tiles, grain=1, load=load)
         return ranges, splats, slots, offsets
-
-
-def _bin_by_bands(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Ranges, splats, slots, offsets of all tiles, on a CPU."""
-    return BandCount(geometry, size, (0, size[2] * size[3])).lists()
 
 
 def _validate(splats: Splats, tile_size: int) -> None:

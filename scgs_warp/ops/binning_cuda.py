@@ -1,6 +1,6 @@
 """Splats to tiles on CUDA: a radix sort of the splats by depth, then one of all pairs by tile.
 
-Two ways in. ``bin_by_radix`` asks the device for the number of pairs, once, in the middle. ``bin_within`` never asks:
+Two ways in. ``RadixCount`` asks the device for the number of pairs, once, in the middle. ``bin_within`` never asks:
 it has room for so many pairs and says afterwards, on the device, how many there were. Both run on a CPU as well, where
 they are tested.
 """
@@ -81,13 +81,9 @@ class RadixCount:
         return 16 * self.pairs + 12 * len(self._counts)
 
     def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Ranges, splats, slots, offsets."""
         found = _list(self._geometry, self._size, self._counts, self._order, self._offsets, self.pairs, True)
         return *found, self._offsets
-
-
-def bin_by_radix(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Ranges, splats, slots, offsets of all tiles."""
-    return RadixCount(geometry, size, (0, size[2] * size[3])).lists()
 
 
 def bytes_within(capacity: int, count: int, tiles: int) -> int:

@@ -9,8 +9,8 @@ from splats import random_splats
 from torch import Tensor
 
 import scgs_warp
-from scgs_warp.ops.binning import _bin_by_bands, bin_splats
-from scgs_warp.ops.binning_cuda import bin_by_radix, bin_within, geometry_of
+from scgs_warp.ops.binning import BandCount, bin_splats
+from scgs_warp.ops.binning_cuda import RadixCount, bin_within, geometry_of
 from scgs_warp.ops.compositing import composite
 from scgs_warp.ops.covariance import covariance
 from scgs_warp.ops.harmonics import spherical_harmonics
@@ -162,9 +162,9 @@ def case_binning(d: Draw, device: str) -> None:
     assert not bool(broken[tiles.splats.cpu().long()].any()), "a broken splat is in a tile"
     size = (splats.width, splats.height, tiles.columns, tiles.rows, tile_size)
     ours_of = (tiles.ranges, tiles.splats, tiles.slots, tiles.offsets)
-    for lists in (_bin_by_bands, bin_by_radix) if device == "cpu" else (bin_by_radix,):
-        for ours, other in zip(ours_of, lists(geometry_of(splats), size)):
-            assert torch.equal(ours, other), f"{lists.__name__} differs"
+    for counted in (BandCount, RadixCount) if device == "cpu" else (RadixCount,):
+        for ours, other in zip(ours_of, counted(geometry_of(splats), size, (0, tiles.columns * tiles.rows)).lists()):
+            assert torch.equal(ours, other), f"{counted.__name__} differs"
     if tile_size == 16:
         room = max(1, len(tiles.splats) + int(d.rng.integers(-3, 4)))
         within, total = bin_within(splats, room)
