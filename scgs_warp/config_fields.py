@@ -154,6 +154,9 @@ class DensifyConfig:
     percent_dense: float = 0.01
     """Gaussians larger than this share of the extent are split, smaller ones cloned."""
     min_opacity: float = 0.005
+    min_contribution: float = 0.05
+    """Before each opacity reset and at the end of densification, prune what makes up less than this many pixels (its
+    blending weights summed) of every training view; 0: nothing."""
     prune_large: Literal["auto", "always", "never"] = "auto"
     """Whether the next two hold; auto: where the images have alpha. Filled images show bare walls."""
     max_screen: float = 0.05

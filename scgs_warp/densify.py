@@ -131,6 +131,12 @@ def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> None:
     optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
 
 
+def prunes_unseen(config: DensifyConfig, done: int) -> bool:
+    """Whether the Gaussians are due to be judged by what they make up of the images, ``done`` main steps being over.
+    A reset spares what is hidden: all surfaces are transparent then, and the inside is coloured again."""
+    return config.min_contribution > 0.0 and (done == config.until or done % config.opacity_reset_every == 0)
+
+
 def reset_opacities(gaussians: GaussianParameters, optimizer: Adam) -> None:
     """No opacity above 0.01 any more: what the images need comes back, floaters do not."""
     with torch.no_grad():

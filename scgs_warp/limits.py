@@ -21,9 +21,9 @@ AT_LEAST_ONE = (
 NOT_NEGATIVE = (
     "data.cache_mib seed freeze coarse half_size checkpoint_seconds "
     "pretrain.steps pretrain.warm_up pretrain.clone_share pretrain.arap_weight "
-    "densify.start densify.until densify.grad_threshold densify.min_opacity loss.ssim loss.arap loss.arap_end "
-    "optim.cameras optim.shading optim.settle motion.time_noise motion.hyper_dim motion.hyper_dim_filled "
-    "loss.hexplane_tv loss.hexplane_smooth loss.hexplane_rest"
+    "densify.start densify.until densify.grad_threshold densify.min_opacity densify.min_contribution "
+    "loss.ssim loss.arap loss.arap_end optim.cameras optim.shading optim.settle motion.time_noise "
+    "motion.hyper_dim motion.hyper_dim_filled loss.hexplane_tv loss.hexplane_smooth loss.hexplane_rest"
 ).split()
 AT_MOST = {
     "steps": 100_000_000,

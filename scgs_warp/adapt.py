@@ -1,0 +1,83 @@
+"""Between two steps: what the schedule wants of the numbers of Gaussians and control points."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from .contribution import contributions
+from .densify import densify, mean_gradient, most_that_fit, prune, prunes_unseen, reset_opacities, threshold
+from .frames import Frames
+from .motion.adapt import adapt_control_points
+from .motion.control_points import ControlPoints
+from .motion.spheres import Spheres
+from .optim import generator
+from .pretrain import densify_spheres, thin_spheres
+from .train_state import TrainState
+
+
+def adapt(state: TrainState, frames: Frames, size: tuple[int, int]) -> str | None:
+    """After the step: what the schedule wants of numbers of Gaussians and control points. ``stage_step`` is the step
+    just done. Returns what the user should know of it."""
+    if state.stage == "pretrain":
+        _adapt_spheres(state)
+        return None
+    return _adapt_gaussians(state, frames, size)
+
+
+def _adapt_spheres(state: TrainState) -> None:
+    assert isinstance(state.motion, Spheres)
+    config, done = state.config, state.stage_step + 1
+    if done == config.pretrain.densify_until:
+        thin_spheres(state.gaussians, state.gaussian_optimizer, state.motion, config.motion.nodes)
+        state.reset_stats()
+    elif done < config.pretrain.densify_until and (
+        done % config.pretrain.densify_every == 0 or done == config.pretrain.warm_up
+    ):
+        densify_spheres(state.gaussians, state.gaussian_optimizer, state.motion, state.stats, config, state.step)
+        state.reset_stats()
+
+
+def _adapt_gaussians(state: TrainState, frames: Frames, size: tuple[int, int]) -> str | None:
+    config, done, note = state.config.densify, state.stage_step + 1, None
+    if done > config.until:
+        return None
+    if done >= config.start and done % config.every == 0:
+        limit = threshold(config, *size)
+        if _nodes_due(state, done):
+            assert isinstance(state.motion, ControlPoints) and state.motion_optimizer is not None
+            node_limit = limit * config.node_grad_threshold / config.grad_threshold
+            gradient = mean_gradient(state.stats)
+            adapt_control_points(
+                state.motion, state.motion_optimizer, state.gaussians, gradient, grad_threshold=node_limit
+            )
+        most = most_that_fit(state.gaussians, config.max_gaussians)
+        most = most if state.team is None else state.team.least(most)
+        if most < config.max_gaussians:
+            note = f"memory has room for {most:,} Gaussians, not for {config.max_gaussians:,}; they grow no further"
+            config = dataclasses.replace(config, max_gaussians=most)
+        densify(
+            state.gaussians,
+            state.gaussian_optimizer,
+            state.stats,
+            config,
+            grad_threshold=limit,
+            extent=state.extent,
+            prune_large=done > config.opacity_reset_every and config.prune_large != "never",
+            random=generator(state.config.seed, 51, state.step),
+        )
+        state.reset_stats()
+    if prunes_unseen(config, done):
+        prune(state.gaussians, state.gaussian_optimizer, contributions(state, frames) >= config.min_contribution)
+        state.reset_stats()
+    # A reset needs time to heal before densification ends.
+    if done % config.opacity_reset_every == 0 and done + config.opacity_reset_every // 2 <= config.until:
+        reset_opacities(state.gaussians, state.gaussian_optimizer)
+    return note
+
+
+def _nodes_due(state: TrainState, done: int) -> bool:
+    """Control points change at the first densification after each of their own milestones."""
+    config = state.config.densify
+    if not isinstance(state.motion, ControlPoints) or done > config.nodes_until or done <= state.config.freeze:
+        return False
+    return done >= config.nodes_every and done % config.nodes_every < config.every
