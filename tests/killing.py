@@ -24,7 +24,7 @@ import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
 
 from tiny import tiny_config, tiny_dataset  # isort: skip
 
-from scgs_warp import checkpoint, environment, train
+from scgs_warp import adapt, checkpoint, environment, train
 from scgs_warp.config import TrainConfig
 from scgs_warp.train_state import TrainState
 
@@ -90,8 +90,9 @@ MOMENTS: dict[str, Callable[[], None]] = {
     "between the two renames": lambda: wrapped(os, "replace", nth(11, ends(checkpoint.FILE))),
     "before the folder is flushed": lambda: wrapped(checkpoint, "sync_folder", nth(13, always)),
     "after the stage has changed": lambda: wrapped(TrainState, "begin_main", lambda *_: None, die),
-    "while spheres are added": lambda: wrapped(train, "densify_spheres", lambda *_: None, nth(2, always)),
-    "while Gaussians are added": lambda: wrapped(train, "densify", lambda *_: None, nth(3, always)),
+    "while spheres are added": lambda: wrapped(adapt, "densify_spheres", lambda *_: None, nth(2, always)),
+    "while Gaussians are added": lambda: wrapped(adapt, "densify", lambda *_: None, nth(3, always)),
+    "before the unseen are pruned": lambda: wrapped(adapt, "prune", nth(1, always)),
 }
 """What to do for a run to be killed there."""
 LATE = ("before the first checkpoint",)
@@ -101,10 +102,10 @@ LATE = ("before the first checkpoint",)
 def narrate(tell: Callable[[str], None]) -> None:
     """Tell what is being done."""
     wrapped(train, "training_step", lambda state, _: tell(f"{state.stage} step"))
-    wrapped(train, "adapt", lambda state, _: tell(f"{state.stage} densification, if due"))
+    wrapped(train, "adapt", lambda state, *_: tell(f"{state.stage} densification, if due"))
     wrapped(TrainState, "begin_main", lambda *_: tell("stage change"))
-    wrapped(train, "densify", lambda *_: tell("main densification"))
-    wrapped(train, "densify_spheres", lambda *_: tell("pretrain densification"))
+    wrapped(adapt, "densify", lambda *_: tell("main densification"))
+    wrapped(adapt, "densify_spheres", lambda *_: tell("pretrain densification"))
     wrapped(checkpoint, "write", lambda *_: tell("checkpoint: gathering"))
     wrapped(checkpoint, "_write_through", lambda *_: tell("checkpoint: writing"))
     wrapped(os, "replace", lambda *_: tell("checkpoint: renaming"))

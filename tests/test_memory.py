@@ -13,7 +13,7 @@ import torch
 from fake_scene import FakeScene, install
 from tiny import tiny_config, tiny_dataset
 
-from scgs_warp import densify, film, memory, train
+from scgs_warp import adapt, densify, film, memory, train
 from scgs_warp.apps import cli, view
 from scgs_warp.data import ImageCache, cache
 from scgs_warp.errors import UserError
@@ -191,7 +191,7 @@ def test_training_says_that_memory_ends_growth(monkeypatch: pytest.MonkeyPatch, 
         asked.append(len(gaussians))
         return len(gaussians)
 
-    monkeypatch.setattr(train, "most_that_fit", most)
+    monkeypatch.setattr(adapt, "most_that_fit", most)
     fit(tiny_config(60, motion={"model": "static"}), tiny_dataset(6, 32), output=tmp_path / "run")
     assert len(asked) > 1 and all(later <= first for first, later in itertools.pairwise(asked))
     said = capsys.readouterr()
