@@ -59,6 +59,7 @@ def preset(name: PresetName) -> TrainConfig:
         densify=DensifyConfig(
             start=400,
             until=12_000,
+            every=100,
             opacity_reset_every=3_000,
             sh_every=500,
             nodes_every=2_000,
