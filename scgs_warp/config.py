@@ -102,7 +102,7 @@ def _scale(config: Any, ratio: float) -> Any:
     for item in dataclasses.fields(config):
         value = getattr(config, item.name)
         if item.metadata.get("milestone"):
-            changes[item.name] = max(min(value, 1), round(value * ratio))
+            changes[item.name] = max(min(value, item.metadata["least"]), round(value * ratio))
         elif dataclasses.is_dataclass(value):
             changes[item.name] = _scale(value, ratio)
     return dataclasses.replace(config, **changes)

@@ -15,9 +15,9 @@ CACHE_MIB = 2048
 """Decoded images that are kept in memory, by default: 200 of 800 x 800 pixels with alpha."""
 
 
-def milestone(steps: int) -> Any:
-    """A step count that scales with the length of the run."""
-    return field(default=steps, metadata={"milestone": True})
+def milestone(steps: int, least: int = 1) -> Any:
+    """A step count that scales with the length of the run, but not below ``least``."""
+    return field(default=steps, metadata={"milestone": True, "least": least})
 
 
 @dataclass(frozen=True)
@@ -143,8 +143,9 @@ class DensifyConfig:
 
     start: int = milestone(500)
     until: int = milestone(40_000)
-    every: int = 300
-    """Steps between two rounds: some 130 of them in all. Three times as many make twice the Gaussians."""
+    every: int = milestone(300, least=100)
+    """Steps between two rounds. Some 120 rounds are enough, however long the run: three times as many make twice the
+    Gaussians. Fewer steps see too few of the views to judge by."""
     grad_threshold: float = 1.4e-4
     """Gradient of the loss to the 2D mean in normalised device coordinates, at 800 pixels (official code: 2e-4 at any
     size)."""
