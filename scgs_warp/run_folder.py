@@ -246,14 +246,14 @@ class RunFolder:
         if done:
             write_atomically(self.path / "previews" / "latest.png", content.tobytes())
 
-    def look_at_test(self, scene: Scene, test: Dataset) -> None:
-        """PSNR of a few test images, for the curve."""
+    def look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+        """PSNR of a few test images after ``step`` steps, for the curve."""
         scene.motion.eval()
         with self._optional("the look at held-out frames"):
-            self._look_at_test(scene, test)
+            self._look_at_test(scene, test, step)
         scene.motion.train()
 
-    def _look_at_test(self, scene: Scene, test: Dataset) -> None:
+    def _look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
         wanted = range(0, len(test), max(1, len(test) // TEST_IMAGES))
         values = []
         for i in wanted:
@@ -262,10 +262,10 @@ class RunFolder:
             valid = slice(None) if frame.mask is None else frame.mask
             values.append(float(psnr(image[valid], frame.image[valid])))
             if i == 0:
-                self._show("held_out", frame.image.permute(2, 0, 1), image.permute(2, 0, 1), scene.step)
+                self._show("held_out", frame.image.permute(2, 0, 1), image.permute(2, 0, 1), step)
         values = [value for value in values if math.isfinite(value)]
         if values:
-            self.log({"step": scene.step, "test_psnr": sum(values) / len(values)})
+            self.log({"step": step, "test_psnr": sum(values) / len(values)})
 
 
 class Onlooker(RunFolder):
@@ -288,5 +288,5 @@ class Onlooker(RunFolder):
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
         pass
 
-    def look_at_test(self, scene: Scene, test: Dataset) -> None:
+    def look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
         pass

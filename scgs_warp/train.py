@@ -272,6 +272,9 @@ def _loop(
             state.failures = 0
         else:
             _count_failure(state, result.failed, folder, bar)
+        done = state.step + 1
+        if test is not None and (done % config.evaluate_every == 0 or done == config.steps):
+            folder.look_at_test(state.scene(), test, done)  # not after an opacity reset: the curve would show its dips
         state.whole = False
         note = adapt(state, frames, result.size)
         if note is not None and not noted:
@@ -285,8 +288,6 @@ def _loop(
         if last or stopping or state.step % COMPARE_EVERY == 0:
             check_replicas(state)
         folder.record(state, result, bar)
-        if test is not None and (state.step % config.evaluate_every == 0 or last):
-            folder.look_at_test(state.scene(), test)
         now = time.monotonic()
         if now - saved_at >= config.checkpoint_seconds or last or stopping:
             state.save(folder.path)

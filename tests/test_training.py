@@ -16,6 +16,7 @@ from tiny import tiny_config, tiny_dataset
 
 from scgs_warp import checkpoint
 from scgs_warp.config import with_steps
+from scgs_warp.densify import RESET_OPACITY
 from scgs_warp.errors import UserError
 from scgs_warp.evaluate import evaluate
 from scgs_warp.frames import Frames
@@ -43,6 +44,21 @@ def test_every_motion_model_learns(model, tmp_path, device):
     steps = [entry["step"] for entry in log if "loss" in entry]
     assert steps == [50, 100, 150, 200]
     assert any("test_psnr" in entry for entry in log)
+
+
+def test_the_curve_does_not_show_opacity_resets(tmp_path, monkeypatch):
+    """They fall on the same round steps."""
+    looks = []
+    monkeypatch.setattr(
+        RunFolder,
+        "look_at_test",
+        lambda _, scene, test, step: looks.append((step, float(scene.gaussians.opacities().detach().max()))),
+    )
+    schedule = {"until": 45, "opacity_reset_every": 20, "every": 10}
+    config = tiny_config(60, motion={"model": "static"}, densify=schedule, evaluate_every=20)
+    fit(config, tiny_dataset(6), output=tmp_path / "run", test=tiny_dataset(2, split="test"))
+    assert [step for step, _ in looks] == [20, 40, 60]
+    assert all(most > 2 * RESET_OPACITY for _, most in looks), looks
 
 
 def test_checkpoint_round_trip(tmp_path, device):
