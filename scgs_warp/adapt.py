@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from .contribution import contributions
-from .densify import densify, mean_gradient, most_that_fit, prune, prunes_unseen, reset_opacities, threshold
-from .frames import Frames
+from torch import Tensor
+
+from .densify import densify, mean_gradient, most_that_fit, prune, reset_opacities, resets, threshold
 from .motion.adapt import adapt_control_points
 from .motion.control_points import ControlPoints
 from .motion.spheres import Spheres
@@ -15,13 +15,21 @@ from .pretrain import densify_spheres, thin_spheres
 from .train_state import TrainState
 
 
-def adapt(state: TrainState, frames: Frames, size: tuple[int, int]) -> str | None:
+def adapt(state: TrainState, size: tuple[int, int], kept: Tensor | None = None) -> str | None:
     """After the step: what the schedule wants of numbers of Gaussians and control points. ``stage_step`` is the step
-    just done. Returns what the user should know of it."""
+    just done.
+
+    Args:
+        size: width and height of the step's image.
+        kept: [N] bool, the Gaussians that are ``seen``; the others are pruned. None: that is not due.
+
+    Returns:
+        what the user should know of it, if anything.
+    """
     if state.stage == "pretrain":
         _adapt_spheres(state)
         return None
-    return _adapt_gaussians(state, frames, size)
+    return _adapt_gaussians(state, size, kept)
 
 
 def _adapt_spheres(state: TrainState) -> None:
@@ -37,11 +45,13 @@ def _adapt_spheres(state: TrainState) -> None:
         state.reset_stats()
 
 
-def _adapt_gaussians(state: TrainState, frames: Frames, size: tuple[int, int]) -> str | None:
+def _adapt_gaussians(state: TrainState, size: tuple[int, int], kept: Tensor | None) -> str | None:
     config, done, note = state.config.densify, state.stage_step + 1, None
     if done > config.until:
         return None
-    if done >= config.start and done % config.every == 0:
+    if kept is not None:  # before there are newborn ones: a clone is hidden behind its parent
+        state.stats = state.stats.rows(prune(state.gaussians, state.gaussian_optimizer, kept))
+    if done >= config.start and done % config.interval == 0:
         limit = threshold(config, *size)
         if _nodes_due(state, done):
             assert isinstance(state.motion, ControlPoints) and state.motion_optimizer is not None
@@ -66,18 +76,15 @@ def _adapt_gaussians(state: TrainState, frames: Frames, size: tuple[int, int]) -
             random=generator(state.config.seed, 51, state.step),
         )
         state.reset_stats()
-    if prunes_unseen(config, done):
-        prune(state.gaussians, state.gaussian_optimizer, contributions(state, frames) >= config.min_contribution)
-        state.reset_stats()
-    # A reset needs time to heal before densification ends.
-    if done % config.opacity_reset_every == 0 and done + config.opacity_reset_every // 2 <= config.until:
+    if resets(config, done):
         reset_opacities(state.gaussians, state.gaussian_optimizer)
     return note
 
 
 def _nodes_due(state: TrainState, done: int) -> bool:
-    """Control points change at the first densification after each of their own milestones."""
+    """Control points change at the first densification after each of their own milestones, up to ``nodes_until``."""
     config = state.config.densify
-    if not isinstance(state.motion, ControlPoints) or done > config.nodes_until or done <= state.config.freeze:
+    if not isinstance(state.motion, ControlPoints) or done <= state.config.freeze:
         return False
-    return done >= config.nodes_every and done % config.nodes_every < config.every
+    number, late = divmod(done, config.nodes_every)
+    return number > 0 and late < config.interval and done - late <= config.nodes_until

@@ -59,7 +59,6 @@ def preset(name: PresetName) -> TrainConfig:
         densify=DensifyConfig(
             start=400,
             until=12_000,
-            every=100,
             opacity_reset_every=3_000,
             sh_every=500,
             nodes_every=2_000,
@@ -102,7 +101,7 @@ def _scale(config: Any, ratio: float) -> Any:
     for item in dataclasses.fields(config):
         value = getattr(config, item.name)
         if item.metadata.get("milestone"):
-            changes[item.name] = max(min(value, item.metadata["least"]), round(value * ratio))
+            changes[item.name] = max(min(value, 1), round(value * ratio))
         elif dataclasses.is_dataclass(value):
             changes[item.name] = _scale(value, ratio)
     return dataclasses.replace(config, **changes)

@@ -15,9 +15,9 @@ CACHE_MIB = 2048
 """Decoded images that are kept in memory, by default: 200 of 800 x 800 pixels with alpha."""
 
 
-def milestone(steps: int, least: int = 1) -> Any:
-    """A step count that scales with the length of the run, but not below ``least``."""
-    return field(default=steps, metadata={"milestone": True, "least": least})
+def milestone(steps: int) -> Any:
+    """A step count that scales with the length of the run."""
+    return field(default=steps, metadata={"milestone": True})
 
 
 @dataclass(frozen=True)
@@ -143,9 +143,10 @@ class DensifyConfig:
 
     start: int = milestone(500)
     until: int = milestone(40_000)
-    every: int = milestone(300, least=100)
-    """Steps between two rounds. Some 120 rounds are enough, however long the run: three times as many make twice the
-    Gaussians. Fewer steps see too few of the views to judge by."""
+    every: int = 100
+    """Steps between two rounds, at least: fewer see too few of the views to judge by."""
+    rounds: int = 132
+    """Rounds in all, at most: three times as many make twice the Gaussians, not better images."""
     grad_threshold: float = 1.4e-4
     """Gradient of the loss to the 2D mean in normalised device coordinates, at 800 pixels (official code: 2e-4 at any
     size)."""
@@ -158,7 +159,7 @@ class DensifyConfig:
     min_opacity: float = 0.005
     min_contribution: float = 0.05
     """Before each opacity reset and at the end of densification, prune what makes up less than this many pixels (its
-    blending weights summed) of every training view; 0: nothing."""
+    blending weights summed, at the size of the training images) of every view looked at; 0: nothing."""
     prune_large: Literal["auto", "always", "never"] = "auto"
     """Whether the next two hold; auto: where the images have alpha. Filled images show bare walls."""
     max_screen: float = 0.05
@@ -172,6 +173,11 @@ class DensifyConfig:
     nodes_until: int = milestone(25_000)
     node_grad_threshold: float = 2e-4
     max_gaussians: int = 300_000
+
+    @property
+    def interval(self) -> int:
+        """Steps from one round to the next."""
+        return max(self.every, -(-(self.until - self.start) // self.rounds))
 
 
 @dataclass(frozen=True)

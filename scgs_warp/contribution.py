@@ -5,27 +5,47 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .densify import prunes_unseen
 from .frames import Frames
 from .ops.binning import bin_splats
 from .ops.compositing import composite, demand
 from .ops.projection import project
+from .optim import generator
 from .train_state import TrainState
 from .types import Camera, Gaussians
 
-FEWEST_VIEWS = 50
 STEPS_PER_VIEW = 20
-"""One view is looked at for so many steps between two looks, so that they cost some 3 % of the time however many views
-there are."""
+"""At most one view is looked at for so many steps since the last look: a few percent of the time, as a view takes about
+half of a step's."""
+MOST_VIEWS, FEWEST_VIEWS = 300, 50
+"""More are not needed to see every side; fewer, where there are more, do not see enough to judge by."""
 
 
-def contributions(state: TrainState, frames: Frames) -> Tensor:
-    """[N] pixels: the most that a Gaussian makes up of any training view (``weights_in``); infinite where it is in none
-    of those looked at, which are spread evenly over the time."""
+def seen(state: TrainState, frames: Frames) -> Tensor | None:
+    """Which Gaussians are to stay when the present step is done: those that make up ``densify.min_contribution`` pixels
+    of one of the views looked at, drawn at random, other ones each time.
+
+    Returns:
+        [N] bool; None where nothing is due, or the run is too short for enough views.
+    """
+    config = state.config.densify
+    done = state.stage_step + 1
+    if state.stage == "pretrain" or not prunes_unseen(config, done):
+        return None
+    steps = config.until if done == config.until else config.opacity_reset_every
+    count = min(len(frames), MOST_VIEWS, steps // STEPS_PER_VIEW)
+    if count < min(len(frames), FEWEST_VIEWS):
+        return None
+    order = torch.randperm(len(frames), generator=generator(state.config.seed, 52, state.step))
+    return contributions(state, frames, order[:count].tolist()) >= config.min_contribution
+
+
+def contributions(state: TrainState, frames: Frames, indices: list[int]) -> Tensor:
+    """[N] pixels: the most that a Gaussian makes up of any of these frames (``weights_in``); infinite where it is drawn
+    in none of them, hidden or not: about that these views say nothing."""
     most = torch.zeros(len(state.gaussians), device=state.device)
     ever = torch.zeros_like(most, dtype=torch.bool)
-    count = min(len(frames), max(FEWEST_VIEWS, state.config.densify.opacity_reset_every // STEPS_PER_VIEW))
-    for place in range(count):
-        index = frames.by_time[place * len(frames) // count]
+    for index in indices:
         camera = frames.cameras[index]
         with torch.no_grad():
             camera = state.cameras.apply(camera, index) if state.refines_cameras else camera
@@ -37,7 +57,7 @@ def contributions(state: TrainState, frames: Frames) -> Tensor:
 
 
 def weights_in(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> tuple[Tensor, Tensor]:
-    """[N] pixels: each Gaussian's blending weights alpha T, summed over the image; [N] bool, whether it is in view,
+    """[N] pixels: each Gaussian's blending weights alpha T, summed over the image; [N] bool, whether it is drawn,
     hidden or not. Compositing is linear in the channels: the weights are the gradients of an image of ones."""
     shape = gaussians.quats, gaussians.scales, gaussians.opacities
     size = camera.width, camera.height

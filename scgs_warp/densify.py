@@ -119,22 +119,29 @@ def _worth_keeping(
     return keep
 
 
-def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> None:
-    """Keep the rows marked in ``keep`` [N]; if that would leave none, keep the most opaque one."""
+def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> Tensor:
+    """Keep the rows marked in ``keep`` [N]; if that would leave none, keep the most opaque one. Returns the rows."""
     if not bool(keep.any()):
         keep = keep.clone()
         keep[int(gaussians.opacity_logits.nan_to_num(-torch.inf, neginf=-torch.inf).argmax())] = True
-    if bool(keep.all()):
-        return
     index = torch.where(keep)[0]
+    if len(index) == len(keep):
+        return index
     fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
     optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
+    return index
+
+
+def resets(config: DensifyConfig, done: int) -> bool:
+    """Whether opacities are reset after ``done`` main steps: that needs time to heal before densification ends."""
+    every = config.opacity_reset_every
+    return done % every == 0 and done + every // 2 <= config.until
 
 
 def prunes_unseen(config: DensifyConfig, done: int) -> bool:
-    """Whether the Gaussians are due to be judged by what they make up of the images, ``done`` main steps being over.
-    A reset spares what is hidden: all surfaces are transparent then, and the inside is coloured again."""
-    return config.min_contribution > 0.0 and (done == config.until or done % config.opacity_reset_every == 0)
+    """Whether Gaussians are judged by what they make up of the images after ``done`` main steps. A reset spares what is
+    hidden: all surfaces are transparent then, and the inside is coloured again."""
+    return config.min_contribution > 0.0 and (done == config.until or resets(config, done))
 
 
 def reset_opacities(gaussians: GaussianParameters, optimizer: Adam) -> None:

@@ -15,7 +15,7 @@ AT_LEAST_ONE = (
     "motion.layers motion.width motion.time_frequencies motion.position_frequencies "
     "pretrain.densify_every pretrain.progressive_every pretrain.start_ratio pretrain.max_ratio "
     "optim.means_until optim.network_until "
-    "densify.every densify.opacity_reset_every densify.sh_every densify.nodes_every "
+    "densify.every densify.rounds densify.opacity_reset_every densify.sh_every densify.nodes_every "
     "loss.arap_every loss.arap_times loss.arap_refresh"
 ).split()
 NOT_NEGATIVE = (

@@ -17,6 +17,7 @@ from .adapt import adapt
 from .batch import all_views, check_replicas, check_share
 from .camera_refinement import camera_rate
 from .config import TrainConfig
+from .contribution import seen
 from .data.dataset import Dataset
 from .errors import FrameError, UserError
 from .frames import Frames, view_number
@@ -260,6 +261,7 @@ def _loop(
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
             state.begin_main()
         try:
+            kept = seen(state, frames)
             result = training_step(state, frames)
         except NotEnoughMemory:  # before anything was changed: the run goes on where there is more
             state.save(folder.path)
@@ -276,7 +278,7 @@ def _loop(
         if test is not None and (done % config.evaluate_every == 0 or done == config.steps):
             folder.look_at_test(state.scene(), test, done)  # not after an opacity reset: the curve would show its dips
         state.whole = False
-        note = adapt(state, frames, result.size)
+        note = adapt(state, result.size, kept)
         if note is not None and not noted:
             noted = True
             bar.print(f"step {state.step}: {note}")

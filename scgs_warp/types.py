@@ -157,3 +157,7 @@ class Stats:
     @staticmethod
     def zeros(count: int, device: torch.device | str, absolute: bool = False) -> Stats:
         return Stats(*(torch.zeros(count, device=device) for _ in range(3)), absolute=absolute)
+
+    def rows(self, index: Tensor) -> Stats:
+        """Of these Gaussians."""
+        return Stats(self.grad_norm[index], self.count[index], self.max_radii[index], absolute=self.absolute)

@@ -24,12 +24,13 @@ import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
 
 from tiny import tiny_config, tiny_dataset  # isort: skip
 
-from scgs_warp import adapt, checkpoint, environment, train
+from scgs_warp import adapt, checkpoint, contribution, environment, train
 from scgs_warp.config import TrainConfig
 from scgs_warp.train_state import TrainState
 
 STEPS = 48
 FRAMES = 6
+contribution.STEPS_PER_VIEW = 1  # so short a run would look at no view
 
 
 def settings() -> TrainConfig:

@@ -33,16 +33,23 @@ def test_steps_scale_every_milestone():
     assert made.steps == 8_000
     assert (made.pretrain.steps, made.pretrain.densify_until, made.freeze) == (1_000, 750, 300)
     assert (made.densify.until, made.optim.means_until, made.loss.arap_until) == (4_000, 6_600, 8_000)
-    assert made.loss.arap_refresh == 200, "intervals are no milestones"
+    assert made.densify.every == 100 and made.loss.arap_refresh == 200, "intervals are no milestones"
 
 
 def test_as_many_rounds_of_densification_however_long_the_run():
-    """But each looks at a hundred views, or at as many as were asked for."""
-    every = [C.with_steps(C.preset("paper"), steps).densify.every for steps in (160_000, 80_000, 40_000, 8_000)]
-    assert every == [600, 300, 150, 100]
-    assert [C.with_steps(C.preset("cpu"), steps).densify.every for steps in (48_000, 4_000)] == [200, 100]
+    """But each looks at a hundred views, or at as many as were asked for; and scaling twice is scaling once."""
+
+    def interval(name: str, *steps: int) -> int:
+        made = C.preset(name)
+        for count in steps:
+            made = C.with_steps(made, count)
+        return made.densify.interval
+
+    assert [interval("paper", steps) for steps in (160_000, 80_000, 40_000, 8_000)] == [599, 300, 150, 100]
+    assert [interval("cpu", steps) for steps in (48_000, 24_000, 4_000)] == [176, 100, 100]
+    assert interval("quick") == interval("quick", 24_000) == interval("cpu", 4_000, 24_000) == 100
     few = C.with_field(C.preset("cpu"), "densify.every", 20, "test")
-    assert C.with_steps(few, 12_000).densify.every == 20
+    assert C.with_steps(few, 4_000).densify.interval == 20
 
 
 def test_only_control_points_have_a_first_stage():

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tiny import tiny_config
 
-from scgs_warp.config import DensifyConfig
+from scgs_warp.adapt import _nodes_due
+from scgs_warp.config import DensifyConfig, preset, with_steps
 from scgs_warp.densify import densify, prune, reset_opacities, threshold
 from scgs_warp.gaussians import GaussianParameters, gaussians_from_points, neighbor_distance
 from scgs_warp.motion.adapt import adapt_control_points
@@ -180,3 +183,18 @@ def test_control_points_clone_where_the_image_pulls_and_idle_ones_go(device):
     assert (cloned, pruned) == (1, 1)
     assert len(motion) == 7 and motion.log_radii.shape == (7,) and motion.hyper.shape[0] == 7
     assert torch.allclose(motion.positions[6], gaussians.means[2], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "name, steps, due",
+    [
+        ("paper", 80_000, [5_100, 10_200, 15_000, 20_100, 25_200]),
+        ("paper", 40_000, [2_550, 5_100, 7_500, 10_050, 12_600]),
+        ("cpu", 24_000, [2_000, 4_000, 6_000, 8_000]),
+    ],
+)
+def test_control_points_change_at_the_first_round_after_each_milestone(name, steps, due):
+    config = with_steps(preset(name), steps)
+    state = SimpleNamespace(config=config, motion=ControlPoints.__new__(ControlPoints))
+    rounds = range(config.densify.interval, config.densify.until + 1, config.densify.interval)
+    assert [done for done in rounds if _nodes_due(state, done)] == due
