@@ -42,7 +42,7 @@ RICH = tiny_config(
     optim={"cameras": 1e-3},
     densify={"absolute_grad": True},
 )
-LONG = tiny_config(500, batch=2, motion={"width": 32}, densify={"max_gaussians": 3000})
+LONG = tiny_config(500, batch=2, motion={"width": 32}, densify={"max_gaussians": 3000, "until": 400})
 PLANES = tiny_config(20, batch=4, coarse=3, motion={"model": "hexplane"})
 
 

@@ -11,6 +11,7 @@ from splats import random_splats
 from tiny import tiny_config, tiny_dataset
 
 from scgs_warp import debug, memory
+from scgs_warp.contribution import weights_in
 from scgs_warp.errors import UserError
 from scgs_warp.ops import bands, binning_cuda, compositing_cuda
 from scgs_warp.ops.bands import Demand
@@ -152,13 +153,14 @@ def test_rasterization_and_render_go_through_windows(device: str, monkeypatch: p
         renders, alphas, _ = rasterization(*leaves, viewmat[None], K[None], 100, 80, render_mode="RGB+ED")
         gradients = torch.autograd.grad(renders.square().sum(), leaves)
         gaussians = Gaussians(means, quats, scales, opacities, colors, torch.zeros(200, 0, 3, device=device))
-        image = render(gaussians, Camera(viewmat, K, 100, 80))
-        return [renders, alphas, *gradients, image.rgb, image.alpha, image.depth]
+        camera = Camera(viewmat, K, 100, 80)
+        image = render(gaussians, camera)
+        return [renders, alphas, *gradients, image.rgb, image.alpha, image.depth, weights_in(gaussians, camera)[0]]
 
     whole = results()
     cuts = squeeze(monkeypatch, 25_000)
     assert all(torch.equal(a, b) for a, b in zip(results(), whole, strict=True))
-    assert len(cuts) == 2 and min(cuts) > 1
+    assert len(cuts) == 3 and min(cuts) > 1
 
 
 def test_training_in_windows_gives_the_same_checkpoint(tmp_path, monkeypatch: pytest.MonkeyPatch):
