@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from tiny import tiny_config, tiny_dataset
@@ -11,6 +13,8 @@ from scgs_warp.config import TrainConfig, preset, with_steps
 from scgs_warp.errors import UserError
 from scgs_warp.frames import Frames
 from scgs_warp.limits import check
+from scgs_warp.motion.control_points import make_network
+from scgs_warp.motion.per_gaussian import PER_GAUSSIAN_HEADS
 from scgs_warp.train import adapt, fit, training_step
 from scgs_warp.train_state import TrainState
 
@@ -44,6 +48,31 @@ def test_same_bits_whatever_the_threads_and_when_resumed(model, bfloat16, tmp_pa
             fit(config, data, output=tmp_path / "cut")
     fit(config, data, output=tmp_path / "cut", resume=True)
     assert (tmp_path / "cut/checkpoint.safetensors").read_bytes() == results[0]
+
+
+def test_gradients_of_the_network_in_bfloat16(all_threads):
+    """At the size of a scene: there oneDNN cuts sums over the rows by the number of threads, where the CPU has AMX."""
+    config = dataclasses.replace(preset("quick").motion, model="per-gaussian", bfloat16=True)
+    random = torch.Generator().manual_seed(3)
+    network = make_network(config, PER_GAUSSIAN_HEADS, 0).train()
+    positions, times = torch.randn(9_999, 3, generator=random), torch.tensor([0.3])
+    torch.nn.init.normal_(network.head.weight, std=0.1, generator=random)
+    weights = torch.randn(10, generator=random)
+
+    def gradients(threads: int) -> list[torch.Tensor]:
+        environment.configure(threads)
+        network.zero_grad()
+        out = torch.cat(list(network(positions, times).values()), dim=-1)
+        (out * weights).mean().backward()
+        return [parameter.grad.clone() for parameter in network.parameters() if parameter.grad is not None]
+
+    one, two = gradients(1), gradients(2)
+    assert len(one) == len(list(network.parameters()))
+    assert all(torch.equal(a, b) for a, b in zip(one, two))
+    network.low_precision = False
+    exact = gradients(1)
+    for a, b in zip(one, exact):
+        assert b.norm() > 0.0 and (a - b).norm() < 0.05 * b.norm(), float((a - b).norm() / b.norm())
 
 
 @pytest.mark.parametrize("model", ["hexplane", "per-gaussian"])

@@ -19,6 +19,30 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
         return torch.cat([values, angles.sin(), angles.cos()], dim=-1)
 
 
+class _Bfloat16Linear(torch.autograd.Function):
+    """A linear layer in bfloat16. The sums over the rows, which are the parameters' gradients, are made in one piece:
+    how oneDNN cuts them depends on the number of threads (seen with AMX, 9,999 rows)."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        weight = weight.bfloat16()
+        ctx.save_for_backward(x, weight)
+        return nn.functional.linear(x, weight, bias.bfloat16())
+
+    @staticmethod
+    def backward(ctx, *v: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
+        (v_y,) = v
+        x, weight = ctx.saved_tensors
+        v_x = v_y @ weight if ctx.needs_input_grad[0] else None
+        with one_piece():
+            return v_x, (v_y.T @ x).float(), v_y.sum(0, dtype=torch.float32)
+
+
+def _bfloat16_linear(x: Tensor, layer: nn.Module) -> Tensor:
+    """[N, in] to [N, out], bfloat16."""
+    return cast(Tensor, _Bfloat16Linear.apply(x, layer.weight, layer.bias))
+
+
 class DeformationNetwork(nn.Module):
     """Position and time to the channels of a rigid motion: ``heads`` name the outputs and their widths.
 
@@ -82,12 +106,13 @@ class DeformationNetwork(nn.Module):
         count, instants = where.shape[0], when.shape[0]
         both = [where[None].expand(instants, -1, -1), when[:, None].expand(-1, count, -1)]
         inputs = torch.cat(both, dim=-1).reshape(instants * count, -1)
-        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.low_precision and self.training):
-            hidden = inputs
-            for i, layer in enumerate(self.layers):
-                if i == self.skip:
-                    hidden = torch.cat([inputs, hidden], dim=-1)
-                hidden = layer(hidden).relu()
+        if self.low_precision and self.training:
+            inputs = inputs.bfloat16()
+        hidden = inputs
+        for i, layer in enumerate(self.layers):
+            if i == self.skip:
+                hidden = torch.cat([inputs, hidden], dim=-1)
+            hidden = (_bfloat16_linear(hidden, layer) if hidden.dtype is torch.bfloat16 else layer(hidden)).relu()
         return self.head(hidden.float())
 
     def _fused(self, where: Tensor, when: Tensor) -> Tensor | None:
