@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from scgs_warp import environment
-from scgs_warp.ops.adam import Update, adam_step, first_not_finite
+from scgs_warp.ops.adam import Update, adam_step, first_not_finite, first_not_finite_by_norm
 from scgs_warp.optim import ADAM_EPS, Adam
 
 SHAPES = {"a": (37, 3), "b": (1,), "c": (0, 4), "d": (16,), "e": (700, 15, 3), "f": (4096,), "g": (3, 4099)}
@@ -151,10 +151,24 @@ def test_the_first_tensor_that_is_not_finite(bad, place, device):
     assert first_not_finite(tensors) == 2
 
 
+@pytest.mark.parametrize("find", [first_not_finite, first_not_finite_by_norm])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_tensors_without_elements_keep_their_place(find, bad, device):
+    """Stage 1's spheres have an empty gradient (``sh_rest``), of which torch has no infinity norm."""
+    tensors = [torch.zeros(0, 15, 3), torch.ones(7), torch.zeros(0), torch.ones(3, 2)]
+    tensors = [tensor.to(device) for tensor in tensors]
+    assert find(tensors) is None
+    tensors[3][1, 1] = bad
+    assert find(tensors) == 3
+    tensors[1][6] = bad
+    assert find(tensors) == 1
+
+
 def test_nothing_to_do():
     adam_step([])
-    assert first_not_finite([]) is None
-    assert first_not_finite([torch.zeros(0)]) is None
+    for find in (first_not_finite, first_not_finite_by_norm):
+        assert find([]) is None
+        assert find([torch.zeros(0)]) is None
     adam_step([Update(*(torch.zeros(0, 3) for _ in range(4)), 1.0, 1)])
 
 

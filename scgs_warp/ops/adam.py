@@ -78,9 +78,7 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
     if not tensors:
         return None
     if tensors[0].device.type != "cpu":
-        if math.isfinite(float(torch.nn.utils.get_total_norm(tensors, math.inf))):
-            return None
-        return next(i for i, tensor in enumerate(tensors) if not bool(torch.isfinite(tensor).all()))
+        return first_not_finite_by_norm(tensors)
     for tensor in tensors:
         if tensor.dtype != torch.float32:
             raise ValueError(f"tensors must be float32, got {tensor.dtype}")
@@ -91,6 +89,19 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
     launch(kernels.find_bad_chunks, len(chunks), addresses, sizes, chunks, bad, grain=4)
     found = bad.numpy().nonzero()[0]
     return int(chunks[found[0], 0]) if len(found) else None
+
+
+def first_not_finite_by_norm(tensors: Sequence[Tensor]) -> int | None:
+    """Return what :func:`first_not_finite` does, in torch operations and with one read of the device.
+
+    Args:
+        tensors: floating point, on one device. Tensors without elements count as finite: torch has no infinity norm
+            of them, and stage 1 has such a gradient (spheres carry no spherical harmonics beyond degree 0).
+    """
+    filled = [(index, tensor) for index, tensor in enumerate(tensors) if tensor.numel() > 0]
+    if not filled or math.isfinite(float(torch.nn.utils.get_total_norm([tensor for _, tensor in filled], math.inf))):
+        return None
+    return next(index for index, tensor in filled if not bool(torch.isfinite(tensor).all()))
 
 
 def _simd(form: str, device: torch.device) -> bool:
