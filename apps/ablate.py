@@ -12,10 +12,10 @@ import tyro
 
 from scgs_warp.apps.cli import prepare, run
 from scgs_warp.apps.settings import Settings, builtin_scene, configuration
-from scgs_warp.config import PresetName
+from scgs_warp.config.presets import PresetName
 
 if TYPE_CHECKING:
-    from scgs_warp.ablate import Cell
+    from scgs_warp.ablation.cells import Cell
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,13 @@ def check(options: Options) -> None:
     Raises:
         UserError: naming the option.
     """
-    from scgs_warp.ablate import VARIED
+    from scgs_warp.ablation.cells import VARIED
     from scgs_warp.errors import UserError
 
     if options.jobs < 1:
         raise UserError(f"--jobs {options.jobs}: must be at least 1")
     if options.ray is not None and not options.table_only:
-        from scgs_warp.ray_cluster import check_address
+        from scgs_warp.ablation.ray_cluster import check_address
 
         check_address(options.ray)
     if options.ablation == "nodes" and options.nodes is not None:
@@ -107,14 +107,14 @@ def find_scenes(folders: tuple[Path, ...], named: str | None, device: str) -> di
 
 def make_cells(options: Options, device: str) -> list[Cell]:
     """All cells that were asked for, checked before the first is trained."""
-    from scgs_warp.ablate import parse_seeds, parse_values, plan
+    from scgs_warp.ablation.cells import parse_seeds, parse_values, plan
 
     check(options)
     config, named = configuration(options, options.config, {}, "cpu")
     values = parse_values(options.ablation, words(options.values))
     seeds = parse_seeds(words(options.seeds))
     if options.lpips_weights is not None:
-        from scgs_warp.metrics import LPIPS
+        from scgs_warp.evaluation.image_metrics import LPIPS
 
         LPIPS(options.lpips_weights, device)  # says at once what is wrong with them
     scenes = find_scenes(options.data, named, device)
@@ -136,9 +136,9 @@ def train(options: Options, cells: list[Cell]) -> dict[str, str]:
     Returns:
         what went wrong, by the cells' names.
     """
-    from scgs_warp.ablate import is_done
-    from scgs_warp.ablate_jobs import run_cells
-    from scgs_warp.ablate_table import build, write
+    from scgs_warp.ablation.cells import is_done
+    from scgs_warp.ablation.local_runner import run_cells
+    from scgs_warp.ablation.table import build, write
 
     def renew() -> None:
         write(build(options.ablation, options.output, cells), options.output)
@@ -146,7 +146,7 @@ def train(options: Options, cells: list[Cell]) -> dict[str, str]:
     with ExitStack() as stack:
         elsewhere = None
         if options.ray is not None and not all(map(is_done, cells)):
-            from scgs_warp.ablate_ray import on_cluster
+            from scgs_warp.ablation.ray_runner import on_cluster
 
             limits = {"jobs": options.jobs, "threads": options.threads, "device": options.device}
             elsewhere = stack.enter_context(on_cluster(options.ray, cells, options.output, **limits))
@@ -164,8 +164,8 @@ def train(options: Options, cells: list[Cell]) -> dict[str, str]:
 def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="ablate.py", description=__doc__)
 
-    from scgs_warp.ablate_markdown import markdown
-    from scgs_warp.ablate_table import build, write
+    from scgs_warp.ablation.markdown import markdown
+    from scgs_warp.ablation.table import build, write
     from scgs_warp.errors import UserError
 
     # What a cluster has need not be here.

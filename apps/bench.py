@@ -93,7 +93,7 @@ def check(options: Common) -> None:
     Raises:
         UserError: naming the option and the remedy.
     """
-    from scgs_warp.config import MotionConfig
+    from scgs_warp.config.presets import MotionConfig
     from scgs_warp.errors import UserError
 
     run, against = getattr(options, "run", None), getattr(options, "against", None)
@@ -190,11 +190,12 @@ def show_scaling(report: dict[str, Any]) -> None:
 
 def measure(options: Options, plan: Any) -> dict[str, Any]:
     """One size: rows, and what they say together."""
-    from scgs_warp import bench, bench_summary
+    from scgs_warp.benchmark import run as bench
+    from scgs_warp.benchmark import summary
 
     report = bench.bench(type(options).__name__.lower(), plan)  # type: ignore[arg-type]
     if getattr(options, "table_s2", False):
-        report["table_s2"] = bench_summary.table_s2(report["compared"])
+        report["table_s2"] = summary.table_s2(report["compared"])
     return report
 
 
@@ -205,9 +206,10 @@ def main(args: list[str] | None) -> None:
     check(options)
     device = prepare(options.device, options.threads, options.memory_gib)
 
-    from scgs_warp import bench, bench_plot, bench_scaling
-    from scgs_warp.bench_scene import camera_size
-    from scgs_warp.bench_summary import PAPER_FPS
+    from scgs_warp.benchmark import plot, scaling
+    from scgs_warp.benchmark import run as bench
+    from scgs_warp.benchmark.scenes import camera_size
+    from scgs_warp.benchmark.summary import PAPER_FPS
 
     table = isinstance(options, Frame) and options.table_s2
     plan = bench.Plan(
@@ -223,7 +225,7 @@ def main(args: list[str] | None) -> None:
         report=lambda text: print(text, file=sys.stderr, flush=True),
     )
     if isinstance(options, Scaling):
-        report = bench_scaling.scaling(plan, bench_scaling.parse_sweeps(options.sweeps))
+        report = scaling.scaling(plan, scaling.parse_sweeps(options.sweeps))
     else:
         assert isinstance(options, Options)
         report = measure(options, plan)
@@ -231,7 +233,7 @@ def main(args: list[str] | None) -> None:
         bench.write(report, options.json)
     if isinstance(options, Scaling):
         show_scaling(report)
-        for path in bench_plot.draw(report, options.figures):
+        for path in plot.draw(report, options.figures):
             print(path)
         return
     show(report)

@@ -57,8 +57,8 @@ def main(args: list[str] | None) -> None:
 
     import cv2
 
-    from scgs_warp import environment
     from scgs_warp.capture import Request, capture
+    from scgs_warp.runtime import environment
 
     cv2.setNumThreads(environment.thread_count())
     o = options

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Literal
 
-from scgs_warp import environment
 from scgs_warp.errors import UserError, is_shortage, one_line
-from scgs_warp.job import label
+from scgs_warp.runtime import environment
+from scgs_warp.runtime.torchrun import label
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -69,7 +69,7 @@ def prepare(device: Device, threads: int | None, memory_gib: float | None = None
         raise UserError(f"--memory-gib {memory_gib:g}: must be greater than 0")
     environment.configure(threads)
     if memory_gib is not None:
-        from scgs_warp import memory
+        from scgs_warp.runtime import memory
 
         memory.set_limit(memory_gib)
         os.environ[memory.VARIABLE] = str(memory_gib)  # for processes of our own, too

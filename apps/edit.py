@@ -56,8 +56,8 @@ def check(options: Options) -> None:
     Raises:
         UserError: naming the option and the remedy.
     """
-    from scgs_warp import film
     from scgs_warp.errors import UserError
+    from scgs_warp.visualization import video
 
     if (options.run is None) == (options.ply is None):
         raise UserError("edit.py: give one of --run and --ply")
@@ -68,7 +68,7 @@ def check(options: Options) -> None:
     if options.output is not None:
         if options.script is None:
             raise UserError(f"--output {options.output}: a film needs --script")
-        film.check_path(options.output)
+        video.check_path(options.output)
     if options.export is not None and options.export.suffix.lower() != ".ply":
         raise UserError(f"--export {options.export}: end the name in .ply")
     if not 0 <= options.port <= 65535:
@@ -79,10 +79,10 @@ def check(options: Options) -> None:
 
 def open_session(options: Options, device: str) -> EditSession:
     """The scene, ready to be edited, with the script's edit if there is one."""
-    from scgs_warp.data.gaussian_ply import open_ply, rig_static
     from scgs_warp.edit import EditSession
     from scgs_warp.motion import Static
-    from scgs_warp.scene import Scene
+    from scgs_warp.scene.from_gaussians import open_ply, rig_static
+    from scgs_warp.scene.scene import Scene
 
     if options.ply is not None:
         scene = open_ply(options.ply, device, options.nodes)
@@ -108,7 +108,7 @@ def open_browser(session: EditSession, options: Options) -> None:
     import secrets
 
     from scgs_warp.editor import Editor, Proxy
-    from scgs_warp.stopping import stop_signals
+    from scgs_warp.runtime.stop_signals import stop_signals
 
     source = options.run if options.ply is None else options.ply.parent
     assert source is not None
@@ -152,7 +152,7 @@ def main(args: list[str] | None) -> None:
         return
 
     from scgs_warp.edit import film_camera, render_film
-    from scgs_warp.progress import progress
+    from scgs_warp.runtime.progress import progress
 
     if options.output is not None:
         with progress(session.edit.film.frames, "edit") as shown:

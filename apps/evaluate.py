@@ -11,7 +11,7 @@ from scgs_warp.apps.cli import Device, prepare, run
 
 if TYPE_CHECKING:
     from scgs_warp.data import Dataset
-    from scgs_warp.scene import Scene
+    from scgs_warp.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,7 @@ def load_data(scene: Scene, options: Options) -> Dataset:
 
 def training_seconds(folder: Path) -> float | None:
     """What ``metrics.json`` of the run says; None if it does not."""
-    from scgs_warp.data.files import as_number
-    from scgs_warp.json_text import parse_json
+    from scgs_warp.storage.files import as_number, parse_json
 
     try:
         value = parse_json((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]
@@ -92,20 +91,20 @@ def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="evaluate.py")
     device = prepare(options.device, options.threads, options.memory_gib)
 
-    from scgs_warp.evaluate import metrics_of, write_metrics
-    from scgs_warp.progress import progress
-    from scgs_warp.scene import Scene
+    from scgs_warp.evaluation.evaluate import metrics_of, write_metrics
+    from scgs_warp.runtime.progress import progress
+    from scgs_warp.scene.scene import Scene
 
     scene = Scene.load(options.run, device=device)
     lpips = None
     if options.lpips_weights is not None:
-        from scgs_warp.metrics import LPIPS
+        from scgs_warp.evaluation.image_metrics import LPIPS
 
         lpips = LPIPS(options.lpips_weights, device)
     dataset = load_data(scene, options)
     poses = "given"
     if options.split == "train":
-        from scgs_warp.camera_refinement import refined
+        from scgs_warp.training.camera_refinement import refined
 
         found = refined(dataset, options.run, scene.normalisation)
         dataset, poses = (dataset, poses) if found is None else (found, "refined")

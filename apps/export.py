@@ -29,7 +29,7 @@ def main(args: list[str] | None) -> None:
     check(options)
     device = prepare(options.device, options.threads, options.memory_gib)
 
-    from scgs_warp.export.job import export
+    from scgs_warp.export.run import export
 
     print(export(options, device))
 

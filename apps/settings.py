@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from scgs_warp.apps.cli import Device
-from scgs_warp.config import PresetName
+from scgs_warp.config.presets import PresetName
 
 if TYPE_CHECKING:
-    from scgs_warp.config import TrainConfig
+    from scgs_warp.config.presets import TrainConfig
 
 BUILTIN = Path("data/figure")
 
@@ -72,10 +72,10 @@ def configuration(
     Raises:
         UserError: naming the option or the file and its field.
     """
-    from scgs_warp import config, limits
+    from scgs_warp.config import presets, validation
     from scgs_warp.errors import UserError
 
-    values = config.read_config(file) if file else {}
+    values = presets.read_config(file) if file else {}
     folder = values.get("data", {}).pop("folder", None) if isinstance(values.get("data"), dict) else None
     if options.preset:
         if values.get("preset", options.preset) != options.preset:
@@ -85,11 +85,11 @@ def configuration(
     values.setdefault("preset", usual or ("cpu" if folder else "quick"))
     # A complete file says where its milestones lie; a partial one that names the steps wants them scaled.
     steps = values.pop("steps", None) if "pretrain" not in values else None
-    made = config.from_dict(values, str(file or "options"))
+    made = presets.from_dict(values, str(file or "options"))
     if steps is not None:
-        made = config.with_steps(made, config.whole_number(steps, f"{file}: steps"))
+        made = presets.with_steps(made, presets.whole_number(steps, f"{file}: steps"))
     if options.steps is not None and options.steps != made.steps:
-        made = config.with_steps(made, options.steps)
+        made = presets.with_steps(made, options.steps)
     wanted = {
         "data.downscale": options.downscale,
         "data.resample": options.resample,
@@ -102,14 +102,14 @@ def configuration(
     }
     for name, value in wanted.items():
         if value is not None:
-            made = config.with_field(made, name, value, "options")
+            made = presets.with_field(made, name, value, "options")
     for text in options.set:
         name, sign, value = text.partition("=")
         if not sign:
             raise UserError(f"--set {text}: write NAME=VALUE, for example motion.hyper_dim=8")
-        made = config.with_field(made, name.strip(), config.parse_value(value.strip()), f"--set {text}")
+        made = presets.with_field(made, name.strip(), presets.parse_value(value.strip()), f"--set {text}")
     try:
-        limits.check(made)
+        validation.check(made)
     except UserError as error:
         raise UserError(f"{error} (in {file}, or an option beside it)" if file else str(error)) from None
     if folder is not None and not isinstance(folder, str):
@@ -119,8 +119,8 @@ def configuration(
 
 def builtin_scene(device: str) -> Path:
     """The built-in scene, made on first use."""
-    from scgs_warp.data.synthetic import make_synthetic
-    from scgs_warp.progress import progress
+    from scgs_warp.data.synthetic.builtin import make_synthetic
+    from scgs_warp.runtime.progress import progress
 
     with progress(120, "making the built-in scene") as bar:
         make_synthetic(BUILTIN, device=device, progress=lambda done, total: bar.advance())

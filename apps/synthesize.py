@@ -68,11 +68,11 @@ def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="synthesize.py")
     device = prepare(options.device, options.threads)
 
-    from scgs_warp.data.synthesis_cameras import Filming
-    from scgs_warp.data.synthesis_mesh import Look
-    from scgs_warp.data.synthesize import SHEET, Request, film, plan
+    from scgs_warp.data.synthetic.from_mesh import SHEET, Request, film, plan
+    from scgs_warp.data.synthetic.mesh import Look
+    from scgs_warp.data.synthetic.orbit_cameras import Filming
     from scgs_warp.errors import UserError
-    from scgs_warp.progress import progress
+    from scgs_warp.runtime.progress import progress
 
     if len(options.size) not in (1, 2):
         raise UserError(f"--size {' '.join(map(str, options.size))}: give one number, or width and height")

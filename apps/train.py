@@ -11,8 +11,8 @@ import tyro
 
 from scgs_warp.apps.cli import prepare, run
 from scgs_warp.apps.settings import BUILTIN, Settings, builtin_scene, configuration
-from scgs_warp.config import MotionName
-from scgs_warp.job import place
+from scgs_warp.config.presets import MotionName
+from scgs_warp.runtime.torchrun import place
 
 if TYPE_CHECKING:
     from scgs_warp.data import Dataset
@@ -62,12 +62,12 @@ def main(args: list[str] | None) -> None:
     flags = {"motion.model": options.motion, "seed": options.seed}
     config, named = configuration(options, file, flags, "cpu" if options.data else None, where.size if where else 1)
 
-    from scgs_warp.advice import advise, survey
-    from scgs_warp.finish import summary, train_and_finish
-    from scgs_warp.parallel import team_of
-    from scgs_warp.progress import say
-    from scgs_warp.run_folder import refuse_existing
-    from scgs_warp.tensorboard import check_installed
+    from scgs_warp.runtime.progress import say
+    from scgs_warp.training.dataset_advice import advise, survey
+    from scgs_warp.training.process_group import team_of
+    from scgs_warp.training.run import summary, train_and_finish
+    from scgs_warp.training.run_folder import refuse_existing
+    from scgs_warp.training.tensorboard import check_installed
 
     if options.tensorboard:
         check_installed()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from scgs_warp.apps.cli import Device, prepare, run
 
 if TYPE_CHECKING:
-    from scgs_warp.scene import Scene
+    from scgs_warp.scene.scene import Scene
 
 LARGEST = 8192
 
@@ -53,29 +53,29 @@ def check(options: Options) -> None:
     Raises:
         UserError: naming the option and the remedy.
     """
-    from scgs_warp import film
     from scgs_warp.errors import UserError
+    from scgs_warp.visualization import video
 
     if (options.run is None) == (options.ply is None):
         raise UserError("view.py: give one of --run and --ply")
     if options.frames < 1:
         raise UserError(f"--frames {options.frames}: a film needs at least 1")
     if not 16 <= options.size <= LARGEST:
-        taken = f"; a frame of {options.size} x {options.size} would take {film.frame_gib(options.size):,.1f} GiB"
+        taken = f"; a frame of {options.size} x {options.size} would take {video.frame_gib(options.size):,.1f} GiB"
         raise UserError(f"--size {options.size}: give 16 to {LARGEST} pixels{taken if options.size > LARGEST else ''}")
     if not 0 < options.fps <= 1000:
         raise UserError(f"--fps {options.fps:g}: give more than 0 and at most 1000 frames a second")
     if not 0 <= options.time <= 1:
         raise UserError(f"--time {options.time:g}: give a time from 0 to 1")
-    film.check_path(options.output)
+    video.check_path(options.output)
 
 
 def open_scene(options: Options, device: str) -> Scene:
     """What is filmed."""
-    from scgs_warp.scene import Scene
+    from scgs_warp.scene.scene import Scene
 
     if options.ply is not None:
-        from scgs_warp.data.gaussian_ply import open_ply
+        from scgs_warp.scene.from_gaussians import open_ply
 
         return open_ply(options.ply, device)
     assert options.run is not None
@@ -89,9 +89,10 @@ def main(args: list[str] | None) -> None:
     check(options)
     device = prepare(options.device, options.threads, options.memory_gib)
 
-    from scgs_warp import cameras, film
-    from scgs_warp.overlay import Painter
-    from scgs_warp.progress import progress
+    from scgs_warp.geometry import cameras
+    from scgs_warp.runtime.progress import progress
+    from scgs_warp.visualization import video
+    from scgs_warp.visualization.overlay import Painter
 
     scene = open_scene(options, device)
     if options.mode == "time":
@@ -102,9 +103,9 @@ def main(args: list[str] | None) -> None:
     if options.mode == "turntable":
         times = [options.time] * options.frames
     views = [(camera.to(device), time) for camera, time in zip(path, times)]
-    film.require_memory(options.output, path[0].width, path[0].height, options.frames, device)
+    video.require_memory(options.output, path[0].width, path[0].height, options.frames, device)
     painter = Painter(scene, options.show, views)
-    with film.film(options.output, options.fps) as writer, progress(options.frames, "view") as shown:
+    with video.film(options.output, options.fps) as writer, progress(options.frames, "view") as shown:
         for camera, time in views:
             writer.write(painter.paint(camera, time))
             shown.advance()

@@ -30,24 +30,24 @@ import gpu_trust
 from gpu_rules import compare_gradients, compare_images, time_of
 from torch import Tensor
 
-from scgs_warp import environment
-from scgs_warp.bench import bench
-from scgs_warp.bench_clock import machine, now
-from scgs_warp.bench_place import MIDDLE, Plan, posed
-from scgs_warp.bench_rows import Leaves
-from scgs_warp.bench_scene import load_of, scene_camera, synthetic_scene
-from scgs_warp.bench_summary import table_s2
-from scgs_warp.config import MOTIONS
-from scgs_warp.cuda_graph import CudaGraph
-from scgs_warp.frame_graph import FrameGraph
+from scgs_warp.benchmark.plan import MIDDLE, Plan, posed
+from scgs_warp.benchmark.run import bench
+from scgs_warp.benchmark.scenes import load_of, scene_camera, synthetic_scene
+from scgs_warp.benchmark.summary import table_s2
+from scgs_warp.benchmark.timing import machine, now
+from scgs_warp.benchmark.workloads import Leaves
+from scgs_warp.config.presets import MOTIONS
 from scgs_warp.ops.binning import bin_splats
 from scgs_warp.ops.binning_cuda import bin_within
 from scgs_warp.ops.compositing import composite
 from scgs_warp.ops.harmonics import spherical_harmonics
 from scgs_warp.ops.projection import project
 from scgs_warp.ops.ssim import photometric_loss
-from scgs_warp.render import render
-from scgs_warp.scene import Scene
+from scgs_warp.rendering.render import render
+from scgs_warp.runtime import environment
+from scgs_warp.runtime.cuda_graph import CudaGraph
+from scgs_warp.scene.frame_graph import FrameGraph
+from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Camera, Image, Splats
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -329,7 +329,7 @@ def step(s: Setting) -> Report:
 
 def tests(s: Setting) -> Report:
     """The tests that run on CUDA: those whose ``device`` is that, and those of its own files."""
-    selection = ["tests/test_ssim.py", "-k", "bad_arguments"] if s.quick else ["-k", "cuda and not gpu_check"]
+    selection = ["tests/kernels/test_ssim.py", "-k", "bad_arguments"] if s.quick else ["-k", "cuda and not gpu_check"]
     command = [sys.executable, "-m", "pytest", "-x" if s.quick else "--maxfail=50", "-p", "no:cacheprovider"]
     result = subprocess.run(
         [*command, *selection], cwd=ROOT, capture_output=True, text=True, check=False, timeout=TESTS_SECONDS

@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from scgs_warp import memory
-from scgs_warp.render import draw
+from scgs_warp.rendering.render import draw
+from scgs_warp.runtime import memory
 from scgs_warp.types import Camera, Gaussians
 
 ROOT = Path(__file__).resolve().parent.parent

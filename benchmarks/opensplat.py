@@ -32,15 +32,16 @@ import scgs_warp  # noqa: F401  (before torch)
 import torch  # isort: skip
 from torch import Tensor
 
-from scgs_warp import bench_clock, environment
-from scgs_warp.bench import write
-from scgs_warp.bench_peers import TOLERANCE, agree
-from scgs_warp.bench_place import MIDDLE, posed
-from scgs_warp.bench_scene import Size, camera_size, load_of, synthetic_scene
+from scgs_warp.benchmark import timing
+from scgs_warp.benchmark.gsplat import TOLERANCE, agree
+from scgs_warp.benchmark.plan import MIDDLE, posed
+from scgs_warp.benchmark.run import write
+from scgs_warp.benchmark.scenes import Size, camera_size, load_of, synthetic_scene
 from scgs_warp.ops.binning import bin_splats
 from scgs_warp.ops.compositing import composite
 from scgs_warp.ops.harmonics import spherical_harmonics
 from scgs_warp.ops.projection import project
+from scgs_warp.runtime import environment
 from scgs_warp.types import Splats
 
 SOURCE = Path("rasterizer/gsplat-cpu/gsplat_cpu.cpp")
@@ -149,7 +150,7 @@ def timed(passes: dict[str, Callable[[], Any]], seconds: float) -> dict[str, dic
     """Medians and least times in milliseconds; all passes in turns, so that a disturbance meets both sides."""
     times: dict[str, list[float]] = {name: [] for name in passes}
     began = time.perf_counter()
-    while time.perf_counter() - began < seconds or len(next(iter(times.values()))) < bench_clock.FEWEST + 1:
+    while time.perf_counter() - began < seconds or len(next(iter(times.values()))) < timing.FEWEST + 1:
         for name, function in passes.items():
             start = time.perf_counter()
             function()
@@ -244,7 +245,7 @@ def main() -> int:
         if options.build is None:
             shutil.rmtree(folder, ignore_errors=True)
     extra = {"opensplat": commit_of(options.checkout), "flags": options.flags}
-    report = {"date": bench_clock.now(), "machine": bench_clock.machine("cpu"), "what": "opensplat", **extra, **found}
+    report = {"date": timing.now(), "machine": timing.machine("cpu"), "what": "opensplat", **extra, **found}
     if options.json is not None:
         write(report, options.json)
     print(json.dumps(report, indent=2))

@@ -25,20 +25,21 @@ import scgs_warp
 
 import torch  # isort: skip
 
-from scgs_warp import environment, train
 from scgs_warp.apps.cli import prepare
 from scgs_warp.apps.cli import run as run_app
-from scgs_warp.bench_clock import machine, now
-from scgs_warp.bench_memory import model_mib, peak_mib
-from scgs_warp.bench_scene import synthetic_scene, training_data, training_state
-from scgs_warp.frames import Frames
-from scgs_warp.job import place
+from scgs_warp.benchmark.memory import model_mib, peak_mib
+from scgs_warp.benchmark.scenes import synthetic_scene, training_data, training_state
+from scgs_warp.benchmark.timing import machine, now
 from scgs_warp.optim import Adam
-from scgs_warp.parallel import Team, team_of
+from scgs_warp.runtime import environment
+from scgs_warp.runtime.torchrun import place
+from scgs_warp.training import step as training
+from scgs_warp.training.frames import Frames
+from scgs_warp.training.process_group import Team, team_of
 
 assert scgs_warp.__version__
 PARTS = [
-    ("view", train, "one_view"),
+    ("view", training, "one_view"),
     ("wait", Team, "rows"),
     ("exchange", Team, "exchange"),
     ("join", Team, "join"),
@@ -107,7 +108,7 @@ def main(arguments: list[str] | None) -> None:
         frames, clock = Frames(data, scene.normalisation, state.config, device), Clock(device)
 
         def step() -> None:
-            if train.training_step(state, frames).failed is not None:
+            if training.training_step(state, frames).failed is not None:
                 raise RuntimeError("the loss is not finite")
             state.step += 1
 

@@ -31,13 +31,13 @@ import numpy as np  # isort: skip
 from scipy.stats import theilslopes
 from soak_editor import RandomUser
 
-from scgs_warp import environment
-from scgs_warp.bench_clock import machine, now
-from scgs_warp.config import MOTIONS, TrainConfig, from_dict, preset, with_steps
-from scgs_warp.data.synthetic import make_synthetic
+from scgs_warp.benchmark.timing import machine, now
+from scgs_warp.config.presets import MOTIONS, TrainConfig, from_dict, preset, with_steps
+from scgs_warp.data.synthetic.builtin import make_synthetic
 from scgs_warp.edit import EditSession
-from scgs_warp.finish import train_and_finish
-from scgs_warp.scene import Scene
+from scgs_warp.runtime import environment
+from scgs_warp.scene.scene import Scene
+from scgs_warp.training.run import train_and_finish
 
 STEEPEST = 30.0
 """MiB an hour. An editor that is open for a working day may have a quarter of a gibibyte more at its end."""

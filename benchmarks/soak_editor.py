@@ -12,18 +12,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from scgs_warp.cameras import orbit_camera
-from scgs_warp.edit import EditSession, Target, render_film, script
+from scgs_warp.edit import EditSession, Target, edit_file, render_film
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import from_matrix
-from scgs_warp.editor import placing
+from scgs_warp.editor import gizmo_pose
+from scgs_warp.editor.frame_image import take
 from scgs_warp.editor.jobs import Jobs
 from scgs_warp.editor.model import Model, Region
-from scgs_warp.editor.picture import take
 from scgs_warp.editor.views import FULL, ClientCamera, Views
 from scgs_warp.editor.worker import Worker
 from scgs_warp.errors import UserError
-from scgs_warp.film import write_png
+from scgs_warp.geometry.cameras import orbit_camera
+from scgs_warp.visualization.video import write_png
 
 SIZE = 96
 """Pixels of a picture."""
@@ -123,8 +123,8 @@ class RandomUser:
         screen = (self.random.uniform(0.2, 0.8), self.random.uniform(0.2, 0.8))
 
         def find() -> tuple[int, ...]:
-            point = placing.surface_point(model.session, camera, screen, moment)
-            return () if point is None else placing.region_at(model.session, point, model.region, moment)
+            point = gizmo_pose.surface_point(model.session, camera, screen, moment)
+            return () if point is None else gizmo_pose.region_at(model.session, point, model.region, moment)
 
         model.select(self.worker.call(find), self.random.choice(("replace", "add", "subtract")))
 
@@ -201,7 +201,7 @@ class RandomUser:
 
     def load(self) -> None:
         path = self._path(".json")
-        edit = self.worker.call(lambda: script.read(path, self.model.session))
+        edit = self.worker.call(lambda: edit_file.read(path, self.model.session))
         with self.model.changing() as session:
             session.apply(edit)
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import tyro
 
 import scgs_warp
-from scgs_warp.config import preset, with_steps
+from scgs_warp.config.presets import preset, with_steps
 from scgs_warp.data import load
-from scgs_warp.data.synthetic import make_synthetic
-from scgs_warp.evaluate import evaluate
+from scgs_warp.data.synthetic.builtin import make_synthetic
+from scgs_warp.evaluation.evaluate import evaluate
 
 
 def main(

@@ -17,7 +17,7 @@ import tyro
 from PIL import Image
 
 import scgs_warp
-from scgs_warp.cameras import look_at
+from scgs_warp.geometry.cameras import look_at
 
 
 def main(

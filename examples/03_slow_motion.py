@@ -13,9 +13,9 @@ from pathlib import Path
 import tyro
 
 import scgs_warp
-from scgs_warp.cameras import orbit_camera
 from scgs_warp.edit import Playback
-from scgs_warp.film import film
+from scgs_warp.geometry.cameras import orbit_camera
+from scgs_warp.visualization.video import film
 
 SECONDS = 5.0
 SPEEDS = Playback(map=((0.0, 0.0), (1.0, 0.4), (4.0, 0.6), (SECONDS, 1.0)))

@@ -16,8 +16,8 @@ import tyro
 from PIL import Image
 
 import scgs_warp
-from scgs_warp.cameras import orbit_camera
 from scgs_warp.edit import EditSession
+from scgs_warp.geometry.cameras import orbit_camera
 
 
 def main(

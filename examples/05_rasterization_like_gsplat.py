@@ -15,7 +15,7 @@ import tyro
 from PIL import Image
 
 from scgs_warp import rasterization
-from scgs_warp.cameras import look_at
+from scgs_warp.geometry.cameras import look_at
 
 
 def main(output: Path = Path("ball.png"), count: int = 3000, size: int = 256) -> None:

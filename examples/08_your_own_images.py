@@ -21,8 +21,8 @@ import tyro
 from PIL import Image
 
 import scgs_warp
-from scgs_warp.cameras import orbit_camera
 from scgs_warp.data import load
+from scgs_warp.geometry.cameras import orbit_camera
 
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -7,7 +7,7 @@ Conventions, for every file of this folder:
 - Frames: OpenCV cameras (x right, y down, z forward); ``viewmat`` is world-to-camera; quaternions are ``wxyz``.
   Pixel centres lie at +0.5. Images are planar, ``[C, H, W]``: a row of 16 pixels is one SIMD register.
 - Every kernel's first argument is ``first: int``, the grid index at which this launch starts
-  (``i = first + wp.tid()``). On a CPU ``scgs_warp.warp_interop.launch`` splits one grid over threads with it;
+  (``i = first + wp.tid()``). On a CPU ``scgs_warp.runtime.launch.launch`` splits one grid over threads with it;
   on CUDA it is 0. Kernels therefore use a one-dimensional grid.
 - Arguments stand one to a line, grouped under ``# In:`` and ``# Out:``, named ``*_in`` and ``*_out``, with their shape
   in a comment. Inputs are never written. Each output element is written by exactly one grid index (no atomics), so

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .simd import SIMD
+from .cpu.simd import SIMD
 
 wp.set_module_options({"enable_backward": False})
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .gradients import beyond
+from .gradient_limits import beyond
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .gradients import passed
+from .gradient_limits import passed
 from .types import ALPHA_MAX, ALPHA_MIN, CHANNEL_MAX, SLOT_GEOMETRY, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})

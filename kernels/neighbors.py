@@ -7,7 +7,7 @@ same with SIMD.
 
 import warp as wp
 
-from .gradients import passed
+from .gradient_limits import passed
 
 wp.set_module_options({"enable_backward": False})
 

@@ -8,7 +8,7 @@ pass could have stored costs more.
 
 import warp as wp
 
-from .gradients import beyond
+from .gradient_limits import beyond
 from .quaternion import quat_inverse_norm, quat_matrix, quat_matrix_adjoint, quat_normalise, quat_normalise_adjoint
 from .types import ALPHA_MIN
 

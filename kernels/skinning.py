@@ -8,7 +8,7 @@ node.
 
 import warp as wp
 
-from .gradients import beyond, near, passed
+from .gradient_limits import beyond, near, passed
 from .quaternion import (
     quat_conjugate,
     quat_matrix_adjoint,

@@ -8,16 +8,16 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from .environment import prepare_environment as _prepare_environment
+from .runtime.environment import prepare_environment as _prepare_environment
 
 __version__ = "0.1.0"
 
 _prepare_environment()
 
 if TYPE_CHECKING:
-    from .rasterize import rasterization as rasterization
-    from .scene import Scene as Scene
-    from .train import fit as fit
+    from .rendering.rasterize import rasterization as rasterization
+    from .scene.scene import Scene as Scene
+    from .training.loop import fit as fit
     from .types import Camera as Camera
     from .types import Frame as Frame
     from .types import Gaussians as Gaussians
@@ -30,9 +30,9 @@ _EXPORTS = {
     "Gaussians": "types",
     "Image": "types",
     "Pose": "types",
-    "Scene": "scene",
-    "fit": "train",
-    "rasterization": "rasterize",
+    "Scene": "scene.scene",
+    "fit": "training.loop",
+    "rasterization": "rendering.rasterize",
 }
 __all__ = ["Camera", "Frame", "Gaussians", "Image", "Pose", "Scene", "__version__", "fit", "rasterization"]
 

@@ -6,8 +6,8 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from .environment import one_piece
 from .ops.shading import COLUMNS as SHADING_COLUMNS
+from .runtime.environment import one_piece
 from .types import Gaussians
 
 SH_C0 = 0.28209479177387814

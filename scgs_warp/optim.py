@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -23,12 +22,6 @@ def log_linear(start: float, end: float, step: int, until: int) -> float:
     if start <= 0.0 or end <= 0.0:  # no logarithm: straight
         return start + (end - start) * step / until
     return math.exp(math.log(start) + (math.log(end) - math.log(start)) * step / until)
-
-
-def generator(seed: int, *keys: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """A random generator that depends on (seed, keys) alone: nothing has to be saved for a run to be resumed."""
-    state = np.random.SeedSequence([seed, len(keys), *keys]).generate_state(1, np.uint64)[0]
-    return torch.Generator(device=device).manual_seed(int(state) & (2**63 - 1))
 
 
 @dataclass

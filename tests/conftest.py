@@ -11,7 +11,7 @@ import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
 
 import torch  # isort: skip
 
-from scgs_warp import environment
+from scgs_warp.runtime import environment
 
 environment.configure()
 

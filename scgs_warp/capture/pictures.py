@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..film import write_png
+from ..visualization.video import write_png
 from .writing import Scene
 
 MOST = 48

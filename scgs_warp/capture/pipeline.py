@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..data.files import as_number
 from ..errors import UserError
-from ..film import write_png
-from ..progress import progress
+from ..runtime.progress import progress
+from ..storage.files import as_number
+from ..visualization.video import write_png
 from . import features, mapping, moving, picking, pictures, writing
 from .diagnosis import Outcome, notes, too_few
 from .features import CameraModel, Matching, Shots

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..cameras import agreed_up
+from ..geometry.cameras import agreed_up
 
 MEDIAN_DISTANCE = 4.0
 """From the middle of the scene to the cameras, in units of the written scene: about D-NeRF's."""

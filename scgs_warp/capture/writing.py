@@ -11,9 +11,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..data.files import held_out
-from ..data.transforms import OPENGL_TO_OPENCV
-from ..film import write_png
+from ..data.readers.transforms import OPENGL_TO_OPENCV
+from ..storage.files import held_out
+from ..visualization.video import write_png
 from .features import Shots, quiet
 from .mapping import Solved
 from .similarity import upright

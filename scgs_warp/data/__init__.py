@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from ..config_fields import CACHE_MIB
+from ..config.fields import CACHE_MIB
 from ..errors import UserError
-from . import colmap, dnerf, nerfies, nerfstudio, panoptic, poses_bounds
 from .cache import ImageCache
 from .dataset import Dataset
 from .images import Look, check_options
+from .readers import colmap, dnerf, nerfies, nerfstudio, panoptic, poses_bounds
 
 __all__ = ["Dataset", "ImageCache", "load"]
 

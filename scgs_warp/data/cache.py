@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from .. import memory
-from ..config_fields import CACHE_MIB
+from ..config.fields import CACHE_MIB
+from ..runtime import memory
 
 SHARE = 0.5
 """Part of the memory that is free at the start which images may take."""

@@ -12,13 +12,11 @@ from typing import overload
 import torch
 from torch import Tensor
 
+from ..config.fields import BACKGROUND_COLORS
 from ..errors import UserError
+from ..storage.files import size_text
 from ..types import Camera, Frame
 from .cache import ImageCache, Pixels
-from .files import size_text
-
-BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
-"""What RGBA images are composited on when they are read. With ``random`` the trainer composites, once per step."""
 
 
 def spread(count: int, most: int) -> list[int]:

@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 import torch
 
-from .. import environment
+from ..config.fields import BACKGROUND_COLORS
 from ..errors import UserError
+from ..runtime import environment
+from ..storage.files import size_text
+from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
-from .dataset import BACKGROUND_COLORS
-from .files import size_text
 from .lens import Lens, seen, undistort
-from .paths import is_regular
 
 RESAMPLES = ("area", "bicubic")
 SMALLEST_SIDE = 8

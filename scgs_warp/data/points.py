@@ -8,8 +8,8 @@ import numpy as np
 
 from ..errors import UserError
 from ..gaussians import SH_C0
-from .files import check_ply_counts
-from .paths import is_regular
+from ..storage.files import check_ply_counts
+from ..storage.safe_paths import is_regular
 
 
 def finite(points: np.ndarray) -> np.ndarray:
@@ -48,7 +48,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         UserError: as :func:`read_ply` and ``gaussian_files.read_gaussians``.
     """
     if path.suffix.lower() in (".splat", ".spz"):
-        from .gaussian_files import gaussian_points  # which knows scenes, and those know data sets
+        from ..formats.gaussian_files import gaussian_points
 
         return gaussian_points(path)
     return read_ply(path)

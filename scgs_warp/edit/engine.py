@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 import torch
 
-from ..data.gaussian_ply import rig_static
 from ..errors import UserError
 from ..motion.static import Static
-from ..scene import Scene
+from ..scene.from_gaussians import rig_static
+from ..scene.scene import Scene
 from ..types import Gaussians
 from .document import Edit
 from .graph import ControlGraph, build_graph, sample_times

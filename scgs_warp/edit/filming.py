@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from .. import cameras
-from ..film import film, require_memory
-from ..report import to_bytes
+from ..geometry import cameras
 from ..types import Camera
+from ..visualization.figures import to_bytes
+from ..visualization.video import film, require_memory
 from .document import Film, View
 from .keyframes import cubic
 from .session import EditSession

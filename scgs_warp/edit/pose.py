@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..environment import one_piece
 from ..gaussians import GaussianParameters
 from ..ops.harmonics_rotation import rotate_harmonics
 from ..ops.skinning import skin
+from ..runtime.environment import one_piece
 from ..types import Gaussians, Pose
 from .rotations import IDENTITY, conjugate, multiply
 

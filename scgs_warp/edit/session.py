@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checkpoint import write_atomically
-from ..data.gaussian_ply import write_gaussian_ply
 from ..errors import UserError
-from ..render import render
-from ..scene import Scene
+from ..formats.gaussian_ply import write_gaussian_ply
+from ..rendering.render import render
+from ..scene.scene import Scene
+from ..storage.checkpoint import write_atomically
 from ..types import Camera, Gaussians, Image
-from . import script
+from . import edit_file
 from .document import Edit
 from .engine import Engine
 from .graph import ControlGraph
@@ -158,7 +158,7 @@ class EditSession:
         if name is None:
             name = next(f"handle {i}" for i in range(1, len(taken) + 2) if f"handle {i}" not in taken)
         handle = Handle(name=name, nodes=chosen, time=float(time), **fields)
-        script.check_handle(handle, len(self))
+        edit_file.check_handle(handle, len(self))
         edit = self._without(name)
         self.apply(dataclasses.replace(edit, handles=(*edit.handles, handle)))
         return handle
@@ -256,7 +256,7 @@ class EditSession:
 
     def add_keyframe(self, at: float, easing: Easing = "smooth") -> Keyframe:
         """Keep where all handles are now, for a moment of the film; one that is there already is replaced."""
-        script.check_keyframe(at, easing)
+        edit_file.check_keyframe(at, easing)
         names = [handle.name for handle in self.edit.handles]
         if not names:
             raise UserError("a keyframe needs a handle; take hold of some control points first")
@@ -280,7 +280,7 @@ class EditSession:
         Raises:
             UserError: no film is that small or large.
         """
-        script.check_size(size)
+        edit_file.check_size(size)
         self._change(film=dataclasses.replace(self.edit.film, size=size))
 
     def scene_time(self, at: float) -> float:
@@ -334,8 +334,8 @@ class EditSession:
         Raises:
             UserError: the place cannot be written, or the edit holds something that no file may say.
         """
-        text = script.to_json(self.edit, self)
-        script.parse(json.loads(text), "the edit", self)
+        text = edit_file.to_json(self.edit, self)
+        edit_file.parse(json.loads(text), "the edit", self)
         write_atomically(Path(path), text.encode())
 
     def load(self, path: str | Path) -> None:
@@ -344,7 +344,7 @@ class EditSession:
         Raises:
             UserError: the file is missing or wrong, with the field; the edit is as before.
         """
-        self.apply(script.read(Path(path), self))
+        self.apply(edit_file.read(Path(path), self))
 
     def export_ply(self, path: str | Path, time: float, at: float | None = None) -> None:
         """The edited Gaussians at one moment as a 3D-GS file, world units."""

@@ -19,8 +19,8 @@ import torch
 from scipy.sparse import csc_matrix, diags
 from scipy.sparse.linalg import splu
 
-from ..kernels import editing as kernels
-from ..warp_interop import launch
+from ..kernels import arap_solver as kernels
+from ..runtime.launch import launch
 from .graph import ControlGraph
 from .rotations import exponential, from_matrix, logarithm, to_matrix
 

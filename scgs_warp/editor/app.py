@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..cameras import orbit_camera
 from ..edit import EditSession, Target
 from ..edit.handles import STAY
 from ..errors import UserError
-from . import placing
+from ..geometry.cameras import orbit_camera
+from . import gizmo_pose
 from .display import RADIUS, Display
+from .frame_image import FINE_QUALITY, QUALITY, Picture, take
 from .model import Combine, Model, Moment
 from .overlays import GIZMO, Overlays
-from .panel import Panel
-from .picture import FINE_QUALITY, QUALITY, Picture, take
+from .panel.panel import Panel
 from .proxy import guarded
 from .views import FULL, ClientCamera, Pace, Views
 from .worker import Worker
@@ -87,7 +87,7 @@ class Editor:
         self._waiting: dict[int, Any] = {}
         self._dragger: int | None = None
         self._dragged_at: float | None = None
-        self._place: tuple[placing.Place, Target] | None = None
+        self._place: tuple[gizmo_pose.Place, Target] | None = None
         self.display = Display.of(session.scene.overview)
         with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # its banner names the wrong door
             self.server: viser.ViserServer = viser.ViserServer(HOST, port, label="scgs_warp", verbose=False)
@@ -281,10 +281,10 @@ class Editor:
             self.overlays.place(None)
             return
         if handle is None:
-            self._place = placing.place_of_selection(self.session, model.selection, moment)
+            self._place = gizmo_pose.place_of_selection(self.session, model.selection, moment)
         else:
             target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
-            self._place = placing.place_of(self.session, handle, moment.time), target
+            self._place = gizmo_pose.place_of(self.session, handle, moment.time), target
         place, target = self._place
         position, wxyz = place.pose(target)
         self.overlays.place((self.display.show(position), wxyz))
@@ -300,8 +300,8 @@ class Editor:
         how = how or model.combine
 
         def find() -> tuple[int, ...]:
-            point = placing.surface_point(self.session, self.camera(client), screen, moment)
-            return () if point is None else placing.region_at(self.session, point, model.region, moment)
+            point = gizmo_pose.surface_point(self.session, self.camera(client), screen, moment)
+            return () if point is None else gizmo_pose.region_at(self.session, point, model.region, moment)
 
         nodes = self.worker.call(find)
         held = [h.name for h in self.session.edit.handles if nodes and how == "replace" and set(nodes) <= set(h.nodes)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..cameras import Overview
+from ..geometry.cameras import Overview
 
 RADIUS = 4.0
 """How far the training cameras stand from the scene, in the browser."""

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..edit import Edit, EditSession, Target, script
+from ..edit import Edit, EditSession, Target, edit_file
 from ..edit.handles import STAY
 from ..errors import UserError
 
@@ -187,7 +187,7 @@ class Model:
 
     def _checked(self, edit: Edit) -> Edit:
         """What controls send is trusted no more than a file is: pages may send anything."""
-        return script.parse(json.loads(script.to_json(edit, self.session)), "the edit", self.session)
+        return edit_file.parse(json.loads(edit_file.to_json(edit, self.session)), "the edit", self.session)
 
     def change_handle(self, **fields: Any) -> None:
         """Change fields of the active handle."""

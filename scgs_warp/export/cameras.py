@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..checkpoint import write_atomically
 from ..data.dataset import Dataset
-from ..data.transforms import OPENGL_TO_OPENCV
+from ..data.readers.transforms import OPENGL_TO_OPENCV
+from ..storage.checkpoint import write_atomically
 from ..types import Camera
 
 

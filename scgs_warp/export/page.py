@@ -9,9 +9,9 @@ import json
 import re
 from pathlib import Path
 
-from ..checkpoint import write_atomically
 from ..errors import UserError
-from ..scene import Scene
+from ..scene.scene import Scene
+from ..storage.checkpoint import write_atomically
 from .page_data import pack
 from .page_scene import page_scene
 

@@ -14,7 +14,7 @@ from ..gaussians import GaussianParameters
 from ..kernels.types import ALPHA_MIN
 from ..motion.control_points import ControlPoints
 from ..motion.static_nodes import StaticNodes
-from ..scene import Scene
+from ..scene.scene import Scene
 from .page_data import Column, common_size, integers, quantise
 
 FEWEST_SAMPLES, MOST_SAMPLES = 33, 257

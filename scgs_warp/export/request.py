@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ..errors import UserError
-from ..folders import make_parent
+from ..storage.output_folders import make_parent
 
 Format = Literal["ply", "ply-sequence", "splat", "spz", "glb", "graph", "npz", "cameras", "html"]
 SUFFIXES: dict[Format, str] = {

@@ -7,9 +7,9 @@ import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ..data.gaussian_ply import write_gaussian_ply
 from ..errors import UserError
-from ..folders import holds_only, replace_folder
+from ..formats.gaussian_ply import write_gaussian_ply
+from ..storage.output_folders import holds_only, replace_folder
 from ..types import Gaussians
 
 NAME = "frame_{:05d}.ply"

@@ -18,7 +18,7 @@ from ..edit import EditSession
 from ..edit.pose import compose
 from ..errors import UserError
 from ..gaussians import GaussianParameters
-from ..scene import Scene
+from ..scene.scene import Scene
 from ..types import Gaussians, Pose
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ..config import TrainConfig
+from ..config.presets import TrainConfig
 from .base import Motion
 from .control_points import ControlPoints, heads_of, make_network
 from .hexplane import TEMPORAL, HexPlane

@@ -7,7 +7,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..config import TrainConfig
+from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters
 from ..optim import Adam
 from ..types import Gaussians

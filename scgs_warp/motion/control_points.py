@@ -6,13 +6,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..config import LossConfig, MotionConfig, TrainConfig
-from ..environment import one_piece
+from ..config.presets import LossConfig, MotionConfig, TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.shading import shade
 from ..ops.skinning import skin, skin_rbf
-from ..optim import generator, log_linear
+from ..optim import log_linear
+from ..runtime.environment import one_piece
+from ..seeding import generator
 from ..types import Gaussians, Pose
 from .base import Motion, TrainingPose
 from .network import DeformationNetwork

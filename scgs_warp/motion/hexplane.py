@@ -7,11 +7,12 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from ..config import TrainConfig
+from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.network import Layers, PackedLayers, evaluate, network
 from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_features_and_variation
-from ..optim import generator, log_linear
+from ..optim import log_linear
+from ..seeding import generator
 from ..types import Gaussians
 from .base import Motion, TrainingPose
 

@@ -7,8 +7,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from ..environment import one_piece
 from ..ops.network import Layers, PackedLayers, evaluate, network, supported
+from ..runtime.environment import one_piece
 
 
 def encode(values: Tensor, frequencies: int) -> Tensor:

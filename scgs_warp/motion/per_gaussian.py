@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..config import TrainConfig
+from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
 from ..optim import log_linear
 from ..types import Gaussians

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..config import LossConfig
+from ..config.presets import LossConfig
 from ..ops.arap import arap_energy, reverse_edges, trajectory_graph
 from ..ops.neighbors import NodeLists
 from ..optim import log_linear

@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ..config import LossConfig, TrainConfig
+from ..config.presets import LossConfig, TrainConfig
 from ..gaussians import GaussianParameters
-from ..optim import generator, log_linear
+from ..optim import log_linear
+from ..seeding import generator
 from ..types import Gaussians
 from .base import Motion, TrainingPose
 from .network import DeformationNetwork

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import adam as kernels
-from ..warp_interop import launch
+from ..runtime.launch import launch
 
 Form = Literal["auto", "plain", "cpu"]
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import arap as kernels
-from ..warp_interop import launch
+from ..runtime.launch import launch
 from .neighbors import NodeLists, nearest, node_lists
 
 

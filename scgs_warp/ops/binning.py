@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .. import debug
-from ..kernels import binning_cpu as kernels
+from ..kernels.cpu import binning as kernels
 from ..kernels.types import TILE_SIZE
+from ..runtime import debug
+from ..runtime.launch import launch
 from ..types import Splats, Tiles
-from ..warp_interop import launch
-from . import bands, checks
-from .bands import Demand, Window
+from . import checks, memory_windows
 from .binning_cuda import MAX_PAIRS, RadixCount, geometry_of
+from .memory_windows import Demand, Window
 
 CHUNK_SIZE = 1024
 """Fewest splats worth a chunk on a CPU."""
@@ -46,14 +46,14 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | N
     size = (splats.width, splats.height, columns, rows, tile_size)
     device, whole = splats.means2d.device, (0, columns * rows)
     if demand is not None:
-        bands.require_image(demand.fixed, (splats.width, splats.height), len(splats.means2d), device)
+        memory_windows.require_image(demand.fixed, (splats.width, splats.height), len(splats.means2d), device)
     if columns * rows > MAX_PAIRS:
         raise ValueError(f"splats: an image of {columns * rows} tiles, more than {MAX_PAIRS}; reduce the image")
     count = _count(splats, size, whole)
     if demand is None:
-        bands.require_lists(count, device)
-    elif not bands.fits(count, demand, device):
-        windows = bands.cut(lambda window: _count(splats, size, window), columns, rows, demand, splats)
+        memory_windows.require_lists(count, device)
+    elif not memory_windows.fits(count, demand, device):
+        windows = memory_windows.cut(lambda window: _count(splats, size, window), columns, rows, demand, splats)
         none = torch.empty(0, dtype=torch.int32, device=device)
         return Tiles(none.view(0, 2), none, none, none.long(), *size, windows=tuple(windows))
     return _listed(splats, size, count)

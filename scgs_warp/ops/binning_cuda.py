@@ -13,12 +13,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from .. import debug
-from ..cuda_graph import on_torch_stream
-from ..kernels import binning_cuda as kernels
+from ..kernels.cuda import binning as kernels
 from ..kernels.types import TILE_SIZE
+from ..runtime import debug
+from ..runtime.cuda_graph import on_torch_stream
+from ..runtime.launch import launch, warp_view
 from ..types import Splats, Tiles
-from ..warp_interop import launch, warp_view
 from . import checks
 
 MAX_PAIRS = 2**31 - 1

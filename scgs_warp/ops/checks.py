@@ -1,11 +1,11 @@
-"""What binning and compositing promise each other, checked in debug mode (``scgs_warp.debug``), on any device."""
+"""Checks of what binning and compositing promise each other, for debug mode (``scgs_warp.runtime.debug``)."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from .. import debug
+from ..runtime import debug
 from ..types import Splats, Tiles
 
 UNWRITTEN = -1

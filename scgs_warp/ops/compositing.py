@@ -9,15 +9,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from .. import debug, memory
 from ..kernels import compositing as kernels
-from ..kernels import compositing_cpu as cpu_kernels
+from ..kernels.cpu import compositing as cpu_kernels
 from ..kernels.types import SLOT_GEOMETRY
+from ..runtime import debug, memory
+from ..runtime.launch import launch
 from ..types import Splats, Stats, Tiles
-from ..warp_interop import launch
 from . import checks, compositing_cuda
-from .bands import Demand, Window, slot_bytes
 from .binning import bin_window
+from .memory_windows import Demand, Window, slot_bytes
 
 Form = Literal["auto", "pixel", "cpu", "cuda", "blocks"]
 

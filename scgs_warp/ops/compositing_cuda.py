@@ -7,9 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels import compositing, compositing_blocks, slots_cuda
-from ..kernels import compositing_cuda as native
-from ..warp_interop import launch, launch_blocks
+from ..kernels import compositing
+from ..kernels.cuda import compositing as native
+from ..kernels.cuda import compositing_portable
+from ..kernels.cuda import slots as slots_cuda
+from ..runtime.launch import launch, launch_blocks
 
 
 def forward(
@@ -26,10 +28,10 @@ def forward(
         launch_native(native.composite_tiles, blocks, *lists, *size, *outputs, begin=begin)
     else:
         launch_blocks(
-            compositing_blocks.composite_blocks,
+            compositing_portable.composite_blocks,
             blocks,
-            *(*lists, *size, compositing_blocks.TILE_SIZE, *outputs),
-            block_dim=compositing_blocks.BLOCK_DIM,
+            *(*lists, *size, compositing_portable.TILE_SIZE, *outputs),
+            block_dim=compositing_portable.BLOCK_DIM,
             begin=begin,
         )
 
@@ -49,10 +51,10 @@ def adjoint(
         launch_native(native.composite_tiles_adjoint, blocks, *lists, *size, v_slots, begin=begin)
     else:
         launch_blocks(
-            compositing_blocks.composite_blocks_adjoint,
+            compositing_portable.composite_blocks_adjoint,
             blocks,
-            *(*lists, *size, compositing_blocks.TILE_SIZE, int(absolute), v_slots),
-            block_dim=compositing_blocks.BLOCK_DIM,
+            *(*lists, *size, compositing_portable.TILE_SIZE, int(absolute), v_slots),
+            block_dim=compositing_portable.BLOCK_DIM,
             begin=begin,
         )
 

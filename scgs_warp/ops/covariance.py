@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import covariance as kernels
-from ..warp_interop import launch
+from ..runtime.launch import launch
 
 
 class _Covariance(torch.autograd.Function):

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ..kernels import harmonics as kernels
-from ..kernels import harmonics_cpu as cpu_kernels
-from ..warp_interop import launch
+from ..kernels.cpu import harmonics as cpu_kernels
+from ..runtime.launch import launch
 from .reduction import sum_rows
 
 MAX_DEGREE = 3

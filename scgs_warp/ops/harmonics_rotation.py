@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import harmonics_rotation as kernels
-from ..warp_interop import launch
+from ..runtime.launch import launch
 
 SIZES = (0, 3, 8, 15)
 """Coefficients above degree 0, for degrees 0 to 3."""

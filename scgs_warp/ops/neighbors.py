@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..kernels import neighbor_lists, neighbors_cpu
 from ..kernels import neighbors as kernels
-from ..warp_interop import launch
+from ..kernels.cpu import neighbor_lists, neighbors
+from ..runtime.launch import launch
 from .node_sums import rbf_node_sums
 
 
@@ -47,7 +47,7 @@ def _check_nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tenso
 
 
 def _in_lanes(points: Tensor) -> bool:
-    return points.device.type == "cpu" and points.shape[1] <= neighbors_cpu.MAX_DIMENSIONS
+    return points.device.type == "cpu" and points.shape[1] <= neighbors.MAX_DIMENSIONS
 
 
 def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -70,14 +70,14 @@ def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
     distances = torch.empty(points.shape[0], k, device=points.device)
     arguments = points, nodes, k, indices, distances
     if _in_lanes(points):
-        launch(neighbors_cpu.nearest_lanes, _blocks(points), *arguments, grain=16)
+        launch(neighbors.nearest_lanes, _blocks(points), *arguments, grain=16)
     else:
         launch(kernels.nearest, points.shape[0], *arguments)
     return indices, distances
 
 
 def _blocks(points: Tensor) -> int:
-    return -(-points.shape[0] // neighbors_cpu.LANES)
+    return -(-points.shape[0] // neighbors.LANES)
 
 
 class _Lists(NamedTuple):
@@ -132,7 +132,7 @@ class NeighborSearch:
         launch(neighbor_lists.largest_shift, 1, own.nodes, nodes, shift)
         indices = torch.empty(points.shape[0], k, dtype=torch.int32)
         lists = own.order, own.centres, own.counts, own.lists, shift
-        launch(neighbors_cpu.nearest_listed, blocks, points, nodes, k, *lists, indices, failed, grain=16)
+        launch(neighbors.nearest_listed, blocks, points, nodes, k, *lists, indices, failed, grain=16)
         self._searched += int(failed.sum())
         return indices
 

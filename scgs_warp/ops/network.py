@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels import network_adjoint_cpu as kernels_adjoint
-from ..kernels import network_cpu as kernels
-from ..kernels.network_panels import BLOCK, PANEL
-from ..warp_interop import launch
+from ..kernels.cpu import network as kernels
+from ..kernels.cpu import network_adjoint as kernels_adjoint
+from ..kernels.cpu.network_panels import BLOCK, PANEL
+from ..runtime.launch import launch
 
 ROWS = 8
 """Matrices have a multiple of this many rows."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..kernels import node_sums_cuda as kernels
+from ..kernels.cuda import node_sums as kernels
 from ..kernels.skinning import SUMS
-from ..warp_interop import launch
+from ..runtime.launch import launch
 
 
 def skin_node_sums(order: Tensor, begin: Tensor, pairs: tuple, scaled: int) -> Tensor:

@@ -8,9 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..kernels import planes_cpu as kernels
-from ..kernels import planes_variation_cpu as variation_kernels
-from ..warp_interop import launch
+from ..kernels.cpu import planes as kernels
+from ..kernels.cpu import planes_variation as variation_kernels
+from ..runtime.launch import launch
 
 PAIRS = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
 """Axes of the six planes of a level; 3 is time."""

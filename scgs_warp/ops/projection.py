@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ..kernels import projection as kernels
-from ..kernels import projection_cpu as cpu_kernels
+from ..kernels.cpu import projection as cpu_kernels
+from ..runtime.launch import launch
 from ..types import Splats
-from ..warp_interop import launch
 from .reduction import sum_rows
 
 Form = Literal["auto", "plain", "cpu"]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import reduction as kernels
-from ..warp_interop import launch
+from ..runtime.launch import launch
 
 
 def sum_rows(values: Tensor) -> Tensor:

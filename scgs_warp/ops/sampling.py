@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import sampling as kernels
-from ..warp_interop import launch
+from ..runtime.launch import launch
 
 CHUNK = {"cpu": 4096, "cuda": 128}
 """Points one grid index handles. The result does not depend on it."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import shading as kernels
-from ..warp_interop import launch
+from ..runtime.launch import launch
 
 COLUMNS = 10
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ..kernels import skinning as kernels
-from ..kernels import skinning_cpu, skinning_cpu_adjoint, skinning_palette
+from ..kernels.cpu import skinning, skinning_adjoint, skinning_palette
+from ..runtime.launch import launch
 from ..types import Pose
-from ..warp_interop import launch
 from .neighbors import NodeLists, chunk_size, node_lists, rbf_weights
 from .node_sums import skin_node_sums
 
@@ -60,7 +60,7 @@ def _skin_lanes(means, quats, nodes, translations, rotations, shapes, log_scales
     scaled = int(log_scales is not None)
     outputs = _like(means, quats, means if scaled else None)
     palette = _palette(nodes, (translations, rotations, shapes, log_scales))
-    launch(skinning_cpu.skin_lanes, _lanes(means), means, quats, *palette, scaled, indices, weights, *outputs, grain=32)
+    launch(skinning.skin_lanes, _lanes(means), means, quats, *palette, scaled, indices, weights, *outputs, grain=32)
     return tuple(outputs)
 
 
@@ -143,7 +143,7 @@ def skin(
     floats = means, quats, nodes, *_pose_tensors(pose), weights
     values = [None if value is None else value.contiguous() for value in floats]
     indices = indices.contiguous()
-    if means.device.type == "cpu" and not torch.is_grad_enabled() and indices.shape[1] <= skinning_cpu.MAX_NEIGHBORS:
+    if means.device.type == "cpu" and not torch.is_grad_enabled() and indices.shape[1] <= skinning.MAX_NEIGHBORS:
         return _skin_lanes(*values, indices=indices)
     return _Skin.apply(*values, indices, lists)  # type: ignore[return-value]
 
@@ -187,7 +187,7 @@ class _SkinRbf(torch.autograd.Function):
         weights = torch.empty(indices.shape)
         outputs = _like(means, quats, means if has_log_scales else None)
         launch(
-            skinning_cpu.skin_rbf_lanes,
+            skinning.skin_rbf_lanes,
             _lanes(means),
             *(means, quats, hyper, has_hyper, *palette, has_strengths, has_log_scales, indices, weights, *outputs),
             grain=32,
@@ -211,7 +211,7 @@ class _SkinRbf(torch.autograd.Function):
         v_motion, v_reach = (torch.empty(chunks, count, skinning_palette.ROW) for _ in range(2))
         v_means, v_quats, v_hyper = _like(means, quats, hyper)
         launch(
-            skinning_cpu_adjoint.skin_rbf_lanes_adjoint,
+            skinning_adjoint.skin_rbf_lanes_adjoint,
             chunks,
             *(size, means, quats, hyper, has_hyper, motion, reach, aligned, has_strengths, has_log_scales),
             *(indices, weights, *v_outputs),
@@ -232,7 +232,7 @@ class _SkinRbf(torch.autograd.Function):
 
 
 def _lanes(means: Tensor) -> int:
-    return -(-means.shape[0] // skinning_cpu.LANES)
+    return -(-means.shape[0] // skinning.LANES)
 
 
 def _like(*values: Tensor | None) -> list[Tensor | None]:
@@ -276,7 +276,7 @@ def skin_rbf(
         "hyper_nodes": (hyper_nodes, (count, width)),
     }
     _check_shapes(expected)
-    fits = indices.shape[1] <= skinning_cpu.MAX_NEIGHBORS and width <= skinning_palette.MAX_HYPER
+    fits = indices.shape[1] <= skinning.MAX_NEIGHBORS and width <= skinning_palette.MAX_HYPER
     if means.device.type != "cpu" or not fits:
         points = means if hyper_points is None else torch.cat([means, hyper_points], 1)
         centers = nodes if hyper_nodes is None else torch.cat([nodes, hyper_nodes], 1)

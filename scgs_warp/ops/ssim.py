@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .. import warp_interop
 from ..kernels import ssim as kernels
-from ..kernels import ssim_cpu as cpu_kernels
+from ..kernels.cpu import ssim as cpu_kernels
+from ..runtime import launch
 
 Form = Literal["auto", "pixel", "cpu"]
 
@@ -72,7 +72,7 @@ def _forward_bands(image: Tensor, truth: Tensor, mask: Tensor | None, partials: 
     channels, height, _ = image.shape
     sums = image.new_empty(2, channels, height)
     bands = channels * -(-height // cpu_kernels.BAND)
-    warp_interop.launch(cpu_kernels.photometric_bands, bands, image, truth, mask, sums, partials, grain=1)
+    launch.launch(cpu_kernels.photometric_bands, bands, image, truth, mask, sums, partials, grain=1)
     return sums
 
 
@@ -83,9 +83,9 @@ def _forward_pixels(image: Tensor, truth: Tensor, mask: Tensor | None, partials:
     partials = image.new_empty(3, *image.shape) if partials is None else partials
     sums = image.new_empty(2, channels, height)
     count, masked = image.numel(), int(mask is not None)
-    warp_interop.launch(kernels.blur_rows, count, image, truth, mask, masked, blurred)
-    warp_interop.launch(kernels.photometric, count, image, truth, mask, masked, blurred, values, partials)
-    warp_interop.launch(
+    launch.launch(kernels.blur_rows, count, image, truth, mask, masked, blurred)
+    launch.launch(kernels.photometric, count, image, truth, mask, masked, blurred, values, partials)
+    launch.launch(
         kernels.sum_rows, 2 * channels * height, values.view(2 * channels * height, width), sums.view(-1), grain=16
     )
     return sums
@@ -95,9 +95,9 @@ def _adjoint_pixels(
     image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor, v_sums: Tensor, v_image: Tensor
 ) -> None:
     blurred, count = torch.empty_like(partials), image.numel()
-    warp_interop.launch(kernels.blur_rows_adjoint, count, partials, blurred)
+    launch.launch(kernels.blur_rows_adjoint, count, partials, blurred)
     masked = int(mask is not None)
-    warp_interop.launch(kernels.photometric_adjoint, count, image, truth, mask, masked, blurred, v_sums, v_image)
+    launch.launch(kernels.photometric_adjoint, count, image, truth, mask, masked, blurred, v_sums, v_image)
 
 
 class _Photometric(torch.autograd.Function):
@@ -143,7 +143,7 @@ class _Photometric(torch.autograd.Function):
             v_sums = (v_means / ctx.count).float()
             if ctx.simd:
                 bands = image.shape[0] * -(-image.shape[1] // cpu_kernels.BAND)
-                warp_interop.launch(
+                launch.launch(
                     cpu_kernels.photometric_bands_adjoint, bands, image, truth, mask, partials, v_sums, v_image, grain=1
                 )
             else:

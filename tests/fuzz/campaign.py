@@ -84,7 +84,7 @@ def work(own: argparse.Namespace) -> None:
 
     import torch  # isort: skip
 
-    from scgs_warp import environment
+    from scgs_warp.runtime import environment
 
     environment.configure(threads=1)
     torch.utils.deterministic.fill_uninitialized_memory = True  # what no kernel has written is NaN
@@ -184,7 +184,7 @@ def run(campaign: Campaign) -> None:
 
 def follow(campaign: Campaign, worker: subprocess.Popen[bytes], done: TextIO) -> None:
     """Take what the worker has done until it has ended."""
-    from scgs_warp.progress import progress
+    from scgs_warp.runtime.progress import progress
 
     begun = saved = time.monotonic()
     seconds, rest = campaign.seconds, ""

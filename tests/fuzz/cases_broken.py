@@ -9,10 +9,10 @@ import time
 import torch
 import warp as wp
 
-from scgs_warp.warp_interop import launch
+from fuzz.poison import Draw
+from scgs_warp.runtime.launch import launch
 
 from . import laws
-from .poison import Draw
 
 wp.set_module_options({"enable_backward": False})
 

@@ -10,15 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cuda_emulation import COMPILER, build, launcher
-
+from fuzz.cases_render import check_composite, splats_of
+from fuzz.poison import Draw
+from helpers.cuda_emulation import COMPILER, build, launcher
 from scgs_warp.kernels import compositing
 from scgs_warp.ops import compositing_cuda
-from scgs_warp.warp_interop import _parameters_of, launch
+from scgs_warp.runtime.launch import _parameters_of, launch
 
 from . import fence
-from .cases_render import check_composite, splats_of
-from .poison import Draw
 
 
 @functools.lru_cache(maxsize=1)

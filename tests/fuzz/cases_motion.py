@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from fuzz.cases_render import leaf, on
+from fuzz.fence import walled
+from fuzz.poison import Draw, finite_rows
 from scgs_warp.ops.arap import arap_energy, local_rotations, trajectory_graph
 from scgs_warp.ops.neighbors import NeighborSearch, nearest, node_lists, rbf_weights
 from scgs_warp.ops.network import network
@@ -14,9 +17,6 @@ from scgs_warp.ops.skinning import skin, skin_rbf
 from scgs_warp.types import Pose
 
 from . import laws
-from .cases_render import leaf, on
-from .fence import walled
-from .poison import Draw, finite_rows
 
 
 def nodes_count(d: Draw) -> int:

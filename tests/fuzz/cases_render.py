@@ -5,22 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from splats import random_splats
 from torch import Tensor
 
 import scgs_warp
+from fuzz.poison import Draw, finite_rows
+from helpers.splats import random_splats
 from scgs_warp.ops.binning import BandCount, bin_splats
 from scgs_warp.ops.binning_cuda import RadixCount, bin_within, geometry_of
 from scgs_warp.ops.compositing import composite
 from scgs_warp.ops.covariance import covariance
 from scgs_warp.ops.harmonics import spherical_harmonics
 from scgs_warp.ops.projection import project
-from scgs_warp.render import draw as draw_image
-from scgs_warp.render import render
+from scgs_warp.rendering.render import draw as draw_image
+from scgs_warp.rendering.render import render
 from scgs_warp.types import Camera, Gaussians, Splats, Stats
 
 from . import laws
-from .poison import Draw, finite_rows
 
 FIELDS = ("means2d", "conics", "depths", "opacities", "radii")
 

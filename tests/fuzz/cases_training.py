@@ -8,30 +8,31 @@ import math
 import numpy as np
 import pytest
 import torch
-from edit_scenes import OVERVIEW, bar_points, dress
-from quaternion_kernels import products
 from torch import Tensor
 
-from scgs_warp.config import DensifyConfig, from_dict
-from scgs_warp.data.normalise import Normalisation
-from scgs_warp.densify import densify
+from fuzz.cases_render import camera_of, leaf, on
+from fuzz.fence import walled
+from fuzz.poison import Draw, finite_rows
+from helpers.edit_scenes import OVERVIEW, bar_points, dress
+from helpers.quaternion_kernels import products
+from scgs_warp.config.presets import DensifyConfig, from_dict
 from scgs_warp.errors import UserError
 from scgs_warp.gaussians import GaussianParameters
+from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.motion import Motion, build_motion
 from scgs_warp.ops.adam import Update, adam_step, first_not_finite
 from scgs_warp.ops.harmonics_rotation import SIZES, rotate_harmonics
 from scgs_warp.ops.reduction import sum_rows
 from scgs_warp.ops.shading import shade
 from scgs_warp.ops.ssim import photometric_loss
-from scgs_warp.optim import Adam, generator
-from scgs_warp.scene import Scene
+from scgs_warp.optim import Adam
+from scgs_warp.runtime.launch import launch
+from scgs_warp.scene.scene import Scene
+from scgs_warp.seeding import generator
+from scgs_warp.training.densify import densify
 from scgs_warp.types import Stats
-from scgs_warp.warp_interop import launch
 
 from . import laws
-from .cases_render import camera_of, leaf, on
-from .fence import walled
-from .poison import Draw, finite_rows
 
 LARGEST_PIXEL = 1e9
 """Fourth powers of pixels must fit into a float: beyond, the loss says so by not being finite."""

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scgs_warp import warp_interop
+from scgs_warp.runtime import launch
 
 PAGE = mmap.PAGESIZE
 ROOM = 1 << 23
@@ -124,7 +124,7 @@ def walled(tensor: Tensor) -> Tensor:
 def fenced() -> Iterator[Fence]:
     """Launches on a CPU are fenced, one thread at a time (the thread count must be 1)."""
     global current
-    fence, kernels = Fence(), warp_interop._CpuKernel
+    fence, kernels = Fence(), launch._CpuKernel
     bind, pack = kernels.bind, kernels.pack
 
     def bound(self: Any, arguments: bytes, tensors: tuple, begin: int) -> Callable[[int, int], None]:

@@ -145,7 +145,7 @@ def main() -> int:
     unknown = set(options.format or ()) - set(known)
     if unknown:
         parser.error(f"--format {sorted(unknown)[0]}: there are {', '.join(known)}")
-    from scgs_warp.progress import progress
+    from scgs_warp.runtime.progress import progress
 
     counts = shares({name: known[name] for name in options.format or known}, options.cases)
     rows: list[dict[str, Any]] = []

@@ -8,15 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from fuzz.files_cases import Format, check_dataset, expect, finite, suffixed, within
-from layouts import write_colmap, write_nerfies, write_panoptic, write_poses_bounds
-from nerfstudio_files import HEIGHT, WIDTH
-from nerfstudio_files import write as write_nerfstudio_plain
-from tiny import write_dnerf
 
+from fuzz.files_cases import Format, check_dataset, expect, finite, suffixed, within
+from helpers.layouts import write_colmap, write_nerfies, write_panoptic, write_poses_bounds
+from helpers.nerfstudio_files import HEIGHT, WIDTH
+from helpers.nerfstudio_files import write as write_nerfstudio_plain
+from helpers.tiny import write_dnerf
 from scgs_warp.data import load
-from scgs_warp.data.normalise import Normalisation
-from scgs_warp.motion_metrics import load_ground_truth, score_motion
+from scgs_warp.evaluation.motion_metrics import load_ground_truth, score_motion
+from scgs_warp.geometry.normalisation import Normalisation
 
 PICTURES = (".png", ".jpg", ".webp")
 

@@ -10,17 +10,17 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from edit_scenes import bar_scene
-from fuzz.files_cases import Format, check_gaussians, check_numbers, expect, finite, named, within
 
+from fuzz.files_cases import Format, check_gaussians, check_numbers, expect, finite, named, within
+from helpers.edit_scenes import bar_scene
 from scgs_warp.capture import pipeline
 from scgs_warp.capture.journal import Journal
 from scgs_warp.capture.source import open_source
-from scgs_warp.data import synthesize, synthetic
+from scgs_warp.data.synthetic import builtin, from_mesh
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.filming import film_camera
-from scgs_warp.film import film, write_png
-from scgs_warp.scene import Scene
+from scgs_warp.scene.scene import Scene
+from scgs_warp.visualization.video import film, write_png
 
 EDIT = {
     "format": "scgs-warp edit", "version": 1, "comment": "all there is",
@@ -118,7 +118,7 @@ class _Again(Exception):
     """The stage is done anew."""
 
 
-MARKERS = (synthesize, synthetic)
+MARKERS = (from_mesh, builtin)
 
 
 def write_markers(folder: Path) -> None:

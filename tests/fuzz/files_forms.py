@@ -11,6 +11,7 @@ import zlib
 from typing import Any
 
 import numpy as np
+
 from fuzz.files_bytes import BYTES, JSON, TEXT, Mutator, Random, change_value, json_value, odd_value, set_word
 
 COUNTS = (0, 1, 2, 3, 5, 255, 65536, 10**7, 10**9, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**61, 2**63, 2**64 - 1)

@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from edit_scenes import bar_points, dress
-from fuzz.files_cases import Format, check_gaussians, expect, finite, within
-from gltf_files import bar, box, quad
 
-from scgs_warp.data.gaussian_files import gaussian_points
-from scgs_warp.data.gaussian_ply import open_ply, write_gaussian_ply
-from scgs_warp.data.gaussian_splat import write_splat
-from scgs_warp.data.gaussian_spz import write_spz
-from scgs_warp.data.synthesize import Request, load_subject
+from fuzz.files_cases import Format, check_gaussians, expect, finite, within
+from helpers.edit_scenes import bar_points, dress
+from helpers.gltf_files import bar, box, quad
+from scgs_warp.data.synthetic.from_mesh import Request, load_subject
+from scgs_warp.formats.gaussian_files import gaussian_points
+from scgs_warp.formats.gaussian_ply import write_gaussian_ply
+from scgs_warp.formats.gaussian_splat import write_splat
+from scgs_warp.formats.gaussian_spz import write_spz
+from scgs_warp.scene.from_gaussians import open_ply
 from scgs_warp.types import Gaussians
 
 COUNT = 40

@@ -8,8 +8,8 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from fuzz.files_cases import Format, finite
 
+from fuzz.files_cases import Format, finite
 from scgs_warp.errors import UserError
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from cells import craft
-from edit_scenes import OVERVIEW, dress
+
 from fuzz.files_cases import (
     Broken,
     Format,
@@ -21,23 +20,26 @@ from fuzz.files_cases import (
     named,
     within,
 )
-from tiny import tiny_config, tiny_dataset
-
-from scgs_warp import ablate_table, checkpoint, report
-from scgs_warp.ablate_markdown import markdown
+from helpers.cells import craft
+from helpers.edit_scenes import OVERVIEW, dress
+from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.ablation import table as ablate_table
+from scgs_warp.ablation.markdown import markdown
 from scgs_warp.apps.evaluate import Options, load_data, training_seconds
 from scgs_warp.apps.settings import Settings, configuration
-from scgs_warp.camera_refinement import refined
-from scgs_warp.config import TrainConfig, from_dict, preset, to_dict
+from scgs_warp.config.presets import TrainConfig, from_dict, preset, to_dict
 from scgs_warp.data import Dataset
-from scgs_warp.data.normalise import Normalisation
 from scgs_warp.errors import UserError
-from scgs_warp.frames import Frames
+from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.motion import ControlPoints, build_motion
-from scgs_warp.run_folder import RunFolder, read_seconds
-from scgs_warp.scene import Scene
-from scgs_warp.train import training_step
-from scgs_warp.train_state import TrainState
+from scgs_warp.scene.scene import Scene
+from scgs_warp.storage import checkpoint
+from scgs_warp.training.camera_refinement import refined
+from scgs_warp.training.frames import Frames
+from scgs_warp.training.run_folder import RunFolder, read_seconds
+from scgs_warp.training.state import TrainState
+from scgs_warp.training.step import training_step
+from scgs_warp.visualization import figures
 
 RUN = ("checkpoint.safetensors", "config.json")
 
@@ -152,8 +154,8 @@ def load_log(folder: Path) -> None:
     seconds = read_seconds(folder)
     expect(seconds is None or 0 <= seconds < 1e12, f"{seconds} seconds")
     path = folder / "log.jsonl"
-    lines = report.read_log(path)
-    report.curves(path, folder / ".curves.png")
+    lines = figures.read_log(path)
+    figures.curves(path, folder / ".curves.png")
     (folder / ".curves.png").unlink()
     expect(all(isinstance(line, dict) for line in lines), "a line that is no object")
     with RunFolder(folder, preset("cpu"), None, resume=True) as run:

@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from fuzz.files_cases import Broken, Format
 from fuzz.files_forms import mutate
-
 from scgs_warp.errors import UserError
 
 MODULES = ("files_data", "files_gaussians", "files_runs", "files_edits")
@@ -178,7 +178,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from scgs_warp import environment
+    from scgs_warp.runtime import environment
 
     environment.configure(1)
     load_formats(sys.argv[1:] or MODULES)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .quaternion import normalise, to_matrix
+from reference.quaternion import normalise, to_matrix
 
 
 def covariance(quats: Tensor, scales: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .covariance import covariance
+from reference.covariance import covariance
 
 
 class Projected(NamedTuple):

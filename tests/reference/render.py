@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from reference.compositing import composite
+from reference.projection import Projected, project
 from scgs_warp.types import Splats, Tiles
-
-from .compositing import composite
-from .projection import Projected, project
 
 TILE = 16
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .quaternion import multiply, normalise, to_matrix
+from reference.quaternion import multiply, normalise, to_matrix
 
 C0 = 0.28209479177387814
 

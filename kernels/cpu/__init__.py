@@ -1,0 +1,1 @@
+"""SIMD forms of the stages for the CPU, under the file names of their portable forms."""

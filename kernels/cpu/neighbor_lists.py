@@ -1,0 +1,152 @@
+"""Which nodes a block of sixteen points close together has within reach: what ``nearest_listed`` starts from."""
+
+import warp as wp
+
+from .neighbors import LANES
+
+wp.set_module_options({"enable_backward": False})
+
+LIST_SIZE = wp.constant(128)
+"""Most nodes in a block's list. A block that has more within reach is searched in full."""
+MARGIN = wp.constant(0.35)
+"""How much farther than needed a list reaches, in units of the distance to the block's farthest neighbour."""
+
+
+@wp.kernel
+def largest_shift(
+    first: int,
+    # In:
+    then_in: wp.array2d[float],  # [M, D]
+    nodes_in: wp.array2d[float],  # [M, D]
+    # Out:
+    shift_out: wp.array[float],  # [1]
+):
+    """How far the nodes have moved at most: one grid index. A node that is not finite now is nobody's neighbour and
+    does not count; one that was not is new: infinity."""
+    most = float(0.0)
+    for m in range(nodes_in.shape[0]):
+        poison = float(0.0)
+        d2 = float(0.0)
+        for d in range(nodes_in.shape[1]):
+            e = nodes_in[m, d] - then_in[m, d]
+            d2 += e * e
+            poison += nodes_in[m, d] * 0.0
+        if poison == 0.0:
+            if wp.isnan(d2):
+                most = wp.inf
+            elif d2 > most:
+                most = d2
+    shift_out[first + wp.tid()] = wp.sqrt(most)
+
+
+_WITHIN = """
+#if !defined(__CUDA_ARCH__)
+{
+    typedef float vf __attribute__((vector_size(64)));
+    typedef int vi __attribute__((vector_size(64)));
+    typedef bool vb __attribute__((ext_vector_type(16)));
+    const int D = columns.shape[0], M = columns.shape[1], room = lists.shape[1];
+    const float* centre = centres.data + (long long)block * (D + 1);
+    int* list = lists.data + (long long)block * room;
+    int count = 0;
+    for (int m = 0; m < M && count <= room; m += 16) {
+        const int lanes = M - m < 16 ? M - m : 16;
+        vf d2 = {};
+        for (int d = 0; d < D; ++d) {
+            vf e = {};
+            __builtin_memcpy(&e, columns.data + (long long)d * M + m, 4 * lanes);
+            e = e - centre[d];
+            d2 = d2 + e * e;
+        }
+        unsigned found = __builtin_bit_cast(unsigned short, __builtin_convertvector(d2 < reach * reach, vb));
+        for (found &= (1u << lanes) - 1; found; found &= found - 1, ++count)
+            if (count < room) list[count] = m + __builtin_ctz(found);
+    }
+    return count <= room ? count : -1;
+}
+#else
+    return -1;
+#endif
+"""
+
+
+@wp.func_native(_WITHIN)
+def _within(
+    block: int, reach: float, centres: wp.array2d[float], columns: wp.array2d[float], lists: wp.array2d[wp.int32]
+) -> int:
+    """Write the list of a block: the nodes within ``reach`` of its centre, ascending. How many, -1 if too many."""
+    ...
+
+
+@wp.func
+def _spread(x: int):
+    """Bits 0 .. 9 to bits 0, 3, 6 ... 27."""
+    x = (x | (x << 16)) & 0x030000FF
+    x = (x | (x << 8)) & 0x0300F00F
+    x = (x | (x << 4)) & 0x030C30C3
+    return (x | (x << 2)) & 0x09249249
+
+
+@wp.kernel
+def morton_codes(
+    first: int,
+    # In:
+    points_in: wp.array2d[float],  # [N, D]
+    low: wp.vec3,
+    inverse_size: wp.vec3,
+    # Out:
+    codes_out: wp.array[wp.int32],  # [N]
+):
+    """Place of point ``i`` on a curve through the first three dimensions; anywhere if it is not finite."""
+    i = first + wp.tid()
+    code = int(0)
+    for d in range(wp.min(points_in.shape[1], 3)):
+        cell = (points_in[i, d] - low[d]) * inverse_size[d] * 1023.0
+        if cell > 0.0:
+            code = code | (_spread(int(wp.min(cell, 1023.0))) << d)
+    codes_out[i] = code
+
+
+@wp.kernel
+def list_blocks(
+    first: int,
+    # In:
+    points_in: wp.array2d[float],  # [N, D]
+    columns_in: wp.array2d[float],  # [D, M] the nodes, transposed
+    order_in: wp.array[wp.int32],  # [N]
+    distances_in: wp.array2d[float],  # [N, K] squared
+    # Out:
+    centres_out: wp.array2d[float],  # [blocks, D + 1]
+    counts_out: wp.array[wp.int32],  # [blocks]
+    lists_out: wp.array2d[wp.int32],  # [blocks, LIST_SIZE]
+):
+    """Centre, reach and list of block ``i``."""
+    block = first + wp.tid()
+    D = points_in.shape[1]
+    last = distances_in.shape[1] - 1
+    begin = block * LANES
+    end = wp.min(begin + LANES, points_in.shape[0])
+    for d in range(D):
+        low = float(wp.inf)
+        high = float(-wp.inf)
+        for at in range(begin, end):
+            i = order_in[at]
+            if distances_in[i, last] < wp.inf:
+                low = wp.min(low, points_in[i, d])
+                high = wp.max(high, points_in[i, d])
+        centres_out[block, d] = 0.5 * low + 0.5 * high  # NaN where no point counts: nothing is listed
+    reach = float(0.0)
+    farthest = float(0.0)
+    for at in range(begin, end):
+        i = order_in[at]
+        if distances_in[i, last] < wp.inf:
+            d2 = float(0.0)
+            for d in range(D):
+                e = points_in[i, d] - centres_out[block, d]
+                d2 += e * e
+            own = wp.sqrt(distances_in[i, last])
+            reach = wp.max(reach, wp.sqrt(d2) + own)
+            farthest = wp.max(farthest, own)
+    reach = wp.min(reach + MARGIN * farthest, 1.0e18)  # its square must not overflow
+    centres_out[block, D] = reach
+    counts_out[block] = _within(block, reach, centres_out, columns_in, lists_out)

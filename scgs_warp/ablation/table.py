@@ -1,0 +1,202 @@
+"""The table of an ablation, from the cells that are there, beside the published figures."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..config.presets import FREE_TO_CHANGE
+from ..errors import UserError
+from ..storage.checkpoint import write_atomically
+from .cells import VARIED, Cell, cell_folder, difference, discover, read_metrics, recorded, sort_values
+from .published import PUBLISHED_PSNR, TABLE_S1
+
+METRICS = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds")
+REFERENCE = {"motion": "control-points", "arap": "per-gaussian"}
+"""The row that the others of a table are compared with."""
+
+Row = dict[str, Any]
+
+
+def build(ablation: str, output: Path, planned: Sequence[Cell] = ()) -> dict[str, Any]:
+    """Everything the table says.
+
+    Args:
+        output: holds the cells, ``SCENE/VALUE[-seedN]``.
+        planned: cells that are to have a place even while they are missing.
+
+    Returns:
+        ``ablation``, ``settings`` (what the cells share), ``scenes``, ``values``, ``seeds``, ``cells`` (one entry each,
+        metrics None while missing) and ``tables``: the mean over scenes, if there are several, then one for each scene,
+        with ``rows`` of statistics {mean, std, count}, None where cells are missing.
+
+    Raises:
+        UserError: there are no cells, a file is damaged, or cells differ in more than the ablation varies.
+    """
+    keys = dict.fromkeys([(cell.scene, cell.value, cell.seed) for cell in planned])
+    keys.update(dict.fromkeys(discover(output, ablation)))
+    if not keys:
+        raise UserError(f"{output}: holds no cells of {ablation}; train some first, without --table-only")
+    cells = []
+    for scene, value, seed in keys:
+        metrics = read_metrics(output / scene / cell_folder(value, seed))
+        cells.append({"scene": scene, "value": value, "seed": seed, "metrics": metrics})
+    settings = _shared_settings(ablation, output, cells, planned)
+    scenes = list(dict.fromkeys(cell["scene"] for cell in cells))
+    report = {
+        "ablation": ablation,
+        "settings": {**settings, "device": sorted({c["metrics"]["device"] for c in cells if _has(c, "device")})},
+        "scenes": scenes,
+        "values": sort_values(ablation, [cell["value"] for cell in cells]),
+        "seeds": sorted({cell["seed"] for cell in cells}),
+        "cells": [_without_images(cell) for cell in cells],
+    }
+    tables = [_table(report, cells, [scene]) for scene in scenes]
+    if len(scenes) > 1:
+        tables.insert(0, _table(report, cells, scenes))
+    return {**report, "tables": tables}
+
+
+def _has(cell: Row, key: str) -> bool:
+    return cell["metrics"] is not None and cell["metrics"].get(key) is not None
+
+
+def _without_images(cell: Row) -> Row:
+    if cell["metrics"] is None:
+        return cell
+    return {**cell, "metrics": {key: value for key, value in cell["metrics"].items() if key != "per_image"}}
+
+
+def _shared_settings(ablation: str, output: Path, cells: list[Row], planned: Sequence[Cell]) -> dict[str, Any]:
+    """What the table's head says; refuses to compare what was made differently."""
+    ignored = (*VARIED[ablation], *FREE_TO_CHANGE, "seed", "data.folder")
+    first, shared = "the options", planned[0].settings if planned else None
+    for cell in cells:
+        folder = output / cell["scene"] / cell_folder(cell["value"], cell["seed"])
+        settings = recorded(folder) if cell["metrics"] is not None else None
+        if settings is None:
+            continue
+        if shared is None:
+            first, shared = str(folder), settings
+        differs = difference(settings, shared, ignored)
+        if differs is not None:
+            name, found, wanted = differs
+            raise UserError(
+                f"{folder}: made with {name} = {found!r}, but {first} has {wanted!r}: not one table; "
+                "give the same options, or another --output"
+            )
+    if shared is None:
+        return {}
+    data = {name: shared["data"][name] for name in ("downscale", "resample", "background")}
+    return {"preset": shared["preset"], "steps": shared["steps"], **data}
+
+
+def statistics(values: Sequence[float]) -> dict[str, Any] | None:
+    """Mean, standard deviation of a sample (None of one) and count; None of nothing."""
+    if not values:
+        return None
+    mean = math.fsum(values) / len(values)
+    spread = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1)) if len(values) > 1 else None
+    return {"mean": mean, "std": spread, "count": len(values)}
+
+
+def _over_scenes(cells: list[Row], scenes: list[str], key: str) -> dict[str, Any] | None:
+    """Seeds as the sample, each the mean over the scenes; the mean itself takes every cell there is. None unless every
+    scene has one: a mean over fewer scenes is none of these."""
+    found: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
+    for cell in cells:
+        if cell["scene"] in found and _has(cell, key):
+            found[cell["scene"]][cell["seed"]] = float(cell["metrics"][key])
+    if not all(found.values()):
+        return None
+    complete = set.intersection(*(set(values) for values in found.values()))
+    sample = statistics([math.fsum(v[seed] for v in found.values()) / len(scenes) for seed in sorted(complete)])
+    mean = math.fsum(math.fsum(v.values()) / len(v) for v in found.values()) / len(scenes)
+    return {
+        "mean": mean,
+        "std": None if sample is None else sample["std"],
+        "count": sum(len(values) for values in found.values()),
+    }
+
+
+def _table(report: dict[str, Any], cells: list[Row], scenes: list[str]) -> dict[str, Any]:
+    """The rows of some scenes together."""
+    ablation = report["ablation"]
+    alone = len(scenes) < len(report["scenes"])
+    rows: list[Row] = []
+    for value in report["values"]:
+        own = [cell for cell in cells if cell["value"] == value and cell["scene"] in scenes]
+        rows.append({"value": value, **{key: _over_scenes(own, scenes, key) for key in METRICS}})
+    _compare(ablation, rows)
+    if ablation == "nodes" and not alone:
+        for row in rows:
+            row["published"] = TABLE_S1.get(row["value"])
+    elif ablation == "motion":
+        _published_leads(rows, scenes, "published")
+        if not alone:
+            _published_leads(rows, ["mean"], "published_mean")
+    name = scenes[0] if len(scenes) == 1 else f"mean of {', '.join(scenes)}"
+    return {"name": name, "scenes": scenes, "rows": rows}
+
+
+def _compare(ablation: str, rows: list[Row]) -> None:
+    """How far each row is from the best one, or from the reference."""
+
+    def mean(row: Row | None, key: str) -> float | None:
+        return None if row is None or row[key] is None else row[key]["mean"]
+
+    if ablation == "nodes":
+        best = max((value for row in rows if (value := mean(row, "psnr")) is not None), default=None)
+        for row in rows:
+            value = mean(row, "psnr")
+            row["to_best"] = None if value is None or best is None else value - best
+        return
+    reference = next((row for row in rows if row["value"] == REFERENCE[ablation]), None)
+    for row in rows:
+        if ablation == "motion":
+            ours, its = mean(reference, "psnr"), mean(row, "psnr")
+            row["lead"] = None if ours is None or its is None or row is reference else ours - its
+            continue
+        for key in ("epe", "jitter"):
+            base, its = mean(reference, key), mean(row, key)
+            row[f"{key}_share"] = None if its is None or not base or row is reference else its / base
+
+
+def _published_leads(rows: list[Row], scenes: list[str], key: str) -> None:
+    """The published mean over ``scenes``, None unless all of them are known."""
+    ours = PUBLISHED_PSNR["control-points"]
+    if not all(scene in ours for scene in scenes):
+        return
+    for row in rows:
+        known = PUBLISHED_PSNR[row["value"]]
+        psnr = math.fsum(known[scene] for scene in scenes) / len(scenes)
+        lead = math.fsum(ours[scene] - known[scene] for scene in scenes) / len(scenes)
+        row[key] = {"psnr": psnr, "lead": lead if row["value"] != "control-points" else None}
+
+
+def write(report: dict[str, Any], output: Path) -> list[Path]:
+    """``ABLATION.json``, ``ABLATION.md`` and ``ABLATION.png`` in ``output``.
+
+    Raises:
+        UserError: they cannot be written.
+    """
+    from .markdown import markdown
+    from .plot import picture
+
+    contents = {
+        "json": (json.dumps(report, indent=2) + "\n").encode(),
+        "md": markdown(report).encode(),
+        "png": picture(report),
+    }
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--output {output}: cannot be made ({error.strerror}); name another folder") from error
+    paths = []
+    for ending, content in contents.items():
+        paths.append(output / f"{report['ablation']}.{ending}")
+        write_atomically(paths[-1], content)
+    return paths

@@ -1,0 +1,1 @@
+"""Benchmarks of a frame, a rasterisation, a training step and an edit."""

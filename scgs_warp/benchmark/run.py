@@ -1,0 +1,100 @@
+"""What a frame, a rasterisation and a training step cost, as rows that state what they were measured on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from ..config.presets import MOTIONS
+from ..errors import UserError
+from ..runtime import environment
+from ..scene.scene import Scene
+from .editing import edit_rows
+from .gsplat import Peers
+from .memory import resident_mib
+from .plan import MIDDLE, Place, Plan, posed
+from .scenes import load_of, synthetic_scene
+from .summary import compare_frames, motion_costs
+from .timing import machine, now
+from .workloads import frame_rows, frames_of, raster_rows, step_rows
+
+What = Literal["frame", "raster", "step", "edit"]
+
+
+def thread_counts(threads: int | None, device: str) -> tuple[int, ...]:
+    """One thread and all of them, unless one number is asked for; on a GPU the CPU's threads hardly matter."""
+    if threads is not None or device == "cuda":
+        return (environment.thread_count() if threads is None else threads,)
+    return tuple(sorted({1, environment.available_threads()}))
+
+
+def bench(what: What, plan: Plan) -> dict[str, Any]:
+    """Measure.
+
+    Returns:
+        ``date``, ``machine``, ``what`` and ``rows``, dictionaries with ``KEYS``; of frames also ``motion``, what moving
+        the scene costs, and ``compared``, several motion models in turns. Ready for JSON.
+
+    Raises:
+        UserError: the run cannot be read, gsplat is asked for and not usable, or the renderers disagree.
+    """
+    measure = {"frame": frame_rows, "raster": raster_rows, "step": step_rows, "edit": edit_rows}[what]
+    peers = Peers.find(plan) if plan.against else None
+    rows: list[dict[str, Any]] = []
+    compared: list[dict[str, Any]] = []
+    drawn: dict[str, Callable[[int], None]] = {}
+    before = environment.thread_count()
+    try:
+        for scene in scenes(plan, what):
+            resident = resident_mib(plan.device)
+            load = load_of(*posed(scene, plan.size, MIDDLE), scene.config.antialiased and what != "raster")
+            for threads in plan.threads:
+                environment.configure(threads)
+                place = Place(scene, plan, load, threads, resident)
+                rows += measure(place) if peers is None else peers.rows(place)
+            if what == "frame":
+                drawn[scene.motion_name] = frames_of(scene, plan.size)
+        for threads in plan.threads if len(drawn) > 1 else ():
+            environment.configure(threads)
+            plan.report(f"all in turns, {threads} threads")
+            compared += compare_frames(drawn, threads, plan.seconds, plan.device)
+    finally:
+        environment.configure(before)
+    report = {"date": now(), "machine": machine(plan.device), "what": what, "rows": rows}
+    return {**report, "motion": motion_costs(rows, compared), "compared": compared} if what == "frame" else report
+
+
+def scenes(plan: Plan, what: What) -> Iterator[Scene]:
+    """The run's scene, or a synthetic one for every motion model; a rasterisation knows no motion."""
+    if plan.run is not None:
+        yield Scene.load(plan.run, device=plan.device)
+        return
+    for motion in plan.motions if what != "raster" else ("static",):
+        yield synthetic_scene(motion, plan.gaussians, plan.nodes, plan.device)
+
+
+def check_motions(text: str) -> tuple[str, ...]:
+    """Names of motion models from a list with commas.
+
+    Raises:
+        UserError: one of them is none.
+    """
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in names or ("",):
+        if name not in MOTIONS:
+            raise UserError(f"--motion {text}: {name!r} is no motion model; choose from {','.join(MOTIONS)}")
+    return names
+
+
+def write(report: dict[str, Any], path: Path) -> None:
+    """
+    Raises:
+        UserError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"--json {path}: cannot be written ({error.strerror}); name another file") from error

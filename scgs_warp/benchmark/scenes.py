@@ -1,0 +1,221 @@
+"""Scenes to measure: a seeded figure of any size under any motion model, its camera, and images to train on."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..config.presets import MotionConfig, OptimConfig, TrainConfig
+from ..data.dataset import Dataset
+from ..errors import UserError
+from ..gaussians import SH_C0, GaussianParameters, neighbor_distance
+from ..geometry.cameras import Overview, orbit_camera
+from ..geometry.normalisation import Normalisation
+from ..kernels import benchmark as kernels
+from ..motion import ControlPoints, HexPlane, PerGaussian, build_motion
+from ..motion.base import Motion
+from ..ops.binning import bin_splats
+from ..ops.projection import project
+from ..ops.sampling import farthest_points
+from ..runtime.launch import launch
+from ..scene.scene import Scene
+from ..seeding import generator
+from ..training.state import TrainState
+from ..types import Camera, Frame, Gaussians
+
+SEED = 20
+SMALLEST, LARGEST = 16, 8192
+"""Sides of an image."""
+PARTS = (  # centre, half axes, share of the Gaussians
+    ((0.0, 0.0, 0.30), (0.36, 0.25, 0.50), 0.40),  # trunk
+    ((0.0, 0.0, 1.00), (0.19, 0.21, 0.23), 0.14),  # head
+    ((0.50, 0.0, 0.42), (0.27, 0.12, 0.13), 0.09),  # arms
+    ((-0.50, 0.0, 0.42), (0.27, 0.12, 0.13), 0.09),
+    ((0.19, 0.0, -0.66), (0.15, 0.16, 0.57), 0.14),  # legs
+    ((-0.19, 0.0, -0.66), (0.15, 0.16, 0.57), 0.14),
+)
+SHELL = 0.35
+"""Share of a part's half axes, from its surface inwards, in which the Gaussians lie: trained ones are not hollow."""
+SIZE = 2.0
+"""Median standard deviation of N Gaussians is SIZE / sqrt(N): what they cover together does not depend on N."""
+SIZE_SPREAD = 0.5
+"""Standard deviation of the logarithm of an axis' length."""
+OPACITY_POWER = 0.45
+"""Opacities are a uniform number to this power, between ``OPACITIES``."""
+OPACITIES = (0.02, 0.95)
+OVERVIEW = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0311, math.degrees(0.6911), 15.0, 60.0)
+"""The rig of D-NeRF: distance and field of view."""
+HEAD_WEIGHT = 2e-3
+"""Standard deviation of the last layer's weights: control points move by some hundredths of the figure's height."""
+PLANE_HEAD_WEIGHT = 5e-2
+"""The same where the network is small and its features are."""
+HYPER_SPREAD = 0.02
+FRAMES = 4
+RATES = 1e-6
+"""Learning rates are multiplied by this: Adam does all its work, and the scene stays the same from step to step."""
+
+
+def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> GaussianParameters:
+    """``count`` Gaussians in the shape of a standing figure, 2.5 units high; the same for the same arguments. With the
+    hyper-coordinates and the shading that ``motion`` asks for."""
+    random = generator(seed, 1)
+    centres, axes, shares = (torch.tensor(column) for column in zip(*PARTS))
+    part = torch.multinomial(shares, count, replacement=True, generator=random)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=1)
+    depth = 1.0 - SHELL * torch.rand(count, 1, generator=random)
+    means = centres[part] + axes[part] * direction * depth
+    log_scales = math.log(SIZE / math.sqrt(count)) + SIZE_SPREAD * torch.randn(count, 3, generator=random)
+    colors = (0.5 + 0.4 * torch.sin(5.0 * means + torch.tensor([0.0, 2.0, 4.0]))).clamp(0.0, 1.0)
+    own = motion or MotionConfig(shading=False)
+    made = GaussianParameters(
+        means, log_scales, (colors - 0.5) / SH_C0, hyper_dim=own.hyper_dim, shaded=own.has_shading
+    )
+    low, high = OPACITIES
+    opacities = low + (high - low) * torch.rand(count, generator=random) ** OPACITY_POWER
+    with torch.no_grad():
+        made.quats.copy_(torch.randn(count, 4, generator=random))
+        made.opacity_logits.copy_(opacities.logit())
+        made.sh_rest.copy_(0.05 * torch.randn(made.sh_rest.shape, generator=random))
+        made.hyper.add_(HYPER_SPREAD * torch.randn(made.hyper.shape, generator=random))
+        made.shading.copy_(0.1 * torch.randn(made.shading.shape, generator=random))
+    return made
+
+
+def _loosen(motion: Motion, seed: int) -> None:
+    """Models start at rest; small random weights in their last layers (and features that change with time) make the
+    figure move a little."""
+    random = generator(seed, 2)
+    heads: list[tuple[Any, float]] = []
+    if isinstance(motion, ControlPoints | PerGaussian):
+        heads = [(motion.network.head, HEAD_WEIGHT)]
+    elif isinstance(motion, HexPlane):
+        heads = [(head[-1], PLANE_HEAD_WEIGHT) for head in motion.heads.values()]  # type: ignore[index]
+    with torch.no_grad():
+        for head, weight in heads:
+            head.weight.copy_(weight * torch.randn(head.weight.shape, generator=random))
+        for plane in motion.planes if isinstance(motion, HexPlane) else ():
+            plane.mul_(0.5 + torch.rand(plane.shape, generator=random))
+
+
+def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int = SEED) -> Scene:
+    """A moving figure as a trained scene: ``count`` Gaussians, ``nodes`` control points (control-points only), networks
+    of the paper's size."""
+    config = TrainConfig(seed=seed)
+    config = dataclasses.replace(config, motion=dataclasses.replace(config.motion, model=motion, nodes=nodes))
+    gaussians = figure(count, seed, config.motion)
+    model = build_motion(motion, config)
+    if isinstance(model, ControlPoints):
+        positions = gaussians.means.detach()[farthest_points(gaussians.means.detach(), nodes)]
+        with torch.no_grad():
+            model.positions.copy_(positions)
+            model.hyper.add_(HYPER_SPREAD * torch.randn(model.hyper.shape, generator=generator(seed, 3)))
+            model.log_radii.fill_(math.log(float(neighbor_distance(positions).median())))
+    _loosen(model, seed)
+    scene = Scene(gaussians.to(device), model.to(device), Normalisation.identity(), config, OVERVIEW)
+    scene.motion.eval()  # as a loaded run's: some models keep what training would change
+    scene.freeze_binding()
+    return scene
+
+
+Size = int | tuple[int, int]
+"""The longer side of an image with the scene's proportions, or (width, height)."""
+
+
+def camera_size(text: str) -> Size:
+    """``"800"`` or ``"1920x1080"``.
+
+    Raises:
+        UserError: it is neither, or a side is not one of ``SMALLEST`` to ``LARGEST`` pixels.
+    """
+    sides = text.lower().split("x")
+    if not (1 <= len(sides) <= 2 and all(side.isascii() and side.isdigit() for side in sides)):
+        raise UserError(f"--size {text}: give the longer side, such as 800, or width and height, such as 1920x1080")
+    numbers = [int(side) for side in sides]
+    if not all(SMALLEST <= number <= LARGEST for number in numbers):
+        raise UserError(f"--size {text}: give {SMALLEST} to {LARGEST} pixels a side")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def scene_camera(scene: Scene, size: Size, turn: float = 0.0) -> Camera:
+    """A world camera on the rig of the training cameras, ``turn`` degrees from where a film starts. The horizontal
+    field of view is theirs, whatever the image's proportions."""
+    azimuth = scene.overview.azimuth + turn
+    if isinstance(size, int):
+        return orbit_camera(scene.overview, azimuth, size).to(scene.device)
+    width, height = size
+    placed = orbit_camera(scene.overview, azimuth, width)
+    focal = width / (2 * math.tan(math.radians(scene.overview.fov_x) / 2))
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(placed.viewmat, K, width, height).to(scene.device)
+
+
+class Load(NamedTuple):
+    """How much there is to composite."""
+
+    pairs: int
+    """Pairs of splat and tile."""
+    contributors: float
+    """Mean over covered pixels of the splats blended there: alpha at least 1/255, before the pixel ends."""
+    covered: int = 0
+    """Pixels with at least one of them."""
+
+
+@torch.no_grad()
+def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> Load:
+    """Counted exactly, pixel by pixel; the camera in the units of the Gaussians."""
+    geometry = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    view = camera.viewmat, camera.K, camera.width, camera.height
+    splats = project(*geometry, *view, antialiased=antialiased)
+    tiles = bin_splats(splats)
+    counts = torch.empty(camera.height * camera.width, dtype=torch.int32, device=splats.depths.device)
+    tensors = [splats.means2d, splats.conics, splats.opacities, tiles.ranges, tiles.splats]
+    lists = [tensor.contiguous() for tensor in tensors]
+    launch(kernels.count_contributors, len(counts), *lists, camera.width, tiles.columns, tiles.tile_size, counts)
+    covered = counts > 0
+    mean = float(counts[covered].double().mean()) if bool(covered.any()) else 0.0
+    return Load(len(tiles.splats), mean, int(covered.sum()))
+
+
+def training_data(scene: Scene, size: Size, seed: int = SEED) -> Dataset:
+    """Images of the scene itself from around, with noise: a loss whose gradient reaches everything."""
+    frames = []
+    for index in range(FRAMES):
+        time = index / max(FRAMES - 1, 1)
+        camera = scene_camera(scene, size, 30.0 * index)
+        image = scene.render(camera, time)
+        planar = image.rgb.permute(2, 0, 1).cpu()
+        noise = 0.05 * torch.randn(planar.shape, generator=generator(seed, 3, index))
+        planar = (planar + noise * (image.alpha.cpu() > 0)).clamp(0.0, 1.0)
+        frames.append(Frame(camera.to("cpu"), time, planar.permute(1, 2, 0), name=f"{index}"))
+    return Dataset(frames, folder=Path("synthetic"), split="train", background=_background(scene))
+
+
+def _background(scene: Scene) -> str:
+    """Random backgrounds need alpha; the scene is rendered on what it is evaluated on."""
+    return "black" if scene.config.data.background == "random" else scene.config.data.background
+
+
+def training_state(scene: Scene, arap: bool) -> TrainState:
+    """The scene in the joint phase of training, at full harmonics, statistics for densification on; rates near 0. With
+    ``arap`` every step carries that term, where training does so in one of five: a median over a mixture shows neither.
+    The scene's motion is in training mode from here on."""
+    own = scene.config
+    base = TrainConfig(seed=own.seed, data=own.data, motion=own.motion, antialiased=own.antialiased)
+    rates = OptimConfig()
+    slow = {
+        item.name: RATES * getattr(rates, item.name)
+        for item in dataclasses.fields(rates)
+        if not item.metadata.get("milestone")
+    }
+    loss = dataclasses.replace(base.loss, arap_every=1) if arap else dataclasses.replace(base.loss, arap=0.0)
+    config = dataclasses.replace(base, optim=dataclasses.replace(rates, **slow), loss=loss)
+    step = config.pretrain_steps + max(config.rest_steps, 3 * config.densify.sh_every)
+    scene.motion.train()
+    nothing: Tensor = torch.zeros(0, 3)
+    rest = (scene.normalisation, scene.overview, 1.0, nothing, nothing)
+    return TrainState(config, scene.gaussians, scene.motion, *rest, stage="main", fingerprint="", step=step)

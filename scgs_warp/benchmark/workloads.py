@@ -1,0 +1,177 @@
+"""What is measured: a frame of the moving scene, a rasterisation, a training step."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import UserError
+from ..motion import ControlPoints, HexPlane, PerGaussian, control_points
+from ..motion.base import Motion
+from ..ops.binning import bin_splats
+from ..ops.compositing import composite
+from ..ops.harmonics import spherical_harmonics
+from ..ops.projection import project
+from ..rendering import render
+from ..scene.scene import Scene
+from ..seeding import generator
+from ..training import step as training
+from ..training.frames import Frames
+from ..types import Camera, Gaussians
+from .plan import MIDDLE, Place, posed
+from .scenes import Size, scene_camera, training_data, training_state
+
+RENDER_STAGES = {
+    "project": "project",
+    "harmonics": "spherical_harmonics",
+    "bin": "bin_splats",
+    "composite": "composite",
+}
+
+
+def motion_stages(motion: Motion, training: bool = False) -> dict[str, list[tuple[Any, str]]]:
+    """Where a motion model spends its time: the network (planes, their heads and in training their smoothness
+    included), and skinning (which in training includes the search for neighbours)."""
+    if isinstance(motion, ControlPoints):
+        found: dict[str, list[tuple[Any, str]]] = {"network": [(motion, "poses")]}
+        found["skin"] = [(motion, "bind_and_pose"), (motion, "apply_pose")]
+        if training:
+            found["arap"] = [(motion, "refresh_graph"), (control_points, "rigidity")]
+        return found
+    if isinstance(motion, PerGaussian):
+        return {"network": [(motion.network, "forward")]}
+    if isinstance(motion, HexPlane):
+        return {"network": [(motion, "train_at" if training else "gaussians_at")]}
+    return {}
+
+
+def draw_stages(module: Any) -> dict[str, list[tuple[Any, str]]]:
+    return {stage: [(module, name)] for stage, name in RENDER_STAGES.items()}
+
+
+def instant(index: int) -> float:
+    """The time that frame ``index`` shows: another for each, in [0.3, 0.7]."""
+    return 0.5 + 0.4 * ((0.37 * index) % 1.0 - 0.5)
+
+
+def frames_of(scene: Scene, size: Size) -> Callable[[int], None]:
+    """Draws frame ``index``, as a viewer would."""
+    camera = scene_camera(scene, size)
+
+    def draw(index: int) -> None:
+        scene.render(camera, instant(index))
+
+    return draw
+
+
+def frame_rows(place: Place) -> list[dict[str, Any]]:
+    """Frames of the moving scene: each at another time, so that the network runs for each; neighbours are cached.
+
+    On CUDA the whole is a recorded graph, in which nothing can be timed: its stages are those of a frame drawn step by
+    step."""
+    scene = place.scene
+    camera = scene_camera(scene, place.plan.size)
+    targets = {**motion_stages(scene.motion), **draw_stages(render)}
+
+    @torch.no_grad()
+    def steps(index: int) -> None:
+        view = scene.normalisation.apply_camera(camera).to(scene.device)
+        color = torch.tensor(scene.background_color, device=scene.device)
+        posed = scene.motion.gaussians_at(scene.gaussians, instant(index))
+        render.render(posed, view, color, antialiased=scene.config.antialiased)
+
+    whole = frames_of(scene, place.plan.size)
+    return place.rows("frame", whole, targets, staged=steps if place.plan.device == "cuda" else None)
+
+
+class Leaves:
+    """Gaussians as the tensors that gradients are asked for, and one gradient of an image."""
+
+    def __init__(self, gaussians: Gaussians, camera: Camera) -> None:
+        def leaf(value: Tensor) -> Tensor:
+            return value.detach().clone().requires_grad_()
+
+        self.camera = camera
+        self.gaussians = Gaussians(**{name: leaf(value) for name, value in vars(gaussians).items()})
+        self.harmonics = leaf(torch.cat([gaussians.sh_dc[:, None], gaussians.sh_rest], dim=1))
+        self.degree = round(self.harmonics.shape[1] ** 0.5) - 1
+        self.v_image = torch.rand(3, camera.height, camera.width, generator=generator(0, 4)).to(self.harmonics.device)
+
+    @property
+    def geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        own = self.gaussians
+        return own.means, own.quats, own.scales, own.opacities
+
+    def draw(self) -> Tensor:
+        """[3, H, W] by the project's own stages."""
+        own, camera = self.gaussians, self.camera
+        splats = project(*self.geometry, camera.viewmat, camera.K, camera.width, camera.height)
+        colors = spherical_harmonics(own.sh_dc, own.sh_rest, own.means, camera.position, self.degree)
+        return composite(splats, colors, bin_splats(splats))[0]
+
+    def rasterize(self, rasterization: Callable[..., Any]) -> Tensor:
+        """[3, H, W] through the entry point that gsplat and this project share."""
+        camera = self.camera
+        views = camera.viewmat[None], camera.K[None], camera.width, camera.height
+        image = rasterization(*self.geometry, self.harmonics, *views, sh_degree=self.degree, packed=False)[0]
+        return image[0].permute(2, 0, 1)
+
+
+def raster_rows(place: Place, forward: bool = True) -> list[dict[str, Any]]:
+    """Projection, harmonics, binning and compositing of three channels: forward (unless not wanted), and forward with
+    all gradients."""
+    leaves = Leaves(*posed(place.scene, place.plan.size, MIDDLE))
+    module = _this_module()
+
+    def draw(index: int) -> None:
+        with torch.no_grad():
+            leaves.draw()
+
+    def both(index: int) -> None:
+        torch.autograd.grad(leaves.draw(), tuple(vars(leaves.gaussians).values()), leaves.v_image)
+
+    backward = {"backward": [(torch.autograd, "grad")]}
+    rows = place.rows("raster/forward", draw, draw_stages(module)) if forward else []
+    return rows + place.rows("raster/both", both, {**draw_stages(module), **backward})
+
+
+def _this_module() -> Any:
+    return sys.modules[__name__]
+
+
+def step_rows(place: Place) -> list[dict[str, Any]]:
+    """A training step in the joint phase, on images of the scene itself; with the ARAP term where there is one."""
+    scene = place.scene
+    data = training_data(scene, place.plan.size)
+    rows = []
+    for name, arap in (("step", False), ("step/arap", True)):
+        if arap and not isinstance(scene.motion, ControlPoints):
+            continue
+        cache = getattr(scene.motion, "cache_binding", None)
+        if cache is not None:
+            cache(None)
+        state = training_state(scene, arap)
+        frames = Frames(data, scene.normalisation, state.config, place.plan.device)
+        targets = {
+            **motion_stages(scene.motion, training=True),
+            **draw_stages(render),
+            "loss": [(training, "photometric_loss")],
+            "backward": [(torch.Tensor, "backward")],
+            "adam": [(one, "step") for one in (state.gaussian_optimizer, state.motion_optimizer) if one is not None],
+        }
+
+        def step(index: int, state: Any = state, frames: Frames = frames) -> None:
+            if training.training_step(state, frames).failed is not None:
+                raise UserError(
+                    f"step: the loss of {scene.motion_name} is not finite; measure another scene with --run"
+                )
+            state.step += 1
+
+        rows += place.rows(name, step, targets)
+    scene.motion.eval()
+    scene.freeze_binding()
+    return rows

@@ -1,0 +1,1 @@
+"""Settings of a training run: fields with their defaults, presets, validation."""

@@ -1,0 +1,156 @@
+"""glTF animation clips: what each sampler says at an instant. All float64; quaternions as glTF stores them, xyzw.
+
+Formulas: glTF 2.0 specification, appendix C (interpolation).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import UserError
+from .file import GltfFile
+
+PATHS = {"translation": 3, "rotation": 4, "scale": 3}
+"""Components of what a channel can move; ``weights`` has as many as the mesh has morph targets."""
+
+
+class Sampler(NamedTuple):
+    """A curve through keyframes."""
+
+    times: np.ndarray
+    """[N] seconds, increasing."""
+    values: np.ndarray
+    """[N, C]; of a cubic spline [N, 3, C]: in-tangent, value, out-tangent."""
+    interpolation: str
+    """LINEAR, STEP or CUBICSPLINE."""
+
+
+class Channel(NamedTuple):
+    node: int
+    path: str
+    sampler: Sampler
+
+
+class Clip(NamedTuple):
+    name: str
+    channels: list[Channel]
+    start: float
+    """Seconds of the first keyframe."""
+    end: float
+    """Seconds of the last keyframe."""
+
+
+def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+    """The unit quaternion ``share`` of the shorter way from a to b, [4]."""
+    cosine = float(a @ b)
+    sign = -1.0 if cosine < 0.0 else 1.0
+    angle = float(np.arccos(min(abs(cosine), 1.0)))
+    if angle < 1e-6:  # sine and angle agree to 1e-13, and their quotient would be 0 / 0
+        mixed = (1.0 - share) * a + share * sign * b
+    else:
+        mixed = (np.sin((1.0 - share) * angle) * a + np.sin(share * angle) * sign * b) / np.sin(angle)
+    return mixed / np.linalg.norm(mixed)
+
+
+def interpolate(sampler: Sampler, seconds: float, rotation: bool = False) -> np.ndarray:
+    """[C] the curve at ``seconds``; before the first keyframe and after the last one it stands still."""
+    times, values = sampler.times, sampler.values
+    cubic = sampler.interpolation == "CUBICSPLINE"
+    if seconds <= times[0] or seconds >= times[-1]:
+        key = values[0] if seconds <= times[0] else values[-1]
+        return _unit(key[1] if cubic else key, rotation)
+    k = int(np.searchsorted(times, seconds, side="right")) - 1
+    if sampler.interpolation == "STEP":
+        return _unit(values[k], rotation)
+    step = float(times[k + 1] - times[k])
+    t = (seconds - float(times[k])) / step
+    if cubic:
+        before, after = values[k], values[k + 1]
+        result = (
+            (2 * t**3 - 3 * t**2 + 1) * before[1]
+            + step * (t**3 - 2 * t**2 + t) * before[2]
+            + (-2 * t**3 + 3 * t**2) * after[1]
+            + step * (t**3 - t**2) * after[0]
+        )
+        return _unit(result, rotation)
+    if rotation:
+        return slerp(_unit(values[k], True), _unit(values[k + 1], True), t)
+    return (1.0 - t) * values[k] + t * values[k + 1]
+
+
+def _unit(value: np.ndarray, rotation: bool) -> np.ndarray:
+    length = float(np.linalg.norm(value)) if rotation else 1.0
+    return value / length if length > 0 else np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def read_clips(file: GltfFile) -> list[Clip]:
+    """Every animation of the file, in its order; nameless ones are called ``animation_0`` and so on.
+
+    Raises:
+        UserError: a sampler cannot be used; the message names it.
+    """
+    clips = []
+    for index, animation in enumerate(file.document.animations or []):
+        channels = []
+        for number, channel in enumerate(animation.channels or []):
+            found = _channel(file, animation, channel, f"animations[{index}].channels[{number}]")
+            if found is not None:
+                channels.append(found)
+        times = [channel.sampler.times for channel in channels]
+        start = min((float(t[0]) for t in times), default=0.0)
+        end = max((float(t[-1]) for t in times), default=0.0)
+        clips.append(Clip(animation.name or f"animation_{index}", channels, start, end))
+    return clips
+
+
+def _channel(file: GltfFile, animation: Any, channel: Any, where: str) -> Channel | None:
+    target = channel.target
+    if target is None or target.node is None:
+        return None  # the specification asks to leave such channels out
+    path = target.path
+    if path not in PATHS and path != "weights":
+        return None  # of an extension
+    file.item("nodes", target.node, f"{where}.target.node")
+    samplers = animation.samplers or []
+    if not isinstance(channel.sampler, int) or not 0 <= channel.sampler < len(samplers):
+        raise file.error(f"{where}.sampler", f"is {channel.sampler!r} of {len(samplers)}; export the file again")
+    return Channel(target.node, path, _sampler(file, samplers[channel.sampler], path, where))
+
+
+def _sampler(file: GltfFile, sampler: Any, path: str, where: str) -> Sampler:
+    interpolation = sampler.interpolation or "LINEAR"
+    if interpolation not in ("LINEAR", "STEP", "CUBICSPLINE"):
+        raise file.error(where, f"is interpolated by {str(interpolation)[:30]}; use LINEAR, STEP or CUBICSPLINE")
+    times = file.array(sampler.input, f"{where} input", 1)[:, 0].astype(np.float64)
+    values = file.array(sampler.output, f"{where} output", PATHS.get(path)).astype(np.float64)
+    if not len(times) or (np.diff(times) <= 0).any():
+        raise file.error(where, "has keyframe times that do not increase; export the animation again")
+    parts = 3 if interpolation == "CUBICSPLINE" else 1
+    rows = len(times) * parts
+    if len(values) < rows or (path == "weights" and len(values) % rows) or (path in PATHS and len(values) != rows):
+        raise file.error(where, f"has {len(values)} values for {len(times)} {interpolation} keyframes; export it again")
+    shape = (len(times), parts, -1) if parts == 3 else (len(times), -1)
+    return Sampler(times, values.reshape(shape), interpolation)
+
+
+def choose_clip(file: GltfFile, clips: list[Clip], name: str | None) -> Clip | None:
+    """The clip of that name (case does not matter where it is the only one), the first without a name.
+
+    Returns:
+        None for a file without animations.
+
+    Raises:
+        UserError: there is no such clip; the message lists those there are.
+    """
+    if name is None:
+        return clips[0] if clips else None
+    if not clips:
+        raise UserError(f"--clip {name}: {file.path} holds no animation; leave out --clip")
+    found = [clip for clip in clips if clip.name == name]
+    found = found or [clip for clip in clips if clip.name.lower() == name.lower()]
+    if not found:
+        listed = ", ".join(f"{clip.name} ({clip.end - clip.start:.2f} s)" for clip in clips)
+        raise UserError(f"--clip {name}: {file.path} has no such clip; give one of: {listed}")
+    return found[0]

@@ -1,0 +1,253 @@
+"""glTF 2.0 files: numbers and images, out of a container that pygltflib parses.
+
+Everything that other files of this package take from a glTF document goes through ``GltfFile``, which knows where it
+came from: a message names the file and the field, as ``figure.glb: accessors[3].count``.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import logging
+import struct
+import warnings
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import cv2
+import numpy as np
+
+from ...errors import UserError
+from ...storage.files import parse_json, read_bytes
+from ...storage.safe_paths import inside, is_regular
+from ..images import bomb, whole
+from .schema import problem
+
+UNDERSTOOD = {
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+    "KHR_materials_unlit",
+    "KHR_materials_pbrSpecularGlossiness",
+    "EXT_texture_webp",
+}
+"""Extensions whose data are read; others matter only where a file requires them."""
+HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights")
+"""They change how light is reflected, not what moves where: left out even where required."""
+REMEDIES = {
+    "KHR_draco_mesh_compression": "export it again without Draco compression",
+    "EXT_meshopt_compression": "export it again without meshopt compression",
+    "KHR_texture_basisu": "export it again with PNG or JPEG textures",
+}
+COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+
+
+class GltfFile:
+    """A parsed .glb or .gltf: look-ups that explain themselves when they fail."""
+
+    def __init__(self, path: str | Path) -> None:
+        """
+        Raises:
+            UserError: there is no such file, it is no glTF 2.0, it requires an extension that is not read, or the
+                parser is not installed.
+        """
+        self.path = Path(path)
+        self._json = _checked(self.path)
+        self.document = _parse(self.path)
+        self._buffers: dict[int, bytes] = {}
+        self._digest = hashlib.sha256(self.path.read_bytes())
+        version = str(getattr(self.document.asset, "version", "") or "")
+        if not version.startswith("2."):
+            raise self.error("asset.version", f"is {version or 'missing'}; export it again as glTF 2.0")
+        for name in self.document.extensionsRequired or []:
+            if name not in UNDERSTOOD and not name.startswith(HARMLESS):
+                remedy = REMEDIES.get(name, "export it again without this extension")
+                raise self.error("extensionsRequired", f"names {name}, which is not supported; {remedy}")
+
+    def error(self, field: str, text: str) -> UserError:
+        """The error to raise: file, field, and what is wrong with it and how to put it right."""
+        return UserError(f"{self.path}: {field} {text}")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the file and of the files beside it that were read so far."""
+        return self._digest.hexdigest()
+
+    def item(self, kind: str, index: Any, field: str) -> Any:
+        """Element ``index`` of the document's list ``kind``; ``field`` is what refers to it."""
+        items = getattr(self.document, kind) or []
+        if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
+            raise self.error(field, f"is {index!r}, but there are {len(items)} {kind}; export the file again")
+        return items[index]
+
+    def node_weights(self, index: int) -> list[float] | None:
+        """``nodes[index].weights`` of morph targets, which the parser leaves out; None where there are none."""
+        return self._json["nodes"][index].get("weights")
+
+    def array(self, index: Any, field: str, components: int | None = None) -> np.ndarray:
+        """[count, components] of an accessor; matrices [count, 4, 4] row-major, as mathematicians write them.
+
+        float64 for floats and for normalised integers, else the integers themselves.
+        """
+        accessor = self.item("accessors", index, field)
+        where = f"accessors[{index}]"
+        width = COMPONENTS.get(accessor.type)
+        dtype = TYPES.get(accessor.componentType)
+        count = accessor.count
+        if width is None or dtype is None or not isinstance(count, int) or count < 0:
+            raise self.error(where, "has an unknown type, componentType or count; export the file again")
+        if components is not None and width != components:
+            raise self.error(where, f"is {accessor.type}, but {field} needs {components} components; export it again")
+        if accessor.bufferView is None:
+            raw = np.zeros((count, width), dtype)
+        else:
+            raw = self._strided(accessor.bufferView, accessor.byteOffset or 0, np.dtype(dtype), count, width, where)
+        if accessor.sparse is not None:
+            raw = self._with_sparse(raw, accessor.sparse, where)
+        values: np.ndarray = raw.astype(np.float64) if dtype is np.float32 else raw
+        if accessor.normalized and dtype is not np.float32:
+            largest = 2 ** (8 * raw.dtype.itemsize - (raw.dtype.kind == "i")) - 1
+            values = np.maximum(raw / float(largest), -1.0)
+        if values.dtype == np.float64 and not np.isfinite(values).all():
+            raise self.error(where, f"({field}) holds values that are not finite; repair the model and export it again")
+        return values.reshape(count, 4, 4).swapaxes(1, 2) if accessor.type == "MAT4" else values
+
+    def _strided(
+        self, view: int, offset: int, dtype: np.dtype, count: int, width: int, field: str, fixed: bool = False
+    ) -> np.ndarray:
+        data, stride = self.view(view, field)
+        size = dtype.itemsize * width
+        step = size if fixed or not stride else stride
+        needed = offset + step * (count - 1) + size if count else offset
+        if offset < 0 or step < size or needed > len(data):
+            raise self.error(field, f"needs {needed} bytes of a bufferView of {len(data)}; the file is damaged")
+        if count == 0:
+            return np.zeros((0, width), dtype)
+        strides = (step, dtype.itemsize)
+        return np.ndarray((count, width), dtype.newbyteorder("<"), data, offset, strides).astype(dtype)
+
+    def _with_sparse(self, raw: np.ndarray, sparse: Any, where: str) -> np.ndarray:
+        """The array with the elements that a sparse accessor replaces."""
+        kind = TYPES.get(sparse.indices.componentType)
+        if kind is None or not isinstance(sparse.count, int):
+            raise self.error(f"{where}.sparse", "has an unknown componentType or count; export the file again")
+        indices = self._strided(
+            sparse.indices.bufferView, sparse.indices.byteOffset or 0, np.dtype(kind), sparse.count, 1, where, True
+        )[:, 0]
+        values = self._strided(
+            sparse.values.bufferView, sparse.values.byteOffset or 0, raw.dtype, sparse.count, raw.shape[1], where, True
+        )
+        if len(indices) and int(indices.max()) >= len(raw):
+            raise self.error(f"{where}.sparse", f"names element {int(indices.max())} of {len(raw)}; export it again")
+        result = raw.copy()
+        result[indices] = values
+        return result
+
+    def view(self, index: Any, field: str) -> tuple[bytes, int]:
+        """(bytes, stride or 0) of a buffer view."""
+        view = self.item("bufferViews", index, f"{field}.bufferView")
+        data = self._buffer(view.buffer, f"bufferViews[{index}]")
+        start, length = view.byteOffset or 0, view.byteLength or 0
+        if start < 0 or start + length > len(data):
+            raise self.error(
+                f"bufferViews[{index}]", f"ends behind its buffer of {len(data)} bytes; the file is cut off"
+            )
+        return data[start : start + length], view.byteStride or 0
+
+    def _buffer(self, index: Any, field: str) -> bytes:
+        buffer = self.item("buffers", index, f"{field}.buffer")
+        if index not in self._buffers:
+            if buffer.uri:
+                self._buffers[index] = self.resource(buffer.uri, f"buffers[{index}].uri")
+            else:
+                self._buffers[index] = self.document.binary_blob() or b""
+        return self._buffers[index]
+
+    def resource(self, uri: str, field: str) -> bytes:
+        """What a URI stands for: data in the URI itself, or a file beside this one."""
+        if uri.startswith("data:"):
+            try:
+                return base64.b64decode(uri.partition(",")[2], validate=False)
+            except (binascii.Error, ValueError):
+                raise self.error(field, "is no valid base64; export the file again") from None
+        path = inside(self.path.parent, unquote(uri), f"{self.path}: {field}")
+        try:
+            if not is_regular(path):
+                raise OSError(None, "it is no file")
+            data = path.read_bytes()
+            self._digest.update(data)
+            return data
+        except OSError as error:
+            reason = error.strerror or type(error).__name__
+            raise self.error(
+                field, f"names {uri[:80]}, which cannot be read ({reason}); put it beside the file"
+            ) from None
+
+    def image(self, index: Any, field: str) -> np.ndarray:
+        """[H, W, 4] uint8 RGBA of an image."""
+        image = self.item("images", index, field)
+        where = f"images[{index}]"
+        data = self.resource(image.uri, f"{where}.uri") if image.uri else self.view(image.bufferView, where)[0]
+        claim = bomb(data)
+        if claim is not None:
+            raise self.error(where, f"says it is {claim} in {len(data)} bytes; export the file with smaller textures")
+        try:
+            raw = np.frombuffer(data, np.uint8)
+            pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if whole(raw) else None
+        except cv2.error:
+            pixels = None
+        if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+            kind = image.mimeType or "unknown type"
+            raise self.error(where, f"({kind}) does not decode; export the file with PNG or JPEG textures")
+        if pixels.dtype == np.uint16:
+            pixels = (pixels // 257).astype(np.uint8)
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        code = {1: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}.get(channels)
+        if code is None:
+            raise self.error(where, f"has {channels} channels; export the file with RGB or RGBA textures")
+        return np.ascontiguousarray(cv2.cvtColor(pixels, code))
+
+
+def _checked(path: Path) -> dict[str, Any]:
+    """The document as JSON, whose fields have the types that they should have."""
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give a .glb or .gltf with --mesh")
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        raise UserError(f"{path}: is no glTF by its name; give a .glb or .gltf (Blender exports them)")
+    data = read_bytes(path, "give a .glb or .gltf with --mesh")
+    try:
+        if path.suffix.lower() == ".glb":
+            magic, _, _, length = struct.unpack_from("<4sIII", data)
+            if magic != b"glTF" or 20 + length > len(data):
+                raise ValueError("cut short, or no GLB")
+            data = data[20 : 20 + length]
+        content = parse_json(data.decode("utf-8-sig"))
+    except (ValueError, struct.error) as error:
+        raise UserError(f"{path}: is no glTF that can be read ({str(error)[:80]}); export it again") from None
+    found = problem(content)
+    if found is not None:
+        raise UserError(f"{path}: {found[0]} {found[1]}; export the file again")
+    return content
+
+
+def _parse(path: Path) -> Any:
+    """pygltflib's document."""
+    try:
+        import pygltflib
+    except ImportError:
+        raise UserError(f'{path}: reading glTF needs pygltflib; pip install "scgs-warp[gltf]"') from None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            logging.disable(logging.WARNING)  # the parser logs what it then raises
+            document = pygltflib.GLTF2().load(path)
+    except Exception as error:  # struct, json, dataclasses, unicode: each raises its own
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        raise UserError(f"{path}: is no glTF that can be read ({reason}); export it again") from None
+    finally:
+        logging.disable(logging.NOTSET)
+    if document is None or document.asset is None:
+        raise UserError(f"{path}: asset is missing, so this is no glTF; export it again")
+    return document

@@ -1,0 +1,175 @@
+"""A glTF file as a moving triangle mesh: ``read_scene``, then ``GltfScene.posed`` at any instant. All float64."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .animation import Clip, choose_clip, interpolate, read_clips
+from .file import GltfFile
+from .geometry import Bone, Morph, Part, read_geometry
+from .materials import Material, Texture, read_materials
+from .nodes import Nodes
+
+UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""glTF (y up, a figure faces +z) to this package's worlds (z up, it faces -y)."""
+
+
+class Triangles(NamedTuple):
+    """What does not change with time."""
+
+    faces: np.ndarray
+    """[F, 3] int32"""
+    material: np.ndarray
+    """[F] int32"""
+    uv: np.ndarray
+    """[P, 2]"""
+    colors: np.ndarray
+    """[P, 4] linear"""
+
+
+class Vertices(NamedTuple):
+    """The mesh at an instant."""
+
+    positions: np.ndarray
+    """[P, 3]"""
+    normals: np.ndarray
+    """[P, 3] unit; zeros where faces are flat."""
+
+
+@dataclass
+class GltfScene:
+    """Everything that one clip of one file draws."""
+
+    path: Path
+    clips: list[Clip]
+    clip: Clip | None
+    """None: the file has no animation and nothing moves."""
+    nodes: Nodes
+    parts: list[Part]
+    palette: list[Bone]
+    morphs: list[Morph]
+    materials: list[Material]
+    """The last one is that of primitives without a material."""
+    textures: list[Texture]
+    triangles: Triangles
+    skipped: int
+    """Primitives that are points or lines and are not drawn."""
+    digest: str
+    """SHA-256 of everything that was read."""
+    world_from_gltf: np.ndarray
+    """[4, 4] applied to everything; ``UPRIGHT`` until somebody fits the scene into a room."""
+
+    def palette_at(self, seconds: float) -> np.ndarray:
+        """[B, 4, 4] the matrix that carries each bone's vertices.
+
+        ``world(joint) @ inverse_bind``; that of the node that holds a skinned mesh plays no part (glTF 2.0, 3.7.3.3).
+        """
+        world = self.nodes.world(self.clip, seconds)
+        return np.stack([self.world_from_gltf @ world[bone.node] @ bone.inverse_bind for bone in self.palette])
+
+    def posed(self, seconds: float) -> Vertices:
+        """Linear blend skinning of all vertices, at an instant of the clip."""
+        matrices = self.palette_at(seconds)
+        rest, normals = self._morphed(seconds)
+        blended = np.zeros((len(rest), 4, 4))
+        start = 0
+        for part in self.parts:
+            rows = slice(start, start + len(part.positions))
+            for k in range(part.bones.shape[1]):
+                blended[rows] += part.weights[:, k, None, None] * matrices[part.bones[:, k]]
+            start = rows.stop
+        linear = blended[:, :3, :3]
+        positions = np.einsum("pij,pj->pi", linear, rest) + blended[:, :3, 3]
+        return Vertices(positions, _turned(normals, linear))
+
+    def _morphed(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rest positions and normals [P, 3] with the morph targets of the instant added."""
+        rest = np.concatenate([part.positions for part in self.parts])
+        normals = np.concatenate([part.normals for part in self.parts])
+        curves = {c.node: c.sampler for c in (self.clip.channels if self.clip else []) if c.path == "weights"}
+        for morph in self.morphs:
+            weights = morph.weights
+            if morph.node in curves:
+                found = interpolate(curves[morph.node], seconds)
+                weights = np.zeros(len(weights))
+                weights[: len(found)] = found[: len(weights)]
+            rows = slice(morph.first, morph.first + morph.positions.shape[1])
+            rest[rows] += np.tensordot(weights, morph.positions, axes=1)
+            normals[rows] += np.tensordot(weights, morph.normals, axes=1)
+        return rest, normals
+
+
+def _turned(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """[P, 3] unit normals after the linear maps [P, 3, 3]: by cofactors, which exist where an inverse does not."""
+    a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    sign = np.where(np.einsum("pi,pi->p", a, cofactors[:, 0]) < 0, -1.0, 1.0)
+    turned = np.einsum("pij,pj->pi", cofactors, normals) * sign[:, None]
+    length = np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.where(length > 1e-30, turned / np.maximum(length, 1e-30), 0.0)
+
+
+def read_scene(path: str | Path, clip: str | None = None) -> GltfScene:
+    """Read a file and choose a clip.
+
+    Args:
+        path: .glb or .gltf.
+        clip: name of an animation; None: the first one.
+
+    Raises:
+        UserError: one line naming the file, the field and the remedy; for an unknown clip, those there are.
+    """
+    file = GltfFile(path)
+    clips = read_clips(file)
+    chosen = choose_clip(file, clips, clip)
+    nodes = Nodes(file)
+    if chosen is not None:
+        nodes.check_clip(chosen)
+    materials, textures = read_materials(file)
+    geometry = read_geometry(file, nodes, materials)
+    scene = GltfScene(
+        path=file.path,
+        clips=clips,
+        clip=chosen,
+        nodes=nodes,
+        parts=geometry.parts,
+        palette=geometry.palette,
+        morphs=geometry.morphs,
+        materials=materials,
+        textures=textures,
+        triangles=_triangles(geometry.parts),
+        skipped=geometry.skipped,
+        digest=file.digest,
+        world_from_gltf=UPRIGHT,
+    )
+    _face_outward(scene)
+    return scene
+
+
+def _triangles(parts: list[Part]) -> Triangles:
+    faces, material, count = [], [], 0
+    for part in parts:
+        faces.append(part.faces + count)
+        material.append(np.full(len(part.faces), part.material))
+        count += len(part.positions)
+    return Triangles(
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate(material).astype(np.int32),
+        np.concatenate([part.uv for part in parts]),
+        np.concatenate([part.colors for part in parts]),
+    )
+
+
+def _face_outward(scene: GltfScene) -> None:
+    """Turn round the triangles of mirrored nodes, whose winding the specification asks to read backwards."""
+    matrices = scene.palette_at(scene.clip.start if scene.clip else 0.0)
+    start = 0
+    for part in scene.parts:
+        rows = slice(start, start + len(part.faces))
+        if part.bones.shape[1] == 1 and len(part.bones) and np.linalg.det(matrices[part.bones[0, 0]]) < 0:
+            scene.triangles.faces[rows] = scene.triangles.faces[rows, ::-1]
+        start = rows.stop

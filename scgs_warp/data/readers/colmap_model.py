@@ -1,0 +1,217 @@
+"""COLMAP's sparse models, binary and text: cameras, poses of images, points. Of the observations nothing is kept.
+
+pycolmap gives the camera models their meaning, but does not read the files: it keeps every observation in memory, wants
+rigs and frames to agree with the images, and does not come back from some truncated files. Here nothing is believed
+before the file is known to be long enough.
+Format: https://colmap.github.io/format.html
+"""
+
+from __future__ import annotations
+
+import functools
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import UserError
+
+LONGEST_NAME = 4096
+
+
+class ModelCamera(NamedTuple):
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class ModelImage(NamedTuple):
+    name: str
+    camera: int
+    viewmat: np.ndarray
+    """[4, 4] world-to-camera, OpenCV."""
+
+
+class Model(NamedTuple):
+    cameras: dict[int, ModelCamera]
+    images: list[ModelImage]
+    points: np.ndarray
+    """[P, 3] float64"""
+    colors: np.ndarray
+    """[P, 3] in [0, 1]"""
+
+
+class _Damaged(Exception):
+    """What is wrong with a file, in a few words."""
+
+
+def find(folder: Path) -> Path | None:
+    """The folder of the model: the one with most about images, if COLMAP left several; None where there is none."""
+    places = [folder, *(folder / name for name in ("sparse", "colmap/sparse", "colmap_sparse", "colmap"))]
+    candidates = []
+    for place in places:
+        if place.is_dir():
+            inner = sorted(p for p in place.iterdir() if p.is_dir() and p.name.isdigit()) if place != folder else []
+            candidates += [place, *inner]
+    sizes = {place: max((file.stat().st_size for file in _files(place, "images")), default=-1) for place in candidates}
+    complete = [place for place in candidates if sizes[place] >= 0 and _files(place, "cameras")]
+    return max(complete, key=lambda place: sizes[place], default=None)
+
+
+def _files(place: Path, name: str) -> list[Path]:
+    return [place / f"{name}{suffix}" for suffix in (".bin", ".txt") if (place / f"{name}{suffix}").is_file()]
+
+
+def read_model(place: Path) -> Model:
+    """Cameras, images and points of the model in ``place``; binary if it is there, else text.
+
+    Raises:
+        UserError: a file is missing, or damaged.
+    """
+    suffix = ".bin" if _files(place, "cameras")[0].suffix == ".bin" and (place / "images.bin").is_file() else ".txt"
+    readers = _BINARY if suffix == ".bin" else _TEXT
+    cameras = _read(place / f"cameras{suffix}", readers[0])
+    images = _read(place / f"images{suffix}", readers[1])
+    file = place / f"points3D{suffix}"
+    points, colors = _read(file, readers[2]) if file.is_file() else (np.zeros((0, 3)), np.zeros((0, 3)))
+    if not images:
+        raise UserError(f"{place / f'images{suffix}'}: no image is registered; run COLMAP's mapper on better images")
+    for image in images:
+        if image.camera not in cameras:
+            raise UserError(
+                f"{place / f'images{suffix}'}: {image.name} is of camera {image.camera}, which cameras{suffix} does "
+                "not have; export the model again"
+            )
+    return Model(cameras, images, points, colors)
+
+
+def _read(file: Path, reader: Callable[[bytes], Any]) -> Any:
+    try:
+        return reader(file.read_bytes())
+    except FileNotFoundError:
+        raise UserError(f"{file}: no such file, though the rest of the model is here; export the model again") from None
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
+    except _Damaged as error:
+        raise UserError(f"{file}: {error}; export the model again") from None
+    except (struct.error, ValueError, IndexError, OverflowError):
+        raise UserError(f"{file}: truncated or damaged; export the model again") from None
+
+
+def _pose(quaternion: np.ndarray, translation: np.ndarray, name: str) -> np.ndarray:
+    """[4, 4] from wxyz and the translation of world-to-camera."""
+    with np.errstate(over="ignore"):  # infinite, and refused
+        length = float(np.linalg.norm(quaternion))
+    if not (np.isfinite(translation).all() and 0.99 < length < 1.01):  # NaN: no
+        raise _Damaged(f"the pose of {name[:60]!r} is no unit quaternion and translation of finite numbers")
+    w, x, y, z = quaternion / length
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmat[:3, 3] = translation
+    return viewmat
+
+
+def _model_names() -> dict[int, str]:
+    import pycolmap
+
+    return {int(value): name for name, value in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+
+
+@functools.cache
+def _parameter_count(model: str) -> int:
+    import pycolmap
+
+    return len(pycolmap.Camera(model=model, width=1, height=1).params_info.split(","))
+
+
+def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
+    names, cameras = _model_names(), {}
+    (count,), place = struct.unpack_from("<Q", data), 8
+    for _ in range(_believed(count, len(data) - place, 24)):
+        identity, model, width, height = struct.unpack_from("<iiQQ", data, place)
+        if model not in names:
+            raise _Damaged(f"camera {identity} is of model {model}, which is not known")
+        params = struct.unpack_from(f"<{_parameter_count(names[model])}d", data, place + 24)
+        place += 24 + 8 * len(params)
+        cameras[identity] = ModelCamera(names[model], width, height, params)
+    return cameras
+
+
+def _binary_images(data: bytes) -> list[ModelImage]:
+    images = []
+    (count,), place = struct.unpack_from("<Q", data), 8
+    for _ in range(_believed(count, len(data) - place, 73)):
+        values = struct.unpack_from("<i7di", data, place)
+        place += 64
+        end = data.index(b"\0", place, place + LONGEST_NAME)
+        name = data[place:end].decode("utf-8")
+        (observations,) = struct.unpack_from("<Q", data, end + 1)
+        place = end + 9 + 24 * _believed(observations, len(data) - end - 9, 24)
+        images.append(ModelImage(name, values[8], _pose(np.array(values[1:5]), np.array(values[5:8]), name)))
+    return images
+
+
+def _binary_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    (count,), place = struct.unpack_from("<Q", data), 8
+    count = _believed(count, len(data) - place, 51)
+    points, colors = np.empty((count, 3)), np.empty((count, 3))
+    unpack = struct.Struct("<Q3d3BdQ").unpack_from
+    for index in range(count):
+        values = unpack(data, place)
+        points[index], colors[index] = values[1:4], values[4:7]
+        place += 51 + 8 * _believed(values[8], len(data) - place - 51, 8)
+    return points, colors / 255.0
+
+
+def _believed(count: int, left: int, least: int) -> int:
+    """``count``, where the bytes that are left can hold so many of at least ``least`` bytes."""
+    if count * least > left:
+        raise _Damaged(f"truncated or damaged: lists {count} entries, more than the file holds")
+    return count
+
+
+def _lines(data: bytes) -> Iterator[str]:
+    return (line for line in data.decode("utf-8").removesuffix("\n").split("\n") if not line.startswith("#"))
+
+
+def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
+    cameras, names = {}, set(_model_names().values())
+    for words in (line.split() for line in _lines(data) if line.strip()):
+        if len(words) < 4 or words[1] not in names:
+            raise _Damaged(f"camera {words[0][:20]!r} is of no model that is known")
+        params = tuple(float(word) for word in words[4:])
+        if len(params) != _parameter_count(words[1]):
+            raise _Damaged(f"camera {words[0][:20]!r} has {len(params)} parameters, but {words[1]} another number")
+        cameras[int(words[0])] = ModelCamera(words[1], int(words[2]), int(words[3]), params)
+    return cameras
+
+
+def _text_images(data: bytes) -> list[ModelImage]:
+    images, lines = [], _lines(data)
+    for line in lines:
+        if not line.strip():
+            continue
+        words = line.split(maxsplit=9)
+        values = np.array([float(word) for word in words[1:8]])
+        images.append(ModelImage(words[9].strip(), int(words[8]), _pose(values[:4], values[4:], words[9])))
+        if next(lines, None) is None:  # the image's observations, an empty line if there are none
+            raise _Damaged(f"truncated after {words[9][:60]!r}: its line of observations is missing")
+    return images
+
+
+def _text_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    rows = [[float(word) for word in line.split(maxsplit=8)[1:7]] for line in _lines(data) if line.strip()]
+    table = np.array(rows, np.float64).reshape(len(rows), 6)
+    colors = table[:, 3:] / 255.0
+    return table[:, :3], np.where(np.isfinite(colors), colors, 0.5).clip(0.0, 1.0)
+
+
+_BINARY: tuple[Callable[[bytes], Any], ...] = (_binary_cameras, _binary_images, _binary_points)
+_TEXT: tuple[Callable[[bytes], Any], ...] = (_text_cameras, _text_images, _text_points)

@@ -1,0 +1,196 @@
+"""Reader of the Nerfies layout, which HyperNeRF and NeRF-DS share: one JSON file for each camera, images at scales.
+
+``dataset.json``: ``ids``, ``train_ids``, ``val_ids``; ``metadata.json``: for each id ``time_id``, or ``warp_id`` in
+older data; ``camera/ID.json``: ``orientation`` (world-to-camera, OpenCV), ``position``, ``focal_length``,
+``principal_point``, ``skew``, ``pixel_aspect_ratio``, ``radial_distortion``, ``tangential_distortion``,
+``image_size``; ``scene.json``: ``center`` and ``scale`` of the world; ``points.npy``; ``rgb/1x/ID.png``, ``rgb/2x`` ...
+Layout: Park et al., Nerfies, ICCV 2021; HyperNeRF, SIGGRAPH Asia 2021; Yan et al., NeRF-DS, CVPR 2023.
+
+The masks of NeRF-DS are black where something moves. They do not say where pixels are valid, and are left alone.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import UserError
+from ...storage.files import as_array, as_number, held_out, is_rotation, read_json, read_npy, size_text
+from ..assemble import Shot, assemble, with_points
+from ..dataset import Dataset
+from ..images import Look
+from ..lens import Lens, make_lens
+
+FILE = "dataset.json"
+SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+class World(NamedTuple):
+    """``scene.json``: scaled = (file - centre) * scale, as all programs that read this layout have it."""
+
+    centre: np.ndarray
+    scale: float
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder holds this layout."""
+    return (folder / FILE).is_file() and (folder / "camera").is_dir()
+
+
+def read(folder: Path, split: str, look: Look) -> Dataset:
+    """Read one split: the ids that ``dataset.json`` lists for it, with their own cameras and images.
+
+    ``test`` and ``val`` are ``val_ids``, never trained on. Where none are listed, every eighth of ``ids`` is held out.
+    Times are ``time_id``, from the first to the last of all listed frames.
+
+    Raises:
+        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+    """
+    listed, chosen = _ids(folder / FILE, split)
+    times = _times(folder / "metadata.json", listed)
+    world = _world(folder / "scene.json")
+    images, ratio = _images(folder / "rgb", look.downscale)
+    shots = []
+    for name in chosen:
+        path = folder / "camera" / f"{name}.json"
+        content = read_json(path, "each listed id needs its camera; restore it or drop the id from dataset.json")
+        file = next((images / f"{name}{s}" for s in SUFFIXES if (images / f"{name}{s}").is_file()), None)
+        shots.append(
+            Shot(
+                file if file is not None else images / f"{name}.png",
+                _viewmat(path, content, world),
+                times[name],
+                partial(_lens, path, content, ratio),
+                name,
+            )
+        )
+    data = assemble(shots, look._replace(downscale=max(1.0, look.downscale / ratio)), folder=folder, split=split)
+    return with_points(data, _points(folder / "points.npy", world), None)
+
+
+def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
+    """All ids that are listed anywhere, and those of this split."""
+    content = read_json(path)
+    lists: dict[str, list[str]] = {}
+    for key in ("ids", "train_ids", "val_ids"):
+        values = content.get(key, [])
+        if not isinstance(values, list) or not all(isinstance(item, (str, int)) for item in values):
+            raise UserError(f"{path}: {key} is no list of names; list the frames there")
+        lists[key] = list(dict.fromkeys(str(item) for item in values))
+        for item in lists[key]:
+            if not re.fullmatch(r"[\w.+=@, -]{1,200}", item) or item.strip() != item or item[0] == ".":
+                raise UserError(f"{path}: {key} holds {item[:40]!r}, which names no file; correct the id")
+    everything = list(dict.fromkeys([*lists["ids"], *lists["train_ids"], *lists["val_ids"]]))
+    if not everything:
+        raise UserError(f"{path}: ids, train_ids and val_ids are missing or empty; list the frames there")
+    outside = set(lists["val_ids"])
+    if outside and split != "train":
+        return everything, lists["val_ids"]
+    if outside:
+        chosen = [item for item in lists["train_ids"] or everything if item not in outside]
+        if not chosen:
+            raise UserError(f"{path}: train_ids are all among val_ids, nothing is left to train on; correct the lists")
+        return everything, chosen
+    pool = lists["train_ids"] or everything
+    return everything, [pool[index] for index in held_out(path, range(len(pool)), split)]
+
+
+def _times(path: Path, names: list[str]) -> dict[str, float]:
+    """[0, 1], from the first to the last time of all frames; in the order of the list where there is no metadata."""
+    if not path.is_file():
+        return {name: index / max(len(names) - 1, 1) for index, name in enumerate(names)}
+    content = read_json(path)
+    found: dict[str, float] = {}
+    for name in names:
+        entry = content.get(name)
+        key = "time_id" if isinstance(entry, dict) and "time_id" in entry else "warp_id"
+        value = as_number(entry.get(key)) if isinstance(entry, dict) else None
+        if value is None:
+            raise UserError(f"{path}: {name}.{key} is missing or no number; give every frame the number of its instant")
+        found[name] = value
+    first, last = min(found.values()), max(found.values())
+    return {name: (value - first) / (last - first) if last > first else 0.0 for name, value in found.items()}
+
+
+def _world(path: Path) -> World:
+    if not path.is_file():
+        return World(np.zeros(3), 1.0)
+    content = read_json(path)
+    centre, scale = as_array(content.get("center"), (3,)), as_number(content.get("scale"))
+    if centre is None:
+        raise UserError(f"{path}: center is missing or not three numbers; restore it, or remove the file")
+    if scale is None or scale <= 0:
+        raise UserError(f"{path}: scale is missing or no positive number; restore it, or remove the file")
+    return World(centre, scale)
+
+
+def _images(folder: Path, downscale: float) -> tuple[Path, int]:
+    """The folder of images to read, and how much smaller than the cameras' size they are: the smallest images that are
+    large enough, or the largest there are."""
+    found = {}
+    for place in folder.iterdir() if folder.is_dir() else ():
+        match = re.fullmatch(r"([1-9][0-9]{0,2})x", place.name)
+        if match and place.is_dir():
+            found[int(match[1])] = place
+    if not found:
+        raise UserError(f"{folder}: no folder of images, 1x, 2x, 4x ...; put the images of full size into {folder}/1x")
+    ratio = max([ratio for ratio in found if ratio <= downscale], default=min(found))
+    return found[ratio], ratio
+
+
+def _viewmat(path: Path, content: dict[str, Any], world: World) -> np.ndarray:
+    rotation, position = as_array(content.get("orientation"), (3, 3)), as_array(content.get("position"), (3,))
+    if rotation is None or not is_rotation(rotation):
+        raise UserError(f"{path}: orientation is no rotation of 3 x 3 numbers; correct it or drop the id")
+    if position is None:
+        raise UserError(f"{path}: position is not three finite numbers; correct it or drop the id")
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ ((position - world.centre) * world.scale)
+    return viewmat
+
+
+def _lens(path: Path, content: dict[str, Any], ratio: int, source: tuple[int, int]) -> Lens:
+    """The lens at the size of the images that are read, ``ratio`` times smaller than the camera's."""
+    size = as_array(content.get("image_size"), (2,))
+    if size is None or (size < 1).any():
+        raise UserError(f"{path}: image_size is not two positive numbers; give width and height in pixels")
+    if (np.abs(size / ratio - source) > 1.0).any():
+        raise UserError(
+            f"{path}: image_size is {size[0]:g} x {size[1]:g}, but the images in rgb/{ratio}x are {size_text(source)}; "
+            "they must be that many times smaller; correct the camera or resize the images"
+        )
+    focal, centre = as_number(content.get("focal_length")), as_array(content.get("principal_point"), (2,))
+    aspect, skew = as_number(content.get("pixel_aspect_ratio", 1.0)), as_number(content.get("skew", 0.0))
+    if focal is None or focal <= 0 or aspect is None or aspect <= 0:
+        raise UserError(f"{path}: focal_length or pixel_aspect_ratio is missing or no positive number; give pixels")
+    if centre is None or skew is None:
+        raise UserError(f"{path}: principal_point or skew is missing or no number; give pixels")
+    radial = as_array(content.get("radial_distortion", [0.0] * 3), (2,), (3,), (4,))
+    tangential = as_array(content.get("tangential_distortion", content.get("tangential", [0.0] * 2)), (2,))
+    if radial is None or tangential is None or (len(radial) == 4 and radial[3] != 0):
+        raise UserError(
+            f"{path}: radial_distortion must be three numbers, tangential_distortion two; correct them, or undistort "
+            "the images and leave them out"
+        )
+    k1, k2, k3 = (*radial, 0.0)[:3]
+    sx, sy = source / size
+    fx, fy, cx, cy = focal * sx, focal * aspect * sy, centre[0] * sx, centre[1] * sy
+    params = tuple(map(float, (fx, fy, cx, cy, k1, k2, *tangential, k3, 0.0, 0.0, 0.0)))
+    try:
+        return make_lens("FULL_OPENCV", params, skew * sx)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}; correct the camera or drop the id") from None
+
+
+def _points(path: Path, world: World) -> np.ndarray | None:
+    if not path.is_file():
+        return None
+    points = read_npy(path)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise UserError(f"{path}: has shape {list(points.shape)}; give [P, 3] positions, or remove the file")
+    return (points - world.centre) * world.scale

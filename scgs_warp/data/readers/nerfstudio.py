@@ -1,0 +1,156 @@
+"""Reader of the nerfstudio layout: one ``transforms.json`` for all frames, with intrinsics, poses, and maybe points.
+
+``fl_x, fl_y, cx, cy, w, h`` (pixels; for all frames or in each), per frame ``file_path``, ``transform_matrix``
+(camera-to-world, OpenGL), ``time`` in [0, 1] and ``mask_path``; ``ply_file_path``, sparse points in the frame of the
+poses; ``train_filenames``, ``val_filenames``, ``test_filenames``; ``camera_model`` and ``k1`` ... ``k6, p1, p2``, or
+``distortion_params``, for all frames or in each: such images are undistorted.
+Layout: Tancik et al., Nerfstudio, SIGGRAPH 2023.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import UserError
+from ...storage.files import by_name, held_out
+from ...storage.safe_paths import inside
+from ...types import Camera
+from ..assemble import Shot, assemble, video_border, with_points
+from ..dataset import Dataset
+from ..images import Look
+from ..points import read_points
+from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
+
+FILE = "transforms.json"
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder holds this layout."""
+    return (folder / FILE).is_file()
+
+
+def read(folder: Path, split: str, look: Look) -> Dataset:
+    """Read one split.
+
+    Frames without a time are taken to be evenly spaced in the order of their names (9 before 10). Without lists of
+    files every eighth frame is held out, for ``test`` and ``val`` alike; with lists that leave out one of these two, or
+    leave it empty, it is the other. A frame's mask is False where ``mask_path`` is black, and on borders that
+    undistortion left.
+
+    Raises:
+        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+    """
+    path = folder / FILE
+    content = read_transforms(path)
+    entries = content["frames"]
+    files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
+    times = _times(path, entries, files)
+    for entry in entries:
+        read_distortion(path, {**content, **entry})
+    chosen = _chosen(path, content, files, split)
+    shots = [_shot(path, folder, content, index, files[index], times[index]) for index in chosen]
+    border = video_border(files, times)
+    data = assemble(shots, look, folder=folder, split=split, one_size=True, border=border)
+    return with_points(data, *_points(path, folder, content, data.cameras))
+
+
+def _shot(path: Path, folder: Path, content: dict[str, Any], index: int, file: Path, time: float) -> Shot:
+    entry = content["frames"][index]
+    fields = {**content, **entry}
+    mask = entry.get("mask_path")
+    if mask is not None and not (isinstance(mask, str) and mask):
+        raise UserError(f"{path}: frames[{index}].mask_path is no text; name the mask's file or leave it out")
+    return Shot(
+        file,
+        read_pose(path, index, entry),
+        time,
+        partial(read_lens, path, fields, index),
+        file.stem,
+        None if mask is None else inside(folder, mask, f"{path}: frames[{index}].mask_path", "mask"),
+    )
+
+
+def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list[float]:
+    if any("time" in entry for entry in entries):
+        return read_times(path, entries)
+    order = by_name(files)
+    last = max(len(files) - 1, 1)
+    times = [0.0] * len(files)
+    for place, index in enumerate(order):
+        times[index] = place / last
+    return times
+
+
+def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) -> list[int]:
+    """Indices of the frames of this split, in the order of the file."""
+    lists = {name: content[f"{name}_filenames"] for name in ("train", "val", "test") if f"{name}_filenames" in content}
+    for name in ("val", "test"):  # exporters write all three lists, whether or not they hold frames out twice
+        if lists.get(name) == []:
+            del lists[name]
+    if not lists:
+        return held_out(path, by_name(files), split)
+    substitute = {"val": "test", "test": "val"}.get(split, split)
+    name = split if split in lists else substitute
+    if name not in lists:
+        raise UserError(f"{path}: {split}_filenames is missing while other splits are listed; list the files there")
+    listed = lists[name]
+    if not isinstance(listed, list) or not listed or not all(isinstance(item, str) for item in listed):
+        raise UserError(f"{path}: {name}_filenames is empty or no list of file names; name at least one frame's file")
+    known = {entry["file_path"]: index for index, entry in enumerate(content["frames"])}
+    for item in listed:
+        if item not in known:
+            raise UserError(
+                f"{path}: {name}_filenames names {item!r}, which no frame has as file_path; write it as the frame does"
+            )
+    return sorted({known[item] for item in listed})
+
+
+def _points(
+    path: Path, folder: Path, content: dict[str, Any], cameras: list[Camera]
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Points [P, 3] in the frame of the poses and their colours [P, 3], where the file names any."""
+    name = content.get("ply_file_path")
+    if name is None:
+        return None, None
+    if not isinstance(name, str) or not name:
+        raise UserError(f"{path}: ply_file_path is no text; name the file of points or leave it out")
+    points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
+    moved = _applied(path, content, points)
+    # Writers disagree whether the transform that was applied to the poses was applied to the points, too.
+    if moved is not None and _seen(moved, cameras) > _seen(points, cameras):
+        points = moved
+    return points, colors
+
+
+def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndarray | None:
+    """The points after ``applied_transform`` and ``applied_scale``; None where the file has neither."""
+    if "applied_transform" not in content and "applied_scale" not in content:
+        return None
+    try:
+        matrix = np.array(content.get("applied_transform", np.eye(4)), np.float64)
+        scale = float(content.get("applied_scale", 1.0))
+    except (ValueError, TypeError, OverflowError):
+        matrix, scale = np.zeros(0), 0.0
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all() or not (np.isfinite(scale) and scale > 0):
+        raise UserError(
+            f"{path}: applied_transform must be 3 or 4 rows of 4 numbers, and applied_scale a positive number; "
+            "correct them or leave them out"
+        )
+    return (points @ matrix[:3, :3].T + matrix[:3, 3]) * scale
+
+
+def _seen(points: np.ndarray, cameras: list[Camera]) -> int:
+    """In how many (point, camera) pairs the point falls into the image."""
+    total = 0
+    for camera in cameras:
+        viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
+        local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        ahead = local[local[:, 2] > 1e-9]
+        pixels = ahead @ K.T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        total += int(((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1).sum())
+    return total

@@ -1,0 +1,131 @@
+"""Reader of the layout of Neural 3D Video: ``poses_bounds.npy`` of LLFF for a rig of cameras, and each camera's images.
+
+``poses_bounds.npy [C, 17]``: rows of 3 x 5, the camera-to-world rotation in columns (down, right, backwards),
+position, and (height, width, focal length) in pixels; nearest and farthest depth. Row c belongs to the c-th camera in
+the order of names: ``cam00/images/0000.png``, ``cam00/0000.png`` or ``frames/cam00/0000.png``. Layout: Mildenhall
+et al., LLFF, 2019; Li et al., Neural 3D Video Synthesis, CVPR 2022.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import UserError
+from ...storage.files import is_rotation, natural, read_npy, size_text
+from ..assemble import Shot, assemble, with_points
+from ..dataset import Dataset
+from ..images import Look
+from ..lens import Lens
+from ..points import read_points
+from .transforms import SUFFIXES
+
+FILE = "poses_bounds.npy"
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
+HELD_OUT = 0
+"""The camera that is held out: the central one of Neural 3D Video, and what others report."""
+POINTS = ("points3D.ply", "points3D_downsample2.ply", "points3d.ply")
+TALLER = 0.01
+"""Largest relative difference between the reductions of width and height that rounding explains."""
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder holds this layout."""
+    return (folder / FILE).is_file()
+
+
+def read(folder: Path, split: str, look: Look) -> Dataset:
+    """Read one split: the first camera is ``test`` and ``val``, the others are trained on.
+
+    All cameras share the times, the place of each image in the order of names.
+
+    Raises:
+        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+    """
+    path = folder / FILE
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) < 2:
+        raise UserError(
+            f"{path}: has shape {list(rows.shape)}; give [C, 17] with one row for each of two or more cameras"
+        )
+    cameras = _cameras(folder)
+    if len(cameras) != len(rows):
+        raise UserError(
+            f"{path}: has {len(rows)} rows, but {folder} holds {len(cameras)} folders of images "
+            f"({cameras[0].name} to {cameras[-1].name}); give each camera a row and a folder"
+        )
+    chosen = [index for index in range(len(cameras)) if (index == HELD_OUT) != (split == "train")]
+    files = [_files(camera) for camera in cameras]
+    shots = []
+    for index in chosen:
+        if len(files[index]) != len(files[HELD_OUT]):
+            raise UserError(
+                f"{cameras[index]}: holds {len(files[index])} images, but {cameras[HELD_OUT].name} "
+                f"{len(files[HELD_OUT])}; all cameras need the same instants"
+            )
+        viewmat = _viewmat(path, index, rows[index, :15].reshape(3, 5))
+        lens = partial(_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4])
+        last = max(len(files[index]) - 1, 1)
+        for place, file in enumerate(files[index]):
+            shots.append(Shot(file, viewmat, place / last, lens, f"{_label(folder, cameras[index])}_{file.stem}"))
+    data = assemble(shots, look, folder=folder, split=split)
+    points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
+    return data if points is None else with_points(data, *read_points(points))
+
+
+def _label(folder: Path, camera: Path) -> str:
+    """The camera's name, where the folder of its images is called ``images``."""
+    parts = camera.relative_to(folder).parts
+    return parts[-2] if parts[-1] == "images" else parts[-1]
+
+
+def _cameras(folder: Path) -> list[Path]:
+    """The cameras' folders of images, in the order of their names."""
+    base = folder / "frames" if (folder / "frames").is_dir() else folder
+    found = []
+    for place in sorted((p for p in base.iterdir() if p.is_dir()), key=lambda p: natural(p.name)):
+        inner = place / "images" if (place / "images").is_dir() else place
+        if _files(inner):
+            found.append(inner)
+    if found:
+        return found
+    videos = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in VIDEOS)
+    if videos:
+        stem = Path(videos[0]).stem
+        raise UserError(
+            f"{folder / videos[0]}: a video, not images; unpack each, for example: mkdir -p {folder / stem}/images && "
+            f"ffmpeg -i {folder / videos[0]} {folder / stem}/images/%04d.png"
+        )
+    raise UserError(f"{base}: no folder of images for any camera; put them into cam00/images, cam01/images, ...")
+
+
+def _files(folder: Path) -> list[Path]:
+    files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES]
+    return sorted(files, key=lambda p: natural(p.name))
+
+
+def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
+    """[4, 4] world-to-camera, OpenCV."""
+    down, right, backwards, position = pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3]
+    rotation = np.stack([right, down, -backwards])
+    if not np.isfinite(pose).all() or not is_rotation(rotation):
+        raise UserError(f"{path}: row {index} holds no rotation of finite numbers; restore the file")
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    return viewmat
+
+
+def _lens(path: Path, index: int, column: np.ndarray, source: tuple[int, int]) -> Lens:
+    """The lens of images that may be smaller than those the rig was calibrated with."""
+    height, width, focal = column
+    if min(height, width, focal) < 1:
+        raise UserError(f"{path}: row {index} has no positive height, width and focal length; restore the file")
+    sx, sy = source[0] / width, source[1] / height
+    if abs(sx / sy - 1.0) > TALLER:
+        raise UserError(
+            f"{path}: row {index} is of {width:g} x {height:g} pixels, but the images are {size_text(source)}; "
+            "reduce width and height alike"
+        )
+    return Lens(focal * sx, focal * sy, 0.5 * source[0], 0.5 * source[1])

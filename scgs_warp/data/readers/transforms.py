@@ -1,0 +1,189 @@
+"""What the ``transforms*.json`` layouts share: poses, times, intrinsics, lenses, and errors that name the field.
+
+Poses are camera-to-world, OpenGL (x right, y up, z backward), as NeRF's Blender scenes and nerfstudio write them.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import UserError
+from ...storage.files import as_number, is_rotation, read_json, size_text
+from ...storage.safe_paths import inside
+from ..lens import Lens, make_lens
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""What ``distortion_params`` lists, in nerfstudio's order."""
+PERSPECTIVES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Camera models (COLMAP's and nerfstudio's names) that are a pinhole where all distortion is 0: r, tangential, and with
+FULL_OPENCV a quotient of polynomials."""
+FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+"""Those in which the angle to the optical axis, times a polynomial, is the distance from the centre."""
+
+
+def read_transforms(path: Path) -> dict[str, Any]:
+    """The JSON object in ``path``, with at least one frame; UserError otherwise."""
+    content = read_json(path, "this split needs it, or choose another split")
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"{path}: 'frames' is missing, empty or no list; list at least one frame there")
+    for index, entry in enumerate(frames):
+        if not isinstance(entry, dict):
+            raise UserError(f"{path}: frames[{index}] is no object; give file_path and transform_matrix")
+    return content
+
+
+def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
+    """[4, 4] float64 world-to-camera, OpenCV."""
+    where = f"{path}: frames[{index}].transform_matrix"
+    if "transform_matrix" not in entry:
+        raise UserError(f"{where} is missing; give the 4 x 4 camera-to-world matrix")
+    try:
+        matrix = np.array(entry["transform_matrix"], np.float64)
+    except (ValueError, TypeError, OverflowError):
+        raise UserError(f"{where} is not a matrix of numbers; give 4 rows of 4 numbers") from None
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4):
+        raise UserError(f"{where} has shape {list(matrix.shape)}; give 4 rows of 4 numbers")
+    if not np.isfinite(matrix).all():
+        raise UserError(f"{where} holds NaN or infinity; correct the pose or drop the frame")
+    if not is_rotation(matrix[:3, :3]) or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise UserError(
+            f"{where} is not rigid (scaled, sheared, mirrored, or last row not 0 0 0 1); "
+            "give a rotation and a translation, or drop the frame"
+        )
+    return np.linalg.inv(matrix @ OPENGL_TO_OPENCV)
+
+
+def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
+    """Every frame's time in [0, 1]; where no frame has one, evenly spread in the order of the file."""
+    given = ["time" in entry for entry in entries]
+    if not any(given):
+        last = max(len(entries) - 1, 1)
+        return [index / last for index in range(len(entries))]
+    times = []
+    for index, entry in enumerate(entries):
+        where = f"{path}: frames[{index}].time"
+        if "time" not in entry:
+            raise UserError(f"{where} is missing while other frames have one; give every frame a time, or none")
+        time = as_number(entry["time"])
+        if time is None:
+            raise UserError(f"{where} is {str(entry['time'])[:40]!r}, not a number; give a number from 0 to 1")
+        if not 0.0 <= time <= 1.0:
+            raise UserError(f"{where} is {time:g}, outside [0, 1]; divide all times by the last one")
+        times.append(time)
+    return times
+
+
+def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path:
+    """The frame's image; a name without suffix is completed."""
+    name = entry.get("file_path")
+    if not isinstance(name, str) or not name:
+        raise UserError(f"{path}: frames[{index}].file_path is missing or no text; name the image file")
+    base = inside(folder, name, f"{path}: frames[{index}].file_path", "image")
+    if base.suffix.lower() in SUFFIXES or base.is_file():
+        return base
+    candidates = [base.with_name(base.name + suffix) for suffix in SUFFIXES]
+    return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
+
+
+def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and what follows (fx, fy, cx, cy) among its parameters. ``fields``: the file's, and a frame's over
+    them.
+
+    Raises:
+        UserError: a camera model that is not known, or parameters that are none of its.
+    """
+    name = fields.get("camera_model")
+    if name is not None and (not isinstance(name, str) or name.upper() not in (*PERSPECTIVES, *FISHEYES)):
+        raise UserError(
+            f"{path}: camera_model is {str(name)[:40]!r}, which is not supported; "
+            f"undistort the images to one of {', '.join((*PERSPECTIVES, *FISHEYES))}"
+        )
+    values = {key: _parameter(path, key, fields.get(key, 0.0)) for key in DISTORTION}
+    listed = fields.get("distortion_params")
+    if listed is not None:
+        if not isinstance(listed, list) or len(listed) > len(LISTED):
+            raise UserError(
+                f"{path}: distortion_params is {repr(listed)[:60]}; give up to six numbers, {', '.join(LISTED)}"
+            )
+        values |= {key: _parameter(path, f"distortion_params ({key})", value) for key, value in zip(LISTED, listed)}
+    k1, k2, k3, k4, k5, k6, p1, p2 = values.values()
+    if not any(values.values()) and (name is None or name.upper() in PERSPECTIVES) and not fields.get("is_fisheye"):
+        return "PINHOLE", ()
+    if fields.get("is_fisheye") or (name is not None and name.upper() in FISHEYES):
+        kind, unused = "OPENCV_FISHEYE", ("k5", "k6", "p1", "p2")
+    else:
+        kind, unused = "FULL_OPENCV", () if name is not None and name.upper() == "FULL_OPENCV" else ("k4", "k5", "k6")
+    for key in unused:
+        if values[key] != 0.0:
+            raise UserError(
+                f"{path}: {key} is {values[key]:g}, a lens distortion that camera_model {name} does not have; "
+                "name the model that was calibrated, or undistort the images and set it to 0"
+            )
+    return kind, (k1, k2, k3, k4) if kind == "OPENCV_FISHEYE" else (k1, k2, p1, p2, k3, k4, k5, k6)
+
+
+def _parameter(path: Path, key: str, value: Any) -> float:
+    number = as_number(value)
+    if number is None:
+        raise UserError(f"{path}: {key} is {str(value)[:40]!r}, no number; give the lens distortion, or 0")
+    return number
+
+
+def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int, int]) -> Lens:
+    """The lens at the files' size, from ``fields`` of the file and of a frame over them.
+
+    Raises:
+        UserError: intrinsics are missing, no numbers, or of images of another size than ``source`` (width, height).
+    """
+    fx, fy, cx, cy = read_intrinsics(path, fields, index, source)
+    model, further = read_distortion(path, fields)
+    if model == "PINHOLE":
+        return Lens(fx, fy, cx, cy)
+    try:
+        return make_lens(model, (fx, fy, cx, cy, *further))
+    except ValueError as error:
+        raise UserError(f"{path}: frames[{index}]: {error}; correct the lens, or undistort the images") from None
+
+
+def read_intrinsics(
+    path: Path, fields: dict[str, Any], index: int, source: tuple[int, int]
+) -> tuple[float, float, float, float]:
+    """(fx, fy, cx, cy) in pixels of the file's full size."""
+
+    def number(key: str, default: float | None = None, positive: bool = False) -> float:
+        if key not in fields and default is not None:
+            return default
+        value = as_number(fields.get(key))
+        if value is None or (positive and value <= 0):
+            kind = "positive number" if positive else "number"
+            raise UserError(f"{path}: {key} (frame {index}) is missing or no {kind}; give it in pixels")
+        return value
+
+    width, height = source
+    for key, actual in (("w", width), ("h", height)):
+        if key in fields and number(key) != actual:
+            raise UserError(
+                f"{path}: {key} is {fields[key]}, but the images are {size_text(source)}; "
+                "correct w and h together with the intrinsics, or resize the images"
+            )
+    if "fl_x" in fields:
+        fx = number("fl_x", positive=True)
+        fy = number("fl_y", fx, positive=True)
+    elif "camera_angle_x" in fields:
+        angle = as_number(fields["camera_angle_x"])
+        if angle is None or not 0.0 < angle < math.pi:
+            raise UserError(f"{path}: camera_angle_x is {fields['camera_angle_x']!r}; give radians between 0 and pi")
+        fx = fy = 0.5 * width / math.tan(0.5 * angle)
+    else:
+        raise UserError(f"{path}: neither camera_angle_x nor fl_x is given; add the field of view in radians")
+    return fx, fy, number("cx", 0.5 * width), number("cy", 0.5 * height)

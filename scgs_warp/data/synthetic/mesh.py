@@ -1,0 +1,178 @@
+"""A glTF scene fitted into a room and made ready for rays: one of the subjects that ``synthesis`` writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from ...errors import UserError
+from ...kernels import raycast_mesh as kernels
+from ...runtime.launch import launch
+from ...types import Camera
+from ..gltf.scene import GltfScene
+from .raycast import TOLERANCE, mesh_over, window
+from .renderer import ROOM, SurfacePoints, points_on_triangles
+
+FIT_TIMES = 101
+"""Instants of the clip that are looked at to find out how much room it takes."""
+NUDGE = 1e-5
+"""Times the room's radius: how far behind a surface that did not stop it a ray goes on."""
+FAR = 1000.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """The one light, and how surfaces answer it."""
+
+    light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
+    """Direction to the light, world (z up, the subject faces -y)."""
+    ambient: float = 0.5
+    diffuse: float = 0.5
+    """Light of a surface = ambient x (0.75 .. 1, more from above) + diffuse x cosine, in linear light."""
+    unlit: bool = False
+    """Show bare base colours."""
+
+
+class Posed(NamedTuple):
+    """The mesh at one instant, ready for queries."""
+
+    mesh: wp.Mesh
+    vertices: Tensor
+    """[P, 3] world; the mesh lies over this memory."""
+    normals: Tensor
+    """[P, 3]"""
+
+
+def decoding() -> np.ndarray:
+    """[256] float32 linear value of an sRGB byte (IEC 61966-2-1)."""
+    x = np.arange(256) / 255.0
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+class MeshSubject:
+    """Poses, pictures and tracks of a glTF scene; ``time`` from 0 to 1 goes through ``span`` seconds of its clip."""
+
+    def __init__(self, scene: GltfScene, span: tuple[float, float], look: Look, device: str = "cpu") -> None:
+        """
+        Raises:
+            UserError: the scene has no extent, or the light no direction.
+        """
+        self.scene = scene
+        self.span = span
+        self.look = look
+        self.device = device
+        self._fit()
+        direction = np.asarray(look.light, np.float64)
+        if not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
+            raise UserError("--light: give a direction that is not zero, as --light -0.4 -0.6 0.7")
+        triangles = scene.triangles
+        self.faces = torch.from_numpy(triangles.faces.reshape(-1).copy()).to(device)
+        self.material = torch.from_numpy(triangles.material).to(device)
+        self.uv = self._tensor(triangles.uv)
+        self.colors = self._tensor(triangles.colors)
+        self.light = self._tensor(direction[None] / np.linalg.norm(direction))
+        self.decode = self._tensor(decoding())
+        self._upload_materials()
+
+    def _tensor(self, values) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(self.device)
+
+    def seconds(self, time: float) -> float:
+        """Of the clip."""
+        return self.span[0] + time * (self.span[1] - self.span[0])
+
+    def _fit(self) -> None:
+        """Move and scale the scene so that it stays in a ball of radius ``ROOM`` around the origin at all times."""
+        times = np.linspace(0.0, 1.0, FIT_TIMES if self.scene.clip else 1)
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for time in times:
+            positions = self.scene.posed(self.seconds(float(time))).positions
+            low, high = np.minimum(low, positions.min(0)), np.maximum(high, positions.max(0))
+        centre = (low + high) / 2
+        radius = 0.0
+        for time in times:
+            positions = self.scene.posed(self.seconds(float(time))).positions
+            radius = max(radius, float(np.linalg.norm(positions - centre, axis=1).max()))
+        if not np.isfinite(radius) or radius <= 0.0:
+            raise UserError(f"{self.scene.path}: meshes have no extent (radius {radius:g}); export a surface")
+        fitted = np.eye(4)
+        fitted[:3, :3] *= ROOM / radius
+        fitted[:3, 3] = -centre * ROOM / radius
+        self.scene.world_from_gltf = fitted @ self.scene.world_from_gltf
+
+    def _upload_materials(self) -> None:
+        materials, textures = self.scene.materials, self.scene.textures
+        kinds = [(m.texture, m.alpha_mode, int(m.double_sided), int(m.unlit or self.look.unlit)) for m in materials]
+        self.factors = self._tensor([m.factor for m in materials])
+        self.cutoffs = self._tensor([m.cutoff for m in materials])
+        self.kinds = torch.tensor(kinds, dtype=torch.int32, device=self.device)
+        rows, texels, offset = [], [], 0
+        for texture in textures:
+            height, width = texture.pixels.shape[:2]
+            rows.append((offset, width, height, *texture.wrap, int(texture.nearest)))
+            texels.append(texture.pixels.reshape(-1, 4))
+            offset += width * height
+        if not textures:  # an array with no element has no address
+            rows, texels = [(0, 1, 1, 0, 0, 0)], [np.zeros((1, 4), np.uint8)]
+        self.textures = torch.tensor(rows, dtype=torch.int32, device=self.device)
+        self.texels = torch.from_numpy(np.concatenate(texels)).to(self.device)
+
+    def _surface(self) -> tuple[Tensor, ...]:
+        """What both kernels take to know the surface."""
+        return (self.uv, self.colors, self.material, self.factors, self.kinds, self.cutoffs, self.texels,
+                self.textures, self.decode)  # fmt: skip
+
+    def pose(self, time: float) -> Posed:
+        """The scene at ``time`` in [0, 1]."""
+        vertices = self.scene.posed(self.seconds(time))
+        points, normals = self._tensor(vertices.positions), self._tensor(vertices.normals)
+        return Posed(mesh_over(points, self.faces), points, normals)
+
+    def render(self, posed: Posed, camera: Camera, samples: int) -> Tensor:
+        """[H, W, 4] premultiplied colour and coverage, ``samples`` x ``samples`` rays a pixel."""
+        image = torch.zeros(camera.height, camera.width, 4, device=self.device)
+        left, top, columns, rows = window(posed.vertices, camera)
+        camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
+        launch(
+            kernels.raycast_mesh, columns * rows, posed.mesh.id, self.faces, posed.normals, *self._surface(),
+            self.light, self.look.ambient, self.look.diffuse, camera_to_world, camera.K.to(self.device), left, top,
+            columns, samples, NUDGE * ROOM, FAR, image, grain=64,
+        )  # fmt: skip
+        return image
+
+    def visible(self, posed: Posed, camera: Camera, points: Tensor) -> Tensor:
+        """[P] bool: which surface points [P, 3] the camera sees."""
+        seen = torch.empty(len(points), dtype=torch.int32, device=self.device)
+        launch(
+            kernels.visible_on_mesh, len(points), posed.mesh.id, points, self.faces, *self._surface(),
+            camera.viewmat.to(self.device), camera.K.to(self.device), camera.width, camera.height, TOLERANCE,
+            NUDGE * ROOM, seen,
+        )  # fmt: skip
+        return seen.bool()
+
+    def sample(self, count: int, rng: np.random.Generator) -> SurfacePoints:
+        """Points spread evenly by area over the surface at time 0.
+
+        Raises:
+            UserError: it has no area then.
+        """
+        positions = self.scene.posed(self.seconds(0.0)).positions
+        a, b, c = positions[self.scene.triangles.faces].transpose(1, 0, 2)
+        if not np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() > 0:
+            second = f"{self.seconds(0.0):g}"
+            raise UserError(f"{self.scene.path}: the surface has no area at second {second}; give a later --start")
+        return points_on_triangles(positions, self.scene.triangles.faces, count, rng)
+
+    def track(self, points: SurfacePoints, times) -> np.ndarray:
+        """[T, P, 3] float64 world positions of surface points."""
+        corners = self.scene.triangles.faces[points.face]
+        tracks = []
+        for time in times:
+            positions = self.scene.posed(self.seconds(float(time))).positions
+            tracks.append(np.einsum("pk,pki->pi", points.shares, positions[corners]))
+        return np.stack(tracks)

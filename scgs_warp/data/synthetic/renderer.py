@@ -1,0 +1,234 @@
+"""Moving scenes as data sets: pictures in the D-NeRF layout, with the true motion of their surface beside them.
+
+A ``Subject`` knows how it moves and what rays see of it: the built-in figure (``synthetic``) and glTF files
+(``synthesis_mesh``) are two. This file films it and writes what a reader expects.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...errors import UserError
+from ...types import Camera
+from .orbit_cameras import Shot, camera_of
+
+ROOM = 1.3
+"""World radius of the ball around the origin that a subject never leaves: what D-NeRF's scenes take."""
+SURFACE_POINTS = 2000
+TRUTH_TIMES = 51
+
+Background = Literal["transparent", "black", "white"]
+
+
+class Subject(Protocol):
+    """Something that moves while time goes from 0 to 1, inside the ball of radius ``ROOM`` (world, z up)."""
+
+    device: str
+
+    def pose(self, time: float) -> Any:
+        """The subject at an instant, for the methods below; has ``vertices [P, 3]``."""
+        ...
+
+    def render(self, posed: Any, camera: Camera, samples: int) -> Tensor:
+        """[H, W, 4] premultiplied colour and coverage in [0, 1], ``samples`` x ``samples`` rays a pixel."""
+        ...
+
+    def visible(self, posed: Any, camera: Camera, points: Tensor) -> Tensor:
+        """[P] bool: which surface points [P, 3] the camera sees."""
+        ...
+
+    def sample(self, count: int, rng: np.random.Generator) -> Any:
+        """Surface points, spread evenly by area, in whatever form ``track`` takes."""
+        ...
+
+    def track(self, points: Any, times: Sequence[float]) -> np.ndarray:
+        """[T, P, 3] float64 world positions of surface points."""
+        ...
+
+
+class SurfacePoints(NamedTuple):
+    """Points that stay where they are on their triangle."""
+
+    face: np.ndarray
+    """[P]"""
+    shares: np.ndarray
+    """[P, 3] of the triangle's corners, rows sum to 1."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What all pictures of a scene have in common."""
+
+    fov: float
+    """Horizontal field of view, radians."""
+    width: int
+    height: int
+    samples: int
+    """Rays per pixel and axis."""
+    background: Background = "transparent"
+
+
+def pick_on_triangles(
+    corners: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangle [P] and coordinates u [P, 1], v [P, 1] of points spread evenly by area over triangles [F, 3, 3].
+
+    A point is ``a + u (b - a) + v (c - a)``.
+    """
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    cumulative = np.cumsum(areas / areas.sum())
+    steps = (np.arange(count) + rng.uniform(size=count)) / count
+    face = np.minimum(np.searchsorted(cumulative, steps), len(areas) - 1)
+    u, v = rng.uniform(size=(2, count, 1))
+    flip = u + v > 1.0
+    return face, np.where(flip, 1.0 - u, u), np.where(flip, 1.0 - v, v)
+
+
+def points_on_triangles(
+    positions: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
+) -> SurfacePoints:
+    """Points spread evenly by area over a mesh of vertices [P, 3] and triangles [F, 3]."""
+    face, u, v = pick_on_triangles(positions[faces], count, rng)
+    return SurfacePoints(face, np.concatenate([1.0 - u - v, u, v], axis=1))
+
+
+def write_rgba(path: Path, image: np.ndarray) -> None:
+    """Write premultiplied [H, W, 4] in [0, 1] as an 8-bit PNG, whose colour is not premultiplied.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    alpha = image[..., 3:]
+    color = np.where(alpha > 0, image[..., :3] / np.maximum(alpha, 1e-6), 0.0)
+    pixels = np.concatenate([color, alpha], axis=-1).clip(0.0, 1.0) * 255.0
+    write_png(path, cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_RGBA2BGRA))
+
+
+def over(image: np.ndarray, gray: float) -> np.ndarray:
+    """[H, W, 3] a premultiplied picture [H, W, 4] on a grey ground."""
+    return image[..., :3] + (1.0 - image[..., 3:]) * gray
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Pixels in OpenCV's order; OSError where they cannot be written."""
+    ok, data = cv2.imencode(".png", pixels)
+    if not ok:
+        raise OSError(0, "PNG encoding failed")
+    path.write_bytes(data.tobytes())
+
+
+def write_picture(path: Path, image: np.ndarray, background: Background) -> None:
+    """A premultiplied picture [H, W, 4] with its alpha, or on a ground and without."""
+    if background == "transparent":
+        write_rgba(path, image)
+        return
+    pixels = over(image, 1.0 if background == "white" else 0.0).clip(0.0, 1.0) * 255.0
+    write_png(path, cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_RGB2BGR))
+
+
+class Watcher(Protocol):
+    """Looks at pictures as they are made."""
+
+    def __call__(self, split: str, index: int, shot: Shot, camera: Camera, image: np.ndarray, seen: Any) -> None: ...
+
+
+def write_pictures(
+    folder: Path,
+    subject: Subject,
+    points: Any,
+    shots: Mapping[str, Sequence[Shot]],
+    optics: Optics,
+    done: Callable[[], None],
+    watch: Watcher | None = None,
+) -> None:
+    """``transforms_SPLIT.json`` and ``SPLIT/r_000.png`` of every split, and ``ground_truth.npz``.
+
+    Args:
+        points: of ``subject.sample``; their visibility is that in the training pictures.
+        done: called after each picture.
+        watch: sees each picture; ``seen`` is (positions [P, 3], visible [P]) in training pictures, else None.
+
+    Raises:
+        OSError: something cannot be written.
+    """
+    visible = []
+    for split, planned in shots.items():
+        (folder / split).mkdir()
+        entries, time, posed = [], float("nan"), None
+        for index, shot in enumerate(planned):
+            if shot.time != time:
+                time, posed = shot.time, subject.pose(shot.time)
+            camera = camera_of(shot.camera_to_world, optics.fov, optics.width, optics.height)
+            image = subject.render(posed, camera, optics.samples).cpu().numpy()
+            name = f"{split}/r_{index:03d}"
+            write_picture(folder / f"{name}.png", image, optics.background)
+            seen = None
+            if split == "train":
+                places = subject.track(points, [time])[0]
+                tensor = torch.from_numpy(places.astype(np.float32)).to(subject.device)
+                seen = places, subject.visible(posed, camera, tensor).cpu().numpy()
+                visible.append(seen[1])
+            entries.append({"file_path": f"./{name}", "time": time, "transform_matrix": shot.camera_to_world.tolist()})
+            if watch is not None:
+                watch(split, index, shot, camera, image, seen)
+            done()
+        content = {"camera_angle_x": optics.fov, "frames": entries}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1) + "\n")
+    times = np.linspace(0.0, 1.0, TRUTH_TIMES)
+    np.savez(
+        folder / "ground_truth.npz",
+        points=subject.track(points, times.tolist()).astype(np.float32),
+        times=times.astype(np.float32),
+        visible=np.stack(visible),
+        height=np.float32(height_of(subject)),
+    )
+
+
+def height_of(subject: Subject) -> float:
+    """Extent along z at time 0; of something that lies flat, the largest extent."""
+    vertices = subject.pose(0.0).vertices.cpu().numpy()
+    extent = vertices.max(0) - vertices.min(0)
+    return extent[2] if extent[2] > 0.05 * extent.max() else extent.max()
+
+
+def write_whole(folder: Path, write: Callable[[Path], None]) -> None:
+    """Have ``write`` fill a temporary folder beside ``folder`` and rename it: nothing is ever left half made.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
+    try:
+        write(work)
+        os.chmod(work, 0o755)  # mkdtemp's 0700 is for secrets
+        _replace(folder, work)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror}); make room or choose another folder") from None
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _replace(folder: Path, work: Path) -> None:
+    if folder.exists():
+        old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-old-", dir=folder.parent))
+        os.rename(folder, old / "scene")
+        os.rename(work, folder)
+        shutil.rmtree(old, ignore_errors=True)
+    else:
+        os.rename(work, folder)

@@ -1,0 +1,356 @@
+"""An edit as JSON: readable, versioned, checked. No paths, no code. Numbers come back as the same bits."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zlib
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from ..errors import UserError
+from .document import Edit, Film, Shot, View
+from .field_reader import LIMIT, Node, one_line, read_object, shown
+from .handles import Handle, Lasting, Target
+from .keyframes import Easing, Keyframe
+from .playback import Exaggerate, Hold, Playback
+from .rotations import from_axis
+
+if TYPE_CHECKING:
+    from .session import EditSession
+
+FORMAT = "scgs-warp edit"
+VERSION = 1
+MOST_SECONDS = 3600.0
+LARGEST = 8192
+
+
+def fingerprint(session: EditSession) -> str:
+    """Tells one scene's control points from another's: numbers of control points mean nothing elsewhere."""
+    rest = session.engine.rig.positions.detach().cpu().contiguous().numpy()
+    return f"{zlib.crc32(np.ascontiguousarray(rest).tobytes()):08x}"
+
+
+def to_json(edit: Edit, session: EditSession) -> str:
+    """Text that ``read`` turns into the same edit."""
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "scene": {"control_points": len(session), "fingerprint": fingerprint(session)},
+        "handles": [_plain(handle) for handle in edit.handles],
+        "pins": list(edit.pins),
+        "targets": {name: _plain(target) for name, target in edit.targets.items()},
+        "keyframes": [
+            {"at": k.at, "easing": k.easing, "targets": {n: _plain(t) for n, t in k.targets.items()}}
+            for k in edit.keyframes
+        ],
+        "playback": _plain(edit.playback),
+        "hold": [_plain(hold) for hold in edit.holds],
+        "exaggerate": None if edit.exaggerate is None else _plain(edit.exaggerate),
+        "film": _plain(edit.film),
+    }
+    lines = [f" {json.dumps(key)}: {_compact(value)}" for key, value in content.items() if value is not None]
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """Fields that say something; lists for tuples."""
+    found = dataclasses.asdict(value)
+    return {name: item for name, item in found.items() if item is not None}
+
+
+def _compact(value: Any) -> str:
+    """One line an entry of a list."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return "[\n  " + ",\n  ".join(json.dumps(item) for item in value) + "\n ]"
+    return json.dumps(value)
+
+
+def read(path: Path, session: EditSession) -> Edit:
+    """The edit in a file, for this session's scene: regions said by place become control points.
+
+    Raises:
+        UserError: naming the file, the field and the remedy.
+    """
+    return parse(read_object(path), str(path), session)
+
+
+def parse(content: Any, source: str, session: EditSession) -> Edit:
+    """As ``read``, of a JSON value; ``source`` is what errors name."""
+    root = Node(content, source)
+    if root.raw("format") != FORMAT:
+        raise root.wrong("format", f"is {shown(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
+    if root.raw("version") != VERSION:
+        raise root.wrong("version", f"is {shown(root.raw('version'))}", f"this program reads version {VERSION}")
+    _check_scene(root, session)
+    handles: list[Handle] = []
+    for node in root.children("handles", 1000):
+        handle = _handle(node, session)
+        if any(handle.name == other.name for other in handles):
+            raise node.wrong("name", f"{handle.name!r} is taken", "give every handle a name of its own")
+        handles.append(handle)
+    names = {handle.name for handle in handles}
+    frames = [_keyframe(node, names) for node in root.children("keyframes")]
+    frames.sort(key=lambda frame: frame.at)
+    for first, second in pairwise(frames):
+        if first.at == second.at:
+            raise root.wrong("keyframes", f"has two at {first.at:g} s", "leave one of them out")
+    edit = Edit(
+        handles=tuple(handles),
+        pins=_pins(root, handles, session),
+        targets=_targets(root, names),
+        keyframes=tuple(frames),
+        playback=_playback(root.child("playback")),
+        holds=tuple(_hold(node, session) for node in root.children("hold", 1000)),
+        exaggerate=_exaggerate(root.child("exaggerate"), session),
+        film=_film(root.child("film")),
+    )
+    root.done("comment")
+    return edit
+
+
+def _check_scene(root: Node, session: EditSession) -> None:
+    scene = root.child("scene")
+    if scene is None:
+        return
+    count = scene.integer("control_points", len(session), 0, 1 << 31)
+    if count != len(session):
+        remedy = f"this scene has {len(session)}: give the scene that it was made for"
+        if not session.engine.rig.moves:
+            remedy += f", with --nodes {count}"
+        raise scene.wrong("control_points", f"is {count}", remedy)
+    mark = scene.raw("fingerprint")
+    if mark is not None and mark != fingerprint(session):
+        remedy = "give that scene, or say regions by place (point, sphere, box) and leave fingerprint out"
+        raise scene.wrong("fingerprint", "is that of another scene's control points", remedy)
+    scene.done()
+
+
+def _nodes(node: Node, name: str, session: EditSession, *, time: float = 0.0) -> tuple[int, ...]:
+    """A list of control points, or a place: {"point", "rings"}, {"sphere", "radius"}, {"box"}, at a time."""
+    value = node.raw(name)
+    if isinstance(value, dict):
+        return _place(Node(value, node.source, f"{node.place}.{name}".strip(".")), session, time)
+    if value is None or not isinstance(value, list) or not value:
+        raise node.wrong(name, "is missing or empty", "list control points, or say a place: point, sphere or box")
+    last = len(session) - 1
+    for index in value:
+        if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index <= last:
+            raise node.wrong(name, f"names control point {shown(index)}", f"give whole numbers from 0 to {last}")
+    return tuple(sorted(set(value)))
+
+
+def _place(place: Node, session: EditSession, time: float) -> tuple[int, ...]:
+    time = place.number("time", time, 0.0, 1.0)
+    points = session.engine.to_world(session.engine.motion_at(time).positions)
+    point, sphere, box = place.vector("point", 3), place.vector("sphere", 3), place.items("box", 2)
+    rings = place.integer("rings", 0, 0, 1000)
+    radius = place.number("radius", None, 0.0)
+    place.done()
+    if point is not None:
+        chosen = [int(np.linalg.norm(points - point, axis=1).argmin())]
+    elif sphere is not None and radius is not None:
+        chosen = np.flatnonzero(np.linalg.norm(points - sphere, axis=1) <= radius).tolist()
+    elif len(box) == 2:
+        corners = Node({"low": box[0], "high": box[1]}, place.source, f"{place.place}.box")
+        low, high = corners.vector("low", 3), corners.vector("high", 3)
+        if low is None or high is None:
+            raise place.wrong("box", "lacks a corner", "give two corners of 3 numbers")
+        chosen = np.flatnonzero(((points >= np.array(low)) & (points <= np.array(high))).all(axis=1)).tolist()
+    else:
+        raise place.wrong("", "says no place", "give point, sphere with radius, or box with two corners")
+    if not chosen:
+        raise place.wrong("", f"holds no control point at time {time:g}", "make it larger or move it")
+    return session.graph.ring(chosen, rings)
+
+
+def _handle(node: Node, session: EditSession) -> Handle:
+    time = node.number("time", 0.0, 0.0, 1.0)
+    handle = Handle(
+        name=node.text("name"),
+        nodes=_nodes(node, "nodes", session, time=time),
+        time=time,
+        pivot=node.vector("pivot", 3),
+        stiffness=node.number("stiffness", None, 1e-6, 1e6),
+        turns=node.truth("turns"),
+        lasts=node.choice("lasts", get_args(Lasting), "motion"),
+        window=node.number("window", 0.1, 1e-6, 10.0),
+    )
+    node.done("comment")
+    return handle
+
+
+def check_handle(handle: Handle, count: int) -> None:
+    """What ``_handle`` checks, for a handle that a program made.
+
+    Raises:
+        UserError: naming the field.
+    """
+    node = Node(_plain(handle), f"handle {handle.name!r}")
+    node.text("name")
+    node.number("time", 0.0, 0.0, 1.0)
+    if handle.pivot is not None and (len(handle.pivot) != 3 or not np.all(np.abs(handle.pivot) <= LIMIT)):
+        raise node.wrong("pivot", f"is {list(handle.pivot)}", f"give 3 finite numbers from {-LIMIT:g} to {LIMIT:g}")
+    node.number("stiffness", None, 1e-6, 1e6)
+    node.choice("lasts", get_args(Lasting), "motion")
+    node.number("window", 0.1, 1e-6, 10.0)
+
+
+def check_keyframe(at: float, easing: str) -> None:
+    """What ``_keyframe`` checks.
+
+    Raises:
+        UserError: naming the field.
+    """
+    node = Node({"at": at, "easing": easing}, "keyframe")
+    node.number("at", None, 0.0, MOST_SECONDS)
+    node.choice("easing", get_args(Easing), "smooth")
+
+
+def check_size(size: int) -> None:
+    """What ``_film`` checks of a film's size.
+
+    Raises:
+        UserError: naming the field.
+    """
+    Node({"size": size}, "film").integer("size", 512, 16, LARGEST)
+
+
+def _too_short(direction: tuple[float, ...]) -> bool:
+    """Its length cannot be told."""
+    return not sum(x * x for x in direction) > 1e-200
+
+
+def _pins(root: Node, handles: list[Handle], session: EditSession) -> tuple[int, ...]:
+    value = root.raw("pins")
+    if value is None or value == []:
+        return ()
+    if isinstance(value, dict) and "beyond" in value:
+        node = Node(value, root.source, "pins")
+        rings = node.integer("beyond", 2, 0, 1000)
+        node.done()
+        return session.graph.beyond({n for handle in handles for n in handle.nodes}, rings)
+    return _nodes(root, "pins", session)
+
+
+def _target(node: Node) -> Target:
+    """``rotation`` as a quaternion wxyz, or as ``axis`` and ``degrees``."""
+    rotation, axis = node.vector("rotation", 4), node.vector("axis", 3)
+    degrees = node.number("degrees", None, -180.0, 180.0)
+    translation = node.vector("translation", 3)
+    if (axis is None) != (degrees is None) or (rotation is not None and axis is not None):
+        raise node.wrong("axis", "and degrees belong together", "give both, or rotation alone")
+    if axis is not None:
+        if _too_short(axis):
+            raise node.wrong("axis", "has no direction", "give 3 numbers, not all 0 or next to it")
+        rotation = tuple(from_axis(axis, degrees).tolist())
+    node.done()
+    try:
+        return Target.of(translation, rotation)
+    except UserError as error:
+        raise node.wrong("", f"is wrong: {error}", "correct it") from None
+
+
+def _targets(root: Node, names: set[str]) -> dict[str, Target]:
+    found = {}
+    for name, node in root.entries("targets"):
+        if name not in names:
+            raise node.wrong("", "names no handle", f"there is {one_line(', '.join(sorted(names))) or 'none'}")
+        found[name] = _target(node)
+    return found
+
+
+def _keyframe(node: Node, names: set[str]) -> Keyframe:
+    at = node.number("at", None, 0.0, MOST_SECONDS)
+    if at is None:
+        raise node.wrong("at", "is missing", "give seconds from the film's beginning")
+    easing = node.choice("easing", get_args(Easing), "smooth")
+    found = Keyframe(at, _targets(node, names), easing)
+    node.done("comment")
+    return found
+
+
+def _playback(node: Node | None) -> Playback:
+    if node is None:
+        return Playback()
+    pairs = []
+    for index, pair in enumerate(node.items("map")):
+        at, time = Node({"pair": pair}, node.source, f"{node.place}.map[{index}]").vector("pair", 2) or (0.0, -1.0)
+        if not (0.0 <= time <= 1.0 and at >= 0.0 and (not pairs or at > pairs[-1][0])):
+            raise node.wrong(f"map[{index}]", f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]")
+        pairs.append((at, time))
+    found = Playback(
+        seconds=node.number("seconds", None, 1e-3, MOST_SECONDS),
+        speed=node.number("speed", 1.0, -1000.0, 1000.0),
+        start=node.number("start", 0.0, 0.0, 1.0),
+        repeat=node.choice("repeat", ("once", "loop", "swing"), "once"),
+        freeze=node.number("freeze", None, 0.0, 1.0),
+        map=tuple(pairs),
+    )
+    node.done()
+    return found
+
+
+def _hold(node: Node, session: EditSession) -> Hold:
+    time = node.number("time", 0.0, 0.0, 1.0)
+    frame = node.choice("frame", ("body", "world"), "body")
+    found = Hold(_nodes(node, "nodes", session, time=time), time, frame, node.integer("rings", 2, 0, 100))
+    node.done("comment")
+    return found
+
+
+def _exaggerate(node: Node | None, session: EditSession) -> Exaggerate | None:
+    if node is None:
+        return None
+    nodes = _nodes(node, "nodes", session) if node.raw("nodes") else ()
+    found = Exaggerate(node.number("factor", 1.5, -10.0, 10.0), node.number("about", None, 0.0, 1.0), nodes)
+    node.done("comment")
+    return found
+
+
+def _film(node: Node | None) -> Film:
+    if node is None:
+        return Film()
+    found = Film(
+        seconds=node.number("seconds", 4.0, 1e-3, MOST_SECONDS),
+        fps=node.number("fps", 30.0, 0.01, 1000.0),
+        size=node.integer("size", 512, 16, LARGEST),
+        background=node.vector("background", 3, None, 0.0, 1.0),
+        shot=_shot(node.child("shot")),
+    )
+    node.done()
+    return found
+
+
+def _shot(node: Node | None) -> Shot:
+    if node is None:
+        return Shot()
+    views = []
+    for view in node.children("views"):
+        views.append(
+            View(
+                at=view.number("at", 0.0, 0.0, MOST_SECONDS),
+                azimuth=view.number("azimuth", None, -1e5, 1e5),
+                elevation=view.number("elevation", None, -80.0, 80.0),
+                distance=view.number("distance", None, 1e-9),
+                target=view.vector("target", 3),
+            )
+        )
+        view.done()
+    views.sort(key=lambda view: view.at)
+    found = Shot(
+        kind=node.choice("kind", ("turntable", "fixed", "orbit"), "turntable"),
+        views=tuple(views) or (View(),),
+        turns=node.number("turns", 1.0, -1000.0, 1000.0),
+        up=node.vector("up", 3),
+        fov=node.number("fov", None, 1.0, 150.0),
+    )
+    if found.up is not None and _too_short(found.up):
+        raise node.wrong("up", "has no direction", "give 3 numbers, not all 0 or next to it")
+    if any(a.at == b.at for a, b in pairwise(views)):
+        raise node.wrong("views", "has two at one moment", "give every view a moment of its own")
+    node.done()
+    return found

@@ -1,0 +1,193 @@
+"""Reading JSON that people write: every mistake names the file, the field and the remedy, in one line."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ..errors import UserError
+from ..storage.files import parse_json
+
+MAX_BYTES = 64 << 20
+"""A larger file is no edit."""
+LIMIT = 1e9
+"""Of numbers that nothing else limits: beyond it float32 leaves no scene."""
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises:
+        UserError: it is missing, too large, no JSON, or no object.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UserError(f"{path}: larger than {MAX_BYTES >> 20} MiB; give an edit's JSON")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; give an edit's JSON") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read as UTF-8 text ({type(error).__name__}); give an edit's JSON") from None
+    return parse_object(text, str(path))
+
+
+def parse_object(text: str, path: str) -> dict[str, Any]:
+    """The JSON object in a text; ``path`` is what errors name.
+
+    Raises:
+        UserError: it is no JSON, or no object.
+    """
+    try:
+        content = parse_json(text, parse_constant=_no_constant, object_pairs_hook=_unique)
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno} column {error.colno}"
+        raise UserError(f"{path}: not valid JSON, {where}: {error.msg}; correct it") from None
+    except ValueError as error:
+        raise UserError(f"{path}: not valid JSON ({str(error)[:80] or 'nested too deeply'}); correct it") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: must hold a JSON object; give an edit's JSON")
+    return content
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice!r} stands there twice")
+    return found
+
+
+class Node:
+    """A JSON object and where it stands. Fields are taken by name; ``done`` refuses what nobody took."""
+
+    def __init__(self, value: Any, source: str, place: str = "") -> None:
+        self.source, self.place = source, place
+        if not isinstance(value, dict):
+            raise self.wrong("", f"is {shown(value)}", "give an object")
+        self._value = value
+        self._taken: set[str] = set()
+
+    def wrong(self, name: str, what: str, remedy: str) -> UserError:
+        field = self._inside(name)
+        return UserError(f"{self.source}: {field or 'the file'} {what}; {remedy}")
+
+    def _inside(self, name: str) -> str:
+        """The place of a field; names that people made up may be anything."""
+        return ".".join(part for part in (self.place, one_line(name)) if part)
+
+    def __contains__(self, name: str) -> bool:
+        return self._value.get(name) is not None
+
+    def raw(self, name: str) -> Any:
+        self._taken.add(name)
+        return self._value.get(name)
+
+    def done(self, *also: str) -> None:
+        unknown = sorted(set(self._value) - self._taken - set(also))
+        if unknown:
+            known = ", ".join(sorted(self._taken | set(also)))
+            raise self.wrong(unknown[0], "is not known", f"known here: {known}")
+
+    def number(self, name: str, default: Any = None, low: float = -LIMIT, high: float = LIMIT) -> Any:
+        value = self.raw(name)
+        if value is None:
+            return default
+        if not _is_number(value) or not low <= value <= high:
+            raise self.wrong(name, f"is {shown(value)}", f"give a number from {low:g} to {high:g}")
+        return float(value)
+
+    def integer(self, name: str, default: int, low: int, high: int) -> int:
+        value = self.raw(name)
+        if value is None:
+            return default
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise self.wrong(name, f"is {shown(value)}", f"give a whole number from {low} to {high}")
+        return value
+
+    def truth(self, name: str) -> bool | None:
+        value = self.raw(name)
+        if value is not None and not isinstance(value, bool):
+            raise self.wrong(name, f"is {shown(value)}", "give true or false")
+        return value
+
+    def choice(self, name: str, options: tuple[str, ...], default: str) -> Any:
+        value = self.raw(name)
+        if value is None:
+            return default
+        if not isinstance(value, str) or value not in options:
+            raise self.wrong(name, f"is {shown(value)}", f"choose one of {', '.join(options)}")
+        return value
+
+    def text(self, name: str) -> str:
+        value = self.raw(name)
+        if not isinstance(value, str) or not value.strip() or len(value) > 100 or not value.isprintable():
+            raise self.wrong(name, f"is {shown(value)}", "give a name of 1 to 100 letters")
+        return value
+
+    def vector(self, name: str, size: int, default: Any = None, low: float = -LIMIT, high: float = LIMIT) -> Any:
+        value = self.raw(name)
+        if value is None:
+            return default
+        fits = isinstance(value, list) and len(value) == size and all(map(_is_number, value))
+        if not fits or not all(low <= x <= high for x in value):
+            limits = "" if high == LIMIT else f" from {low:g} to {high:g}"
+            raise self.wrong(name, f"is {shown(value)}", f"give {size} numbers{limits}")
+        return tuple(float(x) for x in value)
+
+    def items(self, name: str, most: int = 100_000) -> list[Any]:
+        value = self.raw(name)
+        if value is None:
+            return []
+        if not isinstance(value, list) or len(value) > most:
+            raise self.wrong(name, f"is {shown(value)}", f"give a list of at most {most}")
+        return value
+
+    def child(self, name: str) -> Node | None:
+        value = self.raw(name)
+        return None if value is None else Node(value, self.source, self._inside(name))
+
+    def children(self, name: str, most: int = 10_000) -> Iterator[Node]:
+        for index, value in enumerate(self.items(name, most)):
+            yield Node(value, self.source, f"{self._inside(name)}[{index}]")
+
+    def entries(self, name: str) -> Iterator[tuple[str, Node]]:
+        """Of an object of objects."""
+        inner = self.child(name)
+        if inner is not None:
+            for key in inner._value:
+                found = inner.child(key)
+                if found is None:
+                    raise inner.wrong(key, "is null", "give an object")
+                yield key, found
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(float(value))
+    except OverflowError:
+        return False
+
+
+def shown(value: Any) -> str:
+    """A JSON value in at most 60 characters of one line."""
+    try:
+        text = json.dumps(value) if value is not None else "missing"
+    except RecursionError:
+        return "nested too deeply"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def one_line(text: str) -> str:
+    """A text in at most 100 characters of one line."""
+    plain = text if text.isprintable() else json.dumps(text)[1:-1]
+    return plain if len(plain) <= 100 else plain[:97] + "..."

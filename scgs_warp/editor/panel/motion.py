@@ -1,0 +1,109 @@
+"""Controls for the scene's own motion: parts of it held still, all of it exaggerated or damped."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from ...edit.playback import Exaggerate, Hold
+from ...errors import UserError
+
+if TYPE_CHECKING:
+    from ..app import Editor
+
+NONE = "none"
+UNCHANGED = 1.0
+MOST = 3.0
+"""Strongest exaggeration that the slider offers; scripts may ask for more."""
+
+
+class MotionSection:
+    """Holds and exaggeration, for what is selected at the moment shown."""
+
+    def __init__(self, editor: Editor) -> None:
+        self.editor, self.model = editor, editor.model
+        self._dress_holds()
+        self._dress_exaggeration()
+
+    def _dress_holds(self) -> None:
+        gui = self.editor.server.gui
+        with gui.add_folder("Hold still"):
+            self.list = gui.add_markdown("")
+            self.frame = gui.add_dropdown(
+                "It stays", ("body", "world"), hint="On the body that it hangs on, or where it is in the world"
+            )
+            self.rings = gui.add_slider("Rings that bend", 0, 12, 1, Hold(()).rings)
+            self.add = gui.add_button("Hold the selection as it is now")
+            self.add.on_click(self.editor.guarded(lambda event: self._hold()))
+            self.chosen = self.editor.on_value(gui.add_dropdown("Hold", (NONE,)), self._select)
+            self.remove = gui.add_button("Let go of this one")
+            self.remove.on_click(self.editor.guarded(lambda event: self._release()))
+
+    def _dress_exaggeration(self) -> None:
+        gui, on = self.editor.server.gui, self.editor.on_value
+        with gui.add_folder("Exaggerate"):
+            self.factor = on(
+                gui.add_slider("Motion times", 0.0, MOST, 0.05, UNCHANGED, hint="Every turn of it; 1: as it was"),
+                lambda factor: self._exaggerate(factor=float(factor)),
+            )
+            self.buttons = gui.add_button_group("", ("Only selection", "All", "Off"))
+            self.buttons.on_click(self.editor.guarded(lambda event: self._extent(event.target.value)))
+            self.about = gui.add_button_group("Unchanged", ("Mean pose", "This moment"))
+            self.about.on_click(self.editor.guarded(lambda event: self._about(event.target.value)))
+            self.extent = gui.add_markdown("")
+
+    def _hold(self) -> None:
+        nodes = self._selection()
+        hold = Hold(nodes, self.model.time, self.frame.value, int(self.rings.value))
+        kept = tuple(other for other in self.model.session.edit.holds if other.nodes != nodes)
+        self.model.replace(holds=(*kept, hold))
+
+    def _selection(self) -> tuple[int, ...]:
+        if not self.model.selection:
+            raise UserError("nothing is chosen; click on the picture first")
+        return self.model.selection
+
+    def _select(self, name: str) -> None:
+        hold = self._holds().get(name)
+        if hold is not None:
+            self.model.select(hold.nodes)
+
+    def _release(self) -> None:
+        gone = self._holds().get(self.chosen.value)
+        if gone is None:
+            raise UserError("no hold is chosen; choose one from the list first")
+        self.model.replace(holds=tuple(hold for hold in self.model.session.edit.holds if hold is not gone))
+
+    def _holds(self) -> dict[str, Hold]:
+        return {f"hold {i}": hold for i, hold in enumerate(self.model.session.edit.holds, 1)}
+
+    def _exaggerate(self, **fields: Any) -> None:
+        present = self.model.session.edit.exaggerate or Exaggerate(UNCHANGED)
+        self.model.replace(exaggerate=dataclasses.replace(present, **fields))
+
+    def _extent(self, what: str) -> None:
+        if what == "Off":
+            self.model.replace(exaggerate=None)
+        else:
+            self._exaggerate(nodes=() if what == "All" else self._selection())
+
+    def _about(self, what: str) -> None:
+        self._exaggerate(about=None if what == "Mean pose" else self.model.time)
+
+    def show(self) -> None:
+        holds, edit = self._holds(), self.model.session.edit
+        rows = [f"| {name} | {len(h.nodes)} | {h.time:.2f} | {h.frame} |" for name, h in holds.items()]
+        head = "| | control points | as at time | stays on |\n|---|---|---|---|\n"
+        self.list.content = head + "\n".join(rows) if rows else "*None yet: choose a limb, then hold it.*"
+        names = (NONE, *holds)
+        if self.chosen.options != names:
+            self.chosen.options = names
+        match = (name for name, hold in holds.items() if hold.nodes == self.model.selection)
+        self.chosen.value = next(match, NONE)
+        exaggerate = edit.exaggerate or Exaggerate(UNCHANGED)
+        self.factor.max = max(MOST, exaggerate.factor)
+        self.factor.min = min(0.0, exaggerate.factor)
+        self.factor.value = exaggerate.factor
+        whom = f"{len(exaggerate.nodes)} control points" if exaggerate.nodes else "everything"
+        about = "the mean pose" if exaggerate.about is None else f"the pose of time {exaggerate.about:.2f}"
+        self.extent.content = f"*Of {whom}, away from {about}.*" if edit.exaggerate else "*Off.*"

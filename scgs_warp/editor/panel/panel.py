@@ -1,0 +1,119 @@
+"""The panel beside the picture: sections of controls, each of which shows the model and changes it."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..escape import plain
+from ..jobs import Jobs, Progress
+from .files import FilesSection
+from .film import FilmSection, TimeSection
+from .motion import MotionSection
+from .shape import ShapeSection
+from .view import ViewSection
+
+if TYPE_CHECKING:
+    from ..app import Editor
+
+HELP = (
+    "**Click** the scene to choose control points (shift: more, ctrl: fewer), then drag the **gizmo**: arrows move, "
+    "arcs turn."
+)
+
+
+class Panel:
+    """Everything beside the picture.
+
+    Attributes: ``jobs`` (films and exports in the making) and the sections ``time``, ``shape``, ``motion``, ``film``,
+    ``view``, ``files``.
+    """
+
+    def __init__(self, editor: Editor) -> None:
+        self.editor = editor
+        self.jobs = Jobs(self._progress, self._ended)
+        self._lock = threading.RLock()
+        gui = editor.server.gui
+        self.status = gui.add_markdown(HELP)
+        self.work = gui.add_markdown("", visible=False)
+        self.bar = gui.add_progress_bar(0.0, animated=True, visible=False)
+        self.stop = gui.add_button("Stop the job", icon=None, color="red", visible=False)
+        self.stop.on_click(editor.guarded(lambda event: self.jobs.cancel()))
+        self.history = gui.add_button_group("Edit", ("Undo", "Redo", "Reset"))
+        self.history.on_click(editor.guarded(self._history))
+        self._commands()
+        self.time = TimeSection(editor)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Shape"):
+            self.shape = ShapeSection(editor)
+        with tabs.add_tab("Motion"):
+            self.motion = MotionSection(editor)
+        with tabs.add_tab("Film"):
+            self.film = FilmSection(editor)
+        with tabs.add_tab("View"):
+            self.view = ViewSection(editor)
+        with tabs.add_tab("Files"):
+            self.files = FilesSection(editor, self.jobs)
+        self.show()
+
+    def _commands(self) -> None:
+        """Keys, where this viser knows them."""
+        add = getattr(self.editor.server.gui, "add_command", None)
+        if add is None:
+            return
+        for label, key, modifier, action in (
+            ("Undo", "Z", "cmd/ctrl", self.editor.model.undo),
+            ("Redo", "Z", "cmd/ctrl+shift", self.editor.model.redo),
+        ):
+            add(label, hotkey=key, modifier=modifier).on_trigger(
+                self.editor.guarded(lambda event, action=action: action())
+            )
+
+    def _history(self, event: Any) -> None:
+        model = self.editor.model
+        what = event.target.value
+        if what == "Reset":
+            model.reset()
+        elif not (model.undo() if what == "Undo" else model.redo()):
+            self.editor.say(event.client, what, f"there is nothing to {what.lower()}", "gray")
+
+    def show(self) -> None:
+        """Make every control say what the model says."""
+        with self._lock:
+            for section in (self.time, self.shape, self.motion, self.film, self.view, self.files):
+                section.show()
+            self.status.content = f"{HELP}\n\n{self._said()}"
+            self.editor.color_overlays()
+
+    def show_time(self) -> None:
+        """As ``show``, of what goes with the moment shown."""
+        with self._lock:
+            self.time.show()
+            self.shape.show_target()
+
+    def _said(self) -> str:
+        model = self.editor.model
+        edit = model.session.edit
+        chosen = f"**{plain(model.active)}**" if model.active else f"{len(model.selection)} control points chosen"
+        counts = f"handles: {len(edit.handles)}, pinned: {len(edit.pins)}, keyframes: {len(edit.keyframes)}"
+        return f"{chosen}; {counts}"
+
+    # Jobs
+
+    def _progress(self, progress: Progress | None) -> None:
+        busy = progress is not None
+        self.work.visible = self.bar.visible = self.stop.visible = busy
+        if progress is not None:
+            doing = "stopping" if progress.stopping else f"{progress.done} of {progress.total}"
+            self.work.content = f"**{plain(progress.name)}**: {doing}"
+            self.bar.value = progress.percent
+            self.stop.disabled = progress.stopping
+
+    def _ended(self, client: Any, name: str, result: Path | None, problem: str | None) -> None:
+        if problem is not None or result is None:
+            self.editor.say(client, name, problem or "nothing was written", "orange")
+            return
+        self.editor.say(client, name, f"done: {result}", "green")
+        self.files.offer(client, result)
+        self.show()

@@ -1,0 +1,35 @@
+"""Controls for what is shown: edited or original, side by side, overlays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, get_args
+
+from ..model import Show
+
+if TYPE_CHECKING:
+    from ..app import Editor
+
+
+class ViewSection:
+    """What the picture shows."""
+
+    def __init__(self, editor: Editor) -> None:
+        self.editor, self.model = editor, editor.model
+        gui, on, unit = editor.server.gui, editor.on_value, editor.node_size
+        self.picture = on(gui.add_dropdown("Show", get_args(Show)), lambda show: self.model.set(show=show))
+        self.nodes = on(gui.add_checkbox("Control points", True), self._overlays)
+        self.graph = on(gui.add_checkbox("Graph", False), self._overlays)
+        self.size = on(gui.add_slider("Their size", 0.1 * unit, 4 * unit, 0.05 * unit, unit), self._overlays)
+        self.through = on(
+            gui.add_checkbox("Seen through the surface", self.model.through, hint="Overlays in front of everything"),
+            lambda through: self.model.set(through=through),
+        )
+
+    def _overlays(self, value: object) -> None:
+        self.show()
+
+    def show(self) -> None:
+        self.picture.value, self.through.value = self.model.show, self.model.through
+        # The browser draws overlays from one camera: beside two halves, or half an original, they would lie
+        alone = self.model.show in ("edited", "split")
+        self.editor.overlays.show(alone and self.nodes.value, alone and self.graph.value, self.size.value)

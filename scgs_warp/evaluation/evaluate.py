@@ -1,0 +1,202 @@
+"""How good is a scene: the metrics of one split, as training and ``apps/evaluate.py`` both report them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ..data import Dataset
+from ..errors import UserError
+from ..types import Frame
+from ..visualization.figures import contact_sheet, to_bytes
+from ..visualization.video import write_png
+from .image_metrics import psnr, ssim
+from .motion_metrics import load_ground_truth, score_motion
+
+if TYPE_CHECKING:
+    from ..scene.scene import Scene
+
+SHEET_ROWS = 8
+"""Images on a contact sheet, evenly spread over the split."""
+
+Lpips = Callable[[Tensor, Tensor], Tensor | float]
+
+
+def _mean(values: list[float]) -> float | None:
+    """None of no values; exact summation, so that the order of the images does not matter."""
+    return math.fsum(values) / len(values) if values else None
+
+
+def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, Any]:
+    """The row of one image; ``image`` and ``truth`` are [H, W, 3] in [0, 1] on the scene's device."""
+    mask = None if frame.mask is None else frame.mask.to(image.device)
+    row: dict[str, Any] = {"name": frame.name, "time": float(frame.time)}
+    row["psnr"] = float(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
+    row["ssim"] = float(ssim(image, truth, mask))
+    if lpips is not None:
+        if mask is not None:  # outside the mask nothing is known: no difference there
+            image = torch.where(mask[..., None], image, truth)
+        row["lpips"] = float(lpips(image, truth))
+    return row
+
+
+class _Renders:
+    """Writes renders and ground truth as they come, and keeps some pairs for the contact sheet."""
+
+    def __init__(self, folder: Path, count: int) -> None:
+        self.folder = folder
+        rows = min(SHEET_ROWS, count)
+        self._chosen = {round(index * (count - 1) / max(rows - 1, 1)) for index in range(rows)}
+        self._rows: list[tuple[Any, Any]] = []
+        self._titles: list[str] = []
+        self._scores: list[float] = []
+        self._names: set[str] = set()
+        try:
+            for name in ("renders", "truth"):
+                (folder / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be written ({error.strerror}); make the folder writable") from None
+
+    def add(self, index: int, frame: Frame, image: Tensor, truth: Tensor, score: float) -> None:
+        name = frame.name if frame.name and frame.name not in self._names else f"{index:05d}"
+        self._names.add(name)
+        pair = to_bytes(truth), to_bytes(image)
+        self._write(self.folder / "truth" / f"{name}.png", pair[0])
+        self._write(self.folder / "renders" / f"{name}.png", pair[1])
+        if index in self._chosen:
+            if frame.mask is not None:  # outside it nothing is known: the sheet shows no error there
+                pair = pair[0], to_bytes(torch.where(frame.mask.to(image.device)[..., None], image, truth))
+            self._rows.append(pair)
+            self._scores.append(score)
+            self._titles.append(f"{name}   t = {frame.time:.3f}")
+
+    def finish(self) -> None:
+        if self._rows:
+            self._write(self.folder / "contact_sheet.png", contact_sheet(self._rows, self._titles, scores=self._scores))
+
+    @staticmethod
+    def _write(path: Path, image: Any) -> None:
+        try:
+            write_png(path, image)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written ({error.strerror}); free space there") from None
+
+
+@torch.no_grad()
+def evaluate(
+    scene: Scene,
+    dataset: Dataset,
+    *,
+    lpips: Lpips | None = None,
+    render_dir: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Render every frame of a split and compare: each metric is the mean over the images, of clamped floats.
+
+    Args:
+        scene: what to render.
+        dataset: the truth. Both lie on its background colour; with ``random`` that is black.
+        lpips: (image, truth), both [H, W, 3] in [0, 1], to their perceptual distance; None: not measured.
+        render_dir: where ``renders/NAME.png``, ``truth/NAME.png`` and ``contact_sheet.png`` go; None: nowhere.
+        progress: called with (done, total) after each image.
+
+    Returns:
+        ``psnr`` [dB], ``ssim``, ``lpips`` (None if not measured), ``images``, and ``per_image``, a list of
+        ``name``, ``time``, ``psnr``, ``ssim`` (and ``lpips``). A metric of no images is None.
+
+    Raises:
+        UserError: ``render_dir`` cannot be written.
+    """
+    renders = None if render_dir is None else _Renders(Path(render_dir), len(dataset))
+    background = dataset.background_color
+    rows = []
+    for index, frame in enumerate(dataset):
+        image = scene.render(frame.camera, frame.time, background).rgb.clamp(0.0, 1.0)
+        truth = frame.image.to(image.device).clamp(0.0, 1.0)
+        rows.append(_measure(frame, image, truth, lpips))
+        if renders is not None:
+            renders.add(index, frame, image, truth, rows[-1]["psnr"])
+        if progress is not None:
+            progress(index + 1, len(dataset))
+    if renders is not None:
+        renders.finish()
+    means = {name: _mean([row[name] for row in rows if name in row]) for name in ("psnr", "ssim", "lpips")}
+    return {**means, "images": len(rows), "per_image": rows}
+
+
+def metrics_of(
+    scene: Scene,
+    dataset: Dataset,
+    *,
+    seconds: float | None = None,
+    lpips: Lpips | None = None,
+    render_dir: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """What ``metrics.json`` says: the metrics of ``evaluate``, and what they were measured on.
+
+    Where the data folder has ``ground_truth.npz``, ``epe`` and ``jitter`` of the motion, too.
+
+    Args:
+        seconds: that training took, if known.
+
+    Raises:
+        UserError: ``render_dir`` cannot be written, or the ground truth cannot be read.
+    """
+    measured = evaluate(scene, dataset, lpips=lpips, render_dir=render_dir, progress=progress)
+    rows = measured.pop("per_image")
+    data = scene.settings.get("data", {})
+    found = {
+        **{key: measured[key] for key in ("psnr", "ssim", "lpips")},
+        "split": dataset.split,
+        "images": measured["images"],
+        "step": scene.step,
+        "seconds": seconds,
+        "gaussians": scene.gaussian_count,
+        "control_points": scene.control_point_count,
+        "motion": scene.motion_name,
+        "device": torch.device(getattr(scene, "device", "cpu")).type,
+        "data": str(dataset.folder),
+        **{key: data.get(key) for key in ("downscale", "resample", "background")},
+        "seed": scene.settings.get("seed"),
+    }
+    truth = load_ground_truth(dataset.folder)
+    if truth is not None:
+        opacities = scene.gaussians_at(float(truth.times[0])).opacities
+        found.update(score_motion(truth, lambda time: scene.gaussians_at(time).means, opacities)._asdict())
+    return {**found, "per_image": rows}
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows no infinity (the PSNR of equal images) and no NaN: null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_metrics(metrics: dict[str, Any], path: str | Path) -> None:
+    """Write them as JSON, at once: a reader sees the old file or the new one.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(json.dumps(_plain(metrics), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(temporary, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise UserError(f"{path}: cannot be written ({error.strerror}); give another file") from None

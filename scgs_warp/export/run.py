@@ -1,0 +1,246 @@
+"""What :class:`Request` asks for, done: open, pose, write."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from .. import data
+from ..edit import EditSession
+from ..errors import UserError
+from ..formats.gaussian_files import fitting, read_gaussians
+from ..formats.gaussian_ply import write_gaussian_ply
+from ..formats.gaussian_splat import write_splat
+from ..formats.gaussian_spz import read_antialiased, write_spz
+from ..runtime.progress import progress
+from ..scene.from_gaussians import open_ply
+from ..scene.scene import Scene
+from ..types import Gaussians
+from .cameras import write_cameras
+from .control_graph import write_graph
+from .glb import write_glb
+from .npz import write_npz
+from .request import Request, check
+from .sequence import check_folder, write_sequence
+from .skeleton import (
+    Moment,
+    Skeleton,
+    at_rest,
+    build_skeleton,
+    even_moments,
+    film_moments,
+    finite_rows,
+    kept,
+    posed,
+    select,
+)
+
+FILE_UP = (0.0, -1.0, 0.0)
+"""What is up in files of Gaussians that do not say it."""
+FRAMES, FPS = 60, 30.0
+
+
+def export(request: Request, device: str = "cpu") -> str:
+    """Write a file, and say in one line what it holds.
+
+    Raises:
+        UserError: it cannot be; what was there is left alone.
+    """
+    check(request)
+    if request.kind == "ply-sequence":
+        check_folder(request.output)
+    if request.still:
+        held = _export_still(request, device)
+    elif request.kind == "cameras":
+        held = _export_cameras(request, device)
+    elif request.kind == "html":
+        held = _export_page(request, device)
+    else:
+        held = _export_moving(request, device)
+    return f"{request.output}: {held}, {_size(request.output)}"
+
+
+def _size(path: Path) -> str:
+    files = path.iterdir() if path.is_dir() else [path]
+    return f"{sum(file.stat().st_size for file in files) / 2**20:.1f} MiB"
+
+
+def _open(request: Request, device: str) -> Scene:
+    if request.run is not None:
+        return Scene.load(request.run, device=device)
+    assert request.ply is not None
+    return open_ply(request.ply, device)
+
+
+def _open_session(request: Request, scene: Scene) -> EditSession:
+    session = EditSession(scene)
+    if request.edit is not None:
+        session.load(request.edit)
+    return session
+
+
+def _export_still(request: Request, device: str) -> str:
+    up, antialiased, when = FILE_UP, False, "at rest"
+    if request.run is None and request.edit is None:
+        assert request.ply is not None
+        antialiased = read_antialiased(request.ply)
+        with torch.no_grad():
+            found = read_gaussians(request.ply)
+            with fitting(request.ply):
+                gaussians, when = kept(found.activate()), f"as in {request.ply}"
+    else:
+        scene = _open(request, device)
+        up, antialiased = scene.overview.up, scene.config.antialiased
+        if request.edit is not None:
+            session, at = _open_session(request, scene), request.at or 0.0
+            gaussians, when = session.gaussians_at(session.scene_time(at), at), f"{at:g} s into the edit's film"
+        elif request.time is not None:
+            gaussians, when = scene.gaussians_at(request.time), f"at time {request.time:g}"
+        else:
+            gaussians = at_rest(scene)
+    gaussians = kept(gaussians)
+    clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased)
+    note = f" ({clipped:,} values clipped to what .spz can hold)" if clipped else ""
+    return f"{len(gaussians.means):,} Gaussians {when}{note}"
+
+
+def write_still(
+    path: Path, gaussians: Gaussians, *, up: tuple[float, float, float] = FILE_UP, antialiased: bool = False
+) -> int:
+    """Write activated Gaussians, world units, in the format that the name ends in: .ply, .splat, .spz or .glb.
+
+    Args:
+        up: unit vector; .glb alone makes use of it.
+        antialiased: whether they were trained with the antialiasing compensation; .spz alone says so.
+
+    Returns:
+        How many values were clipped, as a .spz demands it.
+
+    Raises:
+        UserError: another suffix, or the place cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        write_gaussian_ply(path, gaussians)
+    elif suffix == ".splat":
+        write_splat(path, gaussians)
+    elif suffix == ".spz":
+        return write_spz(path, gaussians, antialiased=antialiased)
+    elif suffix == ".glb":
+        write_glb(path, gaussians, up)
+    else:
+        raise UserError(f"{path}: Gaussians are written as .ply, .splat, .spz or .glb; end the name so")
+    return 0
+
+
+def _export_moving(request: Request, device: str) -> str:
+    scene = _open(request, device)
+    session = None
+    if request.edit is not None or (request.kind != "ply-sequence" and scene.motion.moves):
+        session = _open_session(request, scene)
+    if session is None and request.kind == "glb":
+        gaussians = kept(at_rest(scene))
+        write_glb(request.output, gaussians, scene.overview.up)
+        return f"{len(gaussians.means):,} Gaussians that stand still"
+    if session is None and request.kind != "ply-sequence":
+        raise UserError(f"--format {request.kind}: {request.run} stands still; write its Gaussians as ply or glb")
+    frames = even_moments(request.frames or FRAMES, request.fps or FPS)
+    moments = film_moments(session) if session is not None and request.edit is not None else frames
+    if request.kind == "ply-sequence":
+        return _write_frames(request, scene, session, moments)
+    assert session is not None
+    return _write_skeleton(request, session, moments)
+
+
+def _write_frames(request: Request, scene: Scene, session: EditSession | None, moments: list[Moment]) -> str:
+    counts, rows = [], _usable(scene)  # the same in every frame: row i is one Gaussian
+
+    def frames() -> Iterator[Gaussians]:
+        for moment in moments:
+            counts.append(len((found := kept(select(posed(scene, session, moment), rows))).means))
+            yield found
+
+    with progress(len(moments), "export") as shown:
+        count = write_sequence(request.output, frames(), shown.advance)
+    least, most = min(counts), max(counts)
+    held = f"{most:,}" if least == most else f"{least:,} to {most:,}"
+    return f"{count} frames of {held} Gaussians"
+
+
+def _write_skeleton(request: Request, session: EditSession, moments: list[Moment]) -> str:
+    scene, up = session.scene, session.scene.overview.up
+    with progress(len(moments), "export") as shown:
+        skeleton = build_skeleton(session, moments, shown.advance)
+    length = f"{len(skeleton.rest)} control points at {len(moments)} instants"
+    if request.kind == "graph":
+        write_graph(request.output, skeleton, session.graph.edges, up)
+        return f"{length}, {len(session.graph.edges):,} edges"
+    rest, rows, skeleton = _finite(scene, skeleton)
+    if request.kind == "glb":
+        colors = mean_colors(session, moments)[rows]
+        rest = Gaussians(rest.means, rest.quats, rest.scales, rest.opacities, torch.from_numpy(colors), rest.sh_rest)
+        write_glb(request.output, rest, up, skeleton)
+    else:
+        edited = request.edit is not None  # an edit's turns are not what shading has learnt
+        shading = None if edited else scene.gaussians.shading.detach().cpu().numpy()[rows]
+        write_npz(request.output, rest, skeleton, shading=shading, up=up)
+    return f"{len(rest.means):,} Gaussians, {length}"
+
+
+def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:
+    """The Gaussians that files may hold, at rest; which they are, [N] bool; and what they follow."""
+    rows = _usable(scene) & np.isfinite(skeleton.weights).all(axis=1)
+    if not rows.any():
+        raise UserError("no Gaussian of the scene is finite; train again with a lower rate")
+    return select(at_rest(scene), rows), rows, skeleton.select(rows)
+
+
+def _usable(scene: Scene) -> np.ndarray:
+    """[N] bool: Gaussians all of whose parameters are finite."""
+    rows = finite_rows(at_rest(scene))
+    for part in (scene.gaussians.shading, scene.gaussians.hyper):
+        rows &= part.detach().isfinite().all(dim=1).cpu().numpy()
+    return rows
+
+
+def mean_colors(session: EditSession, moments: list[Moment]) -> np.ndarray:
+    """[N, 3] harmonics of degree 0 over all moments: the brightness that follows the turn of a surface, at its mean,
+    for formats that hold one colour."""
+    scene = session.scene
+    if not scene.gaussians.shading.shape[1]:
+        return scene.gaussians.sh_dc.detach().cpu().numpy()
+    total = np.zeros((scene.gaussian_count, 3))
+    for moment in moments:
+        total += posed(scene, session, moment).sh_dc.detach().cpu().double().numpy()
+    return (total / len(moments)).astype(np.float32)
+
+
+def _export_cameras(request: Request, device: str) -> str:
+    from ..training.camera_refinement import refined
+
+    assert request.run is not None
+    scene = Scene.load(request.run, device=device)
+    settings = scene.settings.get("data", {})
+    folder = settings.get("folder")
+    if not isinstance(folder, str) or not Path(folder).is_dir():
+        raise UserError(f"{request.run}/config.json: data.folder {folder} is no folder; put it back or correct it")
+    how = {key: settings[key] for key in ("downscale", "resample", "background") if key in settings}
+    splits = {split: data.load(folder, split, **how) for split in ("train", "test")}
+    splits["train"] = refined(splits["train"], request.run, scene.normalisation) or splits["train"]
+    count = write_cameras(request.output, splits)
+    return f"{count} cameras"
+
+
+def _export_page(request: Request, device: str) -> str:
+    try:
+        from .page import write_page
+    except ImportError as error:
+        raise UserError(f"--format html: {error}; install the package again") from None
+    assert request.run is not None
+    scene = Scene.load(request.run, device=device)
+    title = request.title or request.run.resolve().name
+    count = write_page(scene, request.output, title=title, max_mib=request.max_mib)
+    return f"{count:,} Gaussians {'and their motion' if scene.motion.moves else 'that stand still'}"

@@ -1,0 +1,64 @@
+"""``.splat``: 32 bytes a Gaussian, no header, no view-dependent colour; what the first web viewers read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..errors import UserError
+from ..gaussians import SH_C0, GaussianParameters
+from ..storage.checkpoint import write_atomically
+from ..storage.files import read_bytes
+from ..types import Gaussians
+from .gaussian_parameters import to_parameters
+
+ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
+"""Position and standard deviations in the units of the ``.ply``; red, green, blue, opacity; wxyz as 128 + 128 q."""
+
+
+def write_splat(path: str | Path, gaussians: Gaussians) -> None:
+    """Write activated Gaussians; those that matter most (volume times opacity) come first, for viewers that draw what
+    has arrived. Colours, opacities and rotations are rounded to 8 bits; harmonics above degree 0 are lost.
+
+    Raises:
+        UserError: the place cannot be written.
+    """
+    scales = gaussians.scales.detach().cpu().double().numpy()
+    opacities = gaussians.opacities.detach().cpu().double().numpy()
+    quats = torch.nn.functional.normalize(gaussians.quats.detach().cpu().double(), dim=1).numpy()
+    colors = 0.5 + SH_C0 * gaussians.sh_dc.detach().cpu().double().numpy()
+    rows = np.zeros(len(scales), ROW)
+    rows["mean"], rows["scale"] = gaussians.means.detach().cpu().numpy(), scales
+    rows["color"] = np.rint(255.0 * np.column_stack([colors, opacities]).clip(0.0, 1.0))
+    rows["quat"] = np.rint(128.0 + 128.0 * quats).clip(0, 255)
+    importance = scales.prod(axis=1) * opacities
+    order = np.argsort(-importance, kind="stable")
+    write_atomically(Path(path), rows[order].tobytes())
+
+
+def read_splat(path: str | Path) -> GaussianParameters:
+    """Raw parameters of degree 0, world units.
+
+    Raises:
+        UserError: it is missing, empty, cut short, or holds no finite Gaussian.
+    """
+    path = Path(path)
+    content = read_bytes(path, "give a .splat")
+    if not content or len(content) % ROW.itemsize:
+        raise UserError(f"{path}: {len(content)} bytes are no multiple of {ROW.itemsize}; export the .splat again")
+    rows = np.frombuffer(content, ROW)
+    color = rows["color"].astype(np.float64) / 255.0
+    opacity = color[:, 3].clip(1e-6, 1.0 - 1e-6)
+    with np.errstate(invalid="ignore"):  # of signalling NaN; such rows are left out
+        scales = np.maximum(rows["scale"].astype(np.float64), 1e-30)
+    values = {
+        "means": rows["mean"],
+        "sh_dc": (color[:, :3] - 0.5) / SH_C0,
+        "sh_rest": np.zeros((len(rows), 0, 3)),
+        "opacity_logits": np.log(opacity / (1.0 - opacity)),
+        "log_scales": np.log(scales),
+        "quats": (rows["quat"].astype(np.float64) - 128.0) / 128.0,
+    }
+    return to_parameters(path, {name: value.astype(np.float32) for name, value in values.items()})

@@ -1,0 +1,1 @@
+"""Cameras, quaternions and scene normalisation."""

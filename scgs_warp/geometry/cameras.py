@@ -1,0 +1,269 @@
+"""Cameras for films: what the training cameras look at, and paths around it. All angles are in degrees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..types import Camera
+
+FULL_ORBIT_GAP = 100.0
+"""Cameras whose azimuths leave no larger gap than this surround the scene."""
+SWING_SHARE = 0.8
+"""Of an observed arc, a turntable uses this much: the scene's sides were seen at a slant at its ends."""
+STEEPEST = 80.0
+"""A turntable's largest elevation: above a pole, azimuth means nothing."""
+
+ROUNDING = 2e-6
+"""Positions closer together than this share of their distance from the origin are one: viewmats are float32."""
+
+Vector = Sequence[float] | np.ndarray | Tensor
+
+
+@dataclass(frozen=True)
+class Overview:
+    """How the training cameras, taken together, see the scene. Plain numbers, world units, kept with the scene."""
+
+    centre: tuple[float, float, float]
+    """The point that the optical axes pass closest to."""
+    up: tuple[float, float, float]
+    """Unit vector."""
+    radius: float
+    """Median distance of the cameras from the centre."""
+    fov_x: float
+    """Median horizontal field of view."""
+    elevation: float
+    """Median elevation of the cameras, seen from the centre."""
+    azimuth: float = 0.0
+    """Where a film starts: the middle of the observed arc, or the first camera if they go all the way round."""
+    sweep: float = 360.0
+    """The arc of azimuths the cameras cover; 360 if they go all the way round."""
+    aspect: float = 1.0
+    """Width of the images divided by their height."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Values that JSON holds exactly."""
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> Overview:
+        """The inverse of ``to_dict``.
+
+        Raises:
+            KeyError, TypeError, ValueError: the values are not those of an overview.
+        """
+        rest = {key: float(value) for key, value in values.items() if key not in ("centre", "up")}
+        return Overview(_triple(values["centre"]), _triple(values["up"]), **rest)
+
+
+def _triple(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
+    x, y, z = vector
+    return float(x), float(y), float(z)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def agreed_up(rotations: np.ndarray) -> np.ndarray:
+    """[3] the direction that the cameras agree to call up.
+
+    Cameras held level have x axes perpendicular to it, whatever their pitch, so it is the direction in which the x
+    axes vary least. If they hardly turn, that leaves a plane to choose from; the mean of the -y axes decides.
+    """
+    mean = -rotations[:, 1].mean(0)
+    values, vectors = np.linalg.eigh(rotations[:, 0].T @ rotations[:, 0] / len(rotations))
+    if values[1] > 0.01 and values[1] > 10 * values[0]:  # they turn by some degrees, and roll by far less
+        level = vectors[:, 0]
+        agreement = float(level @ mean)
+        if abs(agreement) > 0.05:
+            return level * math.copysign(1.0, agreement)
+    if np.linalg.norm(mean) > 1e-3:
+        return _unit(mean)
+    return np.array([0.0, 0.0, 1.0])
+
+
+def _centre(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """[3] the point with the least squared distance to all optical axes.
+
+    Where the axes are parallel, or meet behind the cameras, there is none worth the name; then a point in front of
+    the mean camera, three times as far away as the cameras lie apart.
+    """
+    least = rounding(positions)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    matrix = across.mean(0)
+    if np.linalg.eigvalsh(matrix)[0] > 1e-5:
+        centre = np.linalg.solve(matrix, np.einsum("vij,vj->i", across, positions) / len(positions))
+        depths = np.einsum("vi,vi->v", centre - positions, axes)
+        if np.median(depths) > least and (depths > 0).mean() >= 0.75:
+            return centre
+    middle = positions.mean(0)
+    spread = float(np.linalg.norm(positions - middle, axis=1).max())
+    forward = axes.mean(0)
+    if np.linalg.norm(forward) < 1e-3:  # a panorama: everything around the cameras is the scene
+        return middle
+    return middle + _unit(forward) * (3 * spread if spread > least else 1.0)
+
+
+def rounding(positions: np.ndarray) -> float:
+    """The least distance, among camera centres [V, 3] taken from viewmats, that is one."""
+    return ROUNDING * float(np.linalg.norm(positions, axis=1).max())
+
+
+def _horizon(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors of azimuth 0 and 90, perpendicular to ``up``; x and y where up is z."""
+    helper = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    zero = _unit(helper - (helper @ up) * up)
+    return zero, np.cross(up, zero)
+
+
+def _arc(azimuths: np.ndarray) -> tuple[float, float]:
+    """(start, sweep) of the shortest arc that holds all azimuths."""
+    ordered = np.sort(azimuths % 360.0)
+    gaps = np.diff(np.append(ordered, ordered[0] + 360.0))
+    widest = int(gaps.argmax())
+    return float(ordered[(widest + 1) % len(ordered)]), float(360.0 - gaps[widest])
+
+
+def overview(cameras: Sequence[Camera]) -> Overview:
+    """Deduce from training cameras what they look at and from where; a full orbit and a small arc both work.
+
+    Args:
+        cameras: at least one, world units.
+
+    Raises:
+        ValueError: there is no camera.
+    """
+    if not cameras:
+        raise ValueError("cameras is empty; an overview needs at least one")
+    viewmats = torch.stack([camera.viewmat.detach().cpu().double() for camera in cameras]).numpy()
+    rotations = viewmats[:, :3, :3]
+    positions = -np.einsum("vji,vj->vi", rotations, viewmats[:, :3, 3])
+    up = agreed_up(rotations)
+    centre = _centre(positions, rotations[:, 2])
+    offsets = positions - centre
+    distances = np.linalg.norm(offsets, axis=1)
+    heights = offsets @ up
+    zero, ninety = _horizon(up)
+    flat = np.stack([offsets @ zero, offsets @ ninety], axis=1)
+    aside = np.linalg.norm(flat, axis=1) > 0.1 * distances  # cameras near a pole have no azimuth
+    azimuths = np.degrees(np.arctan2(flat[:, 1], flat[:, 0]))
+    start, sweep = _arc(azimuths[aside]) if aside.any() else (float(azimuths[0]), 0.0)
+    if 360.0 - sweep <= FULL_ORBIT_GAP:
+        azimuth, sweep = float(azimuths[aside][0]), 360.0
+    else:
+        azimuth = start + sweep / 2
+    fields = [2 * math.degrees(math.atan(camera.width / (2 * float(camera.K[0, 0])))) for camera in cameras]
+    return Overview(
+        centre=_triple(centre),
+        up=_triple(up),
+        radius=float(np.median(distances)) or 1.0,
+        fov_x=float(np.median(fields)),
+        elevation=float(np.median(np.degrees(np.arcsin(np.clip(heights / np.maximum(distances, 1e-12), -1, 1))))),
+        azimuth=azimuth % 360.0,
+        sweep=sweep,
+        aspect=float(np.median([camera.width / camera.height for camera in cameras])),
+    )
+
+
+def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
+    """The viewmat of a camera at ``eye`` that sees ``target`` at its image's centre and ``up`` upwards.
+
+    Args:
+        eye: [3] world.
+        target: [3] world.
+        up: [3] any length; if it points along the view, some other direction is taken.
+
+    Returns:
+        [4, 4] world-to-camera, OpenCV (x right, y down, z forward), float32.
+
+    Raises:
+        ValueError: eye and target coincide.
+    """
+    eye, target, up = (np.asarray(vector, np.float64) for vector in (eye, target, up))
+    if not np.linalg.norm(target - eye) > 0:
+        raise ValueError("eye and target coincide; a camera must look somewhere")
+    forward = _unit(target - eye)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6 * max(float(np.linalg.norm(up)), 1e-12):
+        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right = _unit(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return torch.from_numpy(viewmat).float()
+
+
+def image_size(overview: Overview, size: int) -> tuple[int, int]:
+    """(width, height) with the training images' proportions, the longer side ``size``, both even (video wants that)."""
+    width = size if overview.aspect >= 1 else size * overview.aspect
+    height = size / overview.aspect if overview.aspect >= 1 else size
+    return max(2, 2 * round(width / 2)), max(2, 2 * round(height / 2))
+
+
+def orbit_camera(overview: Overview, azimuth: float, size: int, elevation: float | None = None) -> Camera:
+    """A camera on the sphere around the scene's centre, looking at it.
+
+    Args:
+        overview: of the scene.
+        azimuth: degrees, as ``Overview.azimuth``.
+        size: longer side of the image in pixels.
+        elevation: degrees; the training cameras' by default, at most ``STEEPEST``.
+
+    Returns:
+        A camera on the CPU, square pixels, the training cameras' field of view.
+    """
+    width, height = image_size(overview, size)
+    elevation = overview.elevation if elevation is None else elevation
+    tilt = math.radians(max(-STEEPEST, min(STEEPEST, elevation)))
+    turn = math.radians(azimuth)
+    centre, up = np.array(overview.centre), np.array(overview.up)
+    zero, ninety = _horizon(up)
+    aside = math.cos(turn) * zero + math.sin(turn) * ninety
+    eye = centre + overview.radius * (math.cos(tilt) * aside + math.sin(tilt) * up)
+    focal = width / (2 * math.tan(math.radians(overview.fov_x) / 2))
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(look_at(eye, centre, up), K, width, height)
+
+
+def azimuth_of(overview: Overview, eye: Vector) -> float:
+    """The azimuth, 0 to 360 degrees, from which ``orbit_camera`` looks the way that a camera at ``eye`` [3] does."""
+    zero, ninety = _horizon(np.array(overview.up))
+    offset = np.asarray(eye, np.float64) - np.array(overview.centre)
+    return math.degrees(math.atan2(float(offset @ ninety), float(offset @ zero))) % 360.0
+
+
+def turntable(overview: Overview, frames: int, size: int, azimuths: tuple[float, float] | None = None) -> list[Camera]:
+    """Cameras of a film that goes round the scene and loops.
+
+    If the training cameras surround the scene: one turn of equal steps, starting where the first camera stood. If
+    they cover an arc only (a forward-facing capture), nothing is known of the scene's back: the camera swings like a
+    pendulum, from the middle of the arc to one side, to the other, and back, within ``SWING_SHARE`` of the arc.
+
+    Args:
+        overview: of the scene.
+        frames: number of cameras.
+        size: longer side of the images in pixels; the shorter follows the training images' proportions.
+        azimuths: (first, last) in degrees instead: equal steps from the first, the last left out.
+
+    Raises:
+        ValueError: ``frames`` is less than 1.
+    """
+    if frames < 1:
+        raise ValueError(f"frames is {frames}; it must be at least 1")
+    phases = [frame / frames for frame in range(frames)]
+    if azimuths is not None:
+        first, last = azimuths
+        angles = [first + (last - first) * phase for phase in phases]
+    elif overview.sweep >= 360.0:
+        angles = [overview.azimuth + 360.0 * phase for phase in phases]
+    else:
+        reach = SWING_SHARE * overview.sweep / 2
+        angles = [overview.azimuth + reach * math.sin(2 * math.pi * phase) for phase in phases]
+    return [orbit_camera(overview, angle, size) for angle in angles]

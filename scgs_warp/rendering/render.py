@@ -1,0 +1,110 @@
+"""One image of the Gaussians at one instant: project, colour, bin, composite."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isqrt
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..ops.binning import bin_splats
+from ..ops.compositing import composite, demand
+from ..ops.harmonics import MAX_DEGREE, spherical_harmonics
+from ..ops.projection import project
+from ..types import Camera, Gaussians, Image, Splats, Stats, Tiles
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor | None = None,
+    *,
+    sh_degree: int | None = None,
+    stats: Stats | None = None,
+    antialiased: bool = False,
+) -> Image:
+    """Render Gaussians (3D Gaussian Splatting, Kerbl et al. 2023, section 4), colour and expected depth in one pass.
+
+    Args:
+        gaussians: N activated Gaussians in world units; N may be 0.
+        camera: where from; on the device of the Gaussians.
+        background: [3] colour behind everything. None: black.
+        sh_degree: degree of the harmonics used. None: all there is.
+        stats: if given, the backward pass adds to it what ``Stats`` says.
+        antialiased: Mip-Splatting's opacity compensation.
+
+    Returns:
+        Image: ``rgb`` [H, W, 3] (its planar permutation is contiguous), ``alpha`` [H, W], ``depth`` [H, W] in world
+        units along the camera's z. Gradients reach all of ``gaussians``, ``camera.viewmat`` and ``background``.
+
+    Raises:
+        ValueError: a shape, a size or the degree is wrong.
+    """
+    image, alpha = draw(
+        gaussians, camera, background, sh_degree=sh_degree, stats=stats, antialiased=antialiased, depth=True
+    )
+    return Image(image[:3].permute(1, 2, 0), alpha, expected_depth(image[3], alpha))
+
+
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor | None = None,
+    *,
+    sh_degree: int | None = None,
+    stats: Stats | None = None,
+    antialiased: bool = False,
+    depth: bool = False,
+    binned: Callable[[Splats], Tiles] | None = None,
+) -> tuple[Tensor, Tensor]:
+    """As :func:`render`, planar, and depth only on demand: it costs a training step that has no use for it.
+
+    Args:
+        depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
+        binned: lists which splats touch which tile. None: ``bin_splats``.
+
+    Returns:
+        image [3 or 4, H, W] and alpha [H, W].
+    """
+    if background is not None and tuple(background.shape) != (3,):
+        raise ValueError(f"background must be [3], got {tuple(background.shape)}")
+    if sh_degree is None:
+        sh_degree = min(isqrt(gaussians.sh_rest.shape[1] + 1) - 1, MAX_DEGREE)
+    means = gaussians.means
+    shape = gaussians.quats, gaussians.scales, gaussians.opacities
+    size = camera.width, camera.height
+    splats = project(means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased)
+    channels = spherical_harmonics(gaussians.sh_dc, gaussians.sh_rest, means, centre_of(camera), sh_degree)
+    if depth:
+        channels = torch.cat([channels, splats.depths[:, None]], dim=1)
+        background = None if background is None else torch.cat([background, background.new_zeros(1)])
+    beside = demand(splats, channels, background)
+    tiles = bin_splats(splats, demand=beside) if binned is None else binned(splats)
+    return composite(splats, channels, tiles, background, stats=stats)
+
+
+class _FiniteGradient(torch.autograd.Function):
+    """The value as it is; of its gradient what is finite, elsewhere 0."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+        return gradient.nan_to_num(0.0, 0.0, 0.0)
+
+
+def centre_of(camera: Camera) -> Tensor:
+    """[3] ``camera.position``, whose gradient is 0 where a broken viewmat (zero times NaN) would make it NaN."""
+    if not camera.viewmat.requires_grad:
+        return camera.position
+    viewmat: Tensor = _FiniteGradient.apply(camera.viewmat)  # type: ignore[assignment]
+    return Camera(viewmat, camera.K, camera.width, camera.height).position
+
+
+def expected_depth(accumulated: Tensor, alpha: Tensor) -> Tensor:
+    """Accumulated depth over alpha, and 0 where alpha is 0 (nothing was accumulated there); same shape as both."""
+    return accumulated / alpha.clamp_min(1e-10)

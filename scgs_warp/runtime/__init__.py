@@ -1,0 +1,1 @@
+"""The process and its devices: environment, threads, launches, memory, progress, stop signals."""

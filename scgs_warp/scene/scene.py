@@ -1,0 +1,247 @@
+"""A trained scene: Gaussians, their motion, and how its units relate to the world's."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..config.fields import BACKGROUND_COLORS
+from ..config.presets import TrainConfig, from_dict, lasting, to_dict
+from ..config.validation import check_sizes
+from ..errors import UserError
+from ..gaussians import GaussianParameters
+from ..geometry.cameras import Overview
+from ..geometry.normalisation import Normalisation
+from ..motion import build_motion
+from ..motion.base import Motion
+from ..rendering.render import render
+from ..storage import checkpoint
+from ..storage.files import parse_json
+from ..types import Camera, Gaussians, Image
+from .frame_graph import FrameGraph
+from .validation import check_metadata, check_motion, check_settings, check_tensors, reason
+
+
+def moment(time: float) -> float:
+    """``time`` clamped to [0, 1].
+
+    Raises:
+        UserError: it is not finite.
+    """
+    if not math.isfinite(time):
+        raise UserError(f"time is {time}; give a number from 0 (the first moment) to 1 (the last)")
+    return min(max(float(time), 0.0), 1.0)
+
+
+class Scene:
+    """What training returns and a run directory holds. All public methods speak world units.
+
+    Attributes: ``gaussians`` (:class:`GaussianParameters`, normalised units), ``motion``, ``normalisation``,
+    ``config``, ``overview`` (where cameras stood), ``step``, ``settings`` (``config.json`` as a dict).
+    """
+
+    def __init__(
+        self,
+        gaussians: GaussianParameters,
+        motion: Motion,
+        normalisation: Normalisation,
+        config: TrainConfig,
+        overview: Overview,
+        *,
+        step: int = 0,
+        settings: dict[str, Any] | None = None,
+    ) -> None:
+        self.gaussians, self.motion, self.normalisation = gaussians, motion, normalisation
+        self.config, self.overview, self.step = config, overview, step
+        self.settings = settings if settings is not None else to_dict(config)
+        self._frames: FrameGraph | None = None
+
+    @staticmethod
+    def load(run: str | Path, device: str = "cpu") -> Scene:
+        """Read a run directory, as :func:`scgs_warp.fit` and ``apps/train.py`` leave it.
+
+        Args:
+            run: the folder, which holds ``checkpoint.safetensors``.
+            device: where the scene is to live and to be rendered, ``cpu`` or ``cuda``.
+
+        Returns:
+            the scene of the newest checkpoint, ready to render.
+
+        Raises:
+            UserError: it is missing or damaged, or training has not come to its second stage.
+        """
+        folder = Path(run)
+        if not folder.is_dir():
+            raise UserError(f"{folder}: no such run directory; apps/train.py --output makes one")
+        tensors, metadata = checkpoint.read(folder, ("gaussians.", "motion."))
+        scene = scene_from(tensors, metadata, device, str(folder / checkpoint.FILE))
+        settings_path = folder / "config.json"
+        if settings_path.is_file():
+            try:
+                scene.settings = parse_json(settings_path.read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                raise UserError(f"{settings_path}: cannot be read ({error}); restore it or train again") from error
+        check_settings(scene.settings, str(settings_path))
+        scene.motion.eval()
+        if metadata.get("stage") != "main":
+            raise UserError(f"{folder}: training stopped in stage 1; continue it with apps/train.py --resume")
+        scene.freeze_binding()
+        check_motion(scene, str(folder / checkpoint.FILE))
+        return scene
+
+    def freeze_binding(self) -> None:
+        """Find every Gaussian's control points once: they do not depend on time."""
+        cache = getattr(self.motion, "cache_binding", None)
+        if cache is not None:
+            cache(self.gaussians)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the scene lives and is rendered."""
+        return self.gaussians.means.device
+
+    @property
+    def motion_name(self) -> str:
+        """``control-points``, ``per-gaussian``, ``hexplane`` or ``static``."""
+        return self.motion.name
+
+    @property
+    def gaussian_count(self) -> int:
+        """N."""
+        return len(self.gaussians)
+
+    @property
+    def control_point_count(self) -> int:
+        """M; 0 for motion models without."""
+        return self.control_points_at(0.0).shape[0]
+
+    @property
+    def background_color(self) -> tuple[float, float, float]:
+        """What the truth was composited on; black where it was random."""
+        return BACKGROUND_COLORS[self.config.data.background]
+
+    @torch.no_grad()
+    def gaussians_at(self, time: float) -> Gaussians:
+        """The Gaussians at one moment, activated: as other renderers take them.
+
+        Args:
+            time: clamped to [0, 1].
+
+        Returns:
+            N Gaussians in world units on the scene's device. The order is the same at every time: row i is one point
+            of the surface, followed through the motion.
+
+        Raises:
+            UserError: the time is not finite.
+        """
+        posed = self.motion.gaussians_at(self.gaussians, moment(time))
+        undo = self.normalisation
+        return Gaussians(
+            undo.undo(posed.means),
+            posed.quats,
+            undo.undo_scale(posed.scales),
+            posed.opacities,
+            posed.sh_dc,
+            posed.sh_rest,
+        )
+
+    @torch.no_grad()
+    def render(
+        self, camera: Camera, time: float, background: tuple[float, float, float] | Tensor | None = None
+    ) -> Image:
+        """The scene at ``time`` in [0, 1], seen by a world camera; depth in world units.
+
+        Args:
+            camera: any device.
+            time: clamped to [0, 1].
+            background: colour in [0, 1]; None: ``background_color``.
+
+        Returns:
+            ``rgb`` [H, W, 3], ``alpha`` and ``depth`` [H, W], float32 on the scene's device; ``rgb`` may leave [0, 1] a
+            little.
+
+        Raises:
+            UserError: the time is not finite.
+        """
+        time = moment(time)
+        color = torch.as_tensor(self.background_color if background is None else background, dtype=torch.float32)
+        view = self.normalisation.apply_camera(camera)
+        if self.device.type == "cuda" and self.motion.takes_time_tensor:
+            return self.frame_graph().render(view, time, color)
+        posed = self.motion.gaussians_at(self.gaussians, time)
+        image = render(posed, view.to(self.device), color.to(self.device), antialiased=self.config.antialiased)
+        return Image(image.rgb, image.alpha, self.normalisation.undo_scale(image.depth))
+
+    def frame_graph(self) -> FrameGraph:
+        """What draws this scene's frames on CUDA; it takes cameras of the normalised scene. The same one every time,
+        until ``gaussians`` or ``motion`` is replaced."""
+        found = self._frames
+        if found is None or found.gaussians is not self.gaussians or found.motion is not self.motion:
+            found = self._frames = FrameGraph(
+                self.gaussians,
+                self.motion,
+                antialiased=self.config.antialiased,
+                depth_of=self.normalisation.undo_scale,
+            )
+        return found
+
+    @torch.no_grad()
+    def control_points_at(self, time: float) -> Tensor:
+        """[M, 3] control points at ``time``, clamped to [0, 1], world; [0, 3] for motion models without.
+
+        Raises:
+            UserError: the time is not finite.
+        """
+        return self.normalisation.undo(self.motion.control_points_at(moment(time)))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that makes the scene, by name, for a checkpoint."""
+        found = {f"gaussians.{name}": getattr(self.gaussians, name) for name in GaussianParameters.NAMES}
+        found.update({f"motion.{name}": value for name, value in self.motion.state_dict().items()})
+        return found
+
+    def metadata(self) -> dict[str, Any]:
+        return {
+            "config": lasting(to_dict(self.config)),
+            "normalisation": {"centre": self.normalisation.centre.tolist(), "scale": self.normalisation.scale},
+            "overview": self.overview.to_dict(),
+            "step": self.step,
+            "motion": self.motion.name,
+        }
+
+
+def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str, source: str) -> Scene:
+    """Inverse of :meth:`Scene.tensors` and :meth:`Scene.metadata`.
+
+    Raises:
+        UserError: tensors are missing or do not fit each other.
+    """
+    check_tensors(tensors, source)
+    check_metadata(metadata, source)
+    try:
+        config = from_dict(metadata["config"], source)
+        check_sizes(config, f"{source}: ")
+        rows = checkpoint.strip(tensors, "gaussians.")
+        rows.setdefault("shading", torch.zeros(len(rows["means"]), 0))  # runs from before there was any
+        shaded = rows["shading"].shape[1] > 0
+        gaussians = GaussianParameters.empty(
+            len(rows["means"]), rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, "cpu"
+        )
+        gaussians.load_state_dict(rows)
+        state = checkpoint.strip(tensors, "motion.")
+        motion = build_motion(metadata["motion"], config, state)
+        motion.load_state_dict(state)
+        unit = metadata["normalisation"]
+        normalisation = Normalisation(np.asarray(unit["centre"], dtype=np.float64), float(unit["scale"]))
+        overview = Overview.from_dict(metadata["overview"])
+        step = int(metadata["step"])
+    except (KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
+        raise UserError(
+            f"{source}: not a complete checkpoint ({reason(error)}); train again or use the previous one"
+        ) from error
+    return Scene(gaussians.to(device), motion.to(device), normalisation, config, overview, step=step)

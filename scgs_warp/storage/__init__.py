@@ -1,0 +1,1 @@
+"""Files and folders: checkpoints, JSON, output folders, safe paths."""

@@ -1,0 +1,232 @@
+"""Checkpoints: one safetensors file, written atomically, the previous one kept. No pickle; no path, date or host."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import zlib
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from ..errors import UserError
+from .files import parse_json
+
+FILE = "checkpoint.safetensors"
+PREVIOUS = "checkpoint.previous.safetensors"
+DAMAGED = "checkpoint.damaged.safetensors"
+"""What a damaged checkpoint is called once training goes on from the previous one."""
+METADATA_KEY = "scgs_warp"
+"""All metadata is one key of sorted JSON: safetensors writes several keys in random order."""
+FORMAT = 1
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+NOT_NOW = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ESTALE)
+"""A file that cannot be read for these reasons may be sound."""
+WORDS = ""
+"""What the check sum of the metadata is called, among those of the tensors."""
+
+
+class DamagedCheckpoint(UserError):
+    """The newest checkpoint cannot be used; the one before may be sound (:func:`fall_back`)."""
+
+
+def temporary_of(path: Path) -> Path:
+    """What ``path`` is called while it is written: one name, so that those who are killed leave one file, not many."""
+    return path.with_name(f".{path.name}.tmp")
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in ``folder`` outlast a loss of power, where the system can do that."""
+    with suppress(OSError):  # not on Windows, nor on every network share
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+def _write_through(path: Path, content: bytes) -> None:
+    """All of it, on the disk when this returns; on any exception there is no such file.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    try:
+        path.unlink(missing_ok=True)  # in a stranger's folder it may be a link to somewhere else
+        with open(path, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except BaseException:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        raise
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write beside, flush to disk, rename: a reader sees the old file or the new one, never half of it, also after a
+    loss of power.
+
+    Raises:
+        UserError: the disk is full or the folder cannot be written; the old file is intact.
+    """
+    temporary = temporary_of(path)
+    try:
+        _write_through(temporary, content)
+        os.replace(temporary, path)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise UserError(f"{path}: cannot be written ({error.strerror}); the previous file is intact") from error
+    sync_folder(path.parent)
+
+
+def _sum_of_words(metadata: Mapping[str, Any]) -> int:
+    """Of all that the metadata says beside the sums themselves."""
+    rest = {name: value for name, value in metadata.items() if name != "crc32"}
+    return zlib.crc32(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode())
+
+
+def _sum(tensor: Tensor) -> int:
+    return zlib.crc32(np.ascontiguousarray(tensor.numpy()).data)
+
+
+def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+    """Write ``checkpoint.safetensors``; the one before becomes ``checkpoint.previous.safetensors``.
+
+    Whenever the process ends, the folder holds a sound checkpoint under one of the two names. The metadata holds a
+    check sum of each tensor and one of itself.
+
+    Raises:
+        UserError: it cannot be written; the checkpoint before it is intact.
+    """
+    # A clone, since safetensors refuses tensors that share memory.
+    saved = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
+    sums = {name: _sum(tensor) for name, tensor in saved.items()}
+    words = parse_json(json.dumps({**metadata, "format": FORMAT}))
+    sums[WORDS] = _sum_of_words(words)
+    text = json.dumps({**words, "crc32": sums}, sort_keys=True, separators=(",", ":"))
+    content = save(saved, {METADATA_KEY: text})
+    path = folder / FILE
+    temporary = temporary_of(path)
+    try:
+        try:
+            _write_through(temporary, content)
+        except OSError as error:
+            if error.errno not in NO_ROOM or not os.path.exists(path):
+                raise
+            (folder / PREVIOUS).unlink(missing_ok=True)  # room for two, not for three
+            _write_through(temporary, content)
+        if os.path.exists(path):
+            _name_also(path, folder / PREVIOUS)
+        os.replace(temporary, path)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        remedy = (
+            "the one before it is intact: when there is room and leave to write, --resume continues from there"
+            if os.path.exists(path)  # pathlib's raises where the folder may not be looked into
+            else "nothing is saved yet: make room or choose another --output"
+        )
+        raise UserError(f"{path}: cannot be written ({error.strerror}); {remedy}") from error
+    sync_folder(folder)
+
+
+def _name_also(path: Path, name: Path) -> None:
+    """Let ``name`` be what ``path`` is; where there can be no hard links, a copy of it."""
+    temporary = temporary_of(name)
+    with suppress(OSError):  # then there is no previous checkpoint; the newest is written all the same
+        temporary.unlink(missing_ok=True)
+        try:
+            os.link(path, temporary)
+        except OSError:
+            shutil.copyfile(path, temporary)
+        os.replace(temporary, name)
+    with suppress(OSError):  # a rename between two names of one file does nothing
+        temporary.unlink(missing_ok=True)
+
+
+def read(
+    folder: Path, prefixes: tuple[str, ...] = ("",), *, name: str = FILE
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors whose names start with one of ``prefixes``, and the metadata. ``name``: of the file.
+
+    Raises:
+        DamagedCheckpoint: it is damaged, or missing while there is a previous one (with the remedy).
+        UserError: there is no checkpoint, or it is of another format.
+    """
+    path = folder / name
+    spare = name == FILE and (folder / PREVIOUS).is_file()
+    remedy = f"{PREVIOUS} is there: apps/train.py --resume falls back on it" if spare else "train again"
+    if not path.is_file():
+        if spare:
+            raise DamagedCheckpoint(f"{path}: is missing; {remedy}")
+        raise UserError(f"{folder}: no {name} here; give a run directory that apps/train.py wrote")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = parse_json((file.metadata() or {})[METADATA_KEY])
+            tensors = {key: file.get_tensor(key) for key in file.keys() if key.startswith(prefixes)}
+        if not isinstance(metadata, dict):
+            raise ValueError("no metadata")
+        sums = metadata.get("crc32", {})  # runs from before there were any have none
+        if WORDS in sums and sums[WORDS] != _sum_of_words(metadata):
+            raise ValueError("its metadata is not what was written")
+        for key, tensor in tensors.items():
+            if key in sums and sums[key] != _sum(tensor):
+                raise ValueError(f"{key} is not what was written")
+    except (SafetensorError, KeyError, ValueError, TypeError, AttributeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno in NOT_NOW:
+            raise UserError(f"{path}: cannot be read ({error.strerror}); try again, or make it readable") from error
+        raise DamagedCheckpoint(f"{path}: damaged or not ours ({error}); {remedy}") from error
+    if metadata.get("format") != FORMAT:
+        raise UserError(
+            f"{path}: format {str(metadata.get('format'))[:20]} is not {FORMAT}; use the version that wrote it"
+        )
+    return tensors, metadata
+
+
+def fall_back(folder: Path, error: DamagedCheckpoint) -> str:
+    """Put the previous checkpoint in the place of one that is damaged or missing. Whoever calls holds the lock.
+
+    Returns:
+        what to tell the user.
+
+    Raises:
+        DamagedCheckpoint: ``error``, where the previous one is no better.
+        UserError: the folder cannot be written.
+    """
+    path = folder / FILE
+    try:
+        _, metadata = read(folder, name=PREVIOUS)
+    except UserError:
+        raise error from None
+    step = metadata.get("step")
+    if not isinstance(step, int):
+        raise error
+    try:
+        if path.exists():
+            os.replace(path, folder / DAMAGED)
+        _name_also(folder / PREVIOUS, path)
+        path.stat()
+    except OSError as failure:
+        raise UserError(f"{path}: cannot be replaced ({failure.strerror}); make the folder writable") from error
+    sync_folder(folder)
+    return f"{path}: damaged (kept as {DAMAGED}); training goes on from {PREVIOUS}, step {step}"
+
+
+def strip(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors under ``prefix``, without it."""
+    return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def to_device(tensors: Mapping[str, Tensor], device: torch.device | str) -> dict[str, Tensor]:
+    return {name: value.to(device) for name, value in tensors.items()}

@@ -1,0 +1,1 @@
+"""Training: the loop, one step of it, adaptive density control, the run folder."""

@@ -1,0 +1,174 @@
+"""What to expect of a data set, in two lines, before time is spent on it: what it is, and which setting helps.
+
+Thresholds are angles and shares that a user can check in the pictures; what the settings are worth is in
+``docs/quality.md`` and ``docs/design.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..config.presets import TrainConfig
+from ..data.dataset import Dataset, spread
+from ..geometry.normalisation import FEWEST_POINTS, Normalisation
+from ..types import Frame
+
+MOST_PAIRS = 12
+FEWEST_PAIRS = 6
+"""Pairs of neighbouring frames, seen from nearly the same place, whose pixels are compared."""
+SAME_PLACE = 5.0
+"""Degrees between cameras that see the same light."""
+LITTLE_PARALLAX = 5.0
+"""Degrees: seen from the scene, the cameras are that close together. Depth is then a guess."""
+JUMPS = 10.0
+"""Degrees between neighbours in time beyond which the camera goes elsewhere at every instant, as in D-NeRF."""
+GAP = 5.0
+"""Times the usual distance between instants: nothing is known of the motion in between."""
+UNSTEADY = 0.08
+"""Relative change of brightness between neighbouring frames that is a change of exposure."""
+FEW_VISITS = 20
+"""Steps per frame below which frames are hardly learnt."""
+LARGE = 1_000_000
+"""Pixels of an image that make training slow on a CPU."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a data set offers."""
+
+    frames: int
+    width: int
+    height: int
+    instants: int
+    views: int
+    """Most frames of one instant."""
+    arc: float
+    """Degrees: the largest angle between two cameras, seen from the middle of the scene."""
+    turn: float
+    """Degrees: the median angle between the cameras of neighbouring instants."""
+    gap: tuple[float, float]
+    """The longest time without a frame, from and to."""
+    typical_gap: float
+    """Median distance between neighbouring instants."""
+    cut_out: bool
+    """Whether alpha tells objects from nothing."""
+    flicker: float
+    """Relative change of brightness from frame to frame (the ninth decile), where the camera hardly moves."""
+    points: int
+    """Initial points that the data bring."""
+
+
+def survey(data: Dataset) -> Survey:
+    """Look at the cameras and times of all frames, and at the pixels of some."""
+    times = np.array([entry.time for entry in data.entries])
+    instants, counts = np.unique(times, return_counts=True)
+    steps = np.diff(instants)
+    widest = int(steps.argmax()) if len(steps) else 0
+    directions = _directions(data)
+    order = np.argsort(times, kind="stable")
+    near = directions[order]
+    following = np.degrees(np.arccos(np.clip(np.einsum("vi,vi->v", near[1:], near[:-1]), -1, 1)))
+    some = directions[spread(len(directions), 400)]
+    first = data.entries[0].camera
+    return Survey(
+        frames=len(data),
+        width=first.width,
+        height=first.height,
+        instants=len(instants),
+        views=int(counts.max()),
+        arc=float(np.degrees(np.arccos(np.clip((some @ some.T).min(), -1, 1)))),
+        turn=float(np.median(following)) if len(following) else 0.0,
+        gap=(float(instants[widest]), float(instants[widest + 1])) if len(steps) else (0.0, 0.0),
+        typical_gap=float(np.median(steps)) if len(steps) else 0.0,
+        cut_out=bool(data.with_alpha),
+        flicker=_flicker(data, [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(following < SAME_PLACE)]),
+        points=0 if data.points is None else len(data.points),
+    )
+
+
+def _directions(data: Dataset) -> np.ndarray:
+    """[V, 3] unit vectors from the middle of the scene to the cameras."""
+    centre = Normalisation.fit(data.cameras, data.points).centre
+    offsets = np.stack([camera.position.double().cpu().numpy() for camera in data.cameras]) - centre
+    return offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
+
+
+def _flicker(data: Dataset, pairs: list[tuple[int, int]]) -> float:
+    """What exposure changes by between frames that follow each other and are seen from nearly the same place."""
+    changes = []
+    if len(pairs) < FEWEST_PAIRS:
+        return 0.0
+    for place in spread(len(pairs), MOST_PAIRS):
+        before, after = (_brightness(data[index], data.background == "white") for index in pairs[place])
+        if before > 0 and after > 0:
+            changes.append(abs(math.log(after / before)))
+    return math.expm1(float(np.quantile(changes, 0.9))) if changes else 0.0
+
+
+def _brightness(frame: Frame, on_white: bool) -> float:
+    """Mean over what is neither transparent nor masked: a figure that fills more of the image is no brighter."""
+    image = frame.image.mean(dim=2).double()
+    weight = torch.ones_like(image) if frame.alpha is None else frame.alpha.double()
+    if frame.alpha is not None and on_white:
+        image = image - (1.0 - weight)
+    if frame.mask is not None:
+        image, weight = image * frame.mask, weight * frame.mask
+    return float(image.sum()) / max(float(weight.sum()), 1e-9)
+
+
+def advise(found: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str, str]:
+    """Two lines: what the data are, and what to expect and which setting helps."""
+    cameras = (
+        f"{found.views} views of each instant"
+        if found.views > 1
+        else f"one camera, {found.turn:.0f} degrees from frame to frame"
+    )
+    points = f"{found.points:,} points" if found.points else "no points"
+    first = (
+        f"data: {found.frames:,} frames of {found.width} x {found.height} at {found.instants:,} times; {cameras}, "
+        f"{found.arc:.0f} in all; {'cut out by alpha' if found.cut_out else 'filled images'}; {points}"
+    )
+    return first, f"expect {_expectation(found)}; {_help(found, config, device)}"
+
+
+def _expectation(found: Survey) -> str:
+    if found.instants < 2:
+        return "a scene at rest: all frames are of one instant"
+    if found.arc < LITTLE_PARALLAX:
+        return f"good views near the cameras only: they lie within {found.arc:.1f} degrees, which leaves depth unknown"
+    if found.gap[1] - found.gap[0] > max(GAP * found.typical_gap, 0.05):
+        return f"guessed motion from time {found.gap[0]:.2f} to {found.gap[1]:.2f}, where there is no frame"
+    if found.flicker > UNSTEADY:
+        return f"averaged colours: brightness changes by {100 * found.flicker:.0f} % from frame to frame (exposure)"
+    if found.views > 1:
+        return "good views between the cameras at all times: each instant is seen from several sides"
+    if found.turn > JUMPS:
+        return "good views from all around: the camera stands elsewhere at each instant"
+    return "good views near the camera's path; motion along the line of sight stays uncertain"
+
+
+def _help(found: Survey, config: TrainConfig, device: str) -> str:
+    """The setting that is worth most here."""
+    if found.instants < 2 and config.motion.model != "static":
+        return "--motion static is all it needs"
+    if found.width * found.height > LARGE and device == "cpu":
+        factor = math.ceil(math.sqrt(found.width * found.height / LARGE)) * config.data.downscale
+        return f"on a CPU, --downscale {factor} makes it several times faster"
+    if config.steps < FEW_VISITS * found.frames:
+        wanted = math.ceil(FEW_VISITS * found.frames / 1000) * 1000
+        return (
+            f"each frame is seen {config.steps / found.frames:.0f} times only: --steps {wanted} sees all of them enough"
+        )
+    if found.points < FEWEST_POINTS and not found.cut_out:
+        return "COLMAP's points (ply_file_path, or its sparse model) begin some 2 dB better than random ones"
+    if not found.cut_out and found.views == 1 and config.optim.cameras == 0.0:
+        return "if the poses are off by more than a pixel, --set optim.cameras=2e-4 corrects them"
+    if found.cut_out and not config.pretrain.progressive and found.views == 1:
+        return "if a fast limb turns transparent, --progressive follows it frame by frame"
+    return (
+        "the settings fit; --preset paper is the longest and the best" if config.preset != "paper" else "it is set up"
+    )

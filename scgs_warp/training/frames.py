@@ -1,0 +1,118 @@
+"""Training views as the loop needs them: normalised cameras, planar truth on the device, and an order."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..config.presets import TrainConfig
+from ..data.cache import Pixels
+from ..data.dataset import Dataset
+from ..errors import FrameError, UserError
+from ..geometry.normalisation import Normalisation
+from ..seeding import generator
+from ..types import Camera, Frame
+
+PROGRESSIVE_SHARE = 0.2
+
+
+SMALLEST = 64
+"""Images with a shorter side than this are not halved."""
+
+
+def first_frames(data: Dataset) -> Dataset:
+    """The first fifth of the frames by time, with which progressive pre-training begins."""
+    ordered = sorted(range(len(data)), key=lambda index: data.entries[index].time)
+    return data.subset(ordered[: max(1, round(PROGRESSIVE_SHARE * len(ordered)))])
+
+
+def view_number(step: int, config: TrainConfig, view: int) -> int:
+    """Counts views as ``step`` counts steps: what the order of frames and a view's random draws depend on, so that they
+    do not depend on which process looks at it."""
+    return step * config.batch + view
+
+
+def _half(frame: Frame) -> Pixels:
+    def pool(image: Tensor) -> Tensor:
+        return F.avg_pool2d(image[None], 2)[0]
+
+    image = pool(frame.image.permute(2, 0, 1))
+    alpha = None if frame.alpha is None else pool(frame.alpha[None])[0]
+    mask = None if frame.mask is None else pool(frame.mask[None].float())[0] == 1.0
+    return Pixels(image.permute(1, 2, 0), alpha, mask)
+
+
+class Frames:
+    """Random order without replacement, the same for the same seed; every epoch another."""
+
+    def __init__(self, data: Dataset, normalisation: Normalisation, config: TrainConfig, device: str) -> None:
+        self.frames = data
+        self.config, self.device = config, device
+        self.cameras = [normalisation.apply_camera(frame.camera).to(device) for frame in data.entries]
+        self.background = data.background_color.to(device)
+        self.random_background = data.background == "random"
+        self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
+        self.by_time = sorted(range(len(self.frames)), key=lambda i: data.entries[i].time)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def index_at(self, step: int, progressive: bool, view: int = 0) -> int:
+        """The frame of this step's ``view``. ``progressive``: at first only the first 20 % of the frames by time, 20 %
+        more every ``progressive_every`` steps (seed S4), one by one rather than all at once; every other view is then
+        one of the newest 20 %, so that a limb is followed before its places of yesterday make it transparent."""
+        first, allowed, number = 0, len(self.frames), view_number(step, self.config, view)
+        if progressive:
+            grown = PROGRESSIVE_SHARE * (1.0 + step / self.config.pretrain.progressive_every)
+            allowed = min(allowed, max(1, round(grown * allowed)))
+            if number % 2 and allowed < len(self.frames):
+                first = max(0, allowed - max(1, round(PROGRESSIVE_SHARE * len(self.frames))))
+        count = allowed - first
+        epoch, place = divmod(number, count)
+        if self._order[0] != (epoch, count):
+            order = torch.randperm(count, generator=generator(self.config.seed, 41, epoch, count))
+            self._order = ((epoch, count), order.tolist())
+        return self.by_time[first + self._order[1][place]]
+
+    def halved(self, index: int) -> tuple[Frame, Camera]:
+        """Frame and normalised camera at half the size, each pixel the mean of four."""
+        entry, camera = self.frames.entries[index], self.cameras[index]
+        half = self.frames.cache.get((self, index), lambda: _half(self.frames[index]))
+        intrinsics = camera.K * camera.K.new_tensor([0.5, 0.5, 1.0])[:, None]
+        small = Camera(camera.viewmat, intrinsics, half.image.shape[1], half.image.shape[0])
+        return Frame(entry.camera, entry.time, *half, name=entry.name), small
+
+    def expect(self, step: int, progressive: bool, view: int = 0) -> None:
+        """Begin to read the frame of this step's ``view``, if it must be read."""
+        index = self.index_at(step, progressive, view)
+        if (self, index) not in self.frames.cache:
+            self.frames.expect(index)
+
+    def view(
+        self, index: int, step: int, random_background: bool, view: int = 0
+    ) -> tuple[Frame, Camera, Tensor, Tensor, Tensor | None]:
+        """Frame, normalised camera, truth [3, H, W] on the background of this step's ``view``, that background [3],
+        mask.
+
+        Raises:
+            FrameError: its file cannot be read any more.
+        """
+        camera = self.cameras[index]
+        try:
+            if step < self.config.half_size and min(camera.width, camera.height) >= SMALLEST:
+                frame, camera = self.halved(index)
+            else:
+                frame = self.frames[index]
+        except UserError as error:
+            raise FrameError(str(error)) from error
+        truth = frame.image.to(self.device).permute(2, 0, 1).contiguous()
+        background = self.background
+        if frame.alpha is not None and (random_background or self.random_background):
+            random = generator(self.config.seed, 42, view_number(step, self.config, view))
+            color = torch.rand(3, generator=random).to(self.device)
+            gap = 1.0 - frame.alpha.to(self.device)
+            truth = truth + gap * (color - background)[:, None, None]
+            background = color
+        mask = None if frame.mask is None else frame.mask.to(self.device)
+        return frame, camera, truth, background, mask

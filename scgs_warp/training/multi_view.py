@@ -1,0 +1,133 @@
+"""Steps of more than one view: looked at one after the other, or by several processes, to the same bits.
+
+Gradients and statistics are added view by view in their order. Process ``r`` of ``W`` takes the views ``r``, ``r + W``
+and so on: after each round the next ``W`` views are complete.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ..config.presets import TrainConfig
+from ..errors import UserError
+from ..types import Stats
+from .process_group import Team, Total
+
+if TYPE_CHECKING:
+    from .frames import Frames
+    from .state import StepResult, TrainState
+
+TERMS = ("image loss", "regulariser")
+"""What a view can fail by, before it has gradients."""
+DIFFER = "the processes no longer hold the same scene; are the data, the packages and the kind of processor the same?"
+
+
+def all_views(
+    state: TrainState, frames: Frames, look: Callable[[TrainState, Frames, int, Stats], StepResult]
+) -> StepResult:
+    """All views of a step, shared with the other processes if there are any.
+
+    Args:
+        look: one view, forward and backward; adds to the gradients and to the statistics it is given.
+
+    Returns:
+        the first view this process saw, with the losses of all (their mean), the size of the first view of all, and
+        the first failure of all. Unless it failed, parameters have the mean gradient, and ``state.stats`` has grown.
+
+    Raises:
+        UserError: the processes are not at the same point. Lost: there are no longer as many.
+    """
+    team, batch = state.team, state.config.batch
+    size, rank = (1, 0) if team is None else (team.size, team.rank)
+    rows: list[list[float]] = []
+    shown: StepResult | None = None
+    totals = None if team is None else (Total(team), Total(team, torch.maximum))
+    stats = _empty(state)
+    for first in range(0, batch, size):
+        if team is not None:  # a round's gradients are those of one view
+            _drop_gradients(state)
+            stats = _empty(state)
+        result = look(state, frames, first + rank, stats)
+        shown = shown or result
+        added = [] if result.failed else [*_gradients(state), stats.grad_norm, stats.count]
+        row = _row(result, sum(vector.numel() for vector in added))
+        rows += [row] if team is None else team.rows(row)
+        failed = next((TERMS[int(row[0])] for row in rows if row[0] >= 0), None)
+        if failed is not None:
+            return _result(shown, rows, failed)
+        if totals is not None:
+            if len({row[-1] for row in rows}) > 1:
+                raise UserError(f"step {state.step}: {DIFFER}")
+            totals[0].add(added)
+            totals[1].add([stats.max_radii])
+    if totals is not None:
+        totals[0].write([*_gradients(state), stats.grad_norm, stats.count])
+        totals[1].write([stats.max_radii])
+    for gradient in _gradients(state):
+        gradient *= 1.0 / batch
+    state.stats.grad_norm += stats.grad_norm
+    state.stats.count += stats.count
+    torch.maximum(state.stats.max_radii, stats.max_radii, out=state.stats.max_radii)
+    assert shown is not None
+    return _result(shown, rows, None)
+
+
+def _empty(state: TrainState) -> Stats:
+    return Stats.zeros(len(state.gaussians), state.device, state.stats.absolute)
+
+
+def _gradients(state: TrainState) -> list[Tensor]:
+    return [gradient for optimizer in state.optimizers() for _, gradient in optimizer.gradients()]
+
+
+def _drop_gradients(state: TrainState) -> None:
+    for optimizer in state.optimizers():
+        optimizer.zero_grad()
+
+
+def _row(result: StepResult, length: int) -> list[float]:
+    """A view in numbers: which term failed (-1: none), losses, size, and how much there is to add."""
+    code = -1 if result.failed is None else TERMS.index(result.failed)
+    losses = float(result.loss), float(result.l1), float(result.ssim), result.regulariser
+    return [code, *losses, *result.size, length]
+
+
+def _result(shown: StepResult, rows: list[list[float]], failed: str | None) -> StepResult:
+    loss, l1, ssim, regulariser = (sum(values) / len(rows) for values in list(zip(*rows))[1:5])
+    loss, l1, ssim = (torch.tensor(value) for value in (loss, l1, ssim))
+    size = int(rows[0][5]), int(rows[0][6])
+    return shown._replace(loss=loss, l1=l1, ssim=ssim, regulariser=regulariser, size=size, failed=failed)
+
+
+def check_share(config: TrainConfig, team: Team | None) -> None:
+    """Refuse a batch that the processes cannot share.
+
+    Raises:
+        UserError: naming both numbers.
+    """
+    if team is not None and config.batch % team.size:
+        raise UserError(
+            f"batch is {config.batch}, which {team.size} processes cannot share evenly; give --batch a multiple of "
+            f"{team.size}, or --nproc-per-node a divisor of {config.batch}"
+        )
+
+
+def check_replicas(state: TrainState) -> None:
+    """Compare the parameters of all processes; they are the same by construction, unless processors round differently.
+
+    Raises:
+        UserError: they differ.
+    """
+    if state.team is None:
+        return
+    digest = zlib.crc32(str(state.step).encode())
+    for module in (state.gaussians, state.motion, state.cameras):
+        for parameter in module.parameters():
+            digest = zlib.crc32(parameter.detach().cpu().contiguous().numpy().tobytes(), digest)
+    if not state.team.agree(digest):
+        raise UserError(f"step {state.step}: {DIFFER}")

@@ -1,0 +1,157 @@
+"""Stage 1: find the control points. Spheres are grown and pruned, thinned to N_p, trained on, and handed to stage 2."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..config.presets import TrainConfig
+from ..gaussians import SH_C0, GaussianParameters, gaussians_from_points, neighbor_distance
+from ..motion import HexPlane, Motion, build_motion
+from ..motion.control_points import ControlPoints, heads_of, make_network
+from ..motion.spheres import Spheres
+from ..ops.sampling import farthest_points
+from ..optim import Adam
+from ..seeding import generator
+from ..types import Stats
+from .densify import mean_gradient
+
+TRAJECTORY_TIMES = 16
+"""Instants whose positions make the space in which farthest-point sampling chooses control points."""
+START_RADIUS = 0.5
+"""Of the spheres of progressive pre-training, as a share of their spacing."""
+DEAD_OPACITY = 0.01
+SOLID_OPACITY = 0.1
+"""Spheres of less show nothing: neither control points nor Gaussians begin there while there are others."""
+FEWEST_SPHERES = 256
+"""Stage 1 works as if there were at least so many control points: fewer spheres cannot make out a figure."""
+
+
+def sphere_base(config: TrainConfig) -> int:
+    """What the numbers of spheres in stage 1 are multiples of: N_p, or more where that is too few."""
+    return max(config.motion.nodes, FEWEST_SPHERES)
+
+
+def begin_spheres(
+    config: TrainConfig, points: Tensor, colors: Tensor, device: str
+) -> tuple[GaussianParameters, Spheres]:
+    """Spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and the
+    network at rest.
+
+    The sample is spread evenly, since with all frames at once a limb may be anywhere. Progressive pre-training knows
+    the first pose: there the spheres stay as dense as the points, and start smaller than their spacing, because one
+    that sticks out of a thin limb turns transparent before it has shrunk.
+    """
+    count = min(round(sphere_base(config) * config.pretrain.start_ratio), len(points))
+    index = torch.arange(count, device=points.device)
+    if not config.pretrain.progressive and count < len(points):
+        index = farthest_points(points, count)
+    chosen = points[index]
+    gaussians = gaussians_from_points(chosen, colors[index], sh_degree=0, hyper_dim=0)
+    share = START_RADIUS if config.pretrain.progressive else 1.0
+    radius = share * float(neighbor_distance(chosen).median())
+    network = make_network(config.motion, heads_of(config.motion), config.seed).to(device)
+    return gaussians, Spheres(network, radius).to(device)
+
+
+def begin_motion(config: TrainConfig, points: Tensor, times: int = 0) -> Motion:
+    """A motion model without a first stage; control points are then a sample of ``points`` [P, 3], at rest. ``times``:
+    number of the training frames' times, after which feature planes are made."""
+    if config.motion.model == "hexplane":
+        return HexPlane(config.seed, config.motion.plane_times or max(2, times // 2))
+    if config.motion.model != "control-points":
+        return build_motion(config.motion.model, config)
+    positions = points[farthest_points(points, min(config.motion.nodes, len(points)))]
+    radii = torch.full((len(positions),), float(neighbor_distance(positions).median()), device=points.device)
+    network = make_network(config.motion, heads_of(config.motion), config.seed)
+    return ControlPoints(positions, radii, network, config.motion)
+
+
+def densify_spheres(
+    gaussians: GaussianParameters,
+    optimizer: Adam,
+    spheres: Spheres,
+    stats: Stats,
+    config: TrainConfig,
+    step: int,
+) -> None:
+    """Remove transparent spheres, clone those that the image pulls at most, keep between N_p and the cap.
+
+    A threshold on the gradient does not carry over from Gaussians to large spheres, so the share is fixed. A clone
+    lands within a radius of its parent. Too few left (a short first stage can fall to a dozen): more are cloned.
+    """
+    with torch.no_grad():
+        opacities = gaussians.opacities()
+        alive = (opacities >= DEAD_OPACITY) & torch.isfinite(gaussians.means).all(1)
+        if not bool(alive.any()):
+            alive[:] = True
+        kept = torch.where(alive)[0]
+        limit = round(sphere_base(config) * config.pretrain.max_ratio)
+        if len(kept) > limit and step + 1 >= config.pretrain.warm_up:
+            kept = kept[opacities[kept].argsort(descending=True, stable=True)[:limit]].sort().values
+        gradient = mean_gradient(stats)[kept]
+        wanted = min(round(config.pretrain.clone_share * len(kept)), max(limit - len(kept), 0))
+        wanted = max(wanted, config.motion.nodes - len(kept))
+        parents = kept[gradient.argsort(descending=True, stable=True)]
+        clones = parents[torch.arange(wanted, device=kept.device) % len(parents)]
+        index = torch.cat([kept, clones])
+        fresh = torch.arange(len(index), device=index.device) >= len(kept)
+        optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
+        if wanted:
+            noise = torch.randn(wanted, 3, generator=generator(config.seed, 32, step)).to(clones.device)
+            gaussians.means.data[len(kept) :] += noise * spheres.log_radius.exp()
+        spheres.graph = None
+
+
+def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Spheres, nodes: int) -> None:
+    """Farthest-point sampling to N_p in trajectory space, so that parts that move apart are both represented.
+
+    Among solid spheres, if they are enough: the farthest ones of all are strays in empty space that nobody sees.
+    """
+    if len(gaussians) <= nodes:
+        return
+    with torch.no_grad():
+        opacities = gaussians.opacities()
+        count = max(int((opacities >= SOLID_OPACITY).sum()), nodes)
+        kept = opacities.argsort(descending=True, stable=True)[:count].sort().values
+        times = torch.linspace(0.0, 1.0, TRAJECTORY_TIMES)
+        tracks = gaussians.means + spheres.translations(gaussians.means, times)
+        flat = tracks.permute(1, 0, 2).reshape(len(gaussians), -1)[kept].contiguous()
+        index = kept[farthest_points(flat, nodes).to(flat.device)]
+    optimizer.regather(gaussians, GaussianParameters.NAMES, index, torch.zeros_like(index, dtype=torch.bool))
+    spheres.graph = None
+
+
+def control_points_of(gaussians: GaussianParameters, spheres: Spheres, config: TrainConfig) -> ControlPoints:
+    """The spheres' centres become control points. All start with one radius (seed S4: o_i is shared): the spheres' own,
+    but no less than their typical spacing, so that neighbours blend."""
+    positions = gaussians.means.detach()
+    spacing = float(neighbor_distance(positions).median())
+    radius = max(float(spheres.log_radius.detach().exp()), spacing)
+    radii = torch.full((len(positions),), radius, device=positions.device)
+    return ControlPoints(positions, radii, spheres.network, config.motion)
+
+
+def begin_gaussians(
+    config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None = None
+) -> GaussianParameters:
+    """The Gaussians of stage 2: at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
+    options: dict[str, Any] = {
+        "sh_degree": config.sh_degree,
+        "hyper_dim": config.motion.hyper_dim + config.motion.mask,
+        "shaded": config.motion.has_shading,
+    }
+    count = min(config.init_points, config.densify.max_gaussians)
+    if spheres is None or config.init_from == "points":
+        return gaussians_from_points(points[:count], colors[:count], **options)
+    parents, motion = spheres
+    with torch.no_grad():
+        opaque = torch.where(parents.opacities() >= SOLID_OPACITY)[0]
+        opaque = opaque if len(opaque) else torch.arange(len(parents), device=opaque.device)
+        random = generator(config.seed, 34)
+        chosen = opaque[torch.randint(len(opaque), (count,), generator=random).to(opaque.device)]
+        offsets = torch.randn(count, 3, generator=random).to(chosen.device) * motion.log_radius.exp()
+        colors = (parents.sh_dc[chosen] * SH_C0 + 0.5).clamp(0.0, 1.0)
+        return gaussians_from_points(parents.means[chosen] + offsets, colors, **options)

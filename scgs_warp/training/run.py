@@ -1,0 +1,174 @@
+"""A whole run, and what it leaves behind when training is over: scores, contact sheet, curves, a turntable."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from ..config.presets import TrainConfig, to_dict
+from ..data import ImageCache, load
+from ..data.dataset import Dataset
+from ..errors import UserError, one_line
+from ..evaluation.evaluate import Lpips, metrics_of, write_metrics
+from ..geometry import cameras
+from ..runtime.progress import progress
+from ..scene.scene import Scene
+from ..storage.checkpoint import write_atomically
+from ..visualization import video
+from ..visualization.figures import curves
+from ..visualization.overlay import Painter
+from .loop import fit
+from .process_group import Team
+from .run_folder import read_seconds
+
+FILM_FRAMES = 120
+FILM_SIZE = 400
+FPS = 30.0
+QUIET_SECONDS = 2.0
+"""Reading that takes longer shows how far it is."""
+
+
+def settings_of(config: TrainConfig, folder: Path) -> dict[str, Any]:
+    """What ``config.json`` of a run on the data in ``folder`` says."""
+    settings = to_dict(config)
+    settings["data"]["folder"] = str(folder.resolve())
+    return settings
+
+
+def load_splits(config: TrainConfig, folder: Path) -> tuple[Dataset, Dataset]:
+    """Training and held-out frames, which share what ``config.data`` gives them of memory."""
+    look, cache = dataclasses.asdict(config.data), ImageCache(config.data.cache_mib)
+
+    def read(split: str) -> Dataset:
+        began, shown = time.monotonic(), []
+        with ExitStack() as stack:
+
+            def show(done: int, total: int) -> None:
+                if shown:
+                    shown[0].advance()
+                elif time.monotonic() - began > QUIET_SECONDS:
+                    shown.append(stack.enter_context(progress(total, f"reading {split} images", start=done)))
+
+            return load(folder, split, **look, cache=cache, progress=show)
+
+    return read("train"), read("test")
+
+
+def train_and_finish(
+    config: TrainConfig,
+    data: Path,
+    output: Path,
+    *,
+    device: str = "cpu",
+    resume: bool = False,
+    frames: int = FILM_FRAMES,
+    lpips: Lpips | None = None,
+    look: Callable[[Dataset], None] | None = None,
+    tensorboard: bool = False,
+    team: Team | None = None,
+) -> dict[str, Any]:
+    """Load, train, evaluate: what ``apps/train.py`` does.
+
+    Args:
+        data: folder of the data set; its train split is learnt, its test split measured.
+        output: run directory.
+        resume: continue the run in ``output``.
+        frames: length of the turntable; 0: none.
+        lpips: the perceptual distance, if it is to be measured.
+        look: called with the training frames before training begins.
+        tensorboard: also write event files for TensorBoard to ``output``.
+        team: the processes that share the work of training; the first does the rest.
+
+    Returns:
+        what ``metrics.json`` holds; nothing in other processes than the first.
+
+    Raises:
+        UserError: of the data, the configuration, the run directory or the training; or scores and pictures cannot
+            be written after it.
+        KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal, the checkpoint being saved.
+    """
+    train, test = load_splits(config, data)
+    if look is not None:
+        look(train)
+    scene = fit(
+        config,
+        train,
+        output=output,
+        device=device,
+        test=test,
+        resume=resume,
+        settings=settings_of(config, data),
+        tensorboard=tensorboard,
+        team=team,
+    )
+    if team is not None and not team.first:
+        return {}
+    try:
+        return finish(scene, test, output, frames=frames, lpips=lpips)
+    except (UserError, OSError) as error:
+        raise UserError(
+            f"{one_line(error)}; the scene is trained and saved: --resume makes the missing scores and pictures"
+        ) from error
+
+
+def finish(
+    scene: Scene, test: Dataset, folder: Path, *, frames: int = FILM_FRAMES, lpips: Lpips | None = None
+) -> dict[str, Any]:
+    """Evaluate the last step on the test split and write every picture.
+
+    Args:
+        scene: as training left it.
+        test: held-out frames.
+        folder: the run directory; ``metrics.json``, ``contact_sheet.png``, ``curves.png``, ``turntable.mp4``,
+            ``evaluation/`` go there.
+        frames: length of the turntable; 0: none.
+        lpips: the perceptual distance, if it is to be measured.
+
+    Returns:
+        what ``metrics.json`` holds.
+    """
+    scene.freeze_binding()
+    renders = folder / "evaluation" / test.split
+    with progress(len(test), "evaluating") as bar:
+        metrics = metrics_of(
+            scene,
+            test,
+            seconds=read_seconds(folder),
+            lpips=lpips,
+            render_dir=renders,
+            progress=lambda done, total: bar.advance(),
+        )
+    sheet = renders / "contact_sheet.png"
+    if sheet.is_file():
+        write_atomically(folder / "contact_sheet.png", sheet.read_bytes())
+    curves(folder / "log.jsonl", folder / "curves.png")
+    if frames > 0:
+        turntable(scene, folder / "turntable.mp4", frames)
+    write_metrics(metrics, folder / "metrics.json")  # last: a folder that has it is taken to have everything
+    return metrics
+
+
+def turntable(scene: Scene, path: Path, frames: int, size: int = FILM_SIZE) -> None:
+    """A film of the moving scene seen from all around."""
+    path_cameras = cameras.turntable(scene.overview, frames, size)
+    views = [(camera, frame / max(frames - 1, 1)) for frame, camera in enumerate(path_cameras)]
+    painter = Painter(scene, "rgb", views)
+    with video.film(path, FPS) as writer, progress(frames, "turntable") as bar:
+        for camera, time in views:
+            writer.write(painter.paint(camera, time))
+            bar.advance()
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """The scores, one line each, for the terminal."""
+    names = ("psnr", "ssim", "lpips", "epe", "jitter", "seconds", "gaussians", "control_points", "step")
+    found = [(name, metrics[name]) for name in names if metrics.get(name) is not None]
+    return "\n".join(
+        f"{name:>15}  {value:.4g}" if isinstance(value, float) else f"{name:>15}  {json.dumps(value)}"
+        for name, value in found
+    )

@@ -1,0 +1,291 @@
+"""A run directory: config.json, log.jsonl, previews/, and who may write to it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from ..config.presets import TrainConfig, to_dict
+from ..data.dataset import Dataset
+from ..errors import UserError, one_line
+from ..evaluation.image_metrics import psnr
+from ..runtime.progress import Progress, say
+from ..scene.scene import Scene
+from ..storage.checkpoint import FILE, PREVIOUS, write_atomically
+from ..visualization.figures import read_log
+from .tensorboard import TensorBoard, check_installed
+
+if TYPE_CHECKING:
+    from .state import StepResult, TrainState
+
+LOG_EVERY = 50
+PREVIEW_SECONDS = 15.0
+LOCK = ".lock"
+TEST_IMAGES = 4
+BOARD_IMAGES = 20
+"""Training pictures that a run shows in TensorBoard."""
+
+
+def read_seconds(folder: Path) -> float | None:
+    """Seconds of training according to the log; None without one."""
+    newest: float | None = None
+    for entry in _entries(folder):
+        with suppress(ValueError, KeyError, TypeError):  # not ours
+            newest = float(entry["seconds"])
+    return newest
+
+
+def _entries(folder: Path) -> list[dict[str, Any]]:
+    log = folder / "log.jsonl"
+    return read_log(log) if log.is_file() else []
+
+
+def refuse_existing(path: Path, resume: bool) -> None:
+    """Nothing is ever overwritten.
+
+    Raises:
+        UserError: there is a run in ``path`` and ``resume`` was not asked for.
+    """
+    if not resume and ((path / FILE).exists() or (path / PREVIOUS).exists()):
+        raise UserError(f"{path}: holds a run already; continue it with --resume or choose another --output")
+
+
+class RunFolder:
+    """Use as a context manager: holds a lock, so that two trainers cannot share one directory.
+
+    With ``tensorboard`` the log's entries, and a picture now and then, also go to event files. Log, previews, event
+    files and the look at held-out frames are for the eye: where they fail, training says so once and goes on.
+
+    Raises:
+        UserError: not writable, in use, or there is a run already and ``resume`` was not asked for; ``tensorboard``
+            without the package.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        config: TrainConfig,
+        settings: dict[str, Any] | None,
+        *,
+        resume: bool,
+        tensorboard: bool = False,
+    ) -> None:
+        if tensorboard:
+            check_installed()
+        self.tensorboard = tensorboard
+        self._board: TensorBoard | None = None
+        self.path = Path(path)
+        self.settings = settings if settings is not None else to_dict(config)
+        self.resume = resume
+        self.seconds = 0.0
+        self._began = time.perf_counter()
+        self._shown_at = 0.0
+        self._psnr: float | None = None
+        self._told: set[str] = set()
+        self._torn = False
+        """Whether the log may end in the middle of a line."""
+        self.tell: Callable[[str], None] = say
+        """Shows a line that is no error."""
+
+    def __enter__(self) -> RunFolder:
+        if self.resume and not self.path.is_dir():
+            raise UserError(f"{self.path}: no such run directory; give one that apps/train.py wrote, or no --resume")
+        try:
+            (self.path / "previews").mkdir(parents=True, exist_ok=True)
+            self._lock()
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot be written ({error.strerror}); choose another --output") from error
+        try:
+            refuse_existing(self.path, self.resume)
+            if not self.resume:
+                self._write_settings()
+        except UserError:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._optional("the event files for TensorBoard"):
+            board, self._board = self._board, None
+            if board is not None:
+                board.close()
+        os.close(self._lock_file)
+
+    @contextmanager
+    def _optional(self, what: str) -> Iterator[None]:
+        """Around what a run can do without."""
+        try:
+            yield
+        except (OSError, UserError) as error:
+            if what not in self._told:
+                self._told.add(what)
+                self.tell(f"warning: {what}: {one_line(error)}; training goes on without")
+
+    def _lock(self) -> None:
+        self._lock_file = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            import fcntl
+        except ImportError:  # not on Windows: there a second trainer is the user's own care
+            return
+        try:
+            fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(self._lock_file)
+            raise UserError(
+                f"{self.path}: another trainer is running here; wait for it or choose another --output"
+            ) from error
+        except OSError:
+            pass  # a file system without locks: there a second trainer is the user's own care, too
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether a run has begun here that no checkpoint was written of."""
+        names = (FILE, PREVIOUS)
+        return (self.path / "config.json").is_file() and not any((self.path / name).exists() for name in names)
+
+    def begin(self, step: int) -> None:
+        """Write the configuration; drop log lines after ``step``, which a resumed run will write again, and what was
+        half written when the process was killed."""
+        for left in self.path.glob(".*.tmp"):
+            with suppress(OSError):
+                left.unlink()
+        self._write_settings()
+        entries: list[dict[str, Any]] = []
+        for entry in _entries(self.path) if self.resume else []:
+            with suppress(ValueError, TypeError):  # not ours
+                if int(entry.get("step", 0)) <= step:
+                    self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
+                    entries.append(entry)
+        write_atomically(self.path / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries).encode())
+        if self.tensorboard:
+            with self._optional("the event files for TensorBoard"):
+                self._board = TensorBoard(self.path, entries, step, self.seconds)
+        self._began = time.perf_counter()
+
+    def _write_settings(self) -> None:
+        text = json.dumps(self.settings, indent=2, sort_keys=True)
+        write_atomically(self.path / "config.json", text.encode())
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of training, those before a resume counted in."""
+        return self.seconds + time.perf_counter() - self._began
+
+    def log(self, entry: dict[str, Any]) -> None:
+        line = json.dumps({**entry, "seconds": round(self.elapsed, 2)}) + "\n"
+        with self._optional("log lines"):
+            torn, self._torn = self._torn, True
+            with open(self.path / "log.jsonl", "a", encoding="utf-8") as file:
+                file.write("\n" + line if torn else line)
+            self._torn = False
+        self._on_board(lambda board: board.record(entry))
+
+    def _on_board(self, action: Callable[[TensorBoard], None]) -> None:
+        """For those who watch in TensorBoard, if somebody does."""
+        board, self._board = self._board, None  # one that has failed once fails for good, or waits for ever
+        if board is not None:
+            with self._optional("the event files for TensorBoard"):
+                action(board)
+                self._board = board
+
+    def _show(self, name: str, truth: torch.Tensor, render: torch.Tensor, step: int) -> None:
+        self._on_board(lambda board: board.show(name, truth, render, step))
+
+    def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
+        """Progress, a log line every 50 steps, a preview every 15 seconds. ``state.step`` counts the step as done."""
+        due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
+        if due and result.failed is None:
+            seen = slice(None) if result.mask is None else result.mask  # as the loss and the test's score do
+            now = float(psnr(result.render[:, seen], result.truth[:, seen]))
+            if math.isfinite(now):  # equal images, both empty, have none
+                self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
+            self.log(
+                {
+                    "step": state.step,
+                    "stage": state.stage,
+                    "loss": float(result.loss),
+                    "l1": float(result.l1),
+                    "ssim": float(result.ssim),
+                    "regulariser": result.regulariser,
+                    "psnr": None if self._psnr is None else round(self._psnr, 3),
+                    "gaussians": len(state.gaussians),
+                    "control_points": len(getattr(state.motion, "positions", ())),
+                }
+            )
+        if due or result.failed:
+            bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
+        else:
+            bar.advance(1)
+        between = max(1, state.config.steps // BOARD_IMAGES)
+        if state.step % between == 0 and result.failed is None:
+            self._show("train", result.truth, result.render, state.step)
+        if time.monotonic() - self._shown_at >= PREVIEW_SECONDS:
+            self._shown_at = time.monotonic()
+            with self._optional("previews"):
+                self.show(result)
+
+    def show(self, result: StepResult) -> None:
+        """``previews/latest.png``: truth beside render."""
+        import cv2
+
+        pair = torch.cat([result.truth, result.render], dim=2).clamp(0.0, 1.0)
+        pixels = (pair.permute(1, 2, 0).cpu() * 255.0 + 0.5).to(torch.uint8).numpy()[:, :, ::-1]
+        done, content = cv2.imencode(".png", pixels)
+        if done:
+            write_atomically(self.path / "previews" / "latest.png", content.tobytes())
+
+    def look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+        """PSNR of a few test images after ``step`` steps, for the curve."""
+        scene.motion.eval()
+        with self._optional("the look at held-out frames"):
+            self._look_at_test(scene, test, step)
+        scene.motion.train()
+
+    def _look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+        wanted = range(0, len(test), max(1, len(test) // TEST_IMAGES))
+        values = []
+        for i in wanted:
+            frame = test[i]
+            image = scene.render(frame.camera, frame.time).rgb.cpu()
+            valid = slice(None) if frame.mask is None else frame.mask
+            values.append(float(psnr(image[valid], frame.image[valid])))
+            if i == 0:
+                self._show("held_out", frame.image.permute(2, 0, 1), image.permute(2, 0, 1), step)
+        values = [value for value in values if math.isfinite(value)]
+        if values:
+            self.log({"step": step, "test_psnr": sum(values) / len(values)})
+
+
+class Onlooker(RunFolder):
+    """The run directory as processes see it that leave it to another one: nothing is written."""
+
+    def __enter__(self) -> Onlooker:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+    def begin(self, step: int) -> None:
+        pass
+
+    def log(self, entry: dict[str, Any]) -> None:
+        pass
+
+    def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
+        pass
+
+    def look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+        pass

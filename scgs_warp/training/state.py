@@ -1,0 +1,295 @@
+"""Everything a training run is at one step, and how it is saved and resumed to the same bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..config.presets import FREE_TO_CHANGE, TrainConfig, to_dict
+from ..data.dataset import Dataset
+from ..errors import UserError
+from ..gaussians import GaussianParameters
+from ..geometry.cameras import Overview, overview
+from ..geometry.normalisation import COMMON_RADIUS, FEWEST_POINTS, Normalisation
+from ..motion.base import Motion
+from ..motion.spheres import Spheres
+from ..optim import Adam
+from ..scene.scene import Scene, scene_from
+from ..scene.validation import check_metadata, check_motion, check_resumed, check_tensors, reason
+from ..seeding import generator
+from ..storage import checkpoint
+from ..types import Stats
+from .background_points import backdrop
+from .camera_refinement import CameraRefinement
+from .frames import first_frames
+from .initial_points import likely_points
+from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, sphere_base, thin_spheres
+from .process_group import Team
+
+Stage = Literal["pretrain", "main"]
+
+
+class StepResult(NamedTuple):
+    """What a step reports: detached scalars, the mean over its views, and a picture for previews."""
+
+    loss: Tensor
+    l1: Tensor
+    ssim: Tensor
+    regulariser: float
+    render: Tensor
+    truth: Tensor
+    mask: Tensor | None
+    """[H, W] bool, the pixels that count; None: all."""
+    failed: str | None
+    """The name of the term that was not finite, if any; the step was dropped."""
+    size: tuple[int, int]
+    """Width and height of the step's first view, in pixels."""
+
+
+class TrainState:
+    """Parameters, optimisers, statistics, step. ``step`` counts both stages; ``stage_step`` the present one."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        gaussians: GaussianParameters,
+        motion: Motion,
+        normalisation: Normalisation,
+        rig: Overview,
+        extent: float,
+        points: Tensor,
+        colors: Tensor,
+        *,
+        stage: Stage,
+        fingerprint: str,
+        frames: int = 0,
+        step: int = 0,
+    ) -> None:
+        self.config, self.normalisation, self.overview = config, normalisation, rig
+        self.extent, self.points, self.colors = extent, points, colors
+        self.stage: Stage = stage
+        self.step, self.fingerprint = step, fingerprint
+        self.failures = 0
+        self.team: Team | None = None
+        """The processes that share each step's views, if this is one of several; no part of a checkpoint."""
+        self.whole = True
+        """Whether ``step`` counts all that has been done to the parameters."""
+        self.cameras = CameraRefinement(frames if config.optim.cameras > 0 else 0).to(gaussians.means.device)
+        self.camera_optimizer = self.cameras.optimizer()
+        self.enter(gaussians, motion)
+
+    def enter(self, gaussians: GaussianParameters, motion: Motion) -> None:
+        """Take these models, with fresh optimisers and statistics."""
+        self.gaussians, self.motion = gaussians, motion
+        self.gaussian_optimizer = Adam(dict(gaussians.named_parameters()), self.gaussian_rates())
+        self.motion_optimizer = motion.optimizer(self.config)
+        self.reset_stats()
+
+    @staticmethod
+    def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
+        normalisation = Normalisation.fit(data.cameras, data.points)
+        config = suited(config, data)
+        points, colors = (tensor.to(device) for tensor in _initial_points(config, data, normalisation))
+        # A camera that stands still has no extent of its own; sizes are then judged by that of the content.
+        extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
+        rest = (normalisation, overview(data.cameras), extent, points, colors)
+        seen = {"fingerprint": data.fingerprint, "frames": len(data)}
+        if config.pretrain_steps > 0:
+            spheres = begin_spheres(config, points, colors, device)
+            return TrainState(config, *spheres, *rest, stage="pretrain", **seen)
+        gaussians = begin_gaussians(config, points, colors)
+        rest_points = points if data.points is None or not given(data, config) else points[: len(data.points)]
+        motion = begin_motion(config, rest_points, len(data.times.unique())).to(device)  # none on bare walls
+        return TrainState(config, gaussians, motion, *rest, stage="main", **seen)
+
+    def begin_main(self) -> None:
+        """From stage 1 to stage 2: spheres become control points, new Gaussians are made."""
+        assert isinstance(self.motion, Spheres)
+        thin_spheres(self.gaussians, self.gaussian_optimizer, self.motion, self.config.motion.nodes)
+        points = control_points_of(self.gaussians, self.motion, self.config)
+        gaussians = begin_gaussians(self.config, self.points, self.colors, (self.gaussians, self.motion))
+        self.stage = "main"
+        self.enter(gaussians, points)
+
+    @property
+    def device(self) -> torch.device:
+        return self.gaussians.means.device
+
+    @property
+    def stage_step(self) -> int:
+        return self.step if self.stage == "pretrain" else self.step - self.config.pretrain_steps
+
+    @property
+    def refines_cameras(self) -> bool:
+        return len(self.cameras.twists) > 0 and self.stage == "main" and self.stage_step >= self.config.rest_steps
+
+    def optimizers(self) -> list[Adam]:
+        found = [self.gaussian_optimizer, self.motion_optimizer, self.camera_optimizer]
+        return [optimizer for optimizer in found if optimizer is not None]
+
+    def reset_stats(self) -> None:
+        absolute = self.config.densify.absolute_grad and self.stage == "main"
+        self.stats = Stats.zeros(len(self.gaussians), self.device, absolute)
+
+    def gaussian_rates(self) -> dict[str, float]:
+        """Learning rates of the Gaussians that do not follow a schedule, and where the others start."""
+        rates, spheres = self.config.optim, self.stage == "pretrain"
+        return {
+            "means": rates.means,
+            "quats": rates.quats,
+            "log_scales": rates.scales,
+            "opacity_logits": self.config.pretrain.opacity_rate if spheres else rates.opacity,
+            "sh_dc": self.config.pretrain.color_rate if spheres else rates.sh_dc,
+            "sh_rest": rates.sh_rest,
+            "hyper": rates.hyper,
+            "shading": rates.shading,
+        }
+
+    def scene(self) -> Scene:
+        """The scene as it stands, for evaluation and pictures; shares the parameters."""
+        return Scene(self.gaussians, self.motion, self.normalisation, self.config, self.overview, step=self.step)
+
+    def save(self, folder: Path) -> None:
+        """Write the checkpoint; of several processes the first does."""
+        if self.team is not None and not self.team.first:
+            return
+        tensors = dict(self.scene().tensors())
+        tensors.update(self.gaussian_optimizer.tensors("adam.gaussians"))
+        if self.motion_optimizer is not None:
+            tensors.update(self.motion_optimizer.tensors("adam.motion"))
+        if len(self.cameras.twists):
+            tensors["cameras.twists"] = self.cameras.twists
+            tensors.update(self.camera_optimizer.tensors("adam.cameras"))
+        tensors.update({f"extra.{name}": value for name, value in self.motion.extra_state().items()})
+        for name in ("grad_norm", "count", "max_radii"):
+            tensors[f"stats.{name}"] = getattr(self.stats, name)
+        if self.stage == "pretrain":  # stage 2 starts from them
+            tensors["points"], tensors["colors"] = self.points, self.colors
+        metadata = {
+            **self.scene().metadata(),
+            "stage": self.stage,
+            "extent": self.extent,
+            "failures": self.failures,
+            "frames": self.fingerprint,
+        }
+        checkpoint.write(folder, tensors, metadata)
+
+    @staticmethod
+    def resume(folder: Path, config: TrainConfig, data: Dataset, device: str) -> TrainState:
+        """Continue from the checkpoint in ``folder``.
+
+        Raises:
+            UserError: there is none, it is damaged, or it was made with another configuration.
+        """
+        config = suited(config, data)
+        tensors, metadata = checkpoint.read(folder)
+        source = str(folder / checkpoint.FILE)
+        check_metadata(metadata, source)
+        _same_configuration(metadata["config"], to_dict(config), source)
+        if metadata.get("frames") != data.fingerprint:
+            raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
+        check_tensors(tensors, source)
+        check_resumed(tensors, metadata, source)
+        if metadata["step"] > config.steps:
+            raise UserError(f"{source}: is at step {metadata['step']} of {config.steps}; train again without --resume")
+        tensors = checkpoint.to_device(tensors, device)
+        scene = scene_from(tensors, metadata, device, source)
+        nothing = torch.zeros(0, 3, device=device)
+        try:
+            state = TrainState(
+                config,
+                scene.gaussians,
+                scene.motion,
+                scene.normalisation,
+                scene.overview,
+                float(metadata["extent"]),
+                tensors.get("points", nothing),
+                tensors.get("colors", nothing),
+                stage=metadata["stage"],
+                fingerprint=data.fingerprint,
+                frames=len(data),
+                step=scene.step,
+            )
+            state.gaussian_optimizer.load_tensors("adam.gaussians", tensors)
+            if state.motion_optimizer is not None:
+                state.motion_optimizer.load_tensors("adam.motion", tensors)
+            if len(state.cameras.twists):
+                state.cameras.load_state_dict({"twists": tensors["cameras.twists"]})
+                state.camera_optimizer.load_tensors("adam.cameras", tensors)
+            state.motion.load_extra_state(checkpoint.strip(tensors, "extra."))
+            stats = checkpoint.strip(tensors, "stats.")
+            state.stats = Stats(stats["grad_norm"], stats["count"], stats["max_radii"], absolute=state.stats.absolute)
+            state.failures = int(metadata["failures"])
+        except (KeyError, IndexError, ValueError, RuntimeError, TypeError) as error:
+            raise UserError(f"{source}: cannot be resumed ({reason(error)}); train again without --resume") from error
+        state.motion.eval()
+        check_motion(state.scene(), source)
+        state.motion.train()
+        return state
+
+
+def given(data: Dataset, config: TrainConfig) -> bool:
+    """Whether the data brings points to begin with: enough to tell where the scene is, and for every Gaussian to have
+    its control points among them. Fewer are no more than noise of a failed reconstruction."""
+    fewest = max(FEWEST_POINTS, config.motion.neighbors + 1)
+    return data.points is not None and len(data.points) >= fewest
+
+
+def suited(config: TrainConfig, data: Dataset) -> TrainConfig:
+    """What is ``auto``, decided by what the data offers; the figures are of a hand over a shelf, 128 x 96.
+
+    Images without alpha are filled: bare walls are as large as they are (Gaussians not pruned for it: 1.9 dB), and
+    much of what they show rests beside what moves (hyper-coordinates: 0.55 dB; a motion mask: 0.2 dB, none on top).
+    Where there are points, control points begin as a sample of them, and Gaussians at them (2 dB better than spheres
+    that have to find both).
+    """
+    filled = not data.with_alpha
+    motion, growth = config.motion, config.densify
+    if filled:
+        hyper_dim = max(motion.hyper_dim, motion.hyper_dim_filled)
+        config = replace(config, motion=replace(motion, hyper_dim=hyper_dim))
+    if growth.prune_large == "auto":
+        config = replace(config, densify=replace(growth, prune_large="never" if filled else "always"))
+    if given(data, config) and not config.pretrain.with_points:
+        config = replace(config, init_from="points", pretrain=replace(config.pretrain, steps=0))
+    return config
+
+
+def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
+    """Points [P, 3], normalised, and colours [P, 3]: the data's own points in a random order, and some for what has no
+    texture; else likely ones."""
+    count = max(config.init_points, round(sphere_base(config) * config.pretrain.start_ratio))
+    if data.points is None or not given(data, config):
+        # Progressive pre-training starts from the pose of the first frames; what others cover is not there yet.
+        frames = first_frames(data) if config.pretrain.progressive and config.pretrain_steps else data
+        points, colors = likely_points(count, frames, normalisation, config.seed, 31)
+        return points, torch.full_like(points, 0.5) if colors is None else colors
+    order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
+    points = normalisation.apply(data.points)[order].float().contiguous()
+    colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
+    if data.with_alpha:  # then nothing lies behind
+        return points, colors
+    behind = backdrop(count - len(points), points, data, normalisation, config.seed, 35)
+    return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]])
+
+
+def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
+    for name, value in wanted.items():
+        if f"{prefix}{name}" in FREE_TO_CHANGE:
+            continue
+        if isinstance(value, dict):
+            inner = saved.get(name, {})
+            _same_configuration(inner if isinstance(inner, dict) else {}, value, source, f"{prefix}{name}.")
+        elif name not in saved:  # what that version did instead cannot be asked for
+            raise UserError(
+                f"{source}: made by another version, which had no {prefix}{name}; train again with another --output"
+            )
+        elif saved[name] != value:
+            raise UserError(
+                f"{source}: made with {prefix}{name} = {saved[name]!r}, now {value!r}; "
+                "give the same options to --resume, or another --output"
+            )

@@ -1,0 +1,137 @@
+"""One training step, in the order things happen."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ..config.presets import TrainConfig
+from ..ops.adam import first_not_finite
+from ..ops.ssim import photometric_loss
+from ..optim import log_linear
+from ..rendering.render import draw
+from ..seeding import generator
+from ..types import Stats
+from .camera_refinement import camera_rate
+from .frames import Frames, view_number
+from .multi_view import all_views
+from .state import StepResult, TrainState
+
+SETTLED = 0.05
+"""What remains of the constant rates at the last step."""
+
+
+def training_step(state: TrainState, frames: Frames) -> StepResult:
+    """One step: look at each view of the batch, then change the parameters. Changes ``state``, except its ``step``."""
+    set_rates(state)
+    if state.config.batch == 1:
+        result = one_view(state, frames, 0, state.stats)
+    else:
+        result = all_views(state, frames, one_view)
+    failed = result.failed or _bad_gradient(state)
+    if failed is None:
+        state.gaussian_optimizer.step()
+        if state.motion_optimizer is not None and not frozen(state):
+            state.motion_optimizer.step()
+        if state.refines_cameras:
+            state.camera_optimizer.step()
+            state.cameras.centre()
+    for optimizer in state.optimizers():
+        optimizer.zero_grad()
+    return result._replace(failed=failed)
+
+
+def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> StepResult:
+    """One frame: pose, render, compare, go back. Adds to the parameters' gradients and to ``stats``; a loss that is not
+    finite adds nothing.
+
+    Args:
+        view: which one of the step's batch.
+    """
+    config, step = state.config, state.stage_step
+    pretraining = state.stage == "pretrain"
+    progressive = config.pretrain.progressive and pretraining
+    index = frames.index_at(step, progressive, view)
+    random_background = pretraining and config.pretrain.random_background
+    frame, camera, truth, background, mask = frames.view(index, state.step, random_background, view)
+    later, next_view = divmod(view + (1 if state.team is None else state.team.size), config.batch)
+    frames.expect(step + later, progressive, next_view)
+    if state.refines_cameras:
+        camera = state.cameras.apply(camera, index)
+
+    time = noisy_time(frame.time, state, len(frames), view)
+    posed, regulariser = state.motion.train_at(state.gaussians, time, step, config, config.seed, view)
+    collecting = pretraining or step < config.densify.until
+    picture, _ = draw(
+        posed,
+        camera,
+        background,
+        sh_degree=min(state.gaussians.sh_degree, step // config.densify.sh_every),
+        stats=stats if collecting else None,
+        antialiased=config.antialiased,
+    )
+    loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim)
+    total = loss if regulariser is None else loss + regulariser
+
+    failed = _not_finite(loss, regulariser)
+    if failed is None:
+        total.backward()
+    weighted = 0.0 if regulariser is None else float(regulariser.detach())
+    losses, size = (loss.detach(), l1.detach(), ssim.detach(), weighted), (truth.shape[2], truth.shape[1])
+    return StepResult(*losses, picture.detach(), truth, mask, failed, size)
+
+
+def frozen(state: TrainState) -> bool:
+    """Main steps in which only the Gaussians learn (seed S4)."""
+    return state.stage == "main" and state.stage_step < state.config.rest_steps
+
+
+def set_rates(state: TrainState) -> None:
+    """Every learning rate is a function of the step."""
+    config, step = state.config, state.stage_step
+    means = log_linear(config.optim.means, config.optim.means_end, step, config.optim.means_until)
+    settled = settling(step, config)
+    base = state.gaussian_rates()
+    for name, group in state.gaussian_optimizer.groups.items():
+        group.rate = means if name == "means" else base[name] * (settled if state.stage == "main" else 1.0)
+    if state.motion_optimizer is not None:
+        rates = state.motion.rates(step, config)
+        for name, group in state.motion_optimizer.groups.items():
+            group.rate = rates[name]
+    state.camera_optimizer.groups["twists"].rate = camera_rate(step, config.optim, config.rest_steps)
+
+
+def settling(step: int, config: TrainConfig) -> float:
+    """Factor of the constant rates: 1, then log-linearly to ``SETTLED`` over the last share of the main stage. Steps
+    that stay large shake every colour about its best value."""
+    length = round(config.optim.settle * config.main_steps)
+    passed = step - (config.main_steps - length)
+    return log_linear(1.0, SETTLED, passed, length) if length > 0 and passed > 0 else 1.0
+
+
+def noisy_time(time: float, state: TrainState, frames: int, view: int = 0) -> float:
+    """The view's time with noise, for data whose cameras stand elsewhere at every time: it keeps the motion from
+    jumping from frame to frame."""
+    config = state.config
+    fade = max(0.0, 1.0 - state.stage_step / config.optim.network_until)
+    spread = config.motion.time_noise * fade / max(frames - 1, 1)
+    if spread == 0.0:
+        return time
+    noise = torch.randn(1, generator=generator(config.seed, 43, view_number(state.step, config, view)))
+    return min(max(time + spread * float(noise), 0.0), 1.0)
+
+
+def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
+    if not math.isfinite(float(loss.detach())):
+        return "image loss"
+    if regulariser is not None and not math.isfinite(float(regulariser.detach())):
+        return "regulariser"
+    return None
+
+
+def _bad_gradient(state: TrainState) -> str | None:
+    named = [pair for optimizer in state.optimizers() for pair in optimizer.gradients()]
+    bad = first_not_finite([gradient for _, gradient in named])
+    return None if bad is None else f"gradient of {named[bad][0]}"

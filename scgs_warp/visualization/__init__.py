@@ -1,0 +1,1 @@
+"""Pictures and films of a scene and of a run."""

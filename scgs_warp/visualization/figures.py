@@ -1,0 +1,223 @@
+"""What a run looks like: sheets of truth beside render, curves of the log."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import UserError
+from ..storage.checkpoint import write_atomically
+from ..storage.files import as_number, parse_json
+
+NUMBERS, LARGEST = ("step", "seconds"), 1e9
+"""Fields of a log line without which it cannot be placed, and the largest value that they can have."""
+ERROR_RANGE = 0.2
+"""The mean absolute error over the channels that gets the brightest colour of an error map."""
+CAPTION = 22
+"""Height of a caption in pixels."""
+GAP = 4
+PAPER = (255, 255, 255)
+INK = (30, 30, 30)
+
+Picture = Tensor | np.ndarray
+
+
+def to_bytes(image: Picture) -> np.ndarray:
+    """[H, W, 3] or [H, W] floats, clamped to [0, 1], as uint8 on the CPU; NaN becomes 0."""
+    tensor = image.detach() if isinstance(image, Tensor) else torch.from_numpy(np.ascontiguousarray(image))
+    scaled = tensor.float().nan_to_num(0.0, 1.0, 0.0).mul_(255.0).add_(0.5).clamp_(0.0, 255.0)
+    return scaled.to(torch.uint8).cpu().contiguous().numpy()
+
+
+def _floats(image: Picture) -> np.ndarray:
+    if isinstance(image, Tensor):
+        image = image.detach().cpu().numpy()
+    return np.nan_to_num(image.astype(np.float32) / (255.0 if image.dtype == np.uint8 else 1.0)).clip(0.0, 1.0)
+
+
+def error_map(truth: Picture, render: Picture) -> np.ndarray:
+    """[H, W, 3] uint8: absolute error, averaged over the channels, in the colours of inferno; black is no error."""
+    import cv2
+
+    error = np.abs(_floats(truth) - _floats(render)).mean(-1) / ERROR_RANGE
+    return cv2.applyColorMap(to_bytes(error), cv2.COLORMAP_INFERNO)[..., ::-1]
+
+
+def psnr_of(truth: Picture, render: Picture) -> float:
+    """Peak signal-to-noise ratio of clamped floats, in dB; infinite if the images agree."""
+    error = float(np.square(_floats(truth).astype(np.float64) - _floats(render)).mean())
+    return -10.0 * math.log10(error) if error > 0 else math.inf
+
+
+def _write(canvas: np.ndarray, text: str, x: int, y: int, width: int) -> None:
+    """Text in a box ``width`` pixels wide and ``CAPTION`` high, smaller where it would not fit."""
+    import cv2
+
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+    needed = cv2.getTextSize(text, font, scale, 1)[0][0]
+    scale = min(scale, scale * (width - 4) / max(needed, 1))
+    cv2.putText(canvas, text, (x + 2, y + CAPTION - 7), font, scale, INK, 1, cv2.LINE_AA)
+
+
+def _fit(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The picture, made smaller (never larger), in the middle of a cell."""
+    import cv2
+
+    scale = min(1.0, width / image.shape[1], height / image.shape[0])
+    if scale < 1.0:
+        size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    cell = np.full((height, width, 3), PAPER, np.uint8)
+    top, left = (height - image.shape[0]) // 2, (width - image.shape[1]) // 2
+    cell[top : top + image.shape[0], left : left + image.shape[1]] = image
+    return cell
+
+
+def contact_sheet(
+    rows: Sequence[tuple[Picture, Picture]],
+    titles: Sequence[str] = (),
+    *,
+    scores: Sequence[float] = (),
+    cell: int = 400,
+) -> np.ndarray:
+    """Truth, render and error side by side, one row a pair.
+
+    Args:
+        rows: (truth, render), each [H, W, 3]: floats in [0, 1] or uint8; the two of a row have one size.
+        titles: a caption for each row; may be shorter than ``rows``.
+        scores: PSNR of each row, dB, where it is not that of the two pictures (masked pixels do not count).
+        cell: longest side of a picture on the sheet, pixels. Errors are computed before pictures are made smaller.
+
+    Returns:
+        [height, width, 3] uint8 RGB.
+
+    Raises:
+        ValueError: there are no rows, or truth and render differ in size.
+    """
+    if not rows:
+        raise ValueError("rows is empty; a contact sheet needs at least one pair of images")
+    for truth, render in rows:
+        if truth.shape != render.shape or truth.ndim != 3:
+            raise ValueError(f"truth {list(truth.shape)} and render {list(render.shape)} must both be [H, W, 3]")
+    width = min(cell, max(truth.shape[1] for truth, _ in rows))
+    height = min(cell, max(truth.shape[0] for truth, _ in rows))
+    sheet = np.full((CAPTION + len(rows) * (height + CAPTION + GAP), 3 * width + 4 * GAP, 3), PAPER, np.uint8)
+    columns = [GAP + column * (width + GAP) for column in range(3)]
+    for x, text in zip(columns, ("truth", "render", f"error (0 .. {ERROR_RANGE:g})")):
+        _write(sheet, text, x, 0, width)
+    for index, (truth, render) in enumerate(rows):
+        y = CAPTION + index * (height + CAPTION + GAP)
+        pictures = (to_bytes(_floats(truth)), to_bytes(_floats(render)), error_map(truth, render))
+        for x, picture in zip(columns, pictures):
+            sheet[y : y + height, x : x + width] = _fit(picture, width, height)
+        score = scores[index] if index < len(scores) else psnr_of(truth, render)
+        captions = (titles[index] if index < len(titles) else "", "", f"PSNR {score:.2f} dB")
+        for x, text in zip(columns, captions):
+            _write(sheet, text, x, y + height, width)
+    return sheet
+
+
+def read_log(path: str | Path) -> list[dict[str, Any]]:
+    """The lines of a run's ``log.jsonl``; one that is not what a log has (cut off when a run was killed) is left out.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); give the folder of a run") from None
+    lines = []
+    for line in text.splitlines():
+        try:
+            value = parse_json(line)
+        except ValueError:
+            continue
+        if isinstance(value, dict) and all(_sound(value.get(key)) for key in NUMBERS):
+            lines.append(value)
+    return lines
+
+
+def _sound(value: Any) -> bool:
+    """A number that a log has, or nothing."""
+    return value is None or (as_number(value) is not None and 0 <= value <= LARGEST)
+
+
+def _placed(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], list[tuple[str, float]]]:
+    """Where each (stage, step) lies on one axis, stage behind stage, and where each stage begins."""
+    steps: dict[str, list[int]] = {}
+    for line in lines:
+        if as_number(line.get("step")) is not None:
+            steps.setdefault(str(line.get("stage", "")), []).append(int(line["step"]))
+    positions, starts, end = {}, [], 0.0
+    for stage, found in steps.items():
+        # A stage that counts from zero again is put behind the one before it
+        offset = end if min(found) < end else 0.0
+        starts.append((stage, offset + min(found)))
+        positions.update({(stage, step): step + offset for step in found})
+        end = max(end, offset + max(found))
+    return positions, starts
+
+
+def _series(lines: list[dict[str, Any]], key: str, positions: dict[tuple[str, int], float]) -> dict[float, float]:
+    """Position to value, in order; of lines for the same step (a resumed run) the last one counts."""
+    found = {}
+    for line in lines:
+        value = as_number(line.get(key))
+        if value is not None and as_number(line.get("step")) is not None:
+            found[positions[str(line.get("stage", "")), int(line["step"])]] = value
+    return dict(sorted(found.items()))
+
+
+def curves(log_path: str | Path, out_png: str | Path) -> None:
+    """Draw PSNR, loss and the number of Gaussians over the steps of a run.
+
+    Args:
+        log_path: ``log.jsonl``: JSON objects with ``step`` and some of ``stage``, ``psnr``, ``test_psnr``, ``loss``,
+            ``l1``, ``ssim``, ``gaussians``; what is missing is not drawn.
+        out_png: where the picture goes.
+
+    Raises:
+        UserError: the log cannot be read, or the picture cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # no display, no global backend
+    from matplotlib.figure import Figure
+
+    lines = read_log(log_path)
+    stage = ""
+    for line in lines:  # a line without a stage (an evaluation) belongs to that of the lines before it
+        stage = line["stage"] = str(line.get("stage", stage))
+    positions, starts = _placed(lines)
+    panels = (
+        ("PSNR [dB]", (("psnr", "train", "-"), ("test_psnr", "test", "o-"))),
+        ("loss", (("loss", "loss", "-"), ("l1", "L1", "-"))),
+        ("Gaussians", (("gaussians", "Gaussians", "-"),)),
+    )
+    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    for column, (title, series) in enumerate(panels):
+        axes = figure.add_subplot(1, len(panels), column + 1, sharex=figure.axes[0] if column else None)
+        axes.set_title(title)
+        axes.set_xlabel("step")
+        axes.grid(alpha=0.3)
+        for key, label, style in series:
+            points = _series(lines, key, positions)
+            if points:
+                axes.plot(list(points), list(points.values()), style, label=label, markersize=3, linewidth=1.2)
+        drawn = len(axes.lines)
+        if title == "loss" and drawn:
+            axes.set_yscale("log")
+        for _, start in starts[1:]:
+            axes.axvline(start, color="0.6", linestyle=":", linewidth=1)
+        if drawn and len(series) > 1:
+            axes.legend(frameon=False)
+    FigureCanvasAgg(figure)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=110, format="png")
+    write_atomically(Path(out_png), picture.getvalue())

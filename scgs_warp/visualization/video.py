@@ -1,0 +1,271 @@
+"""Films: frames in, one at a time; out comes an .mp4, a .gif or a folder of PNGs. What is not complete never shows up
+under its final name."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import UserError
+from ..storage.output_folders import holds_only, make_parent, replace_folder
+
+SUFFIXES = (".mp4", ".gif", "")
+"""What ``film`` can write; no suffix: a folder of PNGs."""
+QUALITY = 18
+"""x264's constant rate factor; 18 is hard to tell from the original, 6 more halve the file."""
+PALETTE_PIXELS = 400_000
+"""Pixels, spread evenly over the film, that a GIF's one palette is chosen from."""
+PIXEL_BYTES = 64
+"""Memory of a frame while it is made: colour, coverage and depth in float32, their bytes, the encoder's own."""
+GIF_PIXEL_BYTES = 4
+"""Of every frame of a GIF: its bytes, and its places in the palette."""
+FRAME_NAME = "frame_{:05d}.png"
+FRAMES = r"frame_\d{5,}\.png"
+
+
+def check_path(path: str | Path) -> Path:
+    """Find out before the work, not after it, whether a film can be written there.
+
+    Raises:
+        UserError: an unknown suffix, a folder that holds something else, a place that cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UserError(f"{path}: cannot write {path.suffix} films; end the name in .mp4 or .gif, or name a folder")
+    if suffix and path.is_dir():
+        raise UserError(f"{path}: is a folder; give another name for the film")
+    if not suffix and path.exists():
+        if not path.is_dir():
+            raise UserError(f"{path}: is a file; end the name in .mp4 or .gif, or name a folder")
+        if not holds_only(path, FRAMES):
+            raise UserError(f"{path}: holds other files than a film's frames; name a new folder")
+    make_parent(path)
+    return path
+
+
+def frame_gib(width: int, height: int | None = None) -> float:
+    """GiB that a frame takes while it is rendered and written; square without ``height``."""
+    return PIXEL_BYTES * width * (height or width) / 2**30
+
+
+def require_memory(path: str | Path, width: int, height: int, frames: int, device: str) -> None:
+    """Refuse, before the first frame, a film that does not fit into memory.
+
+    Raises:
+        NotEnoughMemory: with the figures.
+    """
+    from ..runtime import memory
+
+    need, what = PIXEL_BYTES * width * height, f"{path}: a frame of {width} x {height}"
+    memory.require(need, device, what, "give a smaller --size")
+    if Path(path).suffix.lower() == ".gif":
+        need += GIF_PIXEL_BYTES * width * height * frames
+        what = f"{path}: a GIF of {frames} frames of {width} x {height}, all of which it keeps,"
+        memory.require(need, "cpu", what, "give a smaller --size or write an .mp4")
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """What goes wrong with the disk becomes one line. PyAV's errors of that kind are OSErrors, too."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"{path}: cannot be written ({reason}); free space or give another path") from None
+
+
+class FilmWriter:
+    """What ``film`` yields; one subclass a format."""
+
+    def __init__(self, path: Path, fps: float, quality: int) -> None:
+        self.path = path
+        self.fps = fps
+        self.quality = quality
+        self.frames = 0
+        self.temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+        self._shape: tuple[int, ...] | None = None
+
+    def write(self, frame: np.ndarray) -> None:
+        """Append one frame.
+
+        Args:
+            frame: [H, W, 3] uint8 RGB, the same size every time.
+
+        Raises:
+            ValueError: it is anything else.
+        """
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+            raise ValueError(f"frame must be [H, W, 3] uint8, got {list(frame.shape)} {frame.dtype}")
+        if self._shape is not None and frame.shape != self._shape:
+            raise ValueError(f"frame must be {list(self._shape)} like the first one, got {list(frame.shape)}")
+        with _told(self.path):
+            if self._shape is None:
+                self._shape = frame.shape
+                self._open(frame)
+            self._write(np.ascontiguousarray(frame))
+        self.frames += 1
+
+    def _open(self, frame: np.ndarray) -> None:
+        """The first frame tells the size."""
+
+    def _write(self, frame: np.ndarray) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Complete the temporary file."""
+
+    def publish(self) -> None:
+        """Give the complete film its name."""
+        os.replace(self.temporary, self.path)
+
+    def discard(self) -> None:
+        """Leave nothing behind; safe to call at any time."""
+        if self.temporary.is_dir():
+            shutil.rmtree(self.temporary, ignore_errors=True)
+        else:
+            self.temporary.unlink(missing_ok=True)
+
+
+class _Mp4(FilmWriter):
+    """H.264, yuv420p, BT.709: what every player and browser shows. Encoded as frames arrive."""
+
+    _container: Any = None
+
+    def _open(self, frame: np.ndarray) -> None:
+        import av
+        from av.video.reformatter import ColorRange, Colorspace
+
+        height, width = frame.shape[:2]
+        self._container = av.open(str(self.temporary), "w", format="mp4", options={"movflags": "+faststart"})
+        rate = Fraction(self.fps).limit_denominator(1000)
+        # x264's macroblock tree reads memory it never wrote (AVX-512): one film in a few hundred came out other bits
+        options = {"crf": str(self.quality), "preset": "medium", "x264-params": "mbtree=0"}
+        self._stream: Any = self._container.add_stream("libx264", rate=rate, options=options)
+        # 4:2:0 halves both sides: they must be even, so an odd one gets its last row or column twice
+        self._padding = ((0, height % 2), (0, width % 2), (0, 0))
+        self._stream.width, self._stream.height = width + width % 2, height + height % 2
+        self._stream.pix_fmt = "yuv420p"
+        # Said in the file as well: without it players guess, by size, and colours shift
+        context = self._stream.codec_context
+        context.color_range = ColorRange.MPEG
+        context.colorspace = context.color_primaries = context.color_trc = Colorspace.ITU709.value
+        self._reformat = {
+            "format": "yuv420p",
+            "dst_colorspace": Colorspace.ITU709,
+            "dst_color_range": ColorRange.MPEG,
+        }
+
+    def _write(self, frame: np.ndarray) -> None:
+        import av
+
+        picture = av.VideoFrame.from_ndarray(np.pad(frame, self._padding, "edge"), format="rgb24")
+        picture = picture.reformat(**self._reformat)
+        picture.pts = self.frames
+        self._container.mux(self._stream.encode(picture))
+
+    def close(self) -> None:
+        container, self._container = self._container, None
+        if container is not None:
+            container.mux(self._stream.encode())
+            container.close()
+
+    def discard(self) -> None:
+        container, self._container = self._container, None
+        if container is not None:
+            with suppress(OSError):
+                container.close()
+        super().discard()
+
+
+class _Gif(FilmWriter):
+    """One palette for the whole film, so that still areas do not flicker; frames wait in memory until it is known."""
+
+    def __init__(self, path: Path, fps: float, quality: int) -> None:
+        super().__init__(path, fps, quality)
+        self._kept: list[np.ndarray] = []
+
+    def _write(self, frame: np.ndarray) -> None:
+        self._kept.append(frame.copy())
+
+    def close(self) -> None:
+        from PIL import Image
+
+        pixels = np.concatenate([frame.reshape(-1, 3) for frame in self._kept[:: max(1, len(self._kept) // 16)]])
+        sample = np.ascontiguousarray(pixels[:: max(1, len(pixels) // PALETTE_PIXELS)])
+        palette = Image.fromarray(sample[None]).quantize(256, method=Image.Quantize.MEDIANCUT)
+        pictures = [
+            Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in self._kept
+        ]
+        # GIF counts in hundredths of a second; browsers slow down what claims less than two
+        duration = 10 * max(2, round(100 / self.fps))
+        pictures[0].save(
+            self.temporary, format="GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0
+        )
+
+
+class _Folder(FilmWriter):
+    """Numbered PNGs; an earlier film's frames in the same folder are replaced as a whole."""
+
+    def _open(self, frame: np.ndarray) -> None:
+        self.discard()
+        self.temporary.mkdir()
+
+    def _write(self, frame: np.ndarray) -> None:
+        write_png(self.temporary / FRAME_NAME.format(self.frames), frame)
+
+    def publish(self) -> None:
+        if self.path.is_dir() and not holds_only(self.path, FRAMES):
+            raise UserError(f"{self.path}: holds other files than a film's frames; name a new folder")
+        replace_folder(self.path, self.temporary)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write [H, W, 3] uint8 RGB losslessly.
+
+    Raises:
+        OSError: the place cannot be written.
+    """
+    import cv2
+
+    encoded = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 4])[1]
+    path.write_bytes(encoded.data)  # numpy's tofile does not say why it failed
+
+
+@contextmanager
+def film(path: str | Path, fps: float = 30, *, quality: int = QUALITY) -> Iterator[FilmWriter]:
+    """Write a film frame by frame; on any exception nothing is left behind, and an earlier film is left alone.
+
+    Args:
+        path: ends in .mp4 (H.264) or .gif; without a suffix, a folder of PNGs. Missing folders above are made.
+        fps: frames a second.
+        quality: of the .mp4, x264's constant rate factor: 0 is lossless, 51 the worst.
+
+    Yields:
+        A writer; hand each frame to its ``write``.
+
+    Raises:
+        UserError: as ``check_path``; or the disk is full; or no frame was written; or ``fps`` makes no sense.
+        OSError, anything: what the body of the ``with`` raises passes unchanged.
+    """
+    path = check_path(path)
+    if not 0 < fps <= 1000:
+        raise UserError(f"fps is {fps}; give a number of frames a second between 0 and 1000")
+    writers = {".mp4": _Mp4, ".gif": _Gif, "": _Folder}
+    writer = writers[path.suffix.lower()](path, fps, quality)
+    try:
+        yield writer
+        if writer.frames == 0:
+            raise UserError(f"{path}: a film needs at least one frame")
+        with _told(path):
+            writer.close()
+            writer.publish()
+    finally:
+        writer.discard()

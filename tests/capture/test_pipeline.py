@@ -1,0 +1,225 @@
+"""Capture as a whole: a film of a furnished room, in which something moves, becomes a folder that trains."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pygltflib")
+
+from helpers.paths import ROOT
+from helpers.room import Film, path_length, save, shoot
+from scgs_warp.capture import Request, capture, mapping, pipeline
+from scgs_warp.capture.similarity import align, centres
+from scgs_warp.data import load
+from scgs_warp.errors import UserError
+from scgs_warp.visualization.video import film as film_writer
+from scgs_warp.visualization.video import write_png
+
+FRAMES = 22
+
+
+@contextmanager
+def silent(total: int, text: str):
+    """No progress, but it is counted."""
+    counted = SimpleNamespace(done=0, total=total)
+
+    def advance(count: int = 1) -> None:
+        counted.done += count
+
+    counted.advance = advance
+    yield counted
+    assert counted.done <= total, text
+
+
+def run(source: Path, folder: Path, **options):
+    return capture(Request(source, **options), folder, show=silent)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory) -> tuple[Film, Path]:
+    made = shoot(FRAMES, 320, 240)
+    return made, save(made, tmp_path_factory.mktemp("film") / "room.mp4", fps=10)
+
+
+OPTIONS = {"features": 1500, "matching": "sequential"}
+
+
+@pytest.fixture(scope="module")
+def captured(filmed, tmp_path_factory) -> Path:
+    """Interrupted before the cameras, then finished."""
+    folder = tmp_path_factory.mktemp("captures") / "room"
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(pipeline.mapping, "solve", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(filmed[1], folder, **OPTIONS)
+    patch.undo()
+    assert not (folder / "transforms.json").exists()
+    before = {file: file.stat().st_mtime_ns for file in (folder / "work/frames").iterdir()}
+    made = run(filmed[1], folder, **OPTIONS)
+    assert not made.made_before and made.outcome.registered == made.outcome.picked == FRAMES
+    assert before == {file: file.stat().st_mtime_ns for file in (folder / "work/frames").iterdir()}, "made once"
+    return folder
+
+
+def read(folder: Path) -> tuple[np.ndarray, list[int], dict]:
+    """World-to-camera matrices [V, 4, 4] as our reader gives them, numbers of the frames, transforms.json."""
+    entries = [entry for split in ("train", "test") for entry in load(folder, split).entries]
+    entries.sort(key=lambda entry: entry.name)
+    views = torch.stack([entry.camera.viewmat for entry in entries]).double().numpy()
+    numbers = [int(entry.name.split("_")[1]) for entry in entries]
+    return views, numbers, json.loads((folder / "transforms.json").read_text())
+
+
+def check_cameras(truth: Film, folder: Path) -> None:
+    views, numbers, _ = read(folder)
+    assert len(numbers) >= 0.9 * len(truth.frames)
+    found, expected = centres(views), truth.centres[numbers]
+    error = np.linalg.norm(align(found, expected).points(found) - expected, axis=1)
+    assert error.max() < 0.01 * path_length(truth.centres), error
+
+
+def test_cameras_are_where_they_were(filmed, captured):
+    truth, _ = filmed
+    check_cameras(truth, captured)
+    views, numbers, _ = read(captured)
+    turned = align(centres(views), truth.centres[numbers]).viewmats(views)
+    traces = np.einsum("vij,vij->v", turned[:, :3, :3], truth.viewmats[numbers, :3, :3])
+    assert np.degrees(np.arccos(((traces - 1) / 2).clip(-1, 1))).max() < 1.0
+    camera = load(captured)[0].camera
+    assert float(camera.K[0, 0]) == pytest.approx(0.85 * 320, rel=0.02)
+
+
+def test_the_folder_trains(captured):
+    """Times are those of the film, no frame is both trained on and held out, points have colours."""
+    content = read(captured)[2]
+    train, test = load(captured), load(captured, "test")
+    assert len(train) + len(test) == FRAMES and not {f.name for f in train} & {f.name for f in test}
+    times = {frame["file_path"]: frame["time"] for frame in content["frames"]}
+    np.testing.assert_allclose(sorted(times.values()), np.arange(FRAMES) / (FRAMES - 1), atol=1e-6)
+    np.testing.assert_allclose([frame["seconds"] for frame in content["frames"]], np.arange(FRAMES) / 10, atol=1e-3)
+    assert train.points is not None and len(train.points) > 500 and train.colors is not None
+    masked = [file.name for file in (captured / "masks").iterdir()]
+    assert sorted(masked) == sorted(file.name for file in (captured / "images").iterdir())
+    for name in ("contact_sheet.png", "cameras.png"):
+        assert (captured / name).stat().st_size > 10_000
+
+
+def test_a_finished_capture_is_left_alone(filmed, captured, tmp_path):
+    files = {file: file.stat().st_mtime_ns for file in captured.rglob("*.[pj]*") if file.name != "journal.json"}
+    assert run(filmed[1], captured, **OPTIONS).made_before
+    with pytest.raises(UserError, match="finished capture, made with other settings"):
+        run(filmed[1], captured, size=200, **OPTIONS)
+    assert files == {file: file.stat().st_mtime_ns for file in files}
+
+
+def test_the_same_film_gives_the_same_bytes(filmed, captured, tmp_path):
+    """Matching and mapping once more, in a copy."""
+    again = tmp_path / "again"
+    shutil.copytree(captured / "work", again / "work")
+    journal = json.loads((again / "work/journal.json").read_text())
+    for name in ("matches", "cameras"):
+        journal["stages"].pop(name)
+    (again / "work/journal.json").write_text(json.dumps(journal))
+    run(filmed[1], again, **OPTIONS)
+    for name in ("transforms.json", "points.ply"):
+        assert (again / name).read_bytes() == (captured / name).read_bytes(), name
+
+
+# What cannot work is said in one line; what was made is kept
+
+
+def write_film(path: Path, frames) -> Path:
+    with film_writer(path, 10) as out:
+        for frame in frames:
+            out.write(frame)
+    return path
+
+
+def noise(seed: int) -> np.ndarray:
+    """A picture that has nothing in common with that of another seed."""
+    rng = np.random.default_rng(seed)
+    return np.kron(rng.integers(0, 256, (20, 27, 3), np.uint8), np.ones((6, 6, 1), np.uint8))
+
+
+def test_images_that_have_nothing_in_common(tmp_path):
+    (tmp_path / "images").mkdir()
+    for index in range(7):
+        write_png(tmp_path / f"images/{index}.png", noise(index))
+    with pytest.raises(UserError, match=r"0 of 7 frames registered; .*little in common.*kept") as error:
+        run(tmp_path / "images", tmp_path / "out", masks="none", features=300)
+    assert "\n" not in str(error.value)
+    assert (tmp_path / "out/contact_sheet.png").is_file() and len(list((tmp_path / "out/work/frames").iterdir())) == 7
+    assert not (tmp_path / "out/transforms.json").exists()
+
+
+def test_a_film_without_texture(tmp_path):
+    bare = shoot(8, 160, 120, samples=1, contrast=0.0)
+    (tmp_path / "images").mkdir()
+    for index, frame in enumerate(bare.frames):
+        write_png(tmp_path / f"images/{index}.png", frame)
+    with pytest.raises(UserError, match="texture"):
+        run(tmp_path / "images", tmp_path / "out")
+
+
+def test_a_film_that_is_too_short_or_rests(tmp_path, filmed):
+    with pytest.raises(UserError, match=r"three\.mp4: 3 frames are too few"):
+        run(write_film(tmp_path / "three.mp4", filmed[0].frames[:3]), tmp_path / "a")
+    with pytest.raises(UserError, match=r"1 of 12 frames are neither blurred nor alike.*11 alike"):
+        run(write_film(tmp_path / "rest.mp4", [filmed[0].frames[0]] * 12), tmp_path / "b")
+    with pytest.raises(UserError, match=r"--start 99"):
+        run(filmed[1], tmp_path / "c", start=99)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [({"frames": 2}, "--frames 2"), ({"size": 4}, "--size 4"), ({"fov": 500.0}, "--fov 500"),
+     ({"least": 2.0}, "--least"), ({"features": 1}, "--features"), ({"seed": -1}, "--seed"),
+     ({"start": 3.0, "end": 2.0}, "--start 3 --end 2")],
+)  # fmt: skip
+def test_options_that_cannot_work(tmp_path, options, named):
+    with pytest.raises(UserError, match=named):
+        run(tmp_path / "film.mp4", tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_app_says_it_in_one_line(tmp_path, captured, filmed):
+    def app(*arguments: str) -> subprocess.CompletedProcess:
+        command = [sys.executable, str(ROOT / "apps/capture.py"), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+    (tmp_path / "film.mp4").write_bytes(b"no film")
+    done = app(str(tmp_path / "film.mp4"), "--output", str(tmp_path / "out"))
+    assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1 and "film.mp4" in done.stderr
+    assert not (tmp_path / "out").exists()
+    done = app(str(filmed[1]), "--output", str(captured), "--features", "1500", "--matching", "sequential")
+    assert done.returncode == 0 and f"{FRAMES} of {FRAMES} frames have a camera" in done.stdout, done.stderr
+
+
+@pytest.mark.slow
+def test_the_acceptance_film(tmp_path):
+    made = shoot(240, 640, 480)
+    run(save(made, tmp_path / "room.mp4"), tmp_path / "out")
+    views, numbers, _ = read(tmp_path / "out")
+    outcome = json.loads((tmp_path / "out/work/journal.json").read_text())["stages"]["frames"]["result"]
+    assert len(numbers) >= 0.9 * len(outcome["indices"])
+    found, expected = centres(views), made.centres[numbers]
+    error = np.linalg.norm(align(found, expected).points(found) - expected, axis=1)
+    assert error.max() < 0.01 * path_length(made.centres)
+
+
+def test_without_a_model_there_is_no_solution(tmp_path):
+    assert mapping.read_solution(tmp_path, SimpleNamespace(names=[])) is None

@@ -1,0 +1,273 @@
+"""The nerfstudio layout, written here: splits, times, masks, borders, points, and what is wrong with the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from helpers.nerfstudio_files import COLORS, FOCAL, HEIGHT, POINTS, WIDTH, rewrite, save, write, write_ply
+from helpers.tiny import tiny_config
+from scgs_warp.data import assemble, images, load
+from scgs_warp.data.borders import border_mask, reduce_mask
+from scgs_warp.errors import UserError
+from scgs_warp.training.state import TrainState
+
+
+def message(folder: Path, split: str = "train") -> str:
+    with pytest.raises(UserError) as caught:
+        load(folder, split)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def share_of_colors_found(data) -> float:
+    """How often the pixel a point projects to has the point's colour."""
+    found = []
+    for frame in data:
+        camera = frame.camera
+        pixels = (data.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
+        pixels = (pixels[:, :2] / pixels[:, 2:]).floor().long()
+        inside = ((pixels >= 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(1)
+        seen = frame.image[pixels[inside, 1], pixels[inside, 0]]
+        found.append(((seen - data.colors[inside]).abs().amax(1) < 1e-3).float().mean())
+    return float(torch.stack(found).mean())
+
+
+def test_points_project_onto_their_pixels(tmp_path):
+    write(tmp_path)
+    data = load(tmp_path)
+    assert data.points.shape == data.colors.shape == (60, 3)
+    assert share_of_colors_found(data) > 0.8  # some dots hide behind others
+    assert data[0].alpha is None and data[0].mask is None
+    half = load(tmp_path, downscale=2)[0].camera
+    assert (half.width, half.height, float(half.K[0, 0]), float(half.K[1, 1])) == (20, 15, FOCAL / 2, FOCAL / 2)
+
+
+def test_splits_by_list_and_by_every_eighth(tmp_path):
+    content = write(tmp_path)
+    assert [frame.name for frame in load(tmp_path, "test")] == ["f_4", "f_12"]
+    assert [frame.name for frame in load(tmp_path, "val")] == ["f_4", "f_12"]
+    assert len(load(tmp_path, "train")) == 18
+    save(tmp_path, {**content, "train_filenames": ["f_3.png", "f_1.png"], "test_filenames": ["f_0.png"]})
+    assert [frame.name for frame in load(tmp_path, "train")] == ["f_1", "f_3"]
+    assert [frame.name for frame in load(tmp_path, "val")] == ["f_0"]
+    lists = {"train_filenames": ["f_3.png"], "val_filenames": ["f_0.png"], "test_filenames": []}
+    save(tmp_path, {**content, **lists})
+    assert [frame.name for frame in load(tmp_path, "test")] == ["f_0"]
+    save(tmp_path, {**content, **lists, "val_filenames": [], "test_filenames": ["f_5.png"]})
+    assert [frame.name for frame in load(tmp_path, "val")] == ["f_5"]
+    save(tmp_path, {**content, **lists, "val_filenames": []})
+    assert "test_filenames is missing" in message(tmp_path, "test")
+    save(tmp_path, {**content, "train_filenames": ["f_3.png"]})
+    assert "test_filenames is missing" in message(tmp_path, "test")
+    save(tmp_path, {**content, "train_filenames": ["f_99.png"]})
+    assert "train_filenames names 'f_99.png'" in message(tmp_path)
+
+
+def test_times_follow_the_names_where_there_are_none(tmp_path):
+    content = write(tmp_path)
+    for entry in content["frames"]:
+        del entry["time"]
+    content["frames"].sort(key=lambda entry: entry["file_path"])  # f_0, f_1, f_10, f_11, ...
+    save(tmp_path, content)
+    times = {frame.name: frame.time for frame in load(tmp_path)}
+    assert times["f_9"] == 9 / 19 and times["f_10"] == 10 / 19
+
+
+def test_intrinsics_of_a_frame_win(tmp_path):
+    content = write(tmp_path)
+    content["frames"][2] |= {"fl_x": 60.0, "fl_y": 70.0, "cx": 21.0}
+    save(tmp_path, content)
+    K = load(tmp_path)[2].camera.K
+    assert [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])] == [60.0, 70.0, 21.0, 15.0]
+
+
+@pytest.mark.parametrize("points_too", [True, False])
+def test_applied_transform_is_followed_whichever_way_it_was_meant(tmp_path, points_too):
+    content = write(tmp_path)
+    turn = np.array([[0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 1.0, -5.0], [1.0, 0.0, 0.0, 2.0]])
+    for entry in content["frames"]:
+        pose = np.array(entry["transform_matrix"])
+        entry["transform_matrix"] = (np.vstack([turn, [0, 0, 0, 1]]) @ pose).tolist()
+    save(tmp_path, {**content, "applied_transform": turn.tolist()})
+    if points_too:
+        write_ply(tmp_path / "points.ply", POINTS @ turn[:, :3].T + turn[:, 3], COLORS)
+    assert share_of_colors_found(load(tmp_path)) > 0.8
+
+
+def test_a_black_border_is_masked_but_nothing_dark_inside(tmp_path):
+    write(tmp_path)
+    for index in range(20):
+        image = cv2.imread(str(tmp_path / f"f_{index}.png"))
+        image[0, 10:20] = 2  # a border, not quite black
+        image[20:24, 20:24] = 0  # something black, inside
+        if index % 2:
+            image[:, :2] = 0  # a dark sleeve that comes and goes
+        cv2.imwrite(str(tmp_path / f"f_{index}.png"), image)
+    for split in ("train", "test"):
+        mask = load(tmp_path, split)[0].mask
+        expected = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+        expected[:2, 9:21] = False
+        assert torch.equal(mask, expected)
+    small = load(tmp_path, downscale=2)[0].mask
+    assert not small[0, 4:11].any() and small[1:].all()
+
+
+def with_alpha(image: np.ndarray, bits: int) -> np.ndarray:
+    """RGBA that is opaque everywhere, of 8 or 16 bits."""
+    most = 2**bits - 1
+    image = image.astype(np.uint8 if bits == 8 else np.uint16) * (most // 255)
+    return np.dstack([image, np.full_like(image[..., :1], most)])
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("background", ["black", "white", "random"])
+def test_opaque_rgba_is_rgb(tmp_path, bits, background):
+    """Filled images stay filled: a border is masked, bare walls get points, large Gaussians are kept."""
+    write(tmp_path)
+
+    def bordered(index: int, image: np.ndarray) -> np.ndarray:
+        image[0] = 0
+        return image
+
+    rewrite(tmp_path, bordered)
+    expected = load(tmp_path, background=background)
+    # Some with alpha, some without, as a tool leaves them that saves what it has touched.
+    rewrite(tmp_path, lambda index, image: with_alpha(image, bits) if bits == 16 or index % 2 else image)
+    data = load(tmp_path, background=background)
+    for plain, frame in zip(expected, data):
+        assert frame.alpha is None and torch.allclose(frame.image, plain.image, rtol=0, atol=1e-6)
+        assert frame.mask is not None and torch.equal(frame.mask, plain.mask)
+    config = tiny_config(20, data={"background": background})
+    state = TrainState.begin(config, data, "cpu")
+    assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 4)
+    assert len(state.gaussians) == config.init_points > len(data.points)
+
+
+def test_one_image_that_an_object_fills_keeps_its_alpha(tmp_path):
+    write(tmp_path)
+
+    def cut_out(index: int, image: np.ndarray) -> np.ndarray:
+        image = with_alpha(image, 8)
+        if index != 1:
+            image[:4, :, 3] = 200
+        return image
+
+    rewrite(tmp_path, cut_out)
+    data = load(tmp_path)
+    assert all(frame.alpha is not None and frame.mask is None for frame in data)
+    assert (data[1].alpha == 1).all() and (data[0].alpha[:4] < 0.8).all()
+    kept = TrainState.begin(tiny_config(20), data, "cpu").config
+    assert (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 0)
+
+
+@pytest.mark.parametrize("count", [47, 49])
+def test_a_border_takes_few_images_to_find(tmp_path, monkeypatch, count):
+    write(tmp_path, count)
+    seen = []
+    monkeypatch.setattr(assemble, "decode", lambda file: seen.append(file.stem) or images.decode(file))
+    load(tmp_path)
+    assert len(seen) == assemble.BORDER_FRAMES
+    assert {"f_0", f"f_{count - 1}"} <= set(seen), "from the whole video"
+
+
+def test_a_black_ground_is_no_border():
+    images = [np.zeros((30, 40, 3), np.uint8) for _ in range(6)]
+    for image in images:
+        image[10:20, 10:30] = 100
+    assert border_mask(images) is None
+    assert border_mask(images[:2]) is None
+
+
+def test_masks_of_frames(tmp_path):
+    content = write(tmp_path)
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :9] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    content["frames"][0]["mask_path"] = "mask.png"
+    save(tmp_path, content)
+    data = load(tmp_path)
+    assert torch.equal(data[0].mask, torch.from_numpy(mask > 0)) and data[1].mask is None
+    assert not load(tmp_path, downscale=2)[0].mask[:, :5].any()
+    cv2.imwrite(str(tmp_path / "mask.png"), mask[:10])
+    assert "its mask is 40 x 10" in message(tmp_path)
+    cv2.imwrite(str(tmp_path / "mask.png"), 0 * mask)
+    assert "all black" in message(tmp_path)
+
+
+@pytest.mark.parametrize("what", ["reduction", "border"])
+def test_a_mask_that_leaves_nothing_is_told(tmp_path, what):
+    content = write(tmp_path)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    if what == "border":
+        rewrite(tmp_path, lambda index, image: cv2.rectangle(image, (0, 0), (WIDTH, 1), (0, 0, 0), -1))
+        mask[0] = 255
+    else:
+        mask[::2, ::2] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    content["frames"][3]["mask_path"] = "mask.png"
+    save(tmp_path, content)
+    if what == "reduction":
+        assert load(tmp_path)[3].mask.sum() == HEIGHT * WIDTH / 4
+    with pytest.raises(UserError, match=r"f_3\.png: no pixel is left") as caught:
+        load(tmp_path, downscale=2 if what == "reduction" else 1)
+    assert "mask_path" in str(caught.value)
+
+
+def test_a_reduced_pixel_is_valid_only_if_all_beneath_are():
+    mask = np.ones((4, 4), bool)
+    mask[0, 3] = False
+    assert reduce_mask(mask, (2, 2)).tolist() == [[True, False], [True, True]]
+
+
+FAULTS = {
+    "distortion": (lambda content: content.__setitem__("k1", "much"), "k1 is 'much', no number"),
+    "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", None), "p2 is 'None'"),
+    "k5": (lambda content: content.__setitem__("k5", 0.1), "k5 is 0.1, a lens distortion that camera_model None does"),
+    "tangential fisheye": (
+        lambda content: content.update({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}),
+        "p1 is 0.1, a lens distortion that camera_model OPENCV_FISHEYE does not have",
+    ),
+    "parameters": (lambda content: content.__setitem__("distortion_params", [0] * 7), "distortion_params is [0, 0, 0"),
+    "parameter": (lambda content: content["frames"][1].__setitem__("distortion_params", 0.1), "distortion_params is 0"),
+    "huge": (lambda content: content.__setitem__("k1", 1e10), "frames[0]: camera parameters are not finite"),
+    "huge focal": (lambda content: content.__setitem__("fl_x", 1e300), "its camera has numbers beyond 1e+30"),
+    "listed": (lambda content: content.__setitem__("distortion_params", [0, "a"]), "distortion_params (k2) is 'a'"),
+    "sphere": (
+        lambda content: content["frames"][3].__setitem__("camera_model", "EQUIRECTANGULAR"),
+        "'EQUIRECTANGULAR'",
+    ),
+    "no text": (lambda content: content.__setitem__("camera_model", 3), "camera_model is '3'"),
+    "no points": (lambda content: content.__setitem__("ply_file_path", "none.ply"), "none.ply: no such file"),
+    "points": (lambda content: content.__setitem__("ply_file_path", 3), "ply_file_path is no text"),
+    "mask": (lambda content: content["frames"][0].__setitem__("mask_path", 3), "frames[0].mask_path"),
+    "no mask": (lambda content: content["frames"][0].__setitem__("mask_path", "no.png"), "no.png: no such image"),
+    "transform": (lambda content: content.__setitem__("applied_transform", [[1, 2]]), "applied_transform must be"),
+    "scale": (lambda content: content.__setitem__("applied_scale", -1), "applied_scale a positive"),
+    "focal": (lambda content: content.pop("fl_x"), "fl_x"),
+    "time": (lambda content: content["frames"][0].__setitem__("time", 3), "frames[0].time is 3, outside"),
+    "split": (lambda content: content.__setitem__("train_filenames", []), "train_filenames is empty"),
+    "pose": (lambda content: content["frames"][0].__setitem__("transform_matrix", [[1]]), "frames[0].transform_matrix"),
+}
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective", "SIMPLE_RADIAL", None])
+def test_models_of_a_pinhole_are_read(tmp_path, model):
+    content = write(tmp_path, camera_model=model, distortion_params=[0.0] * 6, k5=0, k6=0.0)
+    content["frames"][0]["camera_model"] = model
+    save(tmp_path, content)
+    assert len(load(tmp_path)) == 18
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_are_named(name, tmp_path):
+    content = write(tmp_path, 6)
+    change, expected = FAULTS[name]
+    change(content)
+    save(tmp_path, content)
+    text = message(tmp_path)
+    assert expected in text and str(tmp_path) in text

@@ -1,0 +1,260 @@
+"""The solver of edits: against dense float64 twins, the laws of rigid motion, and everything degenerate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from helpers.edit_scenes import figure_scene
+from helpers.limb_bending import LIMBS, bend, grab
+from reference import editing as twin
+from scgs_warp.edit import ArapSolver, EditSession, build_graph
+from scgs_warp.edit.graph import ControlGraph
+from scgs_warp.edit.handles import Goal, anchors_at
+from scgs_warp.edit.rotations import IDENTITY, angle, from_axis, from_matrix, rotate, to_matrix
+from scgs_warp.edit.solver import Anchors, Shape, count_steps
+from scgs_warp.runtime import environment
+
+X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+def cloud(seed: int, count: int, spread=(1.0, 1.0, 1.0)) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, 3)) * spread
+
+
+def graph_of(points: np.ndarray, neighbors: int = 6) -> ControlGraph:
+    return build_graph(torch.from_numpy(points).float()[None], neighbors)
+
+
+def solve(graph: ControlGraph, rest: np.ndarray, goals: list[Goal], pins=(), steps: int = 8) -> Shape:
+    held = np.array(pins, np.int64)
+    return ArapSolver(graph).solve(rest, lambda share: anchors_at(goals, held, rest, share), steps)
+
+
+def turn(nodes, degrees: float = 0.0, axis=(0, 0, 1), shift=(0, 0, 0), pivot=(0, 0, 0), **more) -> Goal:
+    return Goal(np.array(nodes), np.array(pivot, float), from_axis(axis, degrees), np.array(shift, float), **more)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("stretch", "smooth"), [(0.0, 0.0), (2.0, 0.3)])
+def test_one_iteration_is_that_of_the_twin(seed, stretch, smooth):
+    random = np.random.default_rng(seed)
+    rest = cloud(seed, 40)
+    graph = graph_of(rest)
+    posed = rest + 4.0 * random.normal(size=rest.shape)
+    hard = np.arange(40) < 10
+    soft = np.where(np.arange(40) % 7 == 6, 0.3, 0.0)
+    anchors = Anchors(hard, soft, np.zeros(40, bool), posed + 0.0, np.tile(np.eye(3), (40, 1, 1)), np.zeros(40))
+    found = ArapSolver(graph, smooth, stretch).relax(rest, anchors, Shape(posed, anchors.rotations), 1)
+    pulls = soft * np.diff(graph.begin)
+    guessed = twin.place_nodes(graph, rest, posed, anchors.rotations, hard, pulls, posed, 0.0)
+    rotations = twin.turn_nodes(graph, rest, guessed, anchors.rotations, smooth * graph.edge_length**2)
+    np.testing.assert_allclose(found.rotations, rotations, atol=1e-6)
+    expected = twin.place_nodes(graph, rest, guessed, rotations, hard, pulls, posed, stretch)
+    np.testing.assert_allclose(found.positions, expected, atol=1e-6)
+    assert np.abs(expected - posed).max() > 0.05
+    first, second = graph.edges.T
+    turned = np.einsum("eij,ej->ei", 0.5 * (rotations[first] + rotations[second]), rest[first] - rest[second])
+    reversed_edges = ((guessed[first] - guessed[second]) * turned).sum(1) < 0.0
+    assert reversed_edges.any(), "some edges point the wrong way"
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10_000), st.integers(-180, 180), st.integers(-20, 20))
+def test_one_handle_without_pins_moves_everything_rigidly(seed, degrees, tenths):
+    shift = tenths / 10
+    rest = cloud(seed, 50)
+    graph = graph_of(rest, 8)
+    axis = np.random.default_rng(seed + 1).normal(size=3)
+    goal = turn(range(4), degrees, axis, (shift, 0, 0), rest[0])
+    found = solve(graph, rest, [goal], steps=count_steps(np.radians(abs(degrees)), abs(shift), graph.edge_length))
+    alive = graph.component == graph.component[0]
+    expected = rotate(goal.quat, rest - goal.pivot) + goal.pivot + goal.translation
+    size = np.ptp(rest, axis=0).max()
+    if (graph.component[:4] == graph.component[0]).all():
+        np.testing.assert_allclose(found.positions[alive], expected[alive], atol=2e-3 * size)
+    np.testing.assert_array_equal(found.positions[~np.isin(graph.component, graph.component[:4])],
+                                  rest[~np.isin(graph.component, graph.component[:4])])  # fmt: skip
+
+
+def test_a_dragged_point_without_pins_shifts_everything():
+    rest = cloud(3, 60)
+    graph = graph_of(rest, 8)
+    found = solve(graph, rest, [turn([7], shift=(0.5, 0.2, 0), gives_rotation=False)], steps=4)
+    alive = graph.component == graph.component[7]
+    moved = found.positions[alive] - rest[alive]
+    np.testing.assert_allclose(moved, np.broadcast_to([0.5, 0.2, 0], moved.shape), atol=1e-3)
+
+
+def test_rotations_are_rotations_and_pins_hold():
+    rest = cloud(4, 120, (4.0, 0.4, 0.4))
+    graph = graph_of(rest)
+    right, left = np.flatnonzero(rest[:, 0] > 4), np.flatnonzero(rest[:, 0] < -4)
+    found = solve(graph, rest, [turn(right, 135, (0, 1, 0))], left, steps=9)
+    np.testing.assert_allclose(found.rotations @ found.rotations.transpose(0, 2, 1), np.tile(np.eye(3), (120, 1, 1)),
+                               atol=1e-6)  # fmt: skip
+    assert np.linalg.det(found.rotations).min() > 0.999
+    np.testing.assert_array_equal(found.positions[left], rest[left])
+    np.testing.assert_array_equal(from_matrix(found.rotations[left]), np.tile(IDENTITY, (len(left), 1)))
+    np.testing.assert_allclose(found.positions[right], rotate(from_axis((0, 1, 0), 135), rest[right]), atol=1e-12)
+    turned = angle(from_matrix(found.rotations))
+    middle = np.abs(rest[:, 0]) < 1
+    assert 0.3 < turned[middle].mean() < 2.2, "what lies between shares the turn"
+
+
+def test_soft_handles_give_way():
+    rest = cloud(5, 80)
+    graph = graph_of(rest, 8)
+    pins = np.flatnonzero(rest[:, 0] < 0)
+    reached = []
+    for stiffness in (0.01, 1.0, 100.0):
+        found = solve(graph, rest, [turn([int(rest[:, 0].argmax())], shift=(1, 0, 0), stiffness=stiffness)], pins)
+        reached.append(float((found.positions - rest)[rest[:, 0].argmax(), 0]))
+    assert 0.0 < reached[0] < reached[1] < reached[2] < 1.0 and reached[2] > 0.9
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_tiny_graphs(count):
+    rest = cloud(6, count)
+    graph = graph_of(rest)
+    found = solve(graph, rest, [turn([0], 30, shift=(1, 0, 0))])
+    assert np.isfinite(found.positions).all() and np.isfinite(found.rotations).all()
+    np.testing.assert_allclose(found.positions[0], rotate(from_axis((0, 0, 1), 30), rest[0]) + X)
+
+
+def test_everything_pinned_and_nothing_pinned():
+    rest = cloud(7, 30)
+    graph = graph_of(rest)
+    held = solve(graph, rest, [turn([3], shift=(1, 0, 0))], range(30))
+    np.testing.assert_allclose(held.positions[3], rest[3] + X)
+    others = np.arange(30) != 3
+    np.testing.assert_array_equal(held.positions[others], rest[others])
+    none = solve(graph, rest, [])
+    np.testing.assert_array_equal(none.positions, rest)
+
+
+def test_pieces_without_a_handle_stay_to_the_bit():
+    rest = np.concatenate([cloud(8, 40), cloud(9, 40) + 50 * X])
+    graph = graph_of(rest)
+    assert len(np.unique(graph.component)) >= 2
+    found = solve(graph, rest, [turn([0, 1, 2], 40)])
+    np.testing.assert_array_equal(found.positions[40:], rest[40:])
+    assert np.abs(found.positions[:40] - rest[:40]).max() > 0.1
+
+
+def test_points_on_one_another_and_far_away():
+    rest = np.concatenate([cloud(10, 30), np.zeros((5, 3)), [[1e6, 0, 0]]])
+    graph = graph_of(rest)
+    found = solve(graph, rest, [turn([0], 20, shift=(1000.0, 0, 0))], [5, 6], steps=48)
+    assert np.isfinite(found.positions).all() and np.linalg.det(found.rotations).min() > 0.99
+
+
+def test_same_bits_on_any_number_of_threads(all_threads):
+    rest = cloud(11, 700)
+    graph = graph_of(rest)
+    results = []
+    for threads in (1, 2):
+        environment.configure(threads=threads)
+        found = solve(graph, rest, [turn(range(20), 60)], np.arange(300, 400))
+        results.append((found.positions.tobytes(), found.rotations.tobytes()))
+    assert results[0] == results[1]
+
+
+def test_the_graph_is_symmetric_and_parts_that_move_apart_are_not_tied():
+    left, right = cloud(12, 40, (0.3, 1, 1)), cloud(13, 40, (0.3, 1, 1)) + 0.5 * X
+    still = np.concatenate([left, right])
+    apart = np.concatenate([left, right + 20 * X])
+    tied = graph_of(still)
+    assert (tied.matrix != tied.matrix.T).nnz == 0
+    assert any((a < 40) != (b < 40) for a, b in tied.edges)
+    free = build_graph(torch.from_numpy(np.stack([still, apart])).float())
+    assert not any((a < 40) != (b < 40) for a, b in free.edges)
+    assert set(tied.ring([0], 1)) == {0, *tied.neighbors[tied.begin[0] : tied.begin[1]].tolist()}
+    assert tied.ring([0], 0) == (0,) and tied.ring([], 3) == ()
+
+
+def test_a_gap_stays_a_gap_where_nothing_moves():
+    """Two plates face each other, about as far apart as their control points: Gaussians say that they are two."""
+    grid = np.stack(np.meshgrid(np.arange(8), np.arange(8), [0.0]), -1).reshape(-1, 3)
+    plates = np.concatenate([grid, grid + 1.2 * Z])
+    fine = np.stack(np.meshgrid(np.linspace(0, 7, 50), np.linspace(0, 7, 50), [0.0, 1.2]), -1).reshape(-1, 3)
+    shared = np.argsort(np.linalg.norm(fine[:, None] - plates[None], axis=-1), axis=1)[:, :2]
+    near = build_graph(torch.from_numpy(plates).float()[None])
+    apart = build_graph(torch.from_numpy(plates).float()[None], shared=shared)
+    crossing = [sum((a < 64) != (b < 64) for a, b in graph.edges) for graph in (near, apart)]
+    assert crossing[0] > 50 and crossing[1] == 0
+
+
+def test_strays_follow_their_nearest_neighbour():
+    rest = np.concatenate([cloud(14, 60), [[9.0, 0, 0]], [[500.0, 0, 0]]])
+    graph = graph_of(rest)
+    assert graph.stray[60] in range(60) and graph.stray[61] == 61 and (graph.stray[:60] == -1).all()
+
+
+BOUNDS = {
+    "arm": {
+        15: (0.08, 0.08, 0.95, 0.02),
+        45: (0.23, 0.23, 0.85, 0.05),
+        90: (0.41, 0.44, 0.65, 0.09),
+        135: (0.51, 0.57, 0.3, 0.13),
+    },
+    "leg": {
+        15: (0.05, 0.07, 0.9, 0.01),
+        45: (0.13, 0.2, 0.6, 0.02),
+        90: (0.235, 0.37, 0.15, 0.04),
+        135: (0.35, 0.49, -0.25, 0.05),
+    },
+}
+"""What was measured, and a fifth more: edges, Gaussians' neighbours, determinant, error (``limb_bending.Bent``)."""
+
+
+@pytest.mark.parametrize("limb", sorted(LIMBS))
+def test_a_limb_of_the_figure_turns_about_its_joint(limb):
+    """With the figure's true motion, and a joint that is one ring shorter than that of docs/editing.md."""
+    scene, _, bones = figure_scene(256)
+    session = EditSession(scene)
+    node_bones = np.array(scene.motion.bones)
+    grab(session, node_bones, limb, near=1, far=3)
+    everything = np.ones(len(bones), bool)
+    found = {degrees: bend(session, node_bones, everything, bones, limb, degrees) for degrees in (15, 45, 90, 135)}
+    limits = BOUNDS[limb]
+    for degrees, bent in found.items():
+        edges, gaussians, determinant, error = limits[degrees]
+        assert bent.edges < edges and bent.gaussians < gaussians and bent.error < error, (degrees, bent)
+        assert bent.determinant > determinant, (degrees, bent)
+    for small, large in ((15, 45), (45, 90), (90, 135)):
+        assert found[small].edges < found[large].edges
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**31))
+def test_quaternions_and_matrices(seed):
+    random = np.random.default_rng(seed)
+    quats = random.normal(size=(5, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    back = from_matrix(to_matrix(quats))
+    np.testing.assert_allclose(np.abs((back * quats).sum(1)), 1.0, atol=1e-12)
+    vectors = random.normal(size=(5, 3))
+    np.testing.assert_allclose(rotate(quats, vectors), (to_matrix(quats) @ vectors[..., None])[..., 0], atol=1e-12)
+
+
+def test_a_pair_tied_by_one_edge_is_turned_no_further_than_it_has_to_be():
+    """One edge leaves its own axis open."""
+    rest = np.concatenate([cloud(16, 40), [[30.0, 1.0, 2.0], [30.3, 1.4, 2.2]]])
+    graph = graph_of(rest)
+    assert graph.component[40] == graph.component[41] != graph.component[0]
+    solver = ArapSolver(graph)
+    np.testing.assert_array_equal(from_matrix(solver.turns(rest, rest))[:, 1:] ** 2 < 1e-20, True)
+    edge = rest[41] - rest[40]
+    for degrees in (1e-5, 30.0, 179.0):
+        axis = np.cross(edge, [0.0, 0.0, 1.0])
+        least = from_axis(axis, degrees)
+        posed = rest.copy()
+        posed[41] = rest[40] + rotate(least, edge)
+        np.testing.assert_allclose(from_matrix(solver.turns(rest, posed))[40:], [least, least], atol=1e-6)
+    posed[41] = rest[40] - edge
+    turned = solver.turns(rest, posed)[40:]
+    np.testing.assert_allclose(np.linalg.det(turned), 1.0, atol=1e-9)

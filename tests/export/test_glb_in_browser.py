@@ -1,0 +1,179 @@
+"""Exported glTF in a real browser: three.js plays the animation and skins, and reads the Gaussians."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.chromium import chromium
+from helpers.edit_scenes import bar_scene
+from helpers.node_packages import package
+from scgs_warp.edit import EditSession
+from scgs_warp.edit.rotations import rotate
+from scgs_warp.export.control_graph import write_graph
+from scgs_warp.export.glb import write_glb
+from scgs_warp.export.gltf import upright
+from scgs_warp.export.run import write_still
+from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
+from scgs_warp.gaussians import SH_C0
+from scgs_warp.types import Gaussians
+
+FRAMES, FPS = 9, 4.0
+PLAY = """
+import * as THREE from "three";
+import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+const point = new THREE.Vector3();
+
+// World positions of joints and of bound vertices while the first animation plays.
+window.play = async (url, times) => {
+  const gltf = await new GLTFLoader().loadAsync(url);
+  const skeleton = await gltf.parser.getDependency("skin", 0);
+  let bound = null;
+  gltf.scene.traverse((item) => { if (item.isSkinnedMesh || item.isPoints) bound = item; });
+  if (bound.isPoints) {  // which three.js leaves unbound: bind them by its own skinning
+    bound = new THREE.SkinnedMesh(bound.geometry, bound.material);
+    bound.bind(skeleton, new THREE.Matrix4());
+    gltf.scene.add(bound);
+  }
+  const mixer = new THREE.AnimationMixer(gltf.scene);
+  const action = mixer.clipAction(gltf.animations[0]);
+  action.setLoop(THREE.LoopOnce);
+  action.clampWhenFinished = true;
+  action.play();
+  const frames = [];
+  for (const time of times) {
+    mixer.setTime(time);
+    gltf.scene.updateMatrixWorld(true);
+    skeleton.update();
+    const joints = skeleton.bones.map((bone) => bone.getWorldPosition(point).toArray());
+    const vertices = [];
+    for (let i = 0; i < bound.geometry.attributes.position.count; i++)
+      vertices.push(bound.getVertexPosition(i, point).applyMatrix4(bound.matrixWorld).toArray());
+    frames.push({ joints, vertices });
+  }
+  return { frames, duration: gltf.animations[0].duration };
+};
+
+// The Gaussians as three.js's own reader of the extension makes them.
+window.splats = async (url) => {
+  const { GLTFGaussianSplatLoaderExtension } = await import(
+    "three/addons/loaders/GLTFGaussianSplatLoaderExtension.js");
+  const loader = new GLTFLoader();
+  loader.register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
+  const gltf = await loader.loadAsync(url);
+  let found = null;
+  gltf.scene.updateMatrixWorld(true);
+  gltf.scene.traverse((item) => { if (item.isGaussianSplat) found = item; });
+  const arrays = {};
+  for (const name of ["position", "covariance", "color"])
+    arrays[name] = Array.from(found.splatGeometry.getAttribute(name).array);
+  return { arrays, matrix: found.matrixWorld.toArray() };
+};
+window.ready = true;
+"""
+PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><script type="importmap">
+{"imports": {"three": "/three/build/three.module.js", "three/webgpu": "/three/build/three.webgpu.js",
+ "three/tsl": "/three/build/three.tsl.js", "three/addons/": "/three/examples/jsm/"}}
+</script><script type="module" src="/play.js"></script>"""
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """A folder on 127.0.0.1."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> Iterator:
+    """A page with three.js, and the folder it is served from."""
+    folder = tmp_path_factory.mktemp("web")
+    (folder / "three").symlink_to(package("three"))
+    (folder / "index.html").write_text(PAGE)
+    (folder / "play.js").write_text(PLAY)
+    with served(folder) as url, chromium() as browser:
+        window = browser.new_page()
+        problems: list[str] = []
+        window.on("pageerror", lambda error: problems.append(str(error)))
+        window.set_default_timeout(240e3)
+        window.goto(f"{url}/index.html")
+        window.wait_for_function("window.ready === true")
+        yield window, folder
+        assert problems == []
+
+
+def turned(points: np.ndarray, up: tuple[float, float, float]) -> np.ndarray:
+    return rotate(np.array(upright(up))[[3, 0, 1, 2]], points)
+
+
+def test_the_moving_scene_plays_in_three(page):
+    window, folder = page
+    scene = bar_scene()
+    up = scene.overview.up
+    write_glb(folder / "a.glb", at_rest(scene), up, build_skeleton(EditSession(scene), even_moments(FRAMES, FPS)))
+    seconds = [0.0, 1.0, 2.0]
+    found = window.evaluate("([url, times]) => window.play(url, times)", ["/a.glb", seconds])
+    assert found["duration"] == pytest.approx((FRAMES - 1) / FPS)
+    for frame, time in zip(found["frames"], (0.0, 0.5, 1.0)):
+        nodes = turned(scene.control_points_at(time).double().numpy(), up)
+        assert np.abs(np.array(frame["joints"]) - nodes).max() < 2e-6
+        means = turned(scene.gaussians_at(time).means.double().numpy(), up)
+        assert np.abs(np.array(frame["vertices"]) - means).max() < 5e-6
+    first, last = (np.array(found["frames"][i]["vertices"]) for i in (0, 2))
+    assert np.abs(first - last).max() > 0.1
+
+
+def test_the_graph_plays_in_three(page):
+    window, folder = page
+    scene = bar_scene()
+    session, up = EditSession(scene), scene.overview.up
+    skeleton = build_skeleton(session, even_moments(FRAMES, FPS))
+    write_graph(folder / "g.glb", skeleton, session.graph.edges, up)
+    found = window.evaluate("([url, times]) => window.play(url, times)", ["/g.glb", [0.0, 1.0, 2.0]])
+    for frame, time in zip(found["frames"], (0.0, 0.5, 1.0)):
+        nodes = turned(scene.control_points_at(time).double().numpy(), up)
+        assert np.abs(np.array(frame["joints"]) - nodes).max() < 2e-6
+        vertices = np.array(frame["vertices"]).reshape(-1, 6, 3)
+        balls, bars = vertices[: len(nodes)], vertices[len(nodes) :]
+        assert np.abs(balls.mean(1) - nodes).max() < 5e-6
+        ends = bars.reshape(-1, 2, 3, 3).mean(2)
+        assert np.abs(ends - nodes[session.graph.edges]).max() < 5e-6
+
+
+def test_three_reads_the_gaussians(page):
+    window, folder = page
+    gaussians = bar_scene().gaussians_at(0.5)
+    gaussians = Gaussians(**{name: value.detach() for name, value in vars(gaussians).items()})
+    write_still(folder / "s.glb", gaussians, up=(0.0, 0.0, 1.0))
+    found = window.evaluate("(url) => window.splats(url)", "/s.glb")
+    matrix = np.array(found["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix[:3, :3] @ [0, 0, 1], [0, 1, 0], atol=1e-6)
+    arrays = {name: np.array(values, np.float64).reshape(400, -1) for name, values in found["arrays"].items()}
+    np.testing.assert_array_equal(arrays["position"], gaussians.means.double().numpy())
+    quats = gaussians.quats.double().numpy()
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    axes = gaussians.scales.double().numpy()[:, :, None] * rotate(quats[:, None], np.eye(3)[None])
+    spread = np.einsum("nki,nkj->nij", axes, axes)
+    upper = spread[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    np.testing.assert_allclose(arrays["covariance"], upper, rtol=1e-5, atol=1e-6 * upper.max())
+    colors = np.column_stack([0.5 + SH_C0 * gaussians.sh_dc.double().numpy(), gaussians.opacities.double().numpy()])
+    np.testing.assert_allclose(arrays["color"], 255 * colors.clip(0, 1), atol=0.51)

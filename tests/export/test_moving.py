@@ -1,0 +1,353 @@
+"""A moving scene in one file: skeleton, glTF, arrays, sequences, cameras; and the app around it all."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from helpers.edit_scenes import bar_scene
+from helpers.export_files import gltf_arrays, picture
+from helpers.node_packages import gltf_errors
+from helpers.paths import ROOT
+from scgs_warp.apps import edit as edit_app
+from scgs_warp.apps import export as app
+from scgs_warp.apps import view as view_app
+from scgs_warp.config.presets import from_dict
+from scgs_warp.data import load
+from scgs_warp.edit import EditSession
+from scgs_warp.edit.rotations import from_axis, rotate, unit
+from scgs_warp.errors import UserError
+from scgs_warp.export.cameras import write_cameras
+from scgs_warp.export.control_graph import write_graph
+from scgs_warp.export.gltf import influences
+from scgs_warp.export.run import write_still
+from scgs_warp.export.skeleton import Skeleton, at_rest, build_skeleton, even_moments
+from scgs_warp.motion import Static, build_motion
+from scgs_warp.motion.control_points import ControlPoints
+from scgs_warp.scene.scene import Scene
+from scgs_warp.storage import checkpoint
+from scgs_warp.types import Gaussians
+
+DOCS = ROOT / "docs" / "formats.md"
+TIMES = (0.0, 0.5, 1.0)
+
+
+def skinned(skeleton: Skeleton, rest: np.ndarray, frame: int) -> np.ndarray:
+    """[N, 3] linear blend skinning as glTF defines it."""
+    arms = rest[:, None] - skeleton.rest[skeleton.indices]
+    moved = rotate(skeleton.rotations[frame][skeleton.indices], arms) + skeleton.positions[frame][skeleton.indices]
+    return (skeleton.weights[..., None] * moved).sum(1)
+
+
+@pytest.mark.parametrize("share", [None, 0.7])
+def test_the_skeleton_moves_gaussians_as_the_scene_does(share):
+    scene = bar_scene(share=share)
+    skeleton = build_skeleton(EditSession(scene), even_moments(3, 2.0))
+    np.testing.assert_array_equal(skeleton.seconds, [0.0, 0.5, 1.0])
+    np.testing.assert_allclose(skeleton.weights.sum(1), 1.0, atol=1e-12)
+    rest = at_rest(scene).means.double().numpy()
+    for frame, time in enumerate(TIMES):
+        truth = scene.gaussians_at(time).means.double().numpy()
+        assert np.abs(skinned(skeleton, rest, frame) - truth).max() < 2e-6
+        nodes = scene.control_points_at(time).double().numpy()
+        assert np.abs(skeleton.positions[frame, : len(nodes)] - nodes).max() < 1e-6
+    assert np.abs(skinned(skeleton, rest, 0) - skinned(skeleton, rest, 2)).max() > 0.05
+
+
+def bent(scene: Scene) -> EditSession:
+    session = EditSession(scene)
+    x = session.node_positions(0.0)[:, 0]
+    session.add_handle(np.flatnonzero(x > np.quantile(x, 0.8)), 0.0, "end")
+    session.pin(np.flatnonzero(x < np.quantile(x, 0.4)))
+    session.move("end", [0, 0, 0.3], from_axis([0, 1, 0], 40))
+    return session
+
+
+def test_the_skeleton_follows_an_edit():
+    session = bent(bar_scene())
+    skeleton = build_skeleton(session, even_moments(3, 2.0))
+    rest = at_rest(session.scene).means.double().numpy()
+    for frame, time in enumerate(TIMES):
+        truth = session.gaussians_at(time).means.double().numpy()
+        assert np.abs(skinned(skeleton, rest, frame) - truth).max() < 2e-6
+    with pytest.raises(UserError, match="mask"):
+        build_skeleton(bent(bar_scene(share=0.5)), even_moments(2, 2.0))
+
+
+def test_influences_are_what_gltf_wants():
+    weights = np.random.default_rng(0).dirichlet(np.ones(6), 500)
+    weights[:10, 3:] = 0.0
+    weights[:10] /= weights[:10].sum(1, keepdims=True)
+    joints = np.tile(np.arange(1, 7), (500, 1))
+    found = influences(joints, weights)
+    assert len(found) == 2 and found[0][0].dtype == np.dtype("<u2")
+    shares = np.concatenate([part for _, part in found], 1)
+    owners = np.concatenate([part for part, _ in found], 1)
+    assert np.abs(shares.sum(1, dtype=np.float64) - 1).max() < 2e-7 and (owners[shares == 0] == 0).all()
+    dense = np.zeros((500, 7))
+    for k in range(8):
+        dense[np.arange(500), owners[:, k]] += shares[:, k]
+    np.testing.assert_allclose(dense[:, 1:], weights, atol=1e-7)
+
+
+def save(scene: Scene, folder: Path) -> Path:
+    """A run directory that ``Scene.load`` reads; the network is what it is."""
+    folder.mkdir()
+    checkpoint.write(folder, scene.tensors(), {**scene.metadata(), "stage": "main"})
+    (folder / "config.json").write_text(json.dumps(scene.settings))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run whose network moves things a little, with shading."""
+    like = bar_scene(nodes=24, gaussians=120, shaded=True)
+    fields = {"nodes": 24, "layers": 3, "width": 32, "skip": 2}
+    config = from_dict({"motion": fields})
+    template = build_motion("control-points", config)
+    assert isinstance(template, ControlPoints)
+    rig = like.motion
+    assert isinstance(rig, ControlPoints)
+    motion = ControlPoints(rig.positions.detach(), rig.log_radii.detach().exp(), template.network, config.motion)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for parameter in motion.network.parameters():
+            parameter.copy_(0.3 * torch.randn_like(parameter))
+    scene = Scene(like.gaussians, motion, like.normalisation, config, like.overview)
+    return save(scene, tmp_path_factory.mktemp("runs") / "run")
+
+
+def export(*arguments: object) -> None:
+    assert app.cli([*map(str, arguments), "--device", "cpu"]) == 0
+
+
+def player() -> dict:
+    """The functions of the script in the documentation."""
+    script = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)[0]
+    names: dict = {}
+    exec(script, names)
+    return names
+
+
+def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
+    path = tmp_path / "a.npz"
+    export("--run", run, "--output", path, "--frames", 5, "--fps", 4)
+    scene, data = Scene.load(run), dict(np.load(path))
+    assert str(data["format"]) == "scgs-warp motion" and "shading" in data
+    means, quats, scales, sh_dc = (None,) * 4
+    for seconds, time in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
+        means, quats, scales, sh_dc = player()["play"](data, seconds)
+        truth = scene.gaussians_at(time)
+        np.testing.assert_allclose(means, truth.means, atol=2e-6)
+        np.testing.assert_allclose(np.abs((unit(quats) * unit(truth.quats.numpy())).sum(1)), 1.0, atol=1e-6)
+        np.testing.assert_allclose(sh_dc, truth.sh_dc, atol=2e-5)
+        parts = means, quats, scales, data["opacities"], sh_dc, data["sh_rest"]
+        again = Gaussians(*(torch.from_numpy(np.asarray(part)).float() for part in parts))
+        assert float((picture(again) - picture(truth)).abs().max()) < 1e-5
+    assert np.abs(means - data["means"]).max() > 1e-2
+    between = player()["play"](data, 0.6)[0]
+    assert np.isfinite(between).all() and not np.array_equal(between, means)
+    before = path.read_bytes()
+    export("--run", run, "--output", path, "--frames", 5, "--fps", 4)
+    assert path.read_bytes() == before
+
+
+def test_moving_glb_is_valid_and_bound(run, tmp_path):
+    path = tmp_path / "a.glb"
+    export("--run", run, "--output", path, "--frames", 7)
+    scene = Scene.load(run)
+    found, seen = gltf_arrays(path)
+    gltf = seen["gltf"]
+    assert len(gltf.skins[0].joints) == 24 and len(gltf.animations[0].channels) == 48
+    np.testing.assert_array_equal(found["POSITION"], at_rest(scene).means.double().numpy())
+    mean = torch.stack([scene.gaussians_at(frame / 6).sh_dc for frame in range(7)]).mean(0)
+    np.testing.assert_allclose(found["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"], mean, atol=1e-5)
+    issues = gltf_errors(path)
+    codes = {issue["code"] for issue in issues if "KHR_gaussian_splatting" not in issue["pointer"]}
+    assert codes == {"NODE_SKINNED_MESH_LOCAL_TRANSFORMS"}  # for programs that leave points unbound
+    assert {i["code"] for i in issues if i["severity"] == 0} == {"MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
+
+
+def test_graph_is_valid(run, tmp_path):
+    export("--run", run, "--format", "graph", "--output", tmp_path / "g.glb", "--frames", 4)
+    assert gltf_errors(tmp_path / "g.glb") == []
+    session = EditSession(Scene.load(run))
+    found, _ = gltf_arrays(tmp_path / "g.glb")
+    assert len(found["POSITION"]) == 6 * (24 + len(session.graph.edges))
+    np.testing.assert_allclose(found["POSITION"][:144].reshape(24, 6, 3).mean(1),
+                               session.engine.to_world(session.engine.rig.positions.detach().double().numpy()),
+                               atol=1e-6)  # fmt: skip
+    lone = build_skeleton(EditSession(bar_scene(nodes=4, gaussians=20)), even_moments(2, 2.0))
+    write_graph(tmp_path / "lone.glb", lone, np.zeros((0, 2), int), (0.0, 0.0, 1.0))
+    assert gltf_errors(tmp_path / "lone.glb") == []
+
+
+def test_a_sequence_has_a_frame_an_instant(run, tmp_path):
+    folder = tmp_path / "frames"
+    for frames in (4, 3):
+        export("--run", run, "--output", folder, "--frames", frames)
+        assert len(list(folder.iterdir())) == frames
+    scene = Scene.load(run)
+    for frame in range(3):
+        data = PlyData.read(str(folder / f"frame_{frame:05d}.ply"))["vertex"].data
+        truth = scene.gaussians_at(frame / 2)
+        np.testing.assert_array_equal(np.stack([data["x"], data["y"], data["z"]], 1), truth.means)
+        np.testing.assert_array_equal(data["f_dc_1"], truth.sh_dc[:, 1])
+    (folder / "mine.txt").write_text("keep me")
+    assert app.cli(["--run", str(run), "--output", str(folder), "--frames", "2"]) == 2
+    assert len(list(folder.iterdir())) == 4 and sorted(p.name for p in tmp_path.iterdir()) == ["frames"]
+
+
+def test_stills_and_conversions(run, tmp_path):
+    scene = Scene.load(run)
+    for name, arguments, truth in (
+        ("rest.ply", (), at_rest(scene)),
+        ("posed.ply", ("--time", 0.3), scene.gaussians_at(0.3)),
+    ):
+        export("--run", run, "--output", tmp_path / name, *arguments)
+        data = PlyData.read(str(tmp_path / name))["vertex"].data
+        np.testing.assert_array_equal(data["x"], truth.means[:, 0])
+        np.testing.assert_array_equal(data["f_dc_0"], truth.sh_dc[:, 0].detach())
+    export("--run", run, "--time", 0.3, "--output", tmp_path / "posed.glb")
+    found, seen = gltf_arrays(tmp_path / "posed.glb")
+    assert not seen["gltf"].animations
+    np.testing.assert_array_equal(found["POSITION"], scene.gaussians_at(0.3).means)
+    for source, target in (("posed.ply", "a.spz"), ("a.spz", "b.splat"), ("b.splat", "c.ply"), ("c.ply", "d.glb")):
+        export("--ply", tmp_path / source, "--output", tmp_path / target)
+    found, _ = gltf_arrays(tmp_path / "d.glb")
+    expected = scene.gaussians_at(0.3).means.double().numpy()
+    away = np.linalg.norm(found["POSITION"][:, None] - expected[None], axis=2)
+    assert away.min(axis=1).max() < 2e-5 and len(found["POSITION"]) == 120
+
+
+def test_an_edit_is_exported(run, tmp_path):
+    scene = Scene.load(run)
+    session = bent(scene)
+    session.add_keyframe(0.0)
+    session.move("end", [0, 0, -0.2])
+    session.add_keyframe(0.2)
+    content = tmp_path / "edit.json"
+    session.save(content)
+    written = json.loads(content.read_text())
+    written["film"] |= {"seconds": 0.2, "fps": 20}
+    content.write_text(json.dumps(written))
+    session.load(content)
+    export("--run", run, "--edit", content, "--at", 0.1, "--output", tmp_path / "a.ply")
+    data = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    truth = session.gaussians_at(session.scene_time(0.1), 0.1)
+    np.testing.assert_array_equal(data["z"], truth.means[:, 2])
+    assert np.abs(data["z"] - scene.gaussians_at(session.scene_time(0.1)).means[:, 2].numpy()).max() > 0.02
+    export("--run", run, "--edit", content, "--output", tmp_path / "a.npz")
+    played = dict(np.load(tmp_path / "a.npz"))
+    assert len(played["seconds"]) == 4 and "shading" not in played
+    for second in (0.0, 0.1):
+        truth = session.gaussians_at(session.scene_time(second), second)
+        np.testing.assert_allclose(player()["play"](played, second)[0], truth.means, atol=2e-6)
+
+
+def test_cameras_are_read_back(tmp_path):
+    from helpers.tiny import write_dnerf
+
+    folder = write_dnerf(tmp_path / "blobs")
+    splits = {split: load(folder, split) for split in ("train", "test")}
+    assert write_cameras(tmp_path / "transforms.json", splits) == 11
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    for name in content["train_filenames"]:  # its images are where the file says
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    for name in content["test_filenames"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    again = tmp_path / "again"
+    again.mkdir()
+    for name in ("transforms.json", "train", "test"):
+        (tmp_path / name).rename(again / name)
+    for split, truth in splits.items():
+        found = load(again, split)
+        assert len(found) == len(truth)
+        for ours, theirs in zip(found.entries, truth.entries):
+            assert ours.time == theirs.time and ours.name == theirs.name
+            torch.testing.assert_close(ours.camera.viewmat, theirs.camera.viewmat, atol=1e-6, rtol=0)
+            torch.testing.assert_close(ours.camera.K, theirs.camera.K)
+
+
+def test_files_are_filmed_and_edited(run, tmp_path):
+    write_still(tmp_path / "a.spz", Scene.load(run).gaussians_at(0.0))
+    film = tmp_path / "film"
+    arguments = ["--ply", tmp_path / "a.spz", "--frames", 1, "--size", 32, "--mode", "turntable", "--output", film]
+    assert view_app.cli([*map(str, arguments), "--device", "cpu"]) == 0
+    assert len(list(film.iterdir())) == 1
+    arguments = ["--ply", tmp_path / "a.spz", "--nodes", 10, "--export", tmp_path / "b.ply", "--device", "cpu"]
+    assert edit_app.cli([*map(str, arguments)]) == 0
+    assert len(PlyData.read(str(tmp_path / "b.ply"))["vertex"].data) == 120
+
+
+def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
+    (tmp_path / "folder.ply").mkdir()
+    still = save(still_scene(), tmp_path / "still")
+    cases = [
+        (["--output", "a.ply"], "--run and --ply"),
+        (["--run", run, "--output", "a.xyz"], "--format"),
+        (["--run", run, "--output", "a.ply", "--format", "glb"], ".glb"),
+        (["--run", run, "--output", "folder.ply"], "folder"),
+        (["--run", run, "--output", "a.ply", "--time", 1.5], "--time 1.5"),
+        (["--run", run, "--output", "a.npz", "--time", 0.5], "--time 0.5"),
+        (["--run", run, "--output", "a.ply", "--at", 0.5], "--edit"),
+        (["--run", run, "--output", "a.npz", "--frames", 0], "--frames 0"),
+        (["--run", run, "--output", "a.npz", "--fps", 0], "--fps 0"),
+        (["--ply", "a.ply", "--output", "b.spz", "--time", 0.5], "--time 0.5: a file of Gaussians has no times"),
+        (["--run", run, "--output", "b.spz", "--frames", 9], "--frames: "),
+        (["--run", run, "--output", "b.glb", "--time", 0.2, "--frames", 10], "leave out --time"),
+        (["--ply", "a.ply", "--output", "b.glb", "--fps", 10], "--fps: "),
+        (["--run", run, "--output", "b.html", "--frames", 9], "--frames: --format html has no frames"),
+        (["--run", run, "--output", "b.htm", "--fps", 9], "--fps: --format html has no frames"),
+        (["--run", run, "--output", "b.json", "--fps", 9], "--fps: --format cameras has no frames"),
+        (["--run", run, "--output", "b", "--format", "ply-sequence", "--fps", 9], "--fps: a ply-sequence"),
+        (["--run", run, "--output", "b.npz", "--title", "x"], "--title: belongs to a page"),
+        (["--run", run, "--output", "b.glb", "--max-mib", 3], "--max-mib: belongs to a page"),
+        (["--run", run, "--output", "b.html", "--max-mib", 0.001], "0.001 MiB of --max-mib"),
+        (["--run", run, "--output", Path.cwd(), "--format", "ply-sequence"], "is the current folder"),
+        (["--run", tmp_path / "nowhere", "--output", "a.ply"], "nowhere"),
+        (["--ply", "a.ply", "--output", "b.spz"], "no such file"),
+        (["--ply", "a.ply", "--output", "b.npz"], "--run"),
+        (["--run", still, "--output", "b.npz"], "stands still"),
+        (["--run", run, "--format", "cameras", "--output", "b.json"], "data.folder"),
+    ]
+    before = sorted(path.name for path in tmp_path.iterdir())
+    for arguments, words in cases:
+        output = arguments.index("--output") + 1
+        arguments = [tmp_path / a if i == output or a == "a.ply" else a for i, a in enumerate(arguments)]
+        assert app.cli([*map(str, arguments), "--device", "cpu"]) == 2, arguments
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1 and words in lines[0], lines
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_what_is_said_counts_what_is_written(run, tmp_path, capsys):
+    scene = still_scene()
+    with torch.no_grad():
+        scene.gaussians.opacity_logits[0] = -9.0
+        scene.gaussians.opacity_logits[1] = -9.0
+        scene.gaussians.sh_rest.clamp_(-0.9, 0.9)[2, 4, 1] = 1.5
+        scene.gaussians.log_scales[3] = -20.0
+    still = save(scene, tmp_path / "still")
+    for arguments, words in (
+        (["--run", still, "--output", tmp_path / "a.htm"], "a.htm: 18 Gaussians that stand still,"),
+        (["--run", run, "--output", tmp_path / "a.html"], "a.html: 120 Gaussians and their motion,"),
+        (["--run", still, "--output", tmp_path / "f", "--frames", 2], "f: 2 frames of 20 Gaussians,"),
+        (["--run", still, "--output", tmp_path / "a.spz"], "20 Gaussians at rest (4 values clipped to what .spz can"),
+        (["--run", run, "--output", tmp_path / "b.spz"], "b.spz: 120 Gaussians at rest,"),
+    ):
+        export(*arguments)
+        assert words in capsys.readouterr().out
+
+
+def still_scene() -> Scene:
+    scene = bar_scene(nodes=8, gaussians=20)
+    return Scene(scene.gaussians, Static(), scene.normalisation, scene.config, scene.overview)

@@ -1,0 +1,84 @@
+"""Native CUDA bodies of ``kernels.compositing_cuda``, compiled for the CPU with ``cuda_shim.h``."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+
+from scgs_warp.kernels.cuda import compositing
+
+SHIM = Path(__file__).resolve().parent / "cuda_shim.h"
+COMPILER = shutil.which("g++") if sys.platform == "linux" else None
+_TYPES = {wp.vec2: "wp::vec2", wp.vec3: "wp::vec3", wp.vec2i: "wp::vec2i", float: "float", int: "int"}
+_TYPES.update({wp.float32: "float", wp.int32: "int"})
+BODIES = {
+    "composite_tiles": (compositing.FORWARD, compositing.composite_tile),
+    "composite_tiles_adjoint": (compositing.ADJOINT, compositing.composite_tile_adjoint),
+}
+
+
+def source() -> str:
+    """One C function a body: pointers and shapes of its arrays, its integers, the number of blocks and a seed."""
+    parts = [f'#include "{SHIM}"\n']
+    for name, (body, function) in BODIES.items():
+        parameters, values, arrays, integers = ["int tile"], ["tile"], 0, 0
+        for label, kind in list(function.input_types.items())[1:]:
+            if wp.types.is_array(kind):
+                inner = _TYPES[kind.dtype]
+                parameters.append(f"wp::array_t<{inner}> {label}")
+                values.append(f"wp::array_t<{inner}>{{({inner}*)data[{arrays}], shapes[{arrays}]}}")
+                arrays += 1
+            else:
+                parameters.append(f"int {label}")
+                values.append(f"numbers[{integers}]")
+                integers += 1
+        parts.append(f"static void {name}_body({', '.join(parameters)}) {{{body}}}\n")
+        parts.append(
+            f'extern "C" int {name}(int begin, int blocks, unsigned seed,\n'
+            f"    void** data, wp::Shape* shapes, int* numbers) {{\n"
+            f"    std::mt19937 random(seed);\n"
+            f"    for (int tile = begin; tile < begin + blocks; ++tile)\n"
+            f"        if (!shim::run_block([=] {{ {name}_body({', '.join(values)}); }}, random)) return 1;\n"
+            f"    return 0;\n}}\n"
+        )
+    return "".join(parts)
+
+
+def build(folder: Path) -> ctypes.CDLL:
+    assert COMPILER is not None
+    code, library = folder / "bodies.cpp", folder / "bodies.so"
+    code.write_text(source(), encoding="utf-8")
+    flags = ["-O2", "-std=c++17", "-shared", "-fPIC", "-Wno-unknown-pragmas", "-Wno-cpp"]
+    result = subprocess.run(
+        [COMPILER, *flags, str(code), "-o", str(library)], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr[-4000:]
+    return ctypes.CDLL(str(library))
+
+
+def launcher(library: ctypes.CDLL, seed: int = 0) -> Callable[..., None]:
+    """What takes the place of ``ops.compositing_cuda.launch_native``."""
+
+    def launch_native(kernel: wp.Kernel, blocks: int, *args: Any, begin: int = 0) -> None:
+        declared = [argument.type for argument in kernel.adj.args[1:]]
+        arrays = [value for kind, value in zip(declared, args, strict=True) if wp.types.is_array(kind)]
+        numbers = [value for kind, value in zip(declared, args) if not wp.types.is_array(kind)]
+        data = (ctypes.c_void_p * len(arrays))()
+        shapes = (ctypes.c_int * 4 * len(arrays))()
+        for at, tensor in enumerate(arrays):
+            if isinstance(tensor, torch.Tensor):
+                assert tensor.is_contiguous()
+                data[at] = tensor.data_ptr()
+                shapes[at][: tensor.ndim] = list(tensor.shape)
+        integers = (ctypes.c_int * len(numbers))(*numbers)
+        assert getattr(library, kernel.key)(begin, blocks, seed, data, shapes, integers) == 0, "threads wait for ever"
+
+    return launch_native

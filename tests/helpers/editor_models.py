@@ -1,0 +1,39 @@
+"""What the tests of the editor begin with: a bar, and a browser that looks at it."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+from helpers.edit_scenes import bar_scene
+from scgs_warp.edit import EditSession
+from scgs_warp.edit.rotations import from_matrix
+from scgs_warp.editor.model import Model
+from scgs_warp.editor.views import ClientCamera
+from scgs_warp.geometry.cameras import orbit_camera
+
+LEFT, RIGHT = (-0.1, -1.0, 0.25), (1.1, -1.0, 0.25)
+
+
+@functools.cache
+def loaded() -> EditSession:
+    return EditSession(bar_scene(gaussians=1500))
+
+
+def new_model() -> Model:
+    """As the editor begins, but that nothing is pinned around what is grabbed."""
+    made = Model(loaded().fork())
+    made.pin_rings = None
+    return made
+
+
+def chosen(model: Model, point=RIGHT, rings: int = 1) -> tuple[int, ...]:
+    return model.session.ring([model.session.nearest(point, model.time)], rings)
+
+
+def client(session: EditSession, azimuth: float = 40.0, size: int = 96) -> ClientCamera:
+    """A browser that sees the scene as a film's camera does."""
+    camera = orbit_camera(session.scene.overview, azimuth, size)
+    wxyz = from_matrix(camera.viewmat[:3, :3].double().numpy().T)
+    fov = 2 * math.atan(camera.height / (2 * float(camera.K[1, 1])))
+    return ClientCamera(tuple(wxyz.tolist()), tuple(camera.position.tolist()), fov, camera.width, camera.height)

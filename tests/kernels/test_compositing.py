@@ -1,0 +1,293 @@
+"""Compositing: every form against float64, against each other, and against nonsense."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from helpers.splats import random_splats
+from reference.compositing import composite as composite_reference
+from scgs_warp.ops.binning import bin_splats
+from scgs_warp.ops.compositing import composite
+from scgs_warp.runtime import environment
+from scgs_warp.types import Splats, Stats, Tiles
+
+NAMES = ("means2d", "conics", "opacities", "channels", "background")
+
+
+def forms(device: str) -> list[str]:
+    return ["pixel", "cpu"] if device == "cpu" else ["pixel", "cuda"]
+
+
+def random_channels(seed: int, n: int, c: int, device: str = "cpu") -> Tensor:
+    return torch.rand(n, c, generator=torch.Generator().manual_seed(seed + 100)).to(device)
+
+
+def weights_of(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed + 200))
+
+
+def leaves(splats: Splats, channels: Tensor, background: Tensor, dtype: torch.dtype) -> tuple[Splats, list[Tensor]]:
+    tensors = (splats.means2d, splats.conics, splats.opacities, channels, background)
+    if dtype == torch.float64:
+        tensors = tuple(t.cpu() for t in tensors)
+    found = [t.detach().to(dtype, copy=True).requires_grad_() for t in tensors]
+    return replace(splats, means2d=found[0], conics=found[1], opacities=found[2]), found
+
+
+def assert_images_agree(image: Tensor, expected: Tensor, tolerance: float = 1e-5) -> None:
+    """99.9 % of the pixels within the tolerance, none beyond 8e-3 (a threshold that flips moves one by 1 / 255)."""
+    error = (image.cpu().double() - expected.cpu().double()).abs()
+    assert torch.isfinite(image).all()
+    if error.numel():
+        assert error.max() <= 8e-3
+        assert (error > tolerance).double().mean() <= 1e-3
+
+
+def assert_rows_agree(name: str, got: Tensor, expected: Tensor, tolerance: float = 2e-3, share: float = 0.99) -> None:
+    """Relative L2 per row, with a floor of 1e-6 of the tensor's norm; a flipped threshold may spoil a few rows."""
+    got, expected = got.cpu().double(), expected.cpu().double()
+    assert got.shape == expected.shape, name
+    if got.numel() == 0:
+        return
+    got, expected = got.reshape(len(got), -1), expected.reshape(len(expected), -1)
+    error = (got - expected).norm(dim=1) / (expected.norm(dim=1) + 1e-6 * expected.norm() + 1e-12)
+    assert torch.isfinite(got).all(), name
+    assert (error <= tolerance).double().mean() >= share, f"{name}: {error.max()}"
+    assert (got - expected).norm() <= 1e-2 * expected.norm() + 1e-12, name
+
+
+def gradients(splats: Splats, channels: Tensor, background: Tensor, seed: int, form: str | None) -> list[Tensor]:
+    """Of a random linear function of image and alpha; ``form`` None is the float64 twin."""
+    tiles = bin_splats(splats)
+    own, found = leaves(splats, channels, background, torch.float64 if form is None else torch.float32)
+    if form is None:
+        image, alpha = composite_reference(own, found[3], tiles, found[4])
+    else:
+        image, alpha = composite(own, found[3], tiles, found[4], form=form)  # type: ignore[arg-type]
+    v_image, v_alpha = weights_of(seed, *image.shape).to(image), weights_of(seed + 1, *alpha.shape).to(image)
+    ((image * v_image).sum() + (alpha * v_alpha).sum()).backward()
+    return [t.grad if t.grad is not None else torch.zeros_like(t) for t in found]
+
+
+def check(splats: Splats, channels: Tensor, seed: int, device: str, background: Tensor | None = None) -> None:
+    if background is None:
+        background = torch.linspace(0.2, 0.9, channels.shape[1], device=device)
+    tiles = bin_splats(splats)
+    expected, expected_alpha = composite_reference(splats, channels, tiles, background)
+    expected_gradients = gradients(splats, channels, background, seed, None)
+    for form in forms(device):
+        image, alpha = composite(splats, channels, tiles, background, form=form)  # type: ignore[arg-type]
+        assert image.device.type == device and image.shape == expected.shape
+        assert_images_agree(image, expected)
+        assert_images_agree(alpha, expected_alpha)
+        for name, got, wanted in zip(NAMES, gradients(splats, channels, background, seed, form), expected_gradients):
+            assert_rows_agree(f"{form}: {name}", got, wanted)
+
+
+@pytest.mark.parametrize("c", [1, 3, 4, 5, 8, 11])
+def test_channels(device: str, c: int):
+    check(random_splats(c, 200, 50, 40, device), random_channels(c, 200, c, device), c, device)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33), (16, 16), (33, 15), (100, 3)])
+@pytest.mark.parametrize("seed", range(2))
+def test_sizes(device: str, seed: int, size: tuple[int, int]):
+    check(random_splats(seed, 120, *size, device), random_channels(seed, 120, 4, device), seed, device)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        {"opacity": (1.0, 1.0)},  # clamped alpha, sticky end
+        {"opacity": (0.0, 0.02)},  # near the threshold
+        {"log_scale": 5.0},  # larger than the image
+        {"log_scale": -4.0},  # all low-pass
+        {"log_scale": 2.0, "aspect": 2.0},  # needles
+    ],
+    ids=["opaque", "faint", "huge", "tiny", "needles"],
+)
+def test_extremes(device: str, kind: dict):
+    check(random_splats(11, 250, 48, 40, device, **kind), random_channels(11, 250, 4, device), 11, device)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_few(device: str, n: int):
+    splats = random_splats(3, n, 20, 20, device, opacity=(0.5, 0.9))
+    splats = replace(splats, means2d=torch.full_like(splats.means2d, 9.0))
+    check(splats, random_channels(3, n, 3, device), 3, device)
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 80),
+    width=st.integers(1, 40),
+    height=st.integers(1, 40),
+    c=st.integers(1, 9),
+    log_scale=st.integers(-1, 4),
+)
+def test_any_scene(seed: int, n: int, width: int, height: int, c: int, log_scale: int):
+    splats = random_splats(seed, n, width, height, log_scale=log_scale)
+    channels, background = random_channels(seed, n, c), torch.rand(c)
+    tiles = bin_splats(splats)
+    expected, expected_alpha = composite_reference(splats, channels, tiles, background)
+    for form in forms("cpu"):
+        image, alpha = composite(splats, channels, tiles, background, form=form)  # type: ignore[arg-type]
+        flips = (image.double() - expected).abs() > 1e-5
+        assert flips.any(0).sum() <= 1 + 1e-3 * width * height  # small images: one pixel may lie at a threshold
+        assert (image.double() - expected).abs().max() <= 8e-3
+        assert (alpha.double() - expected_alpha).abs().max() <= 8e-3
+
+
+def test_a_pixel_ends_for_good(device: str):
+    """Splats of alpha 0.99, 0.98, 0.9, 0.5 in a row: the third would leave 2e-5, so the fourth is not added either."""
+    one = random_splats(0, 1, 5, 5)
+    conics = torch.tensor([[1e-6, 0.0, 1e-6]]).repeat(4, 1)
+    splats = Splats(
+        *(
+            t.to(device)
+            for t in (
+                torch.full((4, 2), 2.5),
+                conics,
+                torch.arange(1.0, 5.0),
+                torch.tensor([0.99, 0.98, 0.9, 0.5]),
+                one.radii.repeat(4, 1).clamp(min=10),
+            )
+        ),
+        width=5,
+        height=5,
+    )
+    channels = torch.eye(4, device=device)
+    for form in forms(device):
+        image, alpha = composite(splats, channels, bin_splats(splats), form=form)  # type: ignore[arg-type]
+        expected = torch.tensor([0.99, 0.0098, 0.0, 0.0])
+        assert torch.allclose(image[:, 2, 2].cpu(), expected, atol=1e-5)
+        assert abs(float(alpha[2, 2]) - 0.9998) < 1e-5
+
+
+def test_clamped_alpha_passes_no_gradient(device: str):
+    splats = random_splats(0, 1, 8, 8, device)
+    splats = replace(
+        splats,
+        means2d=torch.full_like(splats.means2d, 4.0),
+        conics=torch.tensor([[1e-9, 0.0, 1e-9]], device=device),
+        opacities=torch.ones(1, device=device),
+        radii=torch.full_like(splats.radii, 10),
+    )
+    for form in forms(device):
+        found = gradients(splats, torch.ones(1, 3, device=device), torch.zeros(3, device=device), 0, form)
+        assert all(not g.any() for g in found[:3]) and found[3].any()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("field", ["means2d", "conics", "opacities", "channels"])
+def test_poison_is_left_out(device: str, field: str, value: float):
+    splats, channels = random_splats(8, 60, 30, 30, device), random_channels(8, 60, 4, device)
+    background = torch.rand(4, generator=torch.Generator().manual_seed(0)).to(device)
+    without = replace(splats, radii=splats.radii * (torch.arange(60, device=device) != 9)[:, None].int())
+    poisoned, poisoned_channels = splats, channels
+    if field == "channels":
+        poisoned_channels = channels.clone()
+        poisoned_channels[9, 2] = value
+    else:
+        tensor = getattr(splats, field).clone()
+        tensor.view(60, -1)[9, 0] = value
+        poisoned = replace(splats, **{field: tensor})
+    for form in forms(device):
+        expected = composite(without, channels, bin_splats(without), background, form=form)  # type: ignore[arg-type]
+        got = composite(poisoned, poisoned_channels, bin_splats(poisoned), background, form=form)  # type: ignore[arg-type]
+        assert_images_agree(got[0], expected[0], 1e-6)
+        assert torch.isfinite(got[1]).all()
+        for name, gradient in zip(NAMES, gradients(poisoned, poisoned_channels, background, 8, form)):
+            assert torch.isfinite(gradient).all(), f"{form}: {name}"
+
+
+def backward_buffers(splats: Splats, channels: Tensor, form: str, absolute: bool) -> tuple[list[Tensor], Stats, Tensor]:
+    n, device = len(channels), channels.device
+    own, found = leaves(splats, channels, torch.zeros(channels.shape[1], device=device), torch.float32)
+    stats, absgrad = Stats.zeros(n, device, absolute), torch.full((n, 2), float("nan"), device=device)
+    stats.grad_norm += 1.0
+    stats.max_radii += 0.05
+    tiles = bin_splats(splats)
+    image, _ = composite(own, found[3], tiles, found[4], stats=stats, absgrad=absgrad, form=form)  # type: ignore[arg-type]
+    (image * weights_of(4, *image.shape).to(image)).sum().backward()
+    return [t.grad for t in found if t.grad is not None], stats, absgrad
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize("c", [3, 9])
+def test_stats_and_absgrad(device: str, absolute: bool, c: int):
+    splats, channels = random_splats(9, 90, 40, 24, device), random_channels(9, 90, c, device)
+    splats = replace(splats, radii=splats.radii * (torch.arange(90, device=device) % 7 != 0)[:, None].int())
+    saved: dict = {}
+    image, _ = composite_reference(splats, channels, bin_splats(splats), saved=saved)
+    (image * weights_of(4, *image.shape).double()).sum().backward()
+    expected = torch.zeros(90, 2, dtype=torch.float64)
+    signed = torch.zeros(90, 2, dtype=torch.float64)
+    for offsets, index in saved.values():
+        if len(index):
+            expected.index_add_(0, index, offsets.grad.abs().sum(1))
+            signed.index_add_(0, index, offsets.grad.sum(1))
+    for form in forms(device):
+        _, stats, absgrad = backward_buffers(splats, channels, form, absolute)
+        assert_rows_agree(form, absgrad, expected)
+        radii = splats.radii.cpu().max(1).values
+        pixel = expected if absolute else signed
+        norm = (pixel * torch.tensor([20.0, 12.0])).norm(dim=1)
+        assert torch.allclose(stats.grad_norm.cpu().double(), 1.0 + torch.where(radii > 0, norm, 0.0), rtol=2e-3)
+        assert torch.equal(stats.count.cpu(), (radii > 0).float())
+        assert torch.allclose(stats.max_radii.cpu(), torch.clamp(radii / 40.0, min=0.05))
+
+
+def test_threads_change_nothing(all_threads: None):
+    splats, channels = random_splats(10, 3000, 200, 150), random_channels(10, 3000, 4)
+    results = []
+    for threads in (1, 2):
+        environment.configure(threads=threads)
+        found, stats, absgrad = backward_buffers(splats, channels, "cpu", True)
+        results.append([*found, *composite(splats, channels, bin_splats(splats)), stats.grad_norm, absgrad])
+    assert all(torch.equal(a, b) for a, b in zip(*results))
+
+
+def test_same_without_gradients(device: str):
+    splats, channels = random_splats(12, 100, 40, 40, device), random_channels(12, 100, 6, device)
+    tiles = bin_splats(splats)
+    for form in forms(device):
+        plain = composite(splats, channels, tiles, form=form)  # type: ignore[arg-type]
+        tracked = composite(splats, channels.clone().requires_grad_(), tiles, form=form)  # type: ignore[arg-type]
+        assert tracked[0].requires_grad and not plain[0].requires_grad
+        assert torch.equal(plain[0], tracked[0].detach()) and torch.equal(plain[1], tracked[1].detach())
+
+
+def test_other_tile_sizes_take_the_pixel_form(device: str):
+    splats, channels = random_splats(13, 60, 30, 30, device), random_channels(13, 60, 3, device)
+    image, _ = composite(splats, channels, bin_splats(splats, 8))
+    assert_images_agree(image, composite_reference(splats, channels, bin_splats(splats))[0])
+
+
+def test_crop_of_the_twin():
+    splats, channels = random_splats(14, 60, 50, 40), random_channels(14, 60, 3)
+    tiles: Tiles = bin_splats(splats)
+    whole, crop = (composite_reference(splats, channels, tiles, crop=c)[0] for c in (None, (5, 7, 37, 33)))
+    assert torch.allclose(whole[:, 7:33, 5:37], crop, atol=1e-14)
+
+
+def test_wrong_arguments():
+    splats, channels = random_splats(0, 5, 20, 20), random_channels(0, 5, 3)
+    tiles = bin_splats(splats)
+    with pytest.raises(ValueError, match="channels must be"):
+        composite(splats, channels[:4], tiles)
+    with pytest.raises(ValueError, match="background must be"):
+        composite(splats, channels, tiles, torch.zeros(4))
+    with pytest.raises(ValueError, match="form must be"):
+        composite(splats, channels, tiles, form="fast")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="absgrad must be"):
+        composite(splats, channels, tiles, absgrad=torch.zeros(5))
+    with pytest.raises(ValueError, match="tiles are of"):
+        composite(replace(splats, width=21), channels, tiles)

@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from reference.network import network as twin
+from scgs_warp.motion.network import DeformationNetwork
+from scgs_warp.ops import network as ops
+from scgs_warp.ops.network import Layers, evaluate, network, supported
+from scgs_warp.runtime import environment
+
+SHAPES = [  # inputs of position and time, hidden widths, layers that read the inputs again, outputs
+    (63, 13, [256] * 8, {4}, 7),
+    (5, 2, [32, 64], set(), 1),
+    (30, 2, [64, 32, 96], {1, 2}, 40),
+    (1, 0, [32], set(), 33),
+]
+
+
+def parameters(shape: tuple, seed: int) -> tuple[list[Tensor], list[Tensor]]:
+    where, when, widths, skips, out = shape
+    random = torch.Generator().manual_seed(seed)
+    weights, biases, before = [], [], 0
+    for layer, width in enumerate([*widths, out]):
+        columns = before + (where + when if layer == 0 or layer in skips else 0)
+        weights.append((torch.randn(width, columns, generator=random) * (2.0 / columns) ** 0.5).requires_grad_())
+        biases.append((0.1 * torch.randn(width, generator=random)).requires_grad_())
+        before = width
+    return weights, biases
+
+
+def rows(shape: tuple, positions: int, times: int, seed: int) -> tuple[Tensor, Tensor]:
+    random = torch.Generator().manual_seed(seed + 100)
+    return torch.randn(positions, shape[0], generator=random), torch.randn(times, shape[1], generator=random)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("positions, times", [(1, 1), (7, 1), (13, 3), (70, 1)])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_values_and_gradients(shape, positions, times, seed):
+    weights, biases = parameters(shape, seed)
+    where, when = rows(shape, positions, times, seed)
+    where.requires_grad_()
+    found = network(where, when, weights, biases)
+    own = [p.detach().double().requires_grad_() for p in (where, *weights, *biases)]
+    half = len(weights)
+    expected = twin(own[0], when.double(), own[1 : half + 1], own[half + 1 :])
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
+    v = torch.randn(found.shape, generator=torch.Generator().manual_seed(seed))
+    gradients = torch.autograd.grad(found, (where, *weights, *biases), v)
+    truth = torch.autograd.grad(expected, own, v.double())
+    for got, want in zip(gradients, truth):
+        # Relative to the whole tensor: a value within rounding of 0 may lie on either side of the ReLU.
+        assert float((got.double() - want).norm() / want.norm().clamp_min(1e-6)) < 2e-3
+
+
+def test_inputs_without_a_gradient_cost_nothing_and_change_no_bit(monkeypatch):
+    weights, biases = parameters(SHAPES[2], 11)
+    where, when = rows(SHAPES[2], 13, 2, 11)
+    launched: list[str] = []
+    launch = ops.launch
+    monkeypatch.setattr(ops, "launch", lambda kernel, *a, **k: launched.append(kernel.key) or launch(kernel, *a, **k))
+    results = []
+    for wanted in (False, True):
+        out = network(where.clone().requires_grad_(wanted), when, weights, biases)
+        results.append([out, *torch.autograd.grad(out.sum(), (*weights, *biases))])
+        assert launched.count("network_inputs_adjoint") == wanted
+    assert all(torch.equal(a, b) for a, b in zip(*results))
+
+
+@pytest.mark.parametrize("largest", [32, 64])
+def test_the_adjoint_in_parts_gives_the_same_bits(largest, monkeypatch):
+    weights, biases = parameters(SHAPES[2], 13)
+    where, when = rows(SHAPES[2], 51, 2, 13)
+    where.requires_grad_()
+    v = torch.randn(102, 40, generator=torch.Generator().manual_seed(13))
+    whole = torch.autograd.grad(network(where, when, weights, biases), (where, *weights, *biases), v)
+    monkeypatch.setattr(ops, "LARGEST_ADJOINT", largest)
+    parts = torch.autograd.grad(network(where, when, weights, biases), (where, *weights, *biases), v)
+    assert all(torch.equal(a, b) for a, b in zip(whole, parts))
+
+
+def test_gradient_of_the_inputs_alone():
+    weights, biases = ([p.detach() for p in group] for group in parameters(SHAPES[1], 12))
+    where, when = rows(SHAPES[1], 5, 1, 12)
+    where.requires_grad_()
+    (found,) = torch.autograd.grad(network(where, when, weights, biases).sum(), where)
+    own = where.detach().double().requires_grad_()
+    expected = twin(own, when.double(), [w.double() for w in weights], [b.double() for b in biases])
+    torch.testing.assert_close(found.double(), torch.autograd.grad(expected.sum(), own)[0], rtol=1e-4, atol=1e-6)
+
+
+def test_without_gradient_in_parts_and_packed_gives_the_same_bits():
+    weights, biases = parameters(SHAPES[0], 3)
+    where, when = rows(SHAPES[0], 8200, 2, 3)  # more rows than are evaluated at once
+    trained = network(where, when, weights, biases).detach()
+    with torch.no_grad():
+        assert torch.equal(network(where, when, weights, biases), trained)
+        assert torch.equal(evaluate(Layers(weights, biases, 76), where, when), trained)
+
+
+def test_same_bits_on_any_number_of_threads():
+    weights, biases = parameters(SHAPES[0], 4)
+    where, when = rows(SHAPES[0], 101, 3, 4)
+    where.requires_grad_()
+    results = []
+    before = environment.thread_count()
+    try:
+        for threads in (1, 2, 3):
+            environment.configure(threads)
+            out = network(where, when, weights, biases)
+            results.append([out, *torch.autograd.grad(out, (where, *weights, *biases), torch.ones_like(out))])
+    finally:
+        environment.configure(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_no_positions():
+    weights, biases = parameters(SHAPES[1], 5)
+    where, when = rows(SHAPES[1], 0, 2, 5)
+    where.requires_grad_()
+    out = network(where, when, weights, biases)
+    assert out.shape == (0, 1)
+    gradients = torch.autograd.grad(out.sum(), (where, *weights, *biases))
+    assert gradients[0].shape == where.shape and all(not bool(g.any()) for g in gradients)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 3e38])
+def test_what_is_not_finite_stays_in_its_row_and_is_not_hidden(bad):
+    weights, biases = parameters(SHAPES[1], 6)
+    where, when = rows(SHAPES[1], 20, 1, 6)
+    clean = network(where, when, weights, biases)
+    where[11, 2] = bad
+    out = network(where, when, weights, biases)
+    others = torch.arange(20) != 11
+    assert torch.equal(out[others], clean[others])
+    own = [p.detach() for p in (*weights, *biases)]
+    expected = twin(where[11:12].double(), when.double(), [p.double() for p in own[:3]], [p.double() for p in own[3:]])
+    if bad != bad:
+        assert bool(out[11].isnan().all()) and bool(expected.isnan().all())
+    if bad == 3e38:
+        assert not bool((out[11] == clean[11]).any())
+
+
+def test_a_column_of_ones_gives_back_the_bias():
+    weights, biases = parameters(SHAPES[2], 7)
+    with torch.no_grad():
+        for weight in weights:
+            weight.zero_()
+    where, when = rows(SHAPES[2], 3, 2, 7)
+    assert torch.equal(network(where, when, weights, biases), biases[-1].expand(6, -1))
+
+
+def test_refuses_what_does_not_fit():
+    weights, biases = parameters(SHAPES[1], 8)
+    where, when = rows(SHAPES[1], 3, 1, 8)
+    with pytest.raises(ValueError, match=r"weights\[0\]"):
+        network(where[:, :-1], when, weights, biases)
+    with pytest.raises(ValueError, match="two or more layers"):
+        network(where, when, weights[:1], biases[:1])
+    odd = [torch.zeros(30, 7), torch.zeros(1, 30)]
+    assert not supported(odd, [torch.zeros(30), torch.zeros(1)])
+    with pytest.raises(ValueError, match="multiples of 32"):
+        network(where, when, odd, [torch.zeros(30), torch.zeros(1)])
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_deformation_network_agrees_with_its_layers_in_torch(training):
+    random = torch.Generator().manual_seed(9)
+    model = DeformationNetwork({"rotations": 4, "translations": 3}, generator=random).train(training)
+    torch.nn.init.normal_(model.head.weight, std=0.05, generator=random)
+    positions, times = torch.randn(50, 3, generator=random), torch.rand(2, generator=random)
+    with torch.set_grad_enabled(training):
+        fused = model(positions, times)
+        layered = model(positions.clone().requires_grad_(), times) if training else None
+    assert fused["rotations"].shape == (2, 50, 4) and fused["translations"].shape == (2, 50, 3)
+    if layered is not None:
+        for name, value in fused.items():
+            torch.testing.assert_close(value, layered[name], rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_packed_weights_are_not_kept_when_they_change():
+    random = torch.Generator().manual_seed(10)
+    model = DeformationNetwork({"translations": 3}, generator=random).eval()
+    positions, times = torch.randn(9, 3, generator=random), torch.tensor([0.3])
+    first = model(positions, times)["translations"]
+    assert torch.equal(model(positions, times)["translations"], first)
+    model.head.bias.add_(1.0)  # counted by torch
+    second = model(positions, times)["translations"]
+    torch.testing.assert_close(second, first + 1.0)
+    model.train()
+    model.head.bias.numpy()[:] += 1.0  # not counted, as an optimiser's kernel writes
+    model.eval()
+    torch.testing.assert_close(model(positions, times)["translations"], first + 2.0)
+
+
+def test_times_and_positions_get_a_gradient_where_they_want_one():
+    random = torch.Generator().manual_seed(12)
+    model = DeformationNetwork({"translations": 3}, generator=random)
+    torch.nn.init.normal_(model.head.weight, std=0.05, generator=random)
+    times = torch.tensor([0.2, 0.7], requires_grad=True)
+    model(torch.randn(5, 3, generator=random), times)["translations"].sum().backward()
+    assert times.grad is not None and bool(times.grad.any())
+
+
+def test_under_inference_mode_nothing_is_kept():
+    random = torch.Generator().manual_seed(13)
+    with torch.inference_mode():
+        model = DeformationNetwork({"translations": 3}, generator=random).eval()
+        positions, times = torch.randn(9, 3, generator=random), torch.tensor([0.3])
+        first = model(positions, times)["translations"]
+        model.head.bias.add_(1.0)
+        torch.testing.assert_close(model(positions, times)["translations"], first + 1.0)

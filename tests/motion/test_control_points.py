@@ -1,0 +1,126 @@
+"""What a scene of control points remembers between frames and between steps, and when it forgets it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from scgs_warp.benchmark import scenes
+from scgs_warp.motion import ControlPoints
+from scgs_warp.scene.scene import scene_from
+from scgs_warp.types import Gaussians
+
+
+@pytest.fixture
+def scene(device):
+    return scenes.synthetic_scene("control-points", 700, 40, device)
+
+
+def fresh(scene, time: float) -> Gaussians:
+    """Posed without anything remembered."""
+    motion = scene.motion
+    with torch.no_grad():
+        return motion.apply_pose(
+            scene.gaussians, motion.poses(torch.tensor([time]))[0], motion.binding(scene.gaussians)
+        )
+
+
+def assert_same(actual: Gaussians, expected: Gaussians) -> None:
+    for name, value in vars(expected).items():
+        assert torch.equal(getattr(actual, name), value), name
+
+
+def test_a_frozen_scene_poses_as_one_that_remembers_nothing(scene):
+    motion = scene.motion
+    assert isinstance(motion, ControlPoints)
+    frozen = [scene.gaussians_at(time) for time in (0.2, 0.7)]
+    assert not torch.equal(frozen[0].means, frozen[1].means)
+    for time, posed in zip((0.2, 0.7), frozen):
+        assert_same(posed, fresh(scene, time))
+    motion.cache_binding(None)
+    posed = scene.gaussians_at(0.2)  # weights and skinning in one pass: the same up to rounding
+    for name in ("means", "quats", "scales"):
+        torch.testing.assert_close(getattr(posed, name), getattr(frozen[0], name), rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_what_is_edited_is_bound_anew(scene):
+    gaussians, motion = scene.gaussians, scene.motion
+
+    def jump():
+        gaussians.means[: len(gaussians) // 2] *= -1.0
+
+    def replace():
+        gaussians.means = torch.nn.Parameter(gaussians.means + 0.3)
+
+    def overwrite():
+        gaussians.means.data = gaussians.means.data.flip(0).clone()
+
+    for edit in (jump, replace, overwrite, lambda: motion.log_radii.add_(1.0), lambda: motion.positions.add_(0.2)):
+        before = scene.gaussians_at(0.4)
+        edit()
+        after = scene.gaussians_at(0.4)
+        assert not torch.equal(before.means, after.means)
+        assert_same(after, fresh(scene, 0.4))
+    remembered = motion._cached
+    scene.gaussians_at(0.9)
+    assert motion._cached is remembered
+
+
+def test_edited_numbers_of_gaussians(scene):
+    other = scenes.figure(300).to(scene.device)
+    scene.gaussians_at(0.4)
+    scene.gaussians = other
+    assert_same(scene.gaussians_at(0.4), fresh(scene, 0.4))
+
+
+def test_training_sees_the_neighbours_of_the_step(scene):
+    """Neighbours follow Gaussians and control points as an optimiser moves them, and those of another set."""
+    motion = scene.motion
+    motion.cache_binding(None)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(12):
+        found = motion.neighbors(scene.gaussians)
+        distances = torch.cdist(scene.gaussians.means.double(), motion.positions.double())
+        nearest = distances.gather(1, found.long())
+        torch.testing.assert_close(
+            nearest, distances.topk(found.shape[1], dim=1, largest=False)[0], rtol=1e-4, atol=1e-5
+        )
+        with torch.no_grad():
+            for tensor in (scene.gaussians.means, motion.positions):
+                tensor += (0.004 * step * torch.randn(tensor.shape, generator=generator)).to(tensor)
+            if step == 6:
+                scene.gaussians.means.data = scene.gaussians.means.data.flip(0).clone()
+
+
+def test_shading_turns_with_the_surface_and_nothing_else_changes(scene):
+    gaussians, motion = scene.gaussians, scene.motion
+    assert isinstance(motion, ControlPoints) and gaussians.shading.shape[1] == 10
+    shaded = fresh(scene, 0.6)
+    with torch.no_grad():
+        gaussians.shading.zero_()
+    plain = fresh(scene, 0.6)
+    assert not torch.allclose(shaded.sh_dc, plain.sh_dc, atol=1e-3)
+    torch.testing.assert_close(plain.sh_dc, gaussians.sh_dc, rtol=1e-5, atol=1e-5)
+    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
+        assert torch.equal(getattr(shaded, name), getattr(plain, name)), name
+
+
+def test_shading_learns_and_the_motion_does_not_follow_brightness(scene):
+    gaussians, motion = scene.gaussians, scene.motion
+    motion.cache_binding(None)
+    posed = motion.gaussians_at(gaussians, 0.6)
+    posed.sh_dc.sum().backward()
+    assert gaussians.shading.grad is not None and (gaussians.shading.grad != 0).any()
+    found = [parameter.grad for parameter in motion.parameters() if parameter.grad is not None]
+    assert all(not gradient.any() for gradient in found)
+    assert gaussians.quats.grad is None or not gaussians.quats.grad.any()
+
+
+def test_a_scene_from_before_shading_still_opens(scene):
+    tensors = {name: value.detach().clone() for name, value in scene.tensors().items() if name != "gaussians.shading"}
+    metadata = scene.metadata()
+    del metadata["config"]["motion"]["shading"]
+    opened = scene_from(tensors, metadata, str(scene.device), "old run")
+    assert opened.gaussians.shading.shape == (len(scene.gaussians), 0)
+    torch.testing.assert_close(opened.gaussians_at(0.3).sh_dc, scene.gaussians.sh_dc)

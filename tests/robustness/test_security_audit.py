@@ -1,0 +1,108 @@
+"""The sources hold nothing that would run what a file says, and packages that they need cannot change under them."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from helpers.paths import ROOT
+
+SOURCES = sorted(path for folder in ("kernels", "scgs_warp", "apps") for path in (ROOT / folder).rglob("*.py"))
+
+MODULES = {
+    "pickle",
+    "cPickle",
+    "dill",
+    "cloudpickle",
+    "joblib",
+    "shelve",
+    "marshal",
+    "yaml",
+    "tarfile",
+    "pty",
+    "xmlrpc",
+}
+NAMES = {"eval", "exec", "compile", "__import__"}
+"""Of built-in functions; methods may be called so."""
+ENDINGS = {
+    "os.system", "os.popen", "np.load", "numpy.load", "torch.save", "torch.hub.load", "tempfile.mktemp", "json.load",
+    "extractall", "joblib.load", "shutil.unpack_archive", "yaml.load", "pickle.loads", "os.execv", "os.spawnv",
+}  # fmt: skip
+ONLY_IN = {"json.loads": {"files.py", "page_data.py", "session.py", "model.py", "local_runner.py", "from_mesh.py"}}
+"""Functions that do not take strangers' text well, and where they take our own."""
+
+
+def forbidden(tree: ast.AST, name: str) -> Iterator[str]:
+    """What a source file of this name does that would let a file run code, or go where it wants."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found = {alias.name.partition(".")[0] for alias in node.names} & MODULES
+        elif isinstance(node, ast.ImportFrom):
+            found = {(node.module or "").partition(".")[0]} & MODULES if node.level == 0 else set()
+        elif isinstance(node, ast.Call):
+            found = set(_of_call(node, name))
+        else:
+            continue
+        yield from (f"{name}:{node.lineno} {what}" for what in found)
+
+
+def _of_call(node: ast.Call, name: str) -> Iterator[str]:
+    called = ast.unparse(node.func)
+    given = {keyword.arg: keyword.value for keyword in node.keywords}
+    if called in NAMES or called in ENDINGS or called.rpartition(".")[2] in ENDINGS:
+        yield called
+    if "shell" in given or (called.startswith("subprocess.") and not isinstance(node.args[0], ast.List)):
+        yield f"{called} through a shell"
+    if "allow_pickle" in given and ast.unparse(given["allow_pickle"]) != "False":
+        yield "allow_pickle"
+    if called.endswith("torch.load") and ast.unparse(given.get("weights_only", ast.Constant(None))) != "True":
+        yield "torch.load without weights_only"
+    if name not in ONLY_IN.get(called, {name}):
+        yield f"{called} where parse_json belongs"
+
+
+def test_nothing_runs_what_a_file_says():
+    assert len(SOURCES) > 200
+    found = [list(forbidden(ast.parse(path.read_text(encoding="utf-8")), path.name)) for path in SOURCES]
+    assert [line for lines in found for line in lines] == []
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import pickle", "from yaml import load", "eval('1')", "exec(x)", "np.load(path)", "torch.load(path)",
+        "np.fromfile(p, allow_pickle=True)", "subprocess.run('ls', shell=True)", "subprocess.Popen(command)",
+        "torch.load(p, weights_only=False)", "archive.extractall()", "os.system('x')", "json.loads(text)",
+        "tempfile.mktemp()", "import dill.source",
+    ],
+)  # fmt: skip
+def test_the_audit_sees_what_it_looks_for(code):
+    assert list(forbidden(ast.parse(code), "any.py"))
+
+
+def test_dependencies_are_bounded():
+    """A new major version may do anything: every package has an upper bound."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    needed = re.search(r"^dependencies = \[(.*?)^\]", text, re.M | re.S)
+    extras = re.search(r"^\[project.optional-dependencies\](.*?)^\[", text, re.M | re.S)
+    assert needed is not None and extras is not None
+    listed = re.findall(r'"([^"]+)"', re.sub(r"#.*", "", needed[1] + extras[1]))
+    assert len(listed) > 20
+    assert [item for item in listed if not re.search(r"<|==", item)] == []
+
+
+def test_secrets_are_compared_in_constant_time():
+    """``==`` takes longer the more letters are right."""
+    tree = ast.parse((ROOT / "scgs_warp/editor/proxy.py").read_text(encoding="utf-8"))
+    compared = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Compare)]
+    secrets = [text for text in compared if re.search(r"\b(token|given|key)\b", text)]
+    assert {
+        text
+        for text in secrets
+        if not re.fullmatch(r".* is (not )?None|'token' in .*|key == name|name not in \(KEY.*", text)
+    } == set()
+    called = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    assert sum(text.startswith("hmac.compare_digest(") for text in called) == 2

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from scgs_warp.gaussians import GaussianParameters
+from scgs_warp.motion.network import encode
+from scgs_warp.runtime import environment
+
+
+@pytest.mark.parametrize(
+    "files, expected",
+    [
+        ({"cpu.max": "200000 100000\n"}, 2.0),
+        ({"cpu.max": "50000 100000\n"}, 0.5),
+        ({"cpu.max": "max 100000\n"}, math.inf),
+        ({"cpu.max": "nonsense"}, math.inf),
+        ({"cpu.max": ""}, math.inf),
+        ({"cpu/cpu.cfs_quota_us": "300000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 3.0),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, math.inf),
+        ({}, math.inf),
+    ],
+)
+def test_share_of_a_container(tmp_path, files, expected):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert environment._quota(str(tmp_path)) == expected
+
+
+def test_threads_follow_affinity_and_share(monkeypatch):
+    monkeypatch.setattr(environment.os, "sched_getaffinity", lambda process: set(range(64)), raising=False)
+    for quota, threads in ((2.0, 2), (2.5, 3), (0.1, 1), (math.inf, 64), (1000.0, 64)):
+        monkeypatch.setattr(environment, "_quota", lambda quota=quota: quota)
+        assert environment.available_threads() == threads
+
+
+def test_activations_of_many_gaussians_have_the_same_bits_on_any_number_of_threads():
+    """Torch's own differ where its threads meet: 100,000 elements are cut at 50,000, which is no multiple of 32."""
+    random = torch.Generator().manual_seed(0)
+    gaussians = GaussianParameters(
+        torch.zeros(100_003, 3), torch.randn(100_003, 3, generator=random), torch.zeros(100_003, 3)
+    )
+    gaussians.opacity_logits.data.copy_(torch.randn(100_003, generator=random))
+    positions = torch.randn(4099, 3, generator=random)
+    results = []
+    try:
+        for threads in (1, 2, 3, 5):
+            environment.configure(threads)
+            results.append((gaussians.scales(), gaussians.opacities(), encode(positions, 10)))
+    finally:
+        environment.configure()
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))

@@ -1,0 +1,214 @@
+"""Launches: arguments are checked and arrive, every grid index runs once, whoever runs it."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import weakref
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from scgs_warp.runtime import cpu_threads, environment
+from scgs_warp.runtime.cpu_threads import cut_by_load, cut_evenly, share
+from scgs_warp.runtime.launch import launch
+
+
+@wp.struct
+class Pair:
+    a: wp.int64
+    b: float
+
+
+@wp.kernel(enable_backward=False)
+def mixed(
+    first: int,
+    flag: bool,
+    values: wp.array[wp.vec3],
+    nothing: wp.array[float],
+    scale: float,
+    corner: wp.vec2i,
+    pair: Pair,
+    big: wp.uint64,
+    small: wp.uint8,
+    out: wp.array2d[float],
+):
+    i = first + wp.tid()
+    total = scale * values[i][2] + float(corner[1]) + float(pair.a) + pair.b + float(small)
+    if flag and nothing.shape[0] == 0 and big == wp.uint64(1) << wp.uint64(63):
+        total += 1000.0
+    out[i, 0] = out[i, 0] + total
+
+
+def mixed_arguments(count: int) -> list:
+    pair = Pair()
+    pair.a, pair.b = 7, 0.5
+    values = torch.arange(3.0 * count).view(count, 3)
+    return [True, values, None, 2.0, wp.vec2i(3, 4), pair, 2**63, 200, torch.zeros(count, 2)]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 2, 37, 1000])
+def test_every_kind_of_argument_arrives_once(all_threads: None, threads: int, count: int):
+    environment.configure(threads=threads)
+    arguments = mixed_arguments(count)
+    expected = 2.0 * arguments[1][:, 2] + 4.0 + 7.0 + 0.5 + 200.0 + 1000.0
+    for load in (None, torch.arange(count) ** 2):
+        arguments[-1].zero_()
+        launch(mixed, count, *arguments, grain=1, load=load)
+        assert torch.equal(arguments[-1][:, 0], expected)
+        assert not arguments[-1][:, 1].any()
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "error", "message"),
+    [
+        (1, torch.zeros(4, 2), ValueError, "values must be contiguous"),
+        (1, torch.zeros(4, 3, dtype=torch.float64), ValueError, "values must be contiguous"),
+        (1, torch.zeros(4, 6)[:, ::2], ValueError, "values must be contiguous"),
+        (1, torch.zeros(4, 3, device="meta"), ValueError, "values is on meta"),
+        (3, torch.zeros(1), TypeError, "no array"),
+        (3, "two", TypeError, "mixed"),
+    ],
+)
+def test_wrong_arguments_are_named(place: int, value: object, error: type[Exception], message: str):
+    arguments = mixed_arguments(4)
+    launch(mixed, 4, *arguments)  # known shapes must not hide what else is wrong
+    arguments[place] = value
+    with pytest.raises(error, match=message):
+        launch(mixed, 4, *arguments)
+    with pytest.raises(TypeError, match="takes 9 arguments"):
+        launch(mixed, 4, *arguments[:-1])
+
+
+def test_many_shapes(all_threads: None):
+    """More than are remembered."""
+    for count in range(1, 600):
+        arguments = mixed_arguments(count)
+        launch(mixed, count, *arguments)
+        assert bool((arguments[-1][:, 0] > 1000.0).all()), count
+
+
+def covered(chunks: list[tuple[int, int]]) -> list[int]:
+    return sorted(i for begin, size in chunks for i in range(begin, begin + size))
+
+
+@pytest.mark.parametrize("threads", [2, 3, 16])
+@pytest.mark.parametrize("grain", [1, 7, 512])
+@pytest.mark.parametrize("count", [1, 2, 50, 2500, 49_001])
+def test_even_chunks(count: int, grain: int, threads: int):
+    chunks = cut_evenly(count, threads, grain)
+    assert covered(chunks) == list(range(count))
+    sizes = [size for _, size in chunks]
+    assert all(size >= grain for size in sizes[:-1])
+    assert max(sizes) <= max(grain, count / (2 * threads) + grain)
+
+
+def makespan(costs: list[int], threads: int) -> int:
+    """When all are done if each goes to the thread that is free first."""
+    ends = [0] * threads
+    for cost in costs:
+        ends[ends.index(min(ends))] += cost
+    return max(ends)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8])
+@pytest.mark.parametrize("seed", range(4))
+def test_chunks_by_load_balance(seed: int, threads: int):
+    """A few indices hold nearly all the work, next to each other; the heaviest is a lower bound."""
+    random = np.random.default_rng(seed)
+    costs = random.integers(0, 3, 2500)
+    at = int(random.integers(0, 2480))
+    costs[at : at + 20] += random.integers(0, 20_000, 20)
+    chunks = cut_by_load(torch.from_numpy(np.cumsum(costs)), threads)
+    assert covered(chunks) == list(range(2500))
+    taken = [int(costs[begin : begin + size].sum()) for begin, size in chunks]
+    assert taken == sorted(taken, reverse=True)
+    least = max(costs.sum() / threads, costs.max())
+    assert makespan(taken, threads) <= least + costs.max() / 2 + costs.sum() / (8 * threads)
+    assert len(chunks) < 40 * threads
+
+
+@pytest.mark.parametrize("load", [[0, 0, 0], [5], [0, 0, 9, 9], [9, 9, 9]])
+def test_chunks_of_no_load(load: list[int]):
+    assert covered(cut_by_load(torch.tensor(load), 2)) == list(range(len(load)))
+
+
+def test_an_error_in_a_chunk_comes_back_after_all_others_ran():
+    ran: list[int] = []
+
+    def call(first: int, size: int) -> None:
+        ran.append(first)
+        if first == 3:
+            raise ValueError("chunk 3")
+
+    with pytest.raises(ValueError, match="chunk 3"):
+        share(call, [(k, 1) for k in range(10)], 3)
+    assert sorted(ran) == list(range(10))
+
+
+def test_nobody_waits_for_a_helper_that_found_nothing(monkeypatch: pytest.MonkeyPatch):
+    """The only helper is busy with another job: the asking thread does its own job alone."""
+    monkeypatch.setattr(cpu_threads, "_helpers", cpu_threads._Helpers(environment.configured()))
+    hold, started = threading.Event(), threading.Event()
+
+    def slow(first: int, size: int) -> None:
+        if threading.current_thread() is asking:
+            assert started.wait(10)
+        else:
+            started.set()
+            assert hold.wait(10)
+
+    asking = threading.Thread(target=lambda: share(slow, [(0, 1), (1, 1)], 2))
+    asking.start()
+    assert started.wait(10)
+    ran = torch.zeros(2)
+    share(lambda first, size, ran=ran: ran[first : first + size].add_(1.0), [(0, 1), (1, 1)], 2)
+    assert ran.tolist() == [1.0, 1.0] and not hold.is_set()
+    memory = weakref.ref(ran)
+    del ran
+    assert memory() is None, "a helper that has not woken up yet holds on to the tensors"
+    hold.set()
+    asking.join(10)
+    assert not asking.is_alive()
+
+
+def test_an_interrupt_waits_until_no_helper_writes_any_more(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cpu_threads, "_helpers", cpu_threads._Helpers(environment.configured()))
+    started, ended = threading.Event(), threading.Event()
+
+    class Interrupted(list):
+        """A list of chunks whose length the asking thread fails to learn, once a helper is at work."""
+
+        def __len__(self) -> int:
+            if threading.current_thread() is threading.main_thread() and started.is_set():
+                raise KeyboardInterrupt
+            return super().__len__()
+
+    def call(first: int, size: int) -> None:
+        if threading.current_thread() is threading.main_thread():
+            assert started.wait(10)
+        else:
+            started.set()
+            time.sleep(0.2)
+            ended.set()
+
+    with pytest.raises(KeyboardInterrupt):
+        share(call, Interrupted([(0, 1), (1, 1), (2, 1)]), 2)
+    assert ended.is_set()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_starts_threads_of_its_own():
+    share(lambda first, size: None, [(0, 1), (1, 1)], 2)
+    child = os.fork()
+    if child == 0:
+        done: list[int] = []
+        share(lambda first, size: done.append(first), [(k, 1) for k in range(4)], 2)
+        own = any(thread.name.startswith("warp-") for thread in threading.enumerate())
+        os._exit(0 if sorted(done) == [0, 1, 2, 3] and own else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -1,0 +1,149 @@
+"""Advice: what the survey of a data set finds, and that each remark is made of data that deserve it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from helpers.layouts import write_colmap, write_poses_bounds
+from helpers.scenes import look_at
+from helpers.tiny import tiny_dataset
+from scgs_warp.config.presets import preset
+from scgs_warp.data import Dataset, load
+from scgs_warp.geometry.normalisation import Normalisation
+from scgs_warp.training.dataset_advice import Survey, advise, survey
+from scgs_warp.training.initial_points import common_view, likely_points, random_points
+from scgs_warp.types import Camera, Frame
+
+
+def handheld(
+    frames: int = 40, step: float = 1.0, exposure: float = 0.0, alpha: bool = False, views: int = 1
+) -> Dataset:
+    """A camera that moves by ``step`` degrees a frame around a grey scene, its exposure going up and down."""
+    K = torch.tensor([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]])
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    made = []
+    for index in range(frames):
+        angle = torch.deg2rad(torch.tensor(step * index, dtype=torch.float64))
+        eye = torch.stack([4 * angle.cos(), 4 * angle.sin(), 0.5 * torch.ones_like(angle)])
+        camera = Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), up).float(), K, 32, 24)
+        image = torch.full((24, 32, 3), 0.5 * (1 + exposure * (index % 2)))
+        mask = torch.ones(24, 32, dtype=torch.bool)
+        covered = torch.ones(24, 32) if alpha else None
+        made.append(Frame(camera, (index // views) / max((frames - 1) // views, 1), image, covered, mask, f"{index}"))
+    return Dataset(made, folder=Path("handheld"), split="train")
+
+
+def lines(data: Dataset, **changes) -> tuple[str, str]:
+    found = advise(survey(data), dataclasses.replace(preset("cpu"), **changes))
+    assert not any("\n" in line for line in found)
+    return found
+
+
+def test_survey_counts():
+    found = survey(handheld(41, 2.0))
+    assert (found.frames, found.width, found.height, found.instants, found.views) == (41, 32, 24, 41, 1)
+    assert found.arc == pytest.approx(80, abs=2) and found.turn == pytest.approx(2, abs=0.1)
+    assert found.flicker == 0 and not found.cut_out and found.points == 0
+    assert found.typical_gap == pytest.approx(1 / 40)
+
+
+def test_a_slow_camera():
+    first, second = lines(handheld(41, 2.0))
+    assert first == (
+        "data: 41 frames of 32 x 24 at 41 times; one camera, 2 degrees from frame to frame, 79 in all; filled images; "
+        "no points"
+    )
+    assert "motion along the line of sight" in second and "COLMAP's points" in second
+
+
+def test_hardly_any_parallax():
+    assert "leaves depth unknown" in lines(handheld(30, 0.1))[1]
+
+
+def test_exposure():
+    assert "brightness changes by 20 %" in lines(handheld(exposure=0.2))[1]
+    assert "brightness" not in lines(handheld(exposure=0.04))[1]
+    dark = [dataclasses.replace(f, alpha=torch.zeros(24, 32), image=f.image * 0) for f in handheld(10, alpha=True)]
+    assert survey(Dataset(dark, folder=Path("dark"), split="train")).flicker == 0
+
+
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_a_figure_that_comes_closer_is_no_exposure(background):
+    frames = []
+    for index, frame in enumerate(handheld(20, alpha=True)):
+        alpha = torch.zeros(24, 32)
+        alpha[: 6 + 8 * (index % 2)] = 1.0
+        image = 0.4 * alpha[..., None].expand(24, 32, 3) + (background == "white") * (1 - alpha[..., None])
+        frames.append(dataclasses.replace(frame, alpha=alpha, image=image))
+    data = Dataset(frames, folder=Path("figure"), split="train", background=background)
+    assert survey(data).flicker < 1e-6
+
+
+def test_a_gap_in_time():
+    data = handheld(40)
+    frames = [f for f in data if not 0.4 < f.time < 0.7]
+    assert "guessed motion from time 0.38 to 0.72" in lines(Dataset(frames, folder=Path("gap"), split="train"))[1]
+
+
+def test_frames_of_one_instant():
+    still = [dataclasses.replace(frame, time=0.5) for frame in handheld(12, 5.0)]
+    first, second = lines(Dataset(still, folder=Path("still"), split="train"))
+    assert "12 views of each instant" in first and "--motion static" in second
+
+
+def test_a_camera_that_is_elsewhere_at_each_instant():
+    first, second = lines(tiny_dataset(16))
+    assert "cut out by alpha" in first and "stands elsewhere" in second and "--progressive" in second
+
+
+def test_steps_and_sizes():
+    assert "--steps 1000 sees" in lines(handheld(40), steps=400)[1]
+    found = survey(handheld(40))
+    large = dataclasses.replace(found, width=4000, height=3000)
+    assert "--downscale 4" in advise(large, preset("cpu"))[1]
+    assert "--downscale" not in advise(large, preset("cpu"), "cuda")[1]
+
+
+def test_poses(tmp_path):
+    write_colmap(tmp_path)
+    first, second = lines(load(tmp_path))
+    assert "24 points" in first and "--set optim.cameras=2e-4" in second
+
+
+def test_many_views(tmp_path):
+    write_poses_bounds(tmp_path)
+    first, second = lines(load(tmp_path))
+    assert "3 views of each instant" in first and "each instant is seen from several sides" in second
+
+
+def test_a_single_frame():
+    assert survey(handheld(1)).instants == 1 and isinstance(survey(handheld(1)), Survey)
+    assert len(lines(handheld(1))) == 2
+
+
+def test_points_begin_in_the_common_view():
+    """Cameras that walk past a wall do not all see all of the cube."""
+    data = handheld(20, 0.0)
+    for index, entry in enumerate(data.entries):
+        entry.camera.viewmat[0, 3] += 0.4 * index
+    normalisation = Normalisation.fit(data.cameras)
+    plain = random_points(2000, 0, 31)
+    points, colors = likely_points(2000, data, normalisation, 0, 31)
+    assert colors is None and points.shape == (2000, 3)
+    before, after = (common_view(p, data, normalisation) for p in (plain, points))
+    assert after.mean() > before.mean() + 0.05 and (before < 0.3).sum() > 5 * (after < 0.3).sum()
+    assert torch.equal(points, likely_points(2000, data, normalisation, 0, 31)[0])
+
+
+def test_the_app_says_it(tmp_path, capsys):
+    from scgs_warp.apps.train import cli
+
+    write_colmap(tmp_path / "scene")
+    arguments = ["--data", str(tmp_path / "scene"), "--output", str(tmp_path / "run"), "--steps", "12", "--nodes", "16"]
+    assert cli([*arguments, "--device", "cpu", "--set", "init_points=200"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("data: 12 frames of 80 x 60") and said[1].startswith("expect ")

@@ -1,0 +1,72 @@
+"""Training views: an order without replacement, progressive windows, backgrounds, half-sized images."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.data.dataset import Dataset
+from scgs_warp.geometry.normalisation import Normalisation
+from scgs_warp.training.frames import Frames
+
+
+def frames(size: int = 64, count: int = 10, **changes) -> Frames:
+    return Frames(tiny_dataset(count, size), Normalisation.identity(), tiny_config(100, **changes), "cpu")
+
+
+def test_every_epoch_sees_every_frame_once_in_another_order():
+    made = frames()
+    epochs = [[made.index_at(10 * epoch + i, False) for i in range(10)] for epoch in range(3)]
+    assert all(sorted(epoch) == list(range(10)) for epoch in epochs)
+    assert epochs[0] != epochs[1] != epochs[2]
+
+
+def test_progressive_starts_with_the_first_fifth_and_grows_to_all():
+    made = frames(pretrain={"progressive_every": 50})
+    windows = [range(start, start + 10) for start in (0, 50, 200)]
+    seen = [[made.frames[made.index_at(step, True)].time for step in window] for window in windows]
+    times = sorted(frame.time for frame in made.frames)
+    assert set(seen[0]) == set(times[:2])
+    assert max(seen[1]) in times[3:5] and min(seen[1][1::2]) >= times[2], "every other step looks at the newest fifth"
+    assert set(seen[2]) == set(times)
+
+
+def test_random_background_is_under_the_image_alone():
+    made = frames()
+    frame, _, truth, background, mask = made.view(3, 7, True)
+    plain = made.view(3, 7, False)[2]
+    assert mask is None
+    assert torch.allclose(truth, plain + (1 - frame.alpha) * background[:, None, None])
+    assert torch.equal(truth, made.view(3, 7, True)[2]), "the same step gives the same background"
+    assert not torch.equal(truth, made.view(3, 8, True)[2])
+
+
+@pytest.mark.parametrize("size", [64, 65])
+def test_half_size_sees_the_same_scene(size):
+    made = frames(size, half_size=10)
+    _, camera, truth, _, _ = made.view(2, 9, False)
+    _, whole_camera, whole, _, _ = made.view(2, 10, False)
+    assert truth.shape == (3, size // 2, size // 2) and whole.shape == (3, size, size)
+    assert (camera.width, camera.height) == (size // 2, size // 2)
+    even = whole[:, : size // 2 * 2, : size // 2 * 2]
+    expected = even.unflatten(2, (-1, 2)).unflatten(1, (-1, 2)).mean((2, 4))
+    assert torch.allclose(truth, expected, atol=1e-6)
+    # A point lands on the same place of the image: half the pixel coordinates.
+    point = torch.tensor([0.1, -0.2, 0.3, 1.0])
+    pixels = [(c.K @ (c.viewmat @ point)[:3]) for c in (camera, whole_camera)]
+    assert torch.allclose(pixels[0][:2] / pixels[0][2], 0.5 * pixels[1][:2] / pixels[1][2], atol=1e-4)
+
+
+def test_small_images_and_masks_at_half_size():
+    made = frames(48, half_size=10)
+    assert made.view(0, 0, False)[1].width == 48, "too small to be halved"
+    made = frames(64, half_size=10)
+    mask = torch.ones(64, 64, dtype=torch.bool)
+    mask[10, 11] = False
+    masked = [dataclasses.replace(frame, mask=mask if index == 1 else None) for index, frame in enumerate(made.frames)]
+    made.frames = Dataset(masked, folder=made.frames.folder, split="train")
+    half = made.view(1, 0, False)[4]
+    assert half is not None and not half[5, 5] and int((~half).sum()) == 1

@@ -1,0 +1,272 @@
+"""The loop: it learns, and it survives. That it gives the same bits is test_same_bits.py."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.config.presets import with_steps
+from scgs_warp.errors import UserError
+from scgs_warp.evaluation.evaluate import evaluate
+from scgs_warp.evaluation.image_metrics import psnr
+from scgs_warp.scene.scene import Scene
+from scgs_warp.storage import checkpoint
+from scgs_warp.training.densify import RESET_OPACITY
+from scgs_warp.training.frames import Frames
+from scgs_warp.training.loop import fit
+from scgs_warp.training.run_folder import RunFolder
+from scgs_warp.training.state import TrainState
+from scgs_warp.training.step import training_step
+
+MODELS = ["control-points", "per-gaussian", "hexplane", "static"]
+
+
+def checkpoint_bytes(folder: Path) -> bytes:
+    return (folder / "checkpoint.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_motion_model_learns(model, tmp_path, device):
+    data, test = tiny_dataset(), tiny_dataset(4, split="test")
+    config = tiny_config(200, motion={"model": model})
+    scene = fit(config, data, output=tmp_path / "run", device=device, test=test)
+    black = sum(float(psnr(torch.zeros_like(f.image), f.image)) for f in test) / len(test)
+    assert evaluate(scene, test)["psnr"] > black + 4.0
+    log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    steps = [entry["step"] for entry in log if "loss" in entry]
+    assert steps == [50, 100, 150, 200]
+    assert any("test_psnr" in entry for entry in log)
+
+
+def test_the_curve_does_not_show_opacity_resets(tmp_path, monkeypatch):
+    """They fall on the same round steps."""
+    looks = []
+    monkeypatch.setattr(
+        RunFolder,
+        "look_at_test",
+        lambda _, scene, test, step: looks.append((step, float(scene.gaussians.opacities().detach().max()))),
+    )
+    schedule = {"until": 45, "opacity_reset_every": 20, "every": 10}
+    config = tiny_config(60, motion={"model": "static"}, densify=schedule, evaluate_every=20)
+    fit(config, tiny_dataset(6), output=tmp_path / "run", test=tiny_dataset(2, split="test"))
+    assert [step for step, _ in looks] == [20, 40, 60]
+    assert all(most > 2 * RESET_OPACITY for _, most in looks), looks
+
+
+def test_checkpoint_round_trip(tmp_path, device):
+    data = tiny_dataset(6)
+    scene = fit(tiny_config(40), data, output=tmp_path / "run", device=device)
+    scene.freeze_binding()
+    loaded = Scene.load(tmp_path / "run", device=device)
+    for frame in data:
+        assert torch.equal(scene.render(frame.camera, frame.time).rgb, loaded.render(frame.camera, frame.time).rgb)
+    assert loaded.step == 40
+    posed = loaded.gaussians_at(0.3)
+    assert posed.means.shape == (loaded.gaussian_count, 3)
+    assert loaded.control_points_at(0.3).shape == (loaded.control_point_count, 3)
+
+
+def test_interrupt_saves(tmp_path, monkeypatch):
+    from scgs_warp.training import loop
+
+    data = tiny_dataset(6)
+    step = loop.training_step
+
+    def interrupting(state, frames):
+        if state.step == 20:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return step(state, frames)
+
+    monkeypatch.setattr(loop, "training_step", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        fit(tiny_config(60), data, output=tmp_path / "run")
+    monkeypatch.undo()
+    fit(tiny_config(60), data, output=tmp_path / "run", resume=True)
+    fit(tiny_config(60), data, output=tmp_path / "whole")
+    assert checkpoint_bytes(tmp_path / "run") == checkpoint_bytes(tmp_path / "whole")
+
+
+def test_a_bad_frame_is_dropped_and_named(tmp_path, capsys):
+    data = tiny_dataset(6)
+    data[2].image[5, 5, 0] = float("nan")
+    scene = fit(tiny_config(60), data, output=tmp_path / "run")
+    log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    dropped = [entry for entry in log if "dropped" in entry]
+    assert dropped and all(entry["dropped"] == "image loss" for entry in dropped)
+    assert 8 <= len(dropped) <= 12, "one frame of six, 60 steps"
+    assert all(bool(torch.isfinite(value).all()) for value in scene.tensors().values())
+
+
+@pytest.mark.parametrize(("owner", "name"), [("gaussians", "sh_rest"), ("motion", "network.head.weight")])
+def test_a_bad_gradient_changes_nothing_and_is_named(owner, name, device):
+    data = tiny_dataset(6)
+    config = tiny_config(60, pretrain={"steps": 0}, freeze=0)
+    state = TrainState.begin(config, data, device)
+    frames = Frames(data, state.normalisation, config, device)
+    for _ in range(3):
+        assert training_step(state, frames).failed is None
+        state.step += 1
+    assert state.motion_optimizer is not None
+
+    def everything() -> dict[str, torch.Tensor]:
+        tensors = {**state.scene().tensors(), **state.gaussian_optimizer.tensors("a")}
+        tensors |= state.motion_optimizer.tensors("b") if state.motion_optimizer is not None else {}
+        return {key: value.detach().clone() for key, value in tensors.items()}
+
+    def poison(gradient: torch.Tensor) -> torch.Tensor:
+        gradient = gradient.clone()
+        gradient.view(-1)[-1] = float("inf")
+        return gradient
+
+    before = everything()
+    hook = getattr(state, owner).get_parameter(name).register_hook(poison)
+    assert training_step(state, frames).failed == f"gradient of {name}"
+    after = everything()
+    assert before.keys() == after.keys() and all(torch.equal(before[key], after[key]) for key in before)
+    hook.remove()
+    assert training_step(state, frames).failed is None
+    assert not torch.equal(everything()["b.network.head.weight.exp_avg"], before["b.network.head.weight.exp_avg"])
+
+
+def test_repeated_failure_stops_at_the_last_good_state(tmp_path):
+    data = tiny_dataset(3)
+    for frame in data:
+        frame.image[:] = float("inf")
+    with pytest.raises(UserError, match="not finite 20 times"):
+        fit(tiny_config(60), data, output=tmp_path / "run")
+
+
+def test_refusals(tmp_path):
+    data = tiny_dataset(3)
+    config = tiny_config(20)
+    with pytest.raises(UserError, match="no frames"):
+        fit(config, type(data)([], folder=Path("empty"), split="train"), output=tmp_path / "a")
+    fit(config, data, output=tmp_path / "run")
+    with pytest.raises(UserError, match="holds a run already"):
+        fit(config, data, output=tmp_path / "run")
+    with pytest.raises(UserError, match="made with steps"):
+        fit(with_steps(config, 40), data, output=tmp_path / "run", resume=True)
+    with pytest.raises(UserError, match="no such run"):
+        fit(config, data, output=tmp_path / "new", resume=True)
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "other").mkdir()
+    with pytest.raises(UserError, match="no checkpoint"):
+        fit(config, data, output=tmp_path / "other", resume=True)
+    path = tmp_path / "run/checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(UserError, match="damaged"):
+        Scene.load(tmp_path / "run")
+    with pytest.raises(UserError, match="no such run"):
+        Scene.load(tmp_path / "nowhere")
+
+
+def test_resume_refuses_other_frames(tmp_path):
+    config = tiny_config(20)
+    fit(config, tiny_dataset(3), output=tmp_path / "run")
+    with pytest.raises(UserError, match="other frames"):
+        fit(config, tiny_dataset(4), output=tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize(("section", "field"), [("motion", "shading"), (None, "half_size")])
+def test_resume_refuses_a_run_of_another_version(section, field, tmp_path):
+    """What it did without the field is no value that could be given."""
+    config, data = tiny_config(20), tiny_dataset(3)
+    fit(config, data, output=tmp_path / "run")
+    tensors, metadata = checkpoint.read(tmp_path / "run")
+    del (metadata["config"][section] if section else metadata["config"])[field]
+    checkpoint.write(tmp_path / "run", tensors, metadata)
+    name = f"{section}.{field}" if section else field
+    with pytest.raises(UserError, match=f"made by another version, which had no {name}; train again with another --"):
+        fit(config, data, output=tmp_path / "run", resume=True)
+
+
+def test_what_changes_no_bit_may_differ_on_resume(tmp_path):
+    fit(tiny_config(20), tiny_dataset(3), output=tmp_path / "run")
+    before = checkpoint_bytes(tmp_path / "run")
+    other = tiny_config(20, evaluate_every=7, checkpoint_seconds=0.0)
+    assert fit(other, tiny_dataset(3), output=tmp_path / "run", resume=True).step == 20
+    fit(other, tiny_dataset(3), output=tmp_path / "again")
+    assert checkpoint_bytes(tmp_path / "again") == before
+
+
+def test_without_a_first_stage(tmp_path):
+    config = tiny_config(30, pretrain={"steps": 0})
+    scene = fit(config, tiny_dataset(4), output=tmp_path / "run")
+    places = scene.control_points_at(0.0)
+    assert float(places.std(0).min()) > 0.05, "control points must not coincide"
+
+
+def test_a_camera_that_stands_still():
+    """Its centres have no extent; Gaussians must not all count as too large."""
+    data = tiny_dataset(6)
+    frames = [dataclasses.replace(frame, camera=data[0].camera) for frame in data]
+    still = type(data)(frames, folder=Path("still"), split="train")
+    assert still.extent == 0.0
+    assert TrainState.begin(tiny_config(), still, "cpu").extent > 1.0
+
+
+def test_the_background_is_one(tmp_path):
+    data = type(tiny_dataset(1))(list(tiny_dataset(3)), folder=Path("white"), split="train", background="white")
+    with pytest.raises(UserError, match="loaded on white"):
+        fit(tiny_config(20), data, output=tmp_path / "run")
+
+
+def test_two_trainers_cannot_share_a_directory(tmp_path):
+    config = tiny_config(20)
+    with (
+        RunFolder(tmp_path / "run", config, None, resume=False),
+        pytest.raises(UserError, match="another trainer"),
+        RunFolder(tmp_path / "run", config, None, resume=False),
+    ):
+        pass
+
+
+def test_max_gaussians_bounds_the_model(tmp_path):
+    config = tiny_config(150, densify={"max_gaussians": 320, "grad_threshold": 1e-9})
+    scene = fit(config, tiny_dataset(6), output=tmp_path / "run")
+    assert 100 < scene.gaussian_count <= 320
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_the_psnr_of_training_is_that_of_valid_pixels(masked, tmp_path, device):
+    config = tiny_config(50)
+    mask = torch.zeros(48, 48, dtype=torch.bool)
+    mask[5:40, :20] = True
+    data = tiny_dataset(3)
+    frames = [dataclasses.replace(frame, mask=mask if masked else None) for frame in data]
+    data = type(data)(frames, folder=Path("masked"), split="train")
+    state = TrainState.begin(config, data, device)
+    result = training_step(state, Frames(data, state.normalisation, state.config, device))
+    state.step = 50
+    bar = SimpleNamespace(advance=lambda steps, **shown: None)
+    with RunFolder(tmp_path / "run", config, None, resume=False) as folder:
+        folder.record(state, result, bar)
+    logged = json.loads((tmp_path / "run/log.jsonl").read_text())["psnr"]
+    scores = [float(psnr(result.render[:, seen], result.truth[:, seen])) for seen in (mask.to(device), slice(None))]
+    assert abs(scores[0] - scores[1]) > 0.1
+    assert logged == pytest.approx(scores[0 if masked else 1], abs=1e-3)
+
+
+def test_fit_runs_in_a_thread(tmp_path):
+    """Signals belong to the main thread; elsewhere training works without them."""
+    errors = []
+
+    def work():
+        try:
+            fit(tiny_config(12), tiny_dataset(3), output=tmp_path / "run")
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert not errors
