@@ -28,3 +28,9 @@ POSITION_MAX = wp.constant(1.0e18)
 
 SLOT_GEOMETRY = 8
 """Leading columns of a gradient slot: 2D mean (2), conic (3), opacity (1), absolute 2D mean (2); channels follow."""
+
+PACKED_GEOMETRY = 8
+"""Leading columns of a splat packed for the CPU: mean 2, scaled conic 3, log2 of the opacity, its inverse, -B / A."""
+
+CHANNEL_GROUP = 8
+"""Channels of a splat packed for the CPU are padded with zeros to a multiple of this."""

@@ -27,6 +27,8 @@ from .. import types
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
     "ALPHA_MAX": types.ALPHA_MAX,
+    "CHANNEL_GROUP": types.CHANNEL_GROUP,
+    "PACKED_GEOMETRY": types.PACKED_GEOMETRY,
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
 }
 """Macros by name; a header sees those that its text names."""
@@ -79,12 +81,12 @@ def snippet(header: str, call: str, device: Literal["cpu", "cuda"], otherwise: s
 
 
 def native_function(
-    header: str, *, device: Literal["cpu", "cuda"] = "cpu", otherwise: str = ""
+    header: str, *, device: Literal["cpu", "cuda"] = "cpu", otherwise: str = "", folder: str | Path = FOLDER
 ) -> Callable[[Callable[..., Any]], wp.Function]:
     """Make a Warp function whose body is the function of the same name in ``header``.
 
     Args:
-        header: file name in this folder.
+        header: file name in ``folder``.
         device: where the function runs; a kernel that calls it compiles for the other device, but does nothing there.
         otherwise: statement for the other device, needed where a value is returned.
     """
@@ -94,6 +96,6 @@ def native_function(
         call = f"native::{function.__name__.lstrip('_')}({', '.join(signature.parameters)});"
         if signature.return_annotation is not inspect.Signature.empty:
             call = f"return {call}"
-        return wp.func_native(snippet(header, call, device, otherwise))(function)
+        return wp.func_native(snippet(header, call, device, otherwise, Path(folder)))(function)
 
     return decorate

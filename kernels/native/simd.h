@@ -17,9 +17,7 @@ typedef bool vb32 __attribute__((ext_vector_type(32)));
 static inline vf lane_numbers() { return vf{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}; }
 
 // One bit for each lane of a comparison's result.
-static inline unsigned bits(vi mask) {
-    return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask, vb));
-}
+static inline unsigned bits(vi mask) { return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask, vb)); }
 
 // The first n floats, zeros behind them.
 static inline vf load(const float* from, int n) {

@@ -1,0 +1,90 @@
+"""Native headers: each compiles by itself without a warning, and an edited one is compiled again."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import warp as wp
+
+from scgs_warp.kernels import native
+from scgs_warp.runtime.launch import launch
+
+HEADERS = sorted(path.name for path in native.FOLDER.glob("*.h"))
+COMPILERS = ("clang++", *(f"clang++-{version}" for version in range(25, 15, -1)))
+WARNINGS = ["-Wall", "-Wextra", "-Werror", "-Wno-psabi", "-Wno-unused-function"]
+
+
+def compiler() -> str:
+    """Return a Clang with vectors of bool (16 or newer); skip the test where there is none."""
+    for name in COMPILERS:
+        path = shutil.which(name)
+        if path is None:
+            continue
+        version = subprocess.run([path, "-dumpversion"], capture_output=True, text=True, check=True).stdout
+        if int(version.split(".")[0]) >= 16:
+            return path
+    pytest.skip("no Clang of version 16 or newer is installed")
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_compiles_by_itself(name, tmp_path):
+    """As C++17 beside Warp's own headers, which count as system headers."""
+    constants = native.constant_macros(native.header_text(name))
+    unit = tmp_path / "unit.cpp"
+    lines = ["#define WP_NO_CRT", '#include "builtin.h"', *(f"#define {k} {v}" for k, v in constants.items())]
+    unit.write_text("\n".join([*lines, f'#include "{native.FOLDER / name}"', ""]), encoding="utf-8")
+    warp_headers = Path(wp.__file__).parent / "native"
+    command = [compiler(), "-std=c++17", "-fsyntax-only", *WARNINGS, "-isystem", str(warp_headers), str(unit)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert result.returncode == 0, result.stderr[-4000:]
+
+
+def test_headers_include_only_their_neighbours():
+    for name in HEADERS:
+        text = native.header_text(name)
+        assert "#include" not in text and "#pragma once" not in text, name
+
+
+def test_every_header_is_formatted():
+    formatter = shutil.which("clang-format") or str(Path(sys.executable).with_name("clang-format"))
+    if not Path(formatter).is_file():
+        pytest.skip("clang-format is not installed")
+    paths = [str(native.FOLDER / name) for name in HEADERS]
+    result = subprocess.run([formatter, "--dry-run", "--Werror", *paths], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr[-2000:]
+
+
+KERNEL = """
+import warp as wp
+from scgs_warp.kernels.native import native_function
+
+@native_function("scale.h", folder="{folder}")
+def scale(i: int, values: wp.array[float]): ...
+
+@wp.kernel
+def scale_all(first: int, values: wp.array[float]):
+    scale(first + wp.tid(), values)
+"""
+HEADER = "static inline void scale(int i, wp::array_t<float>& values) {{ values.data[i] *= {factor}; }}\n"
+
+
+def test_an_edited_header_is_compiled_again(tmp_path, monkeypatch):
+    """The kernel's own file stays as it is: only what the header includes changes."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "scale.h").write_text('#pragma once\n#include "factor.h"\n', encoding="utf-8")
+    (tmp_path / "scaling_kernel.py").write_text(KERNEL.format(folder=tmp_path), encoding="utf-8")
+    results = []
+    for factor in ("2.0f", "3.0f", "2.0f"):
+        (tmp_path / "factor.h").write_text(HEADER.format(factor=factor), encoding="utf-8")
+        sys.modules.pop("scaling_kernel", None)
+        module = importlib.import_module("scaling_kernel")
+        values = torch.ones(3)
+        launch(module.scale_all, 3, values)
+        results.append(values.tolist())
+    assert results == [[2.0] * 3, [3.0] * 3, [2.0] * 3]
