@@ -16,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from ..native import native_function
-from ..types import CHANNEL_GROUP, CHANNEL_MAX, PACKED_GEOMETRY
+from ..types import CHANNEL_MAX, PACKED_GEOMETRY
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..kernels import compositing as kernels
 from ..kernels.cpu import compositing as cpu_kernels
-from ..kernels.types import SLOT_GEOMETRY
+from ..kernels.types import CHANNEL_GROUP, PACKED_GEOMETRY, SLOT_GEOMETRY
 from ..runtime import debug, memory
 from ..runtime.launch import launch
 from ..types import Splats, Stats, Tiles
@@ -40,7 +40,7 @@ class _Job:
 def demand(splats: Splats, channels: Tensor, background: Tensor | None = None) -> Demand:
     """What :func:`composite` of these arguments takes beside the lists of splats, with what is made of its image."""
     count, width = channels.shape
-    packed = 4 * (cpu_kernels.PACKED_GEOMETRY + _padded(width)) if channels.device.type == "cpu" else 4
+    packed = 4 * (PACKED_GEOMETRY + _padded(width)) if channels.device.type == "cpu" else 4
     tensors = (splats.means2d, splats.conics, splats.opacities, channels)
     per_pair = slot_bytes(tensors if background is None else (*tensors, background), _slot_width(width))
     gradients = 4 * (8 + width) if per_pair else 0
@@ -239,7 +239,7 @@ def _load(tiles: Tiles, window: Window) -> Tensor:
 
 def _padded(channels: int) -> int:
     """Columns that a packed splat's channels take."""
-    return -(-channels // cpu_kernels.CHANNEL_GROUP) * cpu_kernels.CHANNEL_GROUP
+    return -(-channels // CHANNEL_GROUP) * CHANNEL_GROUP
 
 
 def _slot_width(channels: int) -> int:
@@ -248,7 +248,7 @@ def _slot_width(channels: int) -> int:
 
 
 def _pack(means2d: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor) -> Tensor:
-    packed = torch.empty(len(means2d), cpu_kernels.PACKED_GEOMETRY + _padded(channels.shape[1]))
+    packed = torch.empty(len(means2d), PACKED_GEOMETRY + _padded(channels.shape[1]))
     launch(cpu_kernels.pack_splats, len(means2d), means2d, conics, opacities, channels, packed)
     return packed
 
