@@ -1,5 +1,4 @@
-"""Runs for tests of faults: what they should come to, and something that happens on the way. Fixtures are named in the
-modules that use them."""
+"""Training runs for tests of faults: an undisturbed reference, and actions before a chosen step."""
 
 from __future__ import annotations
 
@@ -16,8 +15,8 @@ from scgs_warp.training import loop, run
 from scgs_warp.training.loop import fit
 
 STEPS = 40
-HERE = 20
-"""The step at which something goes wrong."""
+FAULT_STEP = 20
+"""Step before which a test causes its fault."""
 FRAMES = 6
 
 
@@ -25,26 +24,26 @@ def config(**changes) -> TrainConfig:
     return tiny_config(STEPS, **changes)
 
 
-def often(**changes) -> TrainConfig:
-    """With a checkpoint after every step."""
+def every_step(**changes) -> TrainConfig:
+    """Return a configuration that writes a checkpoint after every step."""
     return config(checkpoint_seconds=0.0, **changes)
 
 
-def bits(folder: Path) -> bytes:
+def checkpoint_bytes(folder: Path) -> bytes:
     return (folder / checkpoint.FILE).read_bytes()
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> bytes:
-    """The checkpoint of a run that nothing has happened to."""
+    """Checkpoint of an undisturbed run."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     fit(config(), tiny_dataset(FRAMES), output=folder)
-    return bits(folder)
+    return checkpoint_bytes(folder)
 
 
 @pytest.fixture
 def at_step(monkeypatch) -> Callable[[int, Callable[[], object]], None]:
-    """Lets something happen before a step, once."""
+    """Run an action once, before a given step."""
 
     def happen(number: int, action: Callable[[], object]) -> None:
         inner, left = loop.training_step, [action]
@@ -59,17 +58,17 @@ def at_step(monkeypatch) -> Callable[[int, Callable[[], object]], None]:
     return happen
 
 
-def refused(folder: Path, made: TrainConfig, data=None, **options) -> str:
-    """The one line that a run ends with."""
+def refusal(folder: Path, made: TrainConfig, data=None, **options) -> str:
+    """Return the one line with which a run ends."""
     with pytest.raises(UserError) as caught:
         fit(made, data or tiny_dataset(FRAMES), output=folder, **options)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
-def go_on(folder: Path, made: TrainConfig | None = None) -> bytes:
+def resume(folder: Path, made: TrainConfig | None = None) -> bytes:
     fit(made or config(), tiny_dataset(FRAMES), output=folder, resume=True)
-    return bits(folder)
+    return checkpoint_bytes(folder)
 
 
 def warnings(text: str) -> list[str]:
@@ -83,7 +82,7 @@ def images(tmp_path) -> Path:
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory) -> tuple[Path, Path]:
-    """A data set, and a run on it that is complete."""
+    """A data set and a complete run on it."""
     folder = tmp_path_factory.mktemp("done")
     data = write_dnerf(folder / "data", size=24)
     run.train_and_finish(config(), data, folder / "run", frames=2)
