@@ -1,4 +1,4 @@
-"""Fixtures: every device present, data at hand."""
+"""Fixtures: devices that are present, thread counts, data sets at hand."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def device(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def all_threads():
-    """Whatever a test does to the thread count is undone."""
+    """Restore the thread count after the test."""
     yield
     environment.configure()
 

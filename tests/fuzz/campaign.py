@@ -1,9 +1,8 @@
 """Fuzz the kernels: ``python tests/fuzz/campaign.py --cases 20000 --seed 0``.
 
-A case is its number: the number chooses the op, the sizes and every value (``--cases 1 --seed 1234`` is that one case).
-Cases run in a process of their own, which writes the number down first: one that ends the process, or that does not
-come back, is reported with its number, and the next ones are run. The summary is a JSON file; a campaign that was
-interrupted goes on where its summary ends.
+The number of a case chooses the op, the sizes and every value: ``--cases 1 --seed 1234`` repeats one case. Cases run in
+a worker process, which records the number first: a case that crashes or hangs is reported, and the next ones are run.
+The summary is a JSON file; an interrupted campaign continues where its summary ends.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ MODULES = ("fuzz.cases_render", "fuzz.cases_motion", "fuzz.cases_training", "fuz
 SAVE_EVERY = 5.0
 """Seconds between two summaries."""
 PATIENCE = 240
-"""Seconds that a case may take; the first ones compile kernels."""
+"""Time limit of a case in seconds; the first ones compile kernels."""
 
 
 def cases_of(modules: list[str], ops: list[str]) -> dict[str, tuple[Any, float]]:
-    """Every case and how often it is drawn, by op."""
+    """Return every case and its frequency, by op."""
     found: dict[str, tuple[Any, float]] = {}
     for module in modules:
         found.update(importlib.import_module(module).CASES)
@@ -50,7 +49,7 @@ def op_of(number: int, cases: dict[str, tuple[Any, float]]) -> str:
 
 
 def run_cases(first: int, last: int, device: str, cases: dict[str, tuple[Any, float]], folder: Path, patience: int):
-    """Cases ``first .. last - 1``; what happened is in ``folder`` as soon as it has happened."""
+    """Run cases ``first .. last - 1``, writing each outcome to ``folder`` at once."""
     from fuzz.fence import fenced
     from fuzz.poison import Draw
 
@@ -72,7 +71,7 @@ def run_cases(first: int, last: int, device: str, cases: dict[str, tuple[Any, fl
 
 
 def work(own: argparse.Namespace) -> None:
-    """All cases, in children of this process: one that a case ends is followed by another."""
+    """Run all cases in child processes; a child that a case crashes is replaced."""
     import warnings
 
     import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
@@ -111,7 +110,7 @@ def work(own: argparse.Namespace) -> None:
 
 
 class Campaign:
-    """Counts and failures of cases ``seed .. seed + cases - 1``, kept in a file."""
+    """Counts and failures of cases ``seed .. seed + cases - 1``, stored in a file."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self.arguments = arguments
@@ -160,7 +159,7 @@ class Campaign:
 
 
 def run(campaign: Campaign) -> None:
-    """The rest of the campaign, in a process of its own."""
+    """Start a worker process for the rest of the campaign."""
     own = campaign.arguments
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -183,7 +182,7 @@ def run(campaign: Campaign) -> None:
 
 
 def follow(campaign: Campaign, worker: subprocess.Popen[bytes], done: TextIO) -> None:
-    """Take what the worker has done until it has ended."""
+    """Collect the worker's outcomes until it exits."""
     from scgs_warp.runtime.progress import progress
 
     begun = saved = time.monotonic()

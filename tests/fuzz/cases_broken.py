@@ -1,4 +1,4 @@
-"""Cases that must fail, each in its way: what shows that a campaign can."""
+"""Cases that must fail, each in another way: they show that a campaign detects failures."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def write_input(first: int, values_in: wp.array[float]):
 
 
 def case_read(d: Draw, device: str) -> None:
-    """Beyond the array, on the side of the wall that is up."""
+    """Write beyond the array, on the fenced side."""
     launch(read_beyond, 16, 16 if d.seed % 2 == 0 else -16, torch.ones(16), torch.empty(16))
 
 
 def case_write(d: Draw, device: str) -> None:
-    """One element too many, in the same cache line."""
+    """Write one element too many, in the same cache line."""
     launch(write_beyond, 17, 0, torch.ones(17)[:17])
     launch(write_beyond, 17, 1, torch.ones(17))
 

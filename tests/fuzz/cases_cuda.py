@@ -49,7 +49,7 @@ def emulated(seed: int) -> Iterator[None]:
 
 
 def case_native_compositing(d: Draw, device: str) -> None:
-    """Finite images and gradients, and the broken are as if they were not there; on a GPU the real thing."""
+    """Images and gradients are finite, and invalid splats change nothing; on a GPU the device's own kernels run."""
     splats, channels_count = splats_of(d, device), int(d.pick((1, 3, 4, 8, 9)))
     count = len(splats.means2d)
     if device == "cpu" and (splats.width * splats.height > 1100 or count > 100):

@@ -1,4 +1,4 @@
-"""Cases of what moves: neighbours, weights, skinning, rigidity, sampling, planes and networks."""
+"""Cases of motion: neighbours, weights, skinning, rigidity, sampling, planes and networks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def nodes_count(d: Draw) -> int:
 
 
 def case_neighbors(d: Draw, device: str) -> None:
-    """Indices are indices; who is poisoned changes nobody else's; a remembered search finds what a new one finds."""
+    """Indices are in range; poisoned points change no other point's neighbours; a cached search equals a new one."""
     count, total = d.count(), nodes_count(d)
     width, k = int(d.pick((1, 2, 3, 3, 3, 5, 11, 12, 20))), int(d.rng.integers(1, min(total, 16) + 1))
     points, nodes = d.normal(count, width), d.normal(total, width)
@@ -52,7 +52,7 @@ def case_neighbors(d: Draw, device: str) -> None:
 
 
 def case_rbf(d: Draw, device: str) -> None:
-    """Weights are weights: in [0, 1], rows sum to 1, whatever the radii are."""
+    """Weights lie in [0, 1] and rows sum to 1, for any radii."""
     count, total, width = d.count(), nodes_count(d), int(d.pick((3, 3, 5, 11)))
     k = int(d.rng.integers(1, min(total, 16) + 1))
     points, nodes, radii = d.normal(count, width), d.normal(total, width), d.uniform(total, low=0.1)
@@ -76,7 +76,7 @@ def case_rbf(d: Draw, device: str) -> None:
 
 
 def moved_by(d: Draw, count: int, total: int, k: int) -> tuple[list[Tensor], list[Tensor | None], Tensor]:
-    """Means, quaternions, nodes; translations, rotations, shape rotations, log scales; indices. Nothing is poisoned."""
+    """Return unpoisoned means, quats, nodes; translations, rotations, shape rotations, log scales; indices."""
     own = [d.normal(count, 3), d.normal(count, 4), d.normal(total, 3)]
     pose: list[Tensor | None] = [d.normal(total, 3), d.normal(total, 4)]
     pose.append(d.normal(total, 4) if d.chance() else None)
@@ -85,8 +85,7 @@ def moved_by(d: Draw, count: int, total: int, k: int) -> tuple[list[Tensor], lis
 
 
 def case_skin(d: Draw, device: str) -> None:
-    """With given weights, in all three forms: who is valid, and moved by valid control points, moves as without the
-    others."""
+    """Valid Gaussians moved by valid control points move as without the others, in all three forms with given weights."""
     count, total, k = d.count(), nodes_count(d), int(d.rng.integers(1, 6))
     own, pose, indices = moved_by(d, count, total, k)
     weights = torch.softmax(d.normal(count, k), 1)
@@ -127,7 +126,7 @@ def check_moved(d: Draw, outputs, clean, leaves, untouched: Tensor, whole: Tenso
 
 
 def case_skin_rbf(d: Draw, device: str) -> None:
-    """The same with weights from radii, in one pass."""
+    """Check the same with weights computed from radii in one pass."""
     count, total, k = d.count(), nodes_count(d), int(d.rng.integers(1, 6))
     own, pose, indices = moved_by(d, count, total, k)
     width = int(d.pick((0, 0, 2, 8, 11)))
@@ -159,7 +158,7 @@ def skinned_rbf(own, pose, more, indices, device) -> tuple[list[Tensor], list[Te
 
 
 def case_arap(d: Draw, device: str) -> None:
-    """Rotations are rotations always; energies away from the broken, and all gradients, are finite."""
+    """Rotations are always rotations; energies away from invalid points, and all gradients, are finite."""
     total, edges = nodes_count(d), int(d.rng.integers(0, 9))
     rest, posed = d.normal(total, 3), d.normal(total, 3)
     neighbors = torch.from_numpy(d.rng.integers(-1, total, (total, edges))).int()
@@ -194,7 +193,7 @@ def case_trajectories(d: Draw, device: str) -> None:
 
 
 def case_sampling(d: Draw, device: str) -> None:
-    """Distinct points, the broken ones last."""
+    """Samples are distinct points, invalid ones last."""
     count = d.count()
     points = d.normal(count, int(d.pick((1, 3, 3, 9))))
     d.poison(points, d.rows(count))
@@ -207,7 +206,7 @@ def case_sampling(d: Draw, device: str) -> None:
 
 
 def case_planes(d: Draw, device: str) -> None:
-    """Any position reads the planes, within them; any time too."""
+    """Any position and any time read inside the planes."""
     count, extents = d.count(), [[int(d.rng.integers(2, 9)) for _ in range(4)] for _ in range(int(d.pick((1, 2))))]
     planes = [walled(d.normal(own[b], own[a], 32).to(device)) for own in extents for a, b in PAIRS]
     planes = [plane.requires_grad_() for plane in planes]
@@ -233,7 +232,7 @@ def case_planes(d: Draw, device: str) -> None:
 
 
 def case_network(d: Draw, device: str) -> None:
-    """Rows do not touch each other; finite rows of moderate size have finite values."""
+    """Rows are independent; finite rows of moderate size have finite values."""
     if device != "cpu":
         return
     rows, times, hidden = d.count() % 70, int(d.pick((0, 1, 1, 2))), 32 * int(d.pick((1, 2)))

@@ -1,4 +1,4 @@
-"""Cases of what draws: projection, harmonics, binning, compositing, and the renderers made of them."""
+"""Cases of rendering: projection, harmonics, binning, compositing and whole renderers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def leaf(tensor: Tensor) -> Tensor:
 
 
 def gaussians_of(d: Draw, count: int, degree: int) -> Gaussians:
-    """Around the origin: some filling the screen, some smaller than a pixel."""
+    """Return Gaussians around the origin, from smaller than a pixel to larger than the screen."""
     size = float(d.pick((0.02, 0.1, 0.5, 3.0)))
     return Gaussians(
         means=d.normal(count, 3, scale=float(d.pick((0.1, 1.0, 1.0, 10.0)))),
@@ -43,7 +43,7 @@ def gaussians_of(d: Draw, count: int, degree: int) -> Gaussians:
 
 
 def camera_of(d: Draw, width: int, height: int, poisoned: float = 0.15) -> Camera:
-    """Looks at the origin from outside, from within, from behind everything, from very far; sometimes it is none."""
+    """Return a camera outside, inside, behind or very far from the Gaussians, or an invalid one."""
     direction = torch.nn.functional.normalize(d.normal(3) + 1e-6, dim=0)
     far = float(d.pick((4.0, 4.0, 4.0, 0.5, 0.0, 1e6, 1e20, 3e38)))
     side = torch.nn.functional.normalize(torch.linalg.cross(direction, d.normal(3) + 1e-6), dim=0)
@@ -73,7 +73,7 @@ def on(device: str, *tensors: Tensor) -> list[Tensor]:
 
 
 def case_projection(d: Draw, device: str) -> None:
-    """Finite splats; broken Gaussians are zero and pass nothing; the others are as they are alone."""
+    """Splats are finite; invalid Gaussians are zero and pass no gradient; the others are as if alone."""
     count, size = d.count(), d.size()
     g, camera = poisoned_gaussians(d, count, 0), camera_of(d, *size)
     shape = [leaf(x) for x in on(device, g.means, g.quats, g.scales, g.opacities)]
@@ -105,7 +105,7 @@ def case_projection(d: Draw, device: str) -> None:
 
 
 def case_harmonics(d: Draw, device: str) -> None:
-    """No colour is negative; what is broken marks its own row alone, and passes nothing."""
+    """No colour is negative; an invalid row affects itself alone and passes no gradient."""
     count, degree = d.count(), int(d.rng.integers(4))
     g, camera = poisoned_gaussians(d, count, max(degree, int(d.rng.integers(4)))), d.normal(3)
     if d.chance(0.2):
@@ -138,7 +138,7 @@ def case_covariance(d: Draw, device: str) -> None:
 
 
 def splats_of(d: Draw, device: str) -> Splats:
-    """Projected Gaussians with anything in them: what another projection might hand in."""
+    """Return splats with arbitrary values, as another projection might produce them."""
     count, (width, height) = d.count(), d.size()
     splats = random_splats(d.seed % 2**31, count, width, height, log_scale=float(d.pick((-1.0, 1.0, 3.0))))
     rows = d.rows(count)
@@ -152,7 +152,7 @@ def splats_of(d: Draw, device: str) -> Splats:
 
 
 def case_binning(d: Draw, device: str) -> None:
-    """Both sorts list the same; counted is emitted; broken splats are in no tile."""
+    """Both sorts give the same lists, as many pairs as counted; invalid splats are in no tile."""
     splats, tile_size = splats_of(d, device), int(d.pick((16, 16, 16, 1, 3, 8, 64, 2**20)))
     if tile_size < 8 and splats.width * splats.height > 4096:
         tile_size = 8
@@ -175,7 +175,7 @@ def case_binning(d: Draw, device: str) -> None:
 
 
 def case_compositing(d: Draw, device: str) -> None:
-    """Finite images and gradients of splats with anything in them; the broken are as if they were not there."""
+    """Images and gradients of arbitrary splats are finite; invalid splats change nothing."""
     splats, channels_count = splats_of(d, device), int(d.pick((1, 3, 3, 4, 5, 8, 9, 17)))
     count = len(splats.means2d)
     channels, background = d.normal(count, channels_count), d.uniform(channels_count)
@@ -209,7 +209,7 @@ def check_composite(d: Draw, splats: Splats, channels: Tensor, background: Tenso
 
 
 def case_draw(d: Draw, device: str) -> None:
-    """The whole walk: finite, valid Gaussians as visible as without the others, gradients finite."""
+    """The whole pipeline draws valid Gaussians as if alone, with finite gradients."""
     count, size, degree = d.count(), d.size(), int(d.rng.integers(4))
     g, camera = poisoned_gaussians(d, count, degree), camera_of(d, *size).to(device)
     values = [leaf(x) for x in on(device, *vars(g).values())]
@@ -249,7 +249,7 @@ def case_render(d: Draw, device: str) -> None:
 
 
 def case_rasterization(d: Draw, device: str) -> None:
-    """The same through gsplat's entry point, with one to three cameras, any of them broken."""
+    """Check the same through gsplat's entry point, with one to three cameras, any of them invalid."""
     count, size, cameras = d.count(), d.size(), int(d.rng.integers(1, 4))
     degree = None if d.chance() else int(d.rng.integers(3))
     g = poisoned_gaussians(d, count, degree or 0)

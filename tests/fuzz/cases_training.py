@@ -1,4 +1,4 @@
-"""Cases of what learns and holds it all together: losses, Adam, sums, quaternions, shading, densification, scenes."""
+"""Cases of training: losses, Adam, sums, quaternions, shading, densification, whole scenes."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from scgs_warp.types import Stats
 from . import laws
 
 LARGEST_PIXEL = 1e9
-"""Fourth powers of pixels must fit into a float: beyond, the loss says so by not being finite."""
+"""Largest pixel whose fourth power fits into a float32; beyond it the loss is not finite."""
 
 
 def case_loss(d: Draw, device: str) -> None:
-    """Finite for finite pixels up to 1e9; what lies under the mask leaves no trace; NaN is never hidden."""
+    """Losses are finite for pixels up to 1e9, ignore masked pixels, and never hide a NaN."""
     (width, height), channels = d.size(), int(d.pick((1, 3, 4)))
     image, truth = d.uniform(channels, height, width), d.uniform(channels, height, width)
     clean, hit = image.clone(), d.rows(channels * height * width)
@@ -66,7 +66,7 @@ def case_loss(d: Draw, device: str) -> None:
 
 
 def case_adam(d: Draw, device: str) -> None:
-    """Elements do not touch each other; finite gradients, however large, leave finite values that still move."""
+    """Elements are independent; finite gradients of any size leave finite values that still change."""
     shapes = [d.count() * int(d.pick((1, 3))) + int(d.pick((0, 0, 4096))) for _ in range(int(d.rng.integers(1, 4)))]
     form = "plain" if device != "cpu" or d.chance(0.3) else "cpu"
     start, hits = [d.normal(n) for n in shapes], [d.rows(n) for n in shapes]
@@ -98,7 +98,7 @@ def case_adam(d: Draw, device: str) -> None:
 
 
 def case_sums(d: Draw, device: str) -> None:
-    """Columns do not touch each other."""
+    """Columns are independent."""
     count, width = d.count() * int(d.pick((1, 40))), int(d.pick((1, 3, 12, 17)))
     values, column = d.normal(count, width), int(d.rng.integers(width))
     clean = sum_rows(values.to(device))
@@ -113,7 +113,7 @@ def case_sums(d: Draw, device: str) -> None:
 
 
 def case_quaternions(d: Draw, device: str) -> None:
-    """Every quaternion, whatever it is, is normalised to a rotation."""
+    """Any quaternion is normalised to a rotation."""
     count = d.count()
     a, b, v_quat = d.normal(count, 4), d.normal(count, 4), d.normal(count, 4)
     x, v_vec, hit = d.normal(count, 3), d.normal(count, 3), d.rows(count)
@@ -136,7 +136,7 @@ def quaternion_products(a: Tensor, b: Tensor, x: Tensor, v_quat: Tensor, v_vec: 
 
 
 def case_shading(d: Draw, device: str) -> None:
-    """Valid rows are as they are without the others; gradients are finite."""
+    """Valid rows are as if alone; gradients are finite."""
     count = d.count()
     inputs = [d.normal(count, 3), 0.5 * d.normal(count, 10), d.normal(count, 4), d.normal(count, 4)]
     clean, hit = shade(*on(device, *inputs)), d.rows(count)
@@ -166,7 +166,7 @@ def case_turned_harmonics(d: Draw, device: str) -> None:
 
 
 def case_densify(d: Draw, device: str) -> None:
-    """Whatever the parameters and statistics are: broken Gaussians go, one stays, counts agree, the budget holds."""
+    """Any parameters and statistics: invalid Gaussians go, one stays, counts agree, the budget holds."""
     count = max(d.count(), 1)
     made = dress(d.normal(count, 3), seed=d.seed % 1000, degree=1, hyper_dim=2, shaded=d.chance())
     made = made.to(device)
@@ -207,7 +207,7 @@ def motion_of(name: str) -> Motion:
 
 
 def case_scene(d: Draw, device: str) -> None:
-    """A scene with anything in its parameters renders to finite pixels at any time that is one."""
+    """A scene with arbitrary parameters renders to finite pixels at any finite time."""
     name = d.pick(("control-points", "control-points", "static", "per-gaussian", "hexplane"))
     made, motion = dress(bar_points(int(d.pick((1, 17, 60))), 0), shaded=d.chance()), motion_of(name).to(device)
     config = from_dict({"motion": {"nodes": 20, "layers": 2, "width": 32, "skip": 1}})

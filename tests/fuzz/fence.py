@@ -1,8 +1,8 @@
-"""Memory with walls: inside :func:`fenced` every array that a CPU kernel is given ends (or begins) at a page that
-nobody may touch, so that an access out of bounds ends the process at once, wherever it leads.
+"""Guard pages: inside :func:`fenced` every array given to a CPU kernel ends (or begins) at an inaccessible page, so that
+an access out of bounds ends the process at once.
 
-What lies between an array's last byte and the wall (it is less than a cache line, as kernels may rely on torch's
-alignment) is filled with ones, which read as NaN or -1, and looked at afterwards. Arrays that a kernel calls ``*_in``
+The bytes between an array and the guard page (less than a cache line, as kernels may rely on torch's alignment) are
+filled with ones, which read as NaN or -1, and checked afterwards. Arrays that a kernel calls ``*_in``
 must come back as they were.
 """
 
@@ -21,16 +21,16 @@ from scgs_warp.runtime import launch
 
 PAGE = mmap.PAGESIZE
 ROOM = 1 << 23
-"""Bytes of the largest array that is fenced; larger ones are left where they are."""
+"""Bytes of the largest array that is fenced; larger ones stay in place."""
 LINE = 64
 
 
 class OutOfBounds(AssertionError):
-    """A kernel wrote where it must not."""
+    """A kernel wrote outside its arrays."""
 
 
 class _Region:
-    """Some pages between two walls."""
+    """Pages between two guard pages."""
 
     def __init__(self) -> None:
         self.memory = mmap.mmap(-1, ROOM + 2 * PAGE)
@@ -41,7 +41,7 @@ class _Region:
                 raise OSError(ctypes.get_errno(), "mprotect")
 
     def put(self, tensor: Tensor, high: bool) -> tuple[Tensor, int, int]:
-        """A copy of the tensor beside a wall, and where the bytes between its end and the wall (or line) lie."""
+        """Return a copy of the tensor beside a guard page, and the range of the bytes between them."""
         size = tensor.numel() * tensor.element_size()
         begin = PAGE + (ROOM - -(-size // LINE) * LINE if high else 0)
         rest = PAGE + ROOM if high else begin + -(-size // LINE) * LINE
@@ -67,7 +67,7 @@ class Fence:
         return self.regions[place]
 
     def hold(self, tensor: Tensor) -> Tensor:
-        """A copy beside a wall, good until :meth:`release`: for tensors that kernels are given by address."""
+        """Return a copy beside a guard page, valid until :meth:`release`: for tensors passed by address."""
         size = tensor.numel() * tensor.element_size()
         if not 0 < size <= ROOM:
             return tensor.detach().clone()
@@ -76,14 +76,14 @@ class Fence:
         return copy
 
     def release(self) -> None:
-        """The held copies are no longer needed."""
+        """Release the held copies."""
         held, self.held = self.held, []
         for place, (begin, end) in enumerate(held):
             if bytes(self.regions[place].memory[begin:end]) != b"\xff" * (end - begin):
                 raise OutOfBounds("a kernel writes past the end of a tensor that it was given by address")
 
     def run(self, kernel: Any, parameters: list, args: tuple, go: Callable[[tuple], None]) -> None:
-        """``go`` with fenced copies of the tensors among ``args``, and what it wrote back to them."""
+        """Call ``go`` with fenced copies of the tensors among ``args`` and copy its results back."""
         self.launches += 1
         moved: dict[tuple, tuple] = {}
         fenced = list(args)
@@ -110,11 +110,11 @@ class Fence:
 
 
 current: Fence | None = None
-"""The fence that is up, for launches that do not go through ``warp_interop.launch``."""
+"""Return the active fence, for launches that do not go through ``runtime.launch``."""
 
 
 def walled(tensor: Tensor) -> Tensor:
-    """The tensor, beside a wall where a fence is up and it is on a CPU. Not attached to a graph."""
+    """Return the detached tensor, beside a guard page where a fence is active and it is on a CPU."""
     if current is None or tensor.device.type != "cpu":
         return tensor.detach().clone()
     return current.hold(tensor)
@@ -122,7 +122,7 @@ def walled(tensor: Tensor) -> Tensor:
 
 @contextmanager
 def fenced() -> Iterator[Fence]:
-    """Launches on a CPU are fenced, one thread at a time (the thread count must be 1)."""
+    """Fence launches on the CPU; the thread count must be 1."""
     global current
     fence, kernels = Fence(), launch._CpuKernel
     bind, pack = kernels.bind, kernels.pack

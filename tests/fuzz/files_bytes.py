@@ -1,4 +1,4 @@
-"""Damage to files, from a seed: bytes first, then JSON values and text. A mutator is a function of (data, random)."""
+"""Seeded damage to files: bytes, JSON values and text. A mutator is a function of (data, random)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ OTHERS: tuple[Any, ...] = (
     [True] * 3,
 )
 DEEP = 30_000
-"""Brackets: more than the stack of the parser takes."""
+"""Nested brackets, deeper than the parser's stack."""
 INTERESTING = bytes((0, 1, 2, 3, 4, 7, 0x7F, 0x80, 0xC0, 0xFE, 0xFF))
 
 
@@ -67,7 +67,7 @@ def set_bytes(data: bytes, random: Random) -> bytes:
 
 
 def set_word(data: bytes, random: Random) -> bytes:
-    """A count, an offset or a float becomes another: all sizes, at any place, aligned more often than not."""
+    """Replace a count, an offset or a float of any size, mostly at an aligned place."""
     kind = str(random.choice(["<i2", "<i4", "<u4", "<i8", "<f4", "<f8", ">u4", ">u2"]))
     words = {
         "f": (np.nan, np.inf, -np.inf, 0.0, 1e30, -1e30, 1e-45, 3.4e38, 1e300),
@@ -124,7 +124,7 @@ def noise(data: bytes, random: Random) -> bytes:
 
 
 def other_format(data: bytes, random: Random) -> bytes:
-    """The magic of something else entirely: a program tells by content, or does not."""
+    """Replace the magic number by that of another format."""
     magics = (b"\x1f\x8b\x08\0", b"PK\x03\x04", b"\x93NUMPY\x01\0", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0", b"ply\n")
     magics += (b"glTF\x02\0\0\0", b"NGSP", b"\x80\x04\x95", b"{", b"[", b"GIF89a", b"\x7fELF", b"II*\0")
     magic = magics[random.integers(len(magics))]
@@ -138,7 +138,7 @@ BYTES: tuple[Mutator, ...] = (
 
 
 def _place(length: int, random: Random) -> int:
-    """Headers lie at the beginning, and say more than the rest."""
+    """Choose an offset, mostly near the beginning, where headers stand."""
     return int(random.integers(min(length, 200) if random.random() < 0.5 else length))
 
 
@@ -158,7 +158,7 @@ def encode_otherwise(data: bytes, random: Random) -> bytes:
 
 
 def other_token(data: bytes, random: Random) -> bytes:
-    """A word of a text becomes another."""
+    """Replace a word of a text."""
     words = data.split(b" ")
     for _ in range(int(random.choice([1, 1, 3]))):
         words[random.integers(len(words))] = _token(random)
@@ -166,7 +166,7 @@ def other_token(data: bytes, random: Random) -> bytes:
 
 
 def other_line(data: bytes, random: Random) -> bytes:
-    """Lines of a text go, come twice, or change places."""
+    """Remove, double or swap lines of a text."""
     lines = data.split(b"\n")
     place, other = (int(x) for x in random.integers(len(lines), size=2))
     kind = int(random.integers(4))
@@ -191,7 +191,7 @@ TEXT: tuple[Mutator, ...] = (other_token, other_token, other_token, other_line, 
 
 
 def places(value: Any, prefix: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Where in a JSON value something stands, by keys and indices."""
+    """Yield the paths of a JSON value's parts, as keys and indices."""
     found = [prefix] if prefix else []
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, inner in items:
@@ -200,7 +200,7 @@ def places(value: Any, prefix: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def odd_value(old: Any, random: Random) -> Any:
-    """Something that does not belong, or nearly does: in place of ``old``."""
+    """Return a wrong or almost right replacement for ``old``."""
     kind = random.random()
     if kind < 0.4:
         return NUMBERS[random.integers(len(NUMBERS))]
@@ -222,7 +222,7 @@ def odd_value(old: Any, random: Random) -> Any:
 
 
 def change_value(content: Any, random: Random) -> Any:
-    """The value with one place of it changed: replaced, removed, doubled, renamed. Shallow places more often."""
+    """Return the value with one place replaced, removed, doubled or renamed, shallow places more often."""
     content = copy.deepcopy(content)
     known = places(content)
     if not known:
@@ -254,7 +254,7 @@ def json_value(data: bytes, random: Random) -> bytes:
 
 
 def json_twice(data: bytes, random: Random) -> bytes:
-    """A key that stands there twice: parsers take the last."""
+    """Write a key twice; parsers take the last."""
     content = json.loads(data)
     if not isinstance(content, dict) or not content:
         return b"[" + data + b"]"

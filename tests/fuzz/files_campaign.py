@@ -1,7 +1,7 @@
-"""A campaign of damaged files: ``python tests/fuzz/files_campaign.py --cases 5000``.
+"""Fuzz the readers with damaged files: ``python tests/fuzz/files_campaign.py --cases 5000``.
 
-Every case is (format, seed): ``--format NAME --seed N --cases 1`` repeats one. Whatever is not loaded into sound data,
-or refused in one line, within the limits of time and memory, is a failure. Exit status 1 if there was any.
+Every case is (format, seed): ``--format NAME --seed N --cases 1`` repeats one. A case fails unless the file
+is loaded into valid data or refused in one line, within the limits of time and memory. Exit status 1 if there was any.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from typing import Any
 TESTS = Path(__file__).resolve().parent.parent
 GOOD = ("loaded", "refused")
 PATIENCE = 60.0
-"""Seconds for a case; the first one of a format is prepared beforehand."""
+"""Time limit of a case in seconds, preparation apart."""
 START = 300.0
-"""Seconds for a worker to make the formats' folders."""
+"""Time limit of a worker for making the formats' folders, in seconds."""
 
 
 class WorkerProcess:
-    """The process that runs cases; another takes its place when it dies or hangs."""
+    """A worker process that runs cases and is replaced when it dies or hangs."""
 
     def __init__(self, formats: Sequence[str], modules: Sequence[str] = ()) -> None:
         self.formats, self.modules = list(formats), list(modules)
@@ -35,7 +35,7 @@ class WorkerProcess:
         self._heard = b""
 
     def run(self, name: str, seed: int) -> dict[str, Any]:
-        """One case; a hang and a crash are outcomes, too."""
+        """Run one case; hangs and crashes are outcomes, too."""
         if self._process is None:
             self._start()
         found = self._ask({"format": name, "seed": seed}, PATIENCE)
@@ -93,13 +93,13 @@ class WorkerProcess:
 
 
 def shares(formats: dict[str, float], cases: int) -> dict[str, int]:
-    """How many cases each format gets; at least one."""
+    """Return the number of cases of each format, at least one."""
     total = sum(formats.values())
     return {name: max(1, round(cases * share / total)) for name, share in formats.items()}
 
 
 def campaign(counts: dict[str, int], first: int = 0, worker: WorkerProcess | None = None) -> Iterator[dict[str, Any]]:
-    """The outcome of every case, as it comes: format by format, seeds from ``first`` on."""
+    """Yield the outcome of every case, format by format, with seeds from ``first`` on."""
     worker = worker or WorkerProcess(list(counts))
     try:
         for name, count in counts.items():
@@ -110,7 +110,7 @@ def campaign(counts: dict[str, int], first: int = 0, worker: WorkerProcess | Non
 
 
 def formats() -> dict[str, float]:
-    """Names and shares, from the modules that define them."""
+    """Collect names and shares of formats from the modules that define them."""
     sys.path[:0] = [str(TESTS), str(TESTS.parent)]
     from fuzz.files_worker import load_formats
 
@@ -118,7 +118,7 @@ def formats() -> dict[str, float]:
 
 
 def summary(rows: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
-    """Counts by outcome and by format, the slowest and the largest case, and every failure."""
+    """Summarise counts by outcome and format, the slowest and the largest case, and every failure."""
     table: dict[str, dict[str, int]] = {}
     for row in rows:
         found = table.setdefault(row["format"], collections.Counter())

@@ -1,4 +1,4 @@
-"""What a case is: a folder made once, files in it that are damaged, and a law that loading must keep."""
+"""Cases of damaged files: a folder made once, the files to damage, and a law that loading must keep."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 
 
 class Broken(AssertionError):
-    """What was loaded breaks the law."""
+    """Loaded data break the law."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """One kind of input."""
+    """One kind of input files."""
 
     name: str
     make: Callable[[Path], None]
-    """Fills a folder that does not exist yet."""
+    """Function that fills a new folder."""
     load: Callable[[Path], Any]
-    """Reads the folder, and raises ``Broken`` where what it read is not finite or out of range."""
+    """Function that reads the folder and raises ``Broken`` for values that are not finite or out of range."""
     targets: Callable[[Path], list[Path]] | None = None
-    """The files to be damaged; None: all of them."""
+    """Patterns of the files to damage; None: all."""
     share: float = 1.0
-    """Of the cases."""
+    """Relative number of cases."""
 
     def files(self, folder: Path) -> list[Path]:
         if self.targets is not None:
@@ -55,7 +55,7 @@ def finite(what: str, *values: Any) -> None:
 
 
 def within(what: str, value: Any, low: float = 0.0, high: float = 1.0) -> None:
-    """Finite, and between two numbers, rounding allowed for."""
+    """Require finite values between two numbers, with room for rounding."""
     value = value.detach() if isinstance(value, torch.Tensor) else torch.as_tensor(np.asarray(value))
     finite(what, value)
     if value.numel():
@@ -64,7 +64,7 @@ def within(what: str, value: Any, low: float = 0.0, high: float = 1.0) -> None:
 
 
 def check_dataset(data: Dataset) -> None:
-    """Every frame as training takes it."""
+    """Check every frame as training takes it."""
     expect(len(data) > 0, "no frame")
     for frame in data:
         camera = frame.camera
@@ -88,7 +88,7 @@ def check_dataset(data: Dataset) -> None:
 
 
 def check_gaussians(gaussians: Any) -> None:
-    """Activated Gaussians: what renderers and exporters take."""
+    """Check activated Gaussians as renderers and exporters take them."""
     count = len(gaussians.means)
     for name in ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest"):
         value = getattr(gaussians, name).detach()
@@ -99,7 +99,7 @@ def check_gaussians(gaussians: Any) -> None:
 
 
 def check_numbers(value: Any, what: str, most: float = 1e12) -> None:
-    """All numbers inside dataclasses, lists and dicts."""
+    """Yield all numbers inside dataclasses, lists and dicts."""
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             check_numbers(getattr(value, field.name), f"{what}.{field.name}", most)

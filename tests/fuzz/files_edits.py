@@ -1,4 +1,4 @@
-"""Edits, and the files that long work leaves so as to go on: journals, markers; films to capture."""
+"""Edit files, journals and markers of interrupted work, films to capture."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def write_edit(folder: Path) -> None:
 
 
 def load_edit(folder: Path) -> None:
-    """As ``apps/edit.py --script`` does: read, save again, pose, and stand the camera."""
+    """Read, save again, pose and place the camera, as ``apps/edit.py --script`` does."""
     session = EditSession(scene())
     session.load(folder / "edit.json")
     check_numbers(session.edit, "edit", 1e9)
@@ -96,7 +96,7 @@ def write_journal(folder: Path) -> None:
 
 
 def load_journal(folder: Path) -> None:
-    """As ``apps/capture.py`` goes on; what cannot be used is made again."""
+    """Resume as ``apps/capture.py`` does, which makes unusable files again."""
     journal = Journal(folder, "a film")
     journal.start()
     source = SimpleNamespace(count=9, video=True, path=Path("film.mp4"))
@@ -115,7 +115,7 @@ def load_journal(folder: Path) -> None:
 
 
 class _Again(Exception):
-    """The stage is done anew."""
+    """Run the stage again."""
 
 
 MARKERS = (from_mesh, builtin)
@@ -149,7 +149,7 @@ def write_folder(folder: Path) -> None:
 
 
 def load_source(folder: Path) -> None:
-    """As ``apps/capture.py`` looks at a film."""
+    """Open a film as ``apps/capture.py`` does."""
     videos = sorted(folder.glob("*.mp4"))
     source = open_source(videos[0] if videos else folder)
     for still in source.frames(640):

@@ -1,4 +1,4 @@
-"""Damage that gets past the first check of a format: headers that lie, checksums put right again."""
+"""Damage that passes the first checks of a format: lying headers with valid checksums."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def count_of(random: Random, bits: int = 64) -> int:
 
 
 def spoil_floats(array: np.ndarray, random: Random) -> np.ndarray:
-    """Some entries, a row, a column or all become one odd number."""
+    """Set some entries, a row, a column or all to one odd number."""
     changed = np.array(array, copy=True)
     if not changed.size or changed.dtype.kind not in "fiu":
         return changed
@@ -47,7 +47,7 @@ def spoil_floats(array: np.ndarray, random: Random) -> np.ndarray:
 
 
 def odd_array(array: np.ndarray, random: Random) -> np.ndarray:
-    """Of other values, another shape or another type."""
+    """Change an array's values, shape or type."""
     kind = int(random.integers(7))
     if kind < 3 or not array.size:
         return spoil_floats(array, random)
@@ -65,7 +65,7 @@ def odd_array(array: np.ndarray, random: Random) -> np.ndarray:
 
 
 def npy_header(data: bytes, random: Random) -> bytes:
-    """A header that says another shape, type or order than what follows has."""
+    """Write a header with another shape, type or order than the data."""
     try:
         length = struct.unpack_from("<H", data, 8)[0]
         body = data[10 + length :]
@@ -102,7 +102,7 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def npz_member(data: bytes, random: Random) -> bytes:
-    """A member is spoilt, missing, there twice, a bomb, or called otherwise."""
+    """Spoil, remove, double, inflate or rename a member of an archive."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     names = list(members)
@@ -166,7 +166,7 @@ def ply_header(data: bytes, random: Random) -> bytes:
 
 
 def ply_values(data: bytes, random: Random) -> bytes:
-    """Whole floats of the body, in binary or in text."""
+    """Replace whole floats of the body, in binary or text."""
     head, end, body = data.partition(b"end_header\n")
     if b"ascii" in head:
         words = body.split(b" ")
@@ -188,7 +188,7 @@ def splat_values(data: bytes, random: Random) -> bytes:
 
 
 def spz_inside(data: bytes, random: Random) -> bytes:
-    """Unpacked, damaged, packed again: the checksum is right."""
+    """Unpack, damage and pack again, with a valid checksum."""
     if data[:2] != b"\x1f\x8b":
         return _spz_streams(data, random)
     plain = bytearray(gzip.decompress(data))
@@ -224,7 +224,7 @@ def _spz_streams(data: bytes, random: Random) -> bytes:
 
 
 def png_size(data: bytes, random: Random) -> bytes:
-    """Another width or height, with the right checksum: most is missing, or the picture is a bomb."""
+    """Change the width or height with a valid checksum: data are missing, or the picture is a bomb."""
     if data[:4] != b"\x89PNG":
         return jpeg_size(data, random)
     changed = bytearray(data)
@@ -262,7 +262,7 @@ def colmap_doubles(data: bytes, random: Random) -> bytes:
 
 
 def safetensors_head(data: bytes, random: Random) -> bytes:
-    """The JSON before the tensors: shapes, types, offsets, the metadata inside; its length put right, or not."""
+    """Damage the JSON header: shapes, types, offsets, metadata; with or without the right length."""
     (length,) = struct.unpack_from("<Q", data)
     head, body = json.loads(data[8 : 8 + length]), data[8 + length :]
     if random.random() < 0.5 and "__metadata__" in head:
@@ -278,7 +278,7 @@ def safetensors_head(data: bytes, random: Random) -> bytes:
 
 
 def safetensors_values(data: bytes, random: Random) -> bytes:
-    """Tensors of other values, another shape or another type, in a file that is in order."""
+    """Change values, shapes or types of tensors in an otherwise valid file."""
     import torch
     from safetensors.torch import load, save
 
@@ -300,7 +300,7 @@ def safetensors_values(data: bytes, random: Random) -> bytes:
 
 
 def _without_own_sum(text: str) -> str:
-    """Metadata that is changed on purpose leaves out its own check sum: what it says is to be read."""
+    """Change metadata and drop its checksum, so that the reader gets to the contents."""
     try:
         content = json.loads(text)
         content["crc32"].pop("", None)
@@ -310,7 +310,7 @@ def _without_own_sum(text: str) -> str:
 
 
 def _with_sums(metadata: Any, tensors: Any) -> Any:
-    """Whoever changes a checkpoint on purpose also puts its check sums right."""
+    """Recompute the checksums of a changed checkpoint."""
 
     found = dict(metadata or {})
     for key, text in found.items():
@@ -323,7 +323,7 @@ def _with_sums(metadata: Any, tensors: Any) -> Any:
 
 
 def glb_json(data: bytes, random: Random) -> bytes:
-    """The document inside, with lengths put right."""
+    """Damage the JSON document inside, with valid lengths."""
     (length,) = struct.unpack_from("<I", data, 12)
     mutator = JSON[random.integers(len(JSON))] if random.random() < 0.2 else json_value
     text = mutator(data[20 : 20 + length], random)
@@ -379,7 +379,7 @@ STRUCTURED: dict[str, tuple[Mutator, ...]] = {
 
 
 def mutate(name: str, data: bytes, random: Random) -> bytes:
-    """The content of a file of this name, damaged: as its format allows, seven times of ten, else byte by byte."""
+    """Return a file's content, damaged in terms of its format in 7 of 10 cases, else byte by byte."""
     suffix = name[name.rfind(".") :].lower()
     known = STRUCTURED.get(suffix)
     if known and data and random.random() < 0.7:

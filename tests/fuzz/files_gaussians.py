@@ -39,7 +39,7 @@ def write_text_ply(path: Path) -> None:
 
 
 def write_old_spz(path: Path) -> None:
-    """Version 2: three bytes a rotation."""
+    """Write version 2: three bytes per rotation."""
     import gzip
 
     random = np.random.default_rng(0)
@@ -48,7 +48,7 @@ def write_old_spz(path: Path) -> None:
 
 
 def write_new_spz(path: Path) -> None:
-    """Version 4: a plain header, a table, a zstd stream for each array."""
+    """Write version 4: a plain header, a table, a zstd stream per array."""
     import zstandard
 
     random = np.random.default_rng(0)
@@ -68,7 +68,7 @@ def maker(name: str, write: Any) -> Any:
 
 
 def load_gaussians(name: str, folder: Path) -> None:
-    """As ``apps/export.py --ply``, ``apps/edit.py --ply`` and training from points do."""
+    """Open as ``apps/export.py --ply``, ``apps/edit.py --ply`` and training from points do."""
     path = folder / name
     scene = open_ply(path, nodes=8)
     check_gaussians(scene.gaussians_at(0.3))
@@ -81,7 +81,7 @@ def load_gaussians(name: str, folder: Path) -> None:
 
 
 def write_gltf(folder: Path) -> None:
-    """The bar as JSON beside its bytes."""
+    """Write the bar as JSON beside its binary data."""
     folder.mkdir()
     made, _ = bar(4)
     made.document["buffers"] = [{"byteLength": len(made.binary), "uri": "scene.bin"}]
@@ -90,7 +90,7 @@ def write_gltf(folder: Path) -> None:
 
 
 def load_mesh(name: str, folder: Path) -> None:
-    """As ``apps/synthesize.py --mesh`` does."""
+    """Open as ``apps/synthesize.py --mesh`` does."""
     path = folder / name
     subject, _, lines = load_subject(Request(mesh=path), "cpu")
     expect(all("\n" not in line for line in lines), "a line of several")

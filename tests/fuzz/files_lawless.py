@@ -1,4 +1,4 @@
-"""Readers that break the law, each in its way: does the campaign see it?"""
+"""Readers that break the law, each in another way: they show that the campaign detects it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _make(folder: Path) -> None:
 
 
 def _sound(folder: Path) -> bool:
-    """Nobody may damage what is only being prepared."""
+    """Raise if files are damaged during preparation."""
     file = folder / "a.txt"
     return file.is_file() and file.read_bytes() == b"1 2 3\n"
 
@@ -69,4 +69,4 @@ FORMATS = tuple(
         ("out of memory", _swallow_all), ("untidy", _name_nothing), ("warned", _warn),
     )
 )  # fmt: skip
-"""Named for the outcome that they must have."""
+"""Formats named after their expected outcome."""

@@ -1,4 +1,4 @@
-"""Run directories: checkpoints to look at and to go on from, logs, settings, cells of ablations."""
+"""Run directories: checkpoints to load and to resume, logs, settings, cells of ablations."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def write_run(folder: Path, scene: Scene) -> None:
 
 
 def write_model(model: str, folder: Path) -> None:
-    """A scene of 30 Gaussians that an untrained network moves, or nothing."""
+    """Write a scene of 30 Gaussians, static or moved by an untrained network."""
     fields = {"model": model, "nodes": 12, "layers": 3, "width": 16, "skip": 1, "mask": model == "control-points"}
     config = from_dict({"motion": fields})
     torch.manual_seed(0)
@@ -70,7 +70,7 @@ def write_model(model: str, folder: Path) -> None:
 
 
 def load_scene(folder: Path) -> None:
-    """As viewing, evaluating and exporting open a run."""
+    """Open a run as viewing, evaluation and export do."""
     scene = Scene.load(folder)
     for time in (0.0, 0.37, 1.0):
         check_gaussians(scene.gaussians_at(time))
@@ -96,7 +96,7 @@ def data() -> Dataset:
 
 @functools.cache
 def config_of_run(stage: str) -> TrainConfig:
-    """In ``pretrain`` the first step is one with the ARAP term, which makes the graph."""
+    """The first step of ``pretrain`` has the ARAP term, which builds the graph."""
     short = {"steps": 0 if stage == "main" else 30, "densify_until": 0 if stage == "main" else 20, "warm_up": 0}
     return tiny_config(60, optim={"cameras": 1e-3}, init_points=60, freeze=0, pretrain=short)
 
@@ -106,7 +106,7 @@ def frames_of(state: TrainState) -> Frames:
 
 
 def write_resumable(folder: Path, stage: str = "main") -> None:
-    """A run that learns poses, too, as training leaves it after two steps."""
+    """Write a run with camera refinement, two steps long."""
     config = config_of_run(stage)
     with RunFolder(folder, config, None, resume=False) as run:
         state = TrainState.begin(config, data(), "cpu")
@@ -121,7 +121,7 @@ def write_resumable(folder: Path, stage: str = "main") -> None:
 
 
 def load_resumed(folder: Path, stage: str = "main") -> None:
-    """As ``--resume`` does: the state, the log, and one step from there."""
+    """Resume as ``--resume`` does: state, log, one step."""
     config = config_of_run(stage)
     with RunFolder(folder, config, None, resume=True) as run:
         state = TrainState.resume(folder, config, data(), "cpu")
@@ -171,7 +171,7 @@ def write_config(folder: Path) -> None:
 
 
 def load_config(folder: Path) -> None:
-    """As ``--config`` does."""
+    """Read settings as ``--config`` does."""
     found, place = configuration(Settings(), folder / "config.json", {})
     check_numbers(found, "config", 1e9)
     expect(place is None or isinstance(place, str), f"data.folder is {place!r}")
@@ -184,7 +184,7 @@ def write_cells(folder: Path) -> None:
 
 
 def load_table(folder: Path) -> None:
-    """As ``apps/ablate.py --table-only`` does."""
+    """Build the table as ``apps/ablate.py --table-only`` does."""
     found = ablate_table.build("nodes", folder)
     for table in found["tables"]:
         check_numbers(table["rows"], "table")

@@ -1,7 +1,7 @@
-"""One process that runs cases: a request a line on stdin, an outcome a line on stdout. It is small and may die.
+"""Worker process of the campaign: reads one request per line on stdin, writes one outcome per line to stdout.
 
-The case is damaged in place and put back; what a case leaves in memory would be charged to the next, so the peak is
-reset before each. Memory is limited: an allocation of what a header claims fails here, instead of taking the machine.
+Files are damaged in place and restored. The peak of memory is reset before each case, so that no case pays for the one
+before it. Address space is limited: an allocation as large as a lying header claims fails here.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ FORMATS: dict[str, Format] = {}
 
 
 def load_formats(modules: Sequence[str] = MODULES) -> dict[str, Format]:
-    """Those of some modules of this package, by name, from now on in ``FORMATS``."""
+    """Register the formats of the named modules in ``FORMATS``."""
     for module in modules:
         FORMATS.update({item.name: item for item in importlib.import_module(f"fuzz.{module}").FORMATS})
     return FORMATS
 
 
 HEADROOM = 3 << 30
-"""Bytes of address space beyond what the process needs to stand: threads alone take 8 MiB each."""
+"""Bytes of address space beyond what the idle process takes; each thread takes 8 MiB."""
 MOST_RESIDENT = 700 << 20
-"""Bytes that a case may take beyond that: the largest bombs are smaller than 1 MiB."""
+"""Bytes that a case may allocate beyond that."""
 
 
 def _status(name: str) -> int:
-    """Bytes of a line of /proc/self/status."""
+    """Return a line of /proc/self/status in bytes."""
     for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
         if line.startswith(f"{name}:"):
             return int(line.split()[1]) << 10
@@ -54,7 +54,7 @@ def _status(name: str) -> int:
 
 
 class Worker:
-    """Makes each format's folder once, under a folder of its own."""
+    """Cache of the formats' folders."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -62,7 +62,7 @@ class Worker:
         self.files: dict[str, dict[Path, bytes]] = {}
 
     def prepare(self, name: str) -> None:
-        """Make the folder, and load it undamaged: what a format always takes counts for nobody."""
+        """Make the folder and load it undamaged, so that one-time costs count for no case."""
         if name in self.folders:
             return
         folder = self.root / name / "scene"
@@ -73,7 +73,7 @@ class Worker:
         self.files[name] = {path: path.read_bytes() for path in FORMATS[name].files(folder)}
 
     def damage(self, name: str, random: np.random.Generator) -> str:
-        """Damage one file, rarely two; returns which, and how in general."""
+        """Damage one file, rarely two; return which, and the kind of damage."""
         files = list(self.files[name])
         told = []
         count = min(len(files), 1 if random.random() < 0.9 else 2)
@@ -108,7 +108,7 @@ class Worker:
                 path.write_bytes(content)
 
     def run(self, name: str, seed: int) -> dict[str, Any]:
-        """One case: ``outcome`` is ``loaded`` or ``refused``, else what broke the law; ``detail`` says more."""
+        """Run one case; ``outcome`` is ``loaded``, ``refused`` or the kind of failure, ``detail`` its message."""
         self.prepare(name)
         random = np.random.default_rng([int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big"), seed])
         told = self.damage(name, random)
@@ -152,7 +152,7 @@ class Worker:
 
 
 def _where() -> str:
-    """The innermost lines of this project."""
+    """Return the innermost lines of a traceback that lie in this project."""
     frames = traceback.extract_tb(sys.exc_info()[2])
     own = [f"{Path(f.filename).name}:{f.lineno} {f.name}" for f in frames if "/site-packages/" not in f.filename]
     return " < ".join(reversed(own[-4:]))

@@ -1,4 +1,4 @@
-"""What must hold whatever the input; each law says what it was about when it is broken."""
+"""Laws that hold for any input; a broken law raises with its subject."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def finite(name: str, *tensors: Tensor | None) -> None:
 
 
 def equal(name: str, ours: Tensor, other: Tensor) -> None:
-    """Equal bits, but for the sign of zero; NaN equals NaN."""
+    """Require equal bits, the sign of zero apart; NaN equals NaN."""
     assert ours.shape == other.shape, f"{name}: {tuple(ours.shape)} and {tuple(other.shape)}"
     differs = (ours != other) & ~(ours.isnan() & other.isnan())
     if bool(differs.any()):
@@ -37,7 +37,7 @@ def all_zero_where(name: str, rows: Tensor, tensors: Sequence[Tensor]) -> None:
 
 
 def counted_as_emitted(tiles: Tiles, count: int) -> None:
-    """Lists are what the counts promised: nothing missing, nothing twice, nothing out of range."""
+    """Require lists as counted: nothing missing, doubled or out of range."""
     pairs = len(tiles.splats)
     offsets, ranges = tiles.offsets.cpu(), tiles.ranges.cpu().long()
     assert len(offsets) == count + 1 and int(offsets[0]) == 0 and int(offsets[-1]) == pairs

@@ -1,4 +1,4 @@
-"""What kernels must survive: a table of values, and where they are put. Everything follows from one seed."""
+"""Extreme values for kernels and their seeded placement in tensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def _around(*values: float) -> list[float]:
-    """Each value and its two neighbours in float32."""
+    """Return each value and its two neighbours in float32."""
     found = []
     for value in values:
         own = np.float32(value)
@@ -21,10 +21,10 @@ def _around(*values: float) -> list[float]:
 
 
 BROKEN = (np.nan, np.inf, -np.inf)
-"""What no Gaussian may hold: it is left out, and nothing else is."""
+"""Values that make a Gaussian invalid: it alone is left out."""
 
 DENORMAL = np.array([1, 0x80000001, 0x007FFFFF, 0x807FFFFF, 0x00400000], np.uint32).view(np.float32)
-"""As bits: where denormals are flushed a literal would be zero."""
+"""Bit patterns of denormals; a literal would be flushed to zero."""
 
 ODD = (
     *(0.0, -0.0, 1.1754944e-38, -1.1754944e-38),  # zeros, least normals
@@ -39,7 +39,7 @@ TABLE = np.concatenate([np.array([*BROKEN, *ODD], np.float32), DENORMAL])
 
 @dataclass
 class Draw:
-    """A case's source of chance; the seed names the case."""
+    """Random choices of one case, from its seed."""
 
     seed: int
 
@@ -53,14 +53,14 @@ class Draw:
         return bool(self.rng.random() < share)
 
     def count(self) -> int:
-        """0, 1, a register less or more one, a few, and now and then many."""
+        """Return a count: 0, 1, around a register's width, a few, sometimes many."""
         if self.chance(0.01):
             return int(self.rng.integers(1000, 5000))
         few = (0, 1, 2, 3, 15, 16, 17, 31, 32, 33, 40, 64, 65, 100, 200, int(self.rng.integers(1, 600)))
         return int(self.pick(few))
 
     def size(self) -> tuple[int, int]:
-        """Width and height, 1 x 1 to 257 x 257; most are small, tiles' borders are favoured."""
+        """Return width and height from 1 to 257, mostly small or near multiples of a tile."""
         sides = (1, 2, 3, 7, 15, 16, 17, 31, 32, 33, 47, 48, 49, 64)
         if self.chance(0.05):
             sides = (100, 127, 128, 129, 255, 256, 257, int(self.rng.integers(1, 258)))
@@ -73,11 +73,11 @@ class Draw:
         return torch.from_numpy(self.rng.uniform(low, high, shape).astype(np.float32))
 
     def share(self) -> float:
-        """Of a case's rows that are poisoned."""
+        """Return the share of poisoned rows."""
         return float(self.pick((0.0, 0.02, 0.1, 0.3, 0.6, 0.95)))
 
     def values(self, count: int) -> Tensor:
-        """From the table; sometimes of one kind, sometimes any bit pattern at all."""
+        """Return values from the table, sometimes of one kind, sometimes arbitrary bit patterns."""
         kind = self.pick(("any", "any", "broken", "odd", "one", "bits"))
         if kind == "bits":
             bits = self.rng.integers(0, 2**32, count, dtype=np.uint64).astype(np.uint32)

@@ -1,4 +1,4 @@
-"""Every script in examples/ runs, with tiny settings, and what it leaves makes sense."""
+"""Every script in examples/ runs with tiny settings and writes valid results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ QUICK: dict[str, list[str]] = {
     "07_follow_points.py": ["--points", "20", "--moments", "5"],
     "08_your_own_images.py": ["--frames", "5", "--size", "48"],
 }
-"""Arguments with which a script takes a second or so."""
+"""Arguments with which a script takes about a second."""
 
 
 def module_of(path: Path) -> ModuleType:
@@ -110,7 +110,7 @@ def followed(place: Path, said: str) -> None:
 
 
 def own(place: Path, said: str) -> None:
-    """What was written is what was seen: reading it gives the views that the scene renders."""
+    """Written images equal the views that the scene renders."""
     scene = scgs_warp.Scene.load(place / "runs/example")
     data = load(place / "data/mine", "train")
     assert len(data) == 5 and len(load(place / "data/mine", "test")) == 1

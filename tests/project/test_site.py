@@ -1,4 +1,4 @@
-"""The documentation builds as a site, without a warning, and says what it should; public names say what they take."""
+"""The documentation builds without a warning; commands, options and public names in it exist."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class References(HTMLParser):
 
 
 def test_every_page_image_and_script_is_there(site):
-    """Also of what MkDocs does not check: raw HTML, the theme; nothing comes from another server but links to read."""
+    """Check links in raw HTML and the theme, too; nothing is loaded from another server."""
     pages = sorted(site.rglob("index.html"))
     assert len(pages) >= 12
     checked = 0

@@ -1,4 +1,4 @@
-"""The wheel and the source distribution: nothing forgotten, and an installed one works where there is no checkout."""
+"""The wheel and the source distribution are complete, and an installed wheel works without a checkout."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def belongs(path: Path) -> bool:
 
 
 def files(folder: Path) -> set[str]:
-    """What lies in a folder, by names relative to it, without what Python leaves."""
+    """Return the relative names of a folder's files, without Python's caches."""
     return {
         path.relative_to(folder).as_posix()
         for path in folder.rglob("*")
@@ -115,7 +115,7 @@ WRONG = '\nname: str = scene.gaussian_count\nscene.render(time="noon")\n'
 
 @pytest.mark.slow
 def test_installed_into_an_empty_environment(wheel, tmp_path):
-    """Minutes, most of them pip's: train, view and edit from a folder that has nothing to do with the checkout."""
+    """Train, view and edit from a folder outside the checkout; takes minutes, most of them pip's."""
     home, work = tmp_path / "venv", tmp_path / "work"
     work.mkdir()
     venv.create(home, with_pip=True)
@@ -153,7 +153,7 @@ def test_installed_into_an_empty_environment(wheel, tmp_path):
 
 
 def check_types(work: Path, programs: Path, code: str, status: int) -> None:
-    """The installed package says its types: a mistake is found, no other."""
+    """A type checker finds a mistake in the use of the installed package, and no other."""
     if shutil.which("pyright") is None:
         return
     (work / "client.py").write_text(code)

@@ -1,4 +1,4 @@
-"""A slice of the campaign of damaged files (tests/fuzz/files_campaign.py), and whether it sees what it looks for."""
+"""A slice of the campaign of damaged files (tests/fuzz/files_campaign.py), and proof that it detects failures."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_many_damaged_files_are_loaded_or_refused():
 
 
 def test_the_campaign_sees_what_breaks_the_law(monkeypatch):
-    """Each reader here breaks it in its own way; the worker that hangs or dies is replaced."""
+    """Each of these readers fails in another way; a worker that hangs or dies is replaced."""
     worker = WorkerProcess([item.name for item in LAWLESS], ["files_lawless"])
     try:
         for item in LAWLESS:

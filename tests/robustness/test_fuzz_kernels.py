@@ -1,4 +1,4 @@
-"""Every kernel with anything in its inputs: a slice of the campaign of ``tests/fuzz``, and that it could fail."""
+"""A slice of the campaign of extreme kernel inputs (tests/fuzz/campaign.py), and proof that it detects failures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from scgs_warp.rendering.render import draw
 from scgs_warp.types import Camera, Gaussians, Pose
 
 CASES = 700
-"""Of the slice: under a minute on two busy cores."""
+"""Cases of the slice: under a minute on two busy cores."""
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="the fence asks the kernel for walls of memory")
 
@@ -52,7 +52,7 @@ def test_the_campaign(device: str, tmp_path: Path):
 
 @linux
 def test_a_campaign_can_fail(tmp_path: Path):
-    """What ends the process, hangs, or breaks a law is named, and the cases after it are run."""
+    """A case that crashes, hangs or breaks a law is named, and the following cases run."""
     status, summary = run(tmp_path, "--cases", 30, "--seed", 108, "--modules", "fuzz.cases_broken", "--patience", 5)
     assert status == 1 and summary["cases"] == 30
     found = {failure["op"]: failure["failure"] for failure in summary["failures"]}
@@ -83,7 +83,7 @@ def test_a_case_is_its_number():
 
 
 def test_a_nan_from_the_loss_is_not_hidden(device: str):
-    """Training stops on a gradient that is not finite: what guards against overflow must leave it."""
+    """Overflow guards pass non-finite gradients on, so that training stops there."""
     g, camera = random_gaussians(3, 60, device), random_camera(3, 33, 31, device)
     leaves = [x.clone().requires_grad_() for x in vars(g).values()]
     image, _ = draw(Gaussians(*leaves), camera)
@@ -125,13 +125,13 @@ THRESHOLDS = (struct.unpack("I", struct.pack("f", value))[0] for value in (1 / 2
 SPECIAL = (0x7FC00000, 0x7F800000, 0xFF800000, 0x7F7FFFFF, 0xFF7FFFFF, 0x80000000, 1, 0x80000001, 0x00800000,
            *THRESHOLDS)  # fmt: skip
 BITS = st.one_of(st.sampled_from(SPECIAL), st.integers(0, 2**32 - 1))
-"""As integers: hypothesis cannot draw floats where denormals are flushed."""
+"""Draw bit patterns as integers: hypothesis cannot draw floats where denormals are flushed."""
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(sorted(WIDTHS)), st.integers(0, 3), BITS), max_size=12), st.data())
 def test_any_bits_in_a_few_gaussians(hits: list[tuple[str, int, int]], data: st.DataObject):
-    """Found cases shrink to the few values that matter. Four Gaussians, the first of which nobody touches."""
+    """Four Gaussians, the first untouched; failing cases shrink to the few values that matter."""
     rng = np.random.default_rng(0)
     values = {name: torch.from_numpy(rng.normal(size=(5, n)).astype(np.float32)) for name, n in WIDTHS.items()}
     values["scales"], values["opacities"] = 0.1 * values["scales"].abs(), values["opacities"].abs().clamp(max=0.9)

@@ -19,7 +19,7 @@ FAST = ["before the first checkpoint", "half a checkpoint", "between the two ren
 
 
 def killed(folder: Path, *arguments: str) -> list[dict]:
-    """What came of runs that were killed and resumed."""
+    """Return the outcomes of runs that were killed and resumed."""
     script = ROOT / "tests/helpers/killing.py"
     done = subprocess.run([sys.executable, str(script), str(folder), *arguments], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Files from strangers: they are data, whatever they say. SECURITY.md says what is promised; here it is kept."""
+"""Attacks by files: no file runs code, leaves its folder or exhausts the machine, as SECURITY.md promises."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from scgs_warp.storage import checkpoint
 
 
 class Payload:
-    """Unpickled, it would leave a mark."""
+    """Object whose unpickling leaves a mark."""
 
     def __init__(self, mark: Path) -> None:
         self.mark = mark
@@ -46,7 +46,7 @@ class Payload:
 
 
 def refused(action: Any, *words: str) -> str:
-    """The one line with which something is refused."""
+    """Return the one line of a refusal."""
     with pytest.raises(UserError) as caught:
         action()
     text = str(caught.value)
@@ -72,7 +72,7 @@ def test_a_pickle_that_calls_itself_a_checkpoint_is_not_opened(tmp_path):
 
 
 def rewrite(run: Path, change: Any) -> None:
-    """The checkpoint with other tensors or metadata, in a file that is in order."""
+    """Rewrite a checkpoint with other tensors or metadata as a valid file."""
     path = run / checkpoint.FILE
     tensors, metadata = checkpoint.read(run)
     change(tensors, metadata)
@@ -136,7 +136,7 @@ def test_a_checkpoint_whose_header_lies_is_refused(tmp_path):
 
 
 def test_a_graph_that_points_outside_its_arrays_is_refused(tmp_path):
-    """A kernel would read, and write, what is not its own."""
+    """Indices out of range would make a kernel read and write outside its arrays."""
     write_resumable(tmp_path / "run")
     load_resumed(tmp_path / "run")
     nodes = len(checkpoint.read(tmp_path / "run")[0]["motion.positions"])
@@ -178,7 +178,7 @@ BAD_NAMES = ("a\0b.png", "x" * 300, "\ud800.png", " ")
 
 
 def json_field(path: Path, *keys: Any) -> Any:
-    """Puts a name at this place of a JSON file."""
+    """Set a path at a place of a JSON file."""
 
     def change(name: str) -> None:
         content = json.loads(path.read_text())
@@ -253,7 +253,7 @@ def test_uris_of_a_gltf_stay_beside_it(tmp_path, uri):
 
 
 def test_what_is_no_file_is_not_read(tmp_path):
-    """``/dev/zero`` never ends, and a pipe that nobody writes to never begins."""
+    """``/dev/zero`` never ends; a pipe without a writer never begins."""
     os.mkfifo(tmp_path / "pipe.png")
     (tmp_path / "zero.png").symlink_to("/dev/zero")
     for name in ("pipe.png", "zero.png"):

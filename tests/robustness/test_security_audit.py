@@ -1,4 +1,4 @@
-"""The sources hold nothing that would run what a file says, and packages that they need cannot change under them."""
+"""Audit of the sources: no call that could run a file's contents, upper bounds for every dependency."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ MODULES = {
     "xmlrpc",
 }
 NAMES = {"eval", "exec", "compile", "__import__"}
-"""Of built-in functions; methods may be called so."""
+"""Names of forbidden built-in functions; methods may have these names."""
 ENDINGS = {
     "os.system", "os.popen", "np.load", "numpy.load", "torch.save", "torch.hub.load", "tempfile.mktemp", "json.load",
     "extractall", "joblib.load", "shutil.unpack_archive", "yaml.load", "pickle.loads", "os.execv", "os.spawnv",
 }  # fmt: skip
 ONLY_IN = {"json.loads": {"files.py", "page_data.py", "session.py", "model.py", "local_runner.py", "from_mesh.py"}}
-"""Functions that do not take strangers' text well, and where they take our own."""
+"""Functions unsafe for untrusted text, and the files in which they read our own."""
 
 
 def forbidden(tree: ast.AST, name: str) -> Iterator[str]:
-    """What a source file of this name does that would let a file run code, or go where it wants."""
+    """Yield the unsafe calls and imports of a source file of this name."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found = {alias.name.partition(".")[0] for alias in node.names} & MODULES
@@ -84,7 +84,7 @@ def test_the_audit_sees_what_it_looks_for(code):
 
 
 def test_dependencies_are_bounded():
-    """A new major version may do anything: every package has an upper bound."""
+    """Every dependency has an upper bound, since a new major version may change anything."""
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     needed = re.search(r"^dependencies = \[(.*?)^\]", text, re.M | re.S)
     extras = re.search(r"^\[project.optional-dependencies\](.*?)^\[", text, re.M | re.S)
@@ -95,7 +95,7 @@ def test_dependencies_are_bounded():
 
 
 def test_secrets_are_compared_in_constant_time():
-    """``==`` takes longer the more letters are right."""
+    """``==`` takes longer the more characters match."""
     tree = ast.parse((ROOT / "scgs_warp/editor/proxy.py").read_text(encoding="utf-8"))
     compared = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Compare)]
     secrets = [text for text in compared if re.search(r"\b(token|given|key)\b", text)]
