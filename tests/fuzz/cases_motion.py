@@ -85,7 +85,7 @@ def moved_by(d: Draw, count: int, total: int, k: int) -> tuple[list[Tensor], lis
 
 
 def case_skin(d: Draw, device: str) -> None:
-    """Valid Gaussians moved by valid control points move as without the others, in all three forms with given weights."""
+    """Valid Gaussians moved by valid control points move as without the others, in all three forms."""
     count, total, k = d.count(), nodes_count(d), int(d.rng.integers(1, 6))
     own, pose, indices = moved_by(d, count, total, k)
     weights = torch.softmax(d.normal(count, k), 1)

@@ -1,5 +1,5 @@
-"""Guard pages: inside :func:`fenced` every array given to a CPU kernel ends (or begins) at an inaccessible page, so that
-an access out of bounds ends the process at once.
+"""Guard pages: inside :func:`fenced` every array given to a CPU kernel ends (or begins) at an inaccessible page, so
+that an access out of bounds ends the process at once.
 
 The bytes between an array and the guard page (less than a cache line, as kernels may rely on torch's alignment) are
 filled with ones, which read as NaN or -1, and checked afterwards. Arrays that a kernel calls ``*_in``
