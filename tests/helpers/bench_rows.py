@@ -1,4 +1,4 @@
-"""Tiny benchmarks and what every row of them must hold."""
+"""Tiny benchmarks, and checks of every row of them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A real browser for tests: Chromium without a window, its WebGL in software. Tests that need it are skipped, with the
-reason, where Playwright or a browser is missing."""
+"""A real browser for tests: Chromium without a window, its WebGL in software. Tests that need it
+are skipped where Playwright or a browser is missing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FLAGS = [
 
 
 def find() -> str | None:
-    """The browser's program: what CHROMIUM says, else one on the path."""
+    """Return the browser's program: the value of CHROMIUM, else one on the path."""
     return os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
 
 

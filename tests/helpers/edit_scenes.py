@@ -46,7 +46,7 @@ class Puppet(ControlPoints):
 
 
 class Swing(ControlPoints):
-    """Control points whose network is a formula: what lies at x > 0 swings about y by 60 degrees, once."""
+    """Control points with a formula for a network: those at x > 0 swing about y by 60 degrees, once."""
 
     def poses(self, times: torch.Tensor) -> list[Pose]:
         found = []
@@ -94,8 +94,8 @@ def bar_scene(
     """A bar along x, 2.4 / ``scale`` long in world units, one half of which swings.
 
     Args:
-        stray: where, in normalised units, one more control point is, the last.
-        share: what Gaussians take part in the motion with, by a mask; None: there is none.
+        stray: position of one more control point, the last, in normalised units.
+        share: share of the motion in which Gaussians take part, by a mask; None: no mask.
     """
     fields = {"nodes": nodes, "layers": 1, "width": 8, "skip": 0, "mask": share is not None}
     config = from_dict({"motion": fields})
@@ -156,8 +156,8 @@ def figure_scene(nodes: int = 256, points: int = 12000) -> tuple[Scene, np.ndarr
 
 
 def rich_scene() -> Scene:
-    """All that a page may hold: hyper-coordinates, a share of the motion, rotations of shapes, scales that change, six
-    neighbours, antialiasing."""
+    """Return a scene with every feature of a page: hyper-coordinates, a share of the motion, rotations of shapes,
+    changing scales, six neighbours, antialiasing."""
     scene = bar_scene(nodes=30, gaussians=300, shaded=True, share=0.8)
     motion = scene.motion
     motion.config = dataclasses.replace(motion.config, neighbors=6)

@@ -18,7 +18,7 @@ from scgs_warp.types import Camera, Frame, Gaussians, Image
 
 
 class FakeScene:
-    """What the apps need of ``scgs_warp.scene.scene.Scene``."""
+    """The part of ``scgs_warp.scene.scene.Scene`` that apps use."""
 
     overview = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0, 40.0, 20.0)
     background_color = (0.0, 0.0, 0.0)
@@ -90,7 +90,7 @@ def fake_dataset(
 
 
 def install(monkeypatch: pytest.MonkeyPatch, scene: FakeScene) -> None:
-    """``Scene.load`` gives this scene, or says that the run is missing."""
+    """Have ``Scene.load`` return this scene, or refuse a missing run."""
     from scgs_warp.errors import UserError
 
     class Scene:

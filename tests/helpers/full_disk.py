@@ -1,4 +1,4 @@
-"""Disks that refuse: a real one of a few megabytes, and one that is made believe."""
+"""Full disks: a real one of a few megabytes, and a simulated one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 
 class RefusingFile:
-    """A file that opens, and takes nothing."""
+    """A file that opens and refuses every write."""
 
     def __init__(self, inner: Any, number: int) -> None:
         self._inner, self._number = inner, number
@@ -34,7 +34,7 @@ class RefusingFile:
 
 
 class FakeDisk:
-    """While ``full``, what is written to files whose names hold one of ``names`` is refused."""
+    """While ``full``, refuse writes to files whose names contain one of ``names``."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...], number: int = errno.ENOSPC) -> None:
         self.full, self.names, self.number = False, names, number
@@ -48,7 +48,7 @@ class FakeDisk:
 
 
 class SmallDisk:
-    """A file system of its own. ``fill`` leaves no byte of it, ``free`` gives back what ``fill`` took."""
+    """A small file system. ``fill`` takes every byte of it, ``free`` releases them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -69,7 +69,7 @@ class SmallDisk:
 
 @contextmanager
 def nothing_may_be_written(folder: Path) -> Iterator[None]:
-    """Take away the right to write to a folder; root loses it only as somebody else."""
+    """Take away the right to write to a folder; root changes its user for that."""
     root, mode = os.geteuid() == 0, folder.stat().st_mode
     folder.chmod(0o555)
     if root:
@@ -84,7 +84,7 @@ def nothing_may_be_written(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def small_disk(folder: Path, mib: int) -> Iterator[SmallDisk]:
-    """Mounted at ``folder``; the test is skipped where that is not allowed."""
+    """Mount a small file system at ``folder``; skip the test where that is not allowed."""
     folder.mkdir()
     try:
         made = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={mib}m", "tmpfs", str(folder)], capture_output=True)

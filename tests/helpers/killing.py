@@ -1,8 +1,8 @@
 """Kill training without a warning and resume it: ``python tests/helpers/killing.py FOLDER [MOMENT ...] [--random N]``.
 
-A process of its own that has imported everything and computed nothing; each run is a child of it, and begins at once.
-Prints one JSON object: what each run was doing when it was killed, and whether, resumed, it left the same checkpoint as
-a run that nobody disturbed.
+This process has imported everything and computed nothing; each run is a forked child, which begins at once. Prints one
+JSON object: what each run was doing when it was killed, and whether it left the checkpoint of an undisturbed run after
+being resumed.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def die(*_: Any) -> None:
 
 
 def wrapped(owner: Any, name: str, before: Callable[..., None], after: Callable[..., None] | None = None) -> None:
-    """Let ``before`` and ``after`` be called with the arguments of ``owner.name``."""
+    """Call ``before`` and ``after`` around ``owner.name``, with its arguments."""
     inner = getattr(owner, name)
 
     def outer(*args: Any, **fields: Any) -> Any:
@@ -62,7 +62,7 @@ def wrapped(owner: Any, name: str, before: Callable[..., None], after: Callable[
 
 
 def nth(count: int, when: Callable[..., bool], action: Callable[..., None] = die) -> Callable[..., None]:
-    """Calls ``action`` the ``count``-th time that ``when`` says so."""
+    """Return a function that calls ``action`` the ``count``-th time that ``when`` is true."""
     seen = [0]
 
     def look(*args: Any) -> None:
@@ -99,13 +99,13 @@ MOMENTS: dict[str, Callable[[], None]] = {
     "while Gaussians are added": lambda: wrapped(density_control, "densify", lambda *_: None, nth(3, always)),
     "before the unseen are pruned": lambda: wrapped(density_control, "prune", nth(1, always)),
 }
-"""What to do for a run to be killed there."""
+"""Moments of a kill by name, and how to reach each."""
 LATE = ("before the first checkpoint",)
 """Moments of runs that save at the end only."""
 
 
 def narrate(tell: Callable[[str], None]) -> None:
-    """Tell what is being done."""
+    """Report what the run is doing."""
     wrapped(loop, "training_step", lambda state, _: tell(f"{state.stage} step"))
     wrapped(loop, "adapt", lambda state, *_: tell(f"{state.stage} densification, if due"))
     wrapped(TrainState, "begin_main", lambda *_: tell("stage change"))
@@ -117,10 +117,10 @@ def narrate(tell: Callable[[str], None]) -> None:
 
 
 def run(folder: Path, threads: int, moment: str | None = None, after: float | None = None) -> tuple[int, str, float]:
-    """Train, or go on, in a child. ``after``: kill it so many seconds after it has begun.
+    """Train or resume in a child process; kill it ``after`` so many seconds.
 
     Returns:
-        its exit status (minus the signal), what it did last, and the seconds that it took.
+        its exit status (minus the signal), its last report, and its duration in seconds.
     """
     ear, mouth = os.pipe()
     child = os.fork()
@@ -146,7 +146,7 @@ def run(folder: Path, threads: int, moment: str | None = None, after: float | No
 
 
 def _listen(ear: int, child: int, after: float | None) -> tuple[str, float]:
-    """The last that the child says, and when it began; kills it when its time has come."""
+    """Return the child's last report and its start time; kill it when its time has come."""
     text, began, killed = b"", time.monotonic(), False
     while True:
         begun = bool(text)
@@ -166,7 +166,7 @@ def _listen(ear: int, child: int, after: float | None) -> tuple[str, float]:
 
 
 def outcome(folder: Path, whole: bytes, status: int, doing: str) -> dict[str, Any]:
-    """Resume in one go, with other threads than before; what came of it."""
+    """Resume with another number of threads and return the outcome."""
     found = folder / checkpoint.FILE
     step = int(checkpoint.read(folder)[1]["step"]) if found.is_file() else 0
     ended, _, _ = run(folder, threads=2)

@@ -48,7 +48,7 @@ def dots(
 
 
 def share_found(data: Dataset, tolerance: float = 1e-3) -> float:
-    """How often the pixel that a point projects to has the point's colour. Some hide behind others."""
+    """Return the share of points whose pixel has their colour; some hide behind others."""
     found = []
     points, colors = torch.from_numpy(POINTS).float(), torch.from_numpy(COLORS / 255.0).float()
     for frame in data:

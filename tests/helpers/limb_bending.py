@@ -1,4 +1,4 @@
-"""What the acceptance of editing measures: a limb turned about its joint, the rest pinned.
+"""Measure edits: a limb turned about its joint, the rest pinned.
 
 ``python tests/helpers/limb_bending.py --run runs/figure-quick ... [--picture limbs.png]`` measures runs of the
 built-in scene; the picture is of the first one.
@@ -110,7 +110,7 @@ def determinants(rest: np.ndarray, posed: np.ndarray, turns: np.ndarray, edges: 
 
 DEGREES = (15, 45, 90, 135)
 VIEWS = {"arm": (0.4, -3.6, 0.3), "leg": (3.6, -0.6, 0.1)}
-"""Where the camera of a picture stands."""
+"""Return the camera of a picture."""
 
 
 def measure(session: EditSession, limb: str) -> list[Bent]:

@@ -16,7 +16,7 @@ import pytest
 from helpers.paths import ROOT
 
 INSTALL = "npm install --prefix .node @playcanvas/splat-transform gltf-validator three"
-"""As .ci/run does it."""
+"""Command that installs the packages, as in .ci/run."""
 
 
 @functools.cache
@@ -57,7 +57,7 @@ def splat_transform(source: Path, target: Path, *options: str) -> Path:
 
 
 def gltf_errors(path: Path) -> list[dict]:
-    """What the Khronos validator calls errors and warnings."""
+    """Return the errors and warnings of the Khronos validator."""
     script = (
         "const [place, file] = process.argv.slice(1);"
         "const bytes = new Uint8Array(require('fs').readFileSync(file));"

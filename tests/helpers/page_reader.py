@@ -1,4 +1,4 @@
-"""A page's data read in Python, as docs/page.md describes it: what the page plays, without a browser."""
+"""Reader and player of a page's data in Python, as docs/page.md describes the format."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def pose_of(facts: dict[str, Any], columns: dict[str, np.ndarray], time: float) 
 
 
 class PagePlayer:
-    """Draws what a page holds with our own renderer."""
+    """Renderer of a page's data by the project's own kernels."""
 
     def __init__(self, scene: Scene, facts: dict[str, Any], columns: dict[str, np.ndarray]) -> None:
         self.scene, self.facts, self.columns = scene, facts, columns

@@ -45,7 +45,7 @@ class Film(NamedTuple):
     K: np.ndarray
     """[3, 3]"""
     moving: list[np.ndarray]
-    """[H, W] bool: which pixels show what moves."""
+    """[H, W] bool: pixels that show the moving box."""
 
 
 def pattern(rng: np.random.Generator, height: int, width: int, contrast: float = 1.0) -> np.ndarray:
@@ -111,7 +111,7 @@ def room(seed: int = 0, contrast: float = 1.0) -> Glb:
 
 
 def walk(time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the camera is and looks at, glTF's axes: a sweeping arc through the near half of the room."""
+    """Return the camera's position and target, glTF's axes: a sweeping arc through the near half of the room."""
     eye = np.array([1.9 * np.sin(2.2 * (time - 0.5)), 1.5 + 0.35 * np.sin(6 * time), 2.0 - 0.5 * np.sin(3 * time)])
     target = np.array([0.35 * np.sin(2.0 * time), 0.9, -1.3])
     return eye, target
@@ -158,7 +158,7 @@ def shoot(
 
 
 def _moving(scene, time: float, viewmat: np.ndarray, K: np.ndarray, size: tuple[int, int], bodies: int) -> np.ndarray:
-    """Pixels inside the outline of what moves; furniture in front of it is not looked at."""
+    """Return the pixels inside the moving box's outline; furniture in front of it is ignored."""
     corners = scene.posed(time).positions[np.unique(scene.triangles.faces[bodies:])]
     local = corners @ viewmat[:3, :3].T + viewmat[:3, 3]
     pixels = local @ K.T

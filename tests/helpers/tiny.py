@@ -18,7 +18,7 @@ from scgs_warp.types import Camera, Frame, Gaussians
 
 
 def blobs(time: float) -> Gaussians:
-    """120 small Gaussians: one half swings through a quarter turn."""
+    """Return 120 small Gaussians, half of which swing through a quarter turn."""
     generator = torch.Generator().manual_seed(7)
     means = 0.25 * torch.randn(120, 3, generator=generator)
     colors = torch.rand(120, 3, generator=generator)
