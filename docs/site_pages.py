@@ -1,4 +1,5 @@
-"""MkDocs hook: pages of the site that the repository keeps elsewhere: README, security, changelog, examples."""
+"""MkDocs hook: add the pages that the repository keeps outside ``docs/`` (README, contributing, security, changelog,
+examples)."""
 
 from __future__ import annotations
 
@@ -14,9 +15,10 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages."""
+    """Add the generated pages to the site."""
     pages = {
         "index.md": from_docs((ROOT / "README.md").read_text(encoding="utf-8")),
+        "contributing.md": from_docs((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")),
         "security.md": from_docs((ROOT / "SECURITY.md").read_text(encoding="utf-8")),
         "changelog.md": from_docs((ROOT / "CHANGELOG.md").read_text(encoding="utf-8")),
         "examples.md": examples_page(),
@@ -27,23 +29,24 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **known: Any) -> str:
-    """The folder of examples is a page here."""
+    """Link to the page of examples instead of the folder."""
     return markdown.replace("](../examples/)", "](examples.md)")
 
 
 def on_page_content(html: str, **known: Any) -> str:
-    """Docstrings say :class:`Name`, as editors show it; here the name does."""
+    """Remove reStructuredText roles such as :class: before names: Markdown does not render them."""
     return re.sub(r":(?:class|func|meth|mod):(?=<code>)", "", html)
 
 
 def from_docs(text: str) -> str:
-    """Links that lead from the repository's root, as the site has them: what is wrong then is found by --strict."""
-    text = re.sub(r"(\]\()docs/", r"\1", text).replace("](SECURITY.md)", "](security.md)")
+    """Rewrite links relative to the repository's root as links of the site; ``mkdocs build --strict`` checks them."""
+    text = re.sub(r"(\]\()docs/", r"\1", text)
+    text = text.replace("](SECURITY.md)", "](security.md)").replace("](CONTRIBUTING.md)", "](contributing.md)")
     return re.sub(r"(\]\()examples/?(?=\))", r"\1examples.md", text)
 
 
 def examples_page() -> str:
-    """Every script in examples/ with what it says of itself."""
+    """Build a page of all scripts in examples/ from their docstrings and code."""
     parts = [
         "# Examples\n\nShort scripts in `examples/`, to be read and changed. Each explains its options with `--help`.\n"
     ]

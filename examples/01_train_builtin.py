@@ -1,7 +1,7 @@
 """Train a scene: data in, a run directory out.
 
-Makes the built-in scene (a waving robot, ray-cast on the spot), learns it, and scores views that were held out. The run
-directory is what the other examples begin with.
+The script makes the built-in scene (a waving robot), trains on it, and scores held-out views. The other examples start
+from the run directory that it writes.
 
     python examples/01_train_builtin.py
 """
@@ -25,10 +25,10 @@ def main(
     """Train the built-in scene.
 
     Args:
-        output: run directory; one that is there already is refused.
-        data: where the scene's images are written: a folder in D-NeRF layout.
+        output: run directory; an existing one is refused.
+        data: folder for the scene's images, in D-NeRF layout.
         size: width and height of the images.
-        steps: of training, both stages together.
+        steps: training steps of both stages together.
     """
     make_synthetic(data, size=size, train=60, test=6)
     train, test = load(data, "train"), load(data, "test")

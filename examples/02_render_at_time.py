@@ -1,7 +1,7 @@
 """Render a trained scene: any moment, any camera.
 
-A strip of moments from one camera, colours above depth. Times run from 0 to 1; a camera is world-to-camera in OpenCV's
-convention and intrinsics in pixels.
+The script writes a strip of moments from one camera, colours above depth. Times run from 0 to 1. A camera has a
+world-to-camera matrix in OpenCV's convention and intrinsics in pixels.
 
     python examples/01_train_builtin.py
     python examples/02_render_at_time.py
@@ -26,16 +26,16 @@ def main(
     times: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0),
     size: int = 256,
 ) -> None:
-    """Write a picture of several moments.
+    """Write an image of several moments.
 
     Args:
         run: folder of a run.
-        output: the picture.
+        output: image file to write.
         times: moments, from 0 to 1.
-        size: pixels of each image, square.
+        size: width and height of each image in pixels.
     """
     scene = scgs_warp.Scene.load(run)
-    seen = scene.overview  # where the training cameras stood
+    seen = scene.overview  # positions of the training cameras
     centre = torch.tensor(seen.centre)
     eye = centre + seen.radius * torch.tensor([0.0, -0.9, 0.4])
     K = torch.tensor([[1.4 * size, 0.0, size / 2], [0.0, 1.4 * size, size / 2], [0.0, 0.0, 1.0]])

@@ -1,6 +1,6 @@
-"""Slow motion: the scene is continuous in time, so a film may show any moment between those that were filmed.
+"""Slow motion: the scene is continuous in time, so a film can show any moment between the training frames.
 
-The film runs at normal speed, slows down to a fifth in the middle while the camera goes round, and speeds up again.
+The film runs at normal speed, slows down to a sixth in the middle while the camera goes round, and speeds up again.
 
     python examples/01_train_builtin.py
     python examples/03_slow_motion.py --output slow.gif
@@ -19,7 +19,7 @@ from scgs_warp.visualization.video import film
 
 SECONDS = 5.0
 SPEEDS = Playback(map=((0.0, 0.0), (1.0, 0.4), (4.0, 0.6), (SECONDS, 1.0)))
-"""(second of the film, moment of the scene) pairs, straight in between."""
+"""Pairs of a second of the film and a moment of the scene, linear in between."""
 
 
 def main(run: Path = Path("runs/example"), output: Path = Path("slow.mp4"), size: int = 256, fps: float = 25.0) -> None:
@@ -27,9 +27,9 @@ def main(run: Path = Path("runs/example"), output: Path = Path("slow.mp4"), size
 
     Args:
         run: folder of a run.
-        output: ends in .mp4 or .gif, or names a folder for PNGs.
+        output: name that ends in .mp4 or .gif, or a folder for PNGs.
         size: longer side in pixels, even.
-        fps: frames a second.
+        fps: frames per second.
     """
     scene = scgs_warp.Scene.load(run)
     frames = round(SECONDS * fps)

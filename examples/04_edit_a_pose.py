@@ -1,6 +1,6 @@
-"""Edit a pose: hold some control points, move them, and the scene bends with them.
+"""Edit a pose: take some control points, move them, and the scene bends with them.
 
-Takes the part that moves most (an arm), lifts it, and writes before and after side by side. Whatever is more than two
+The script lifts the part that moves most (an arm), and writes before and after side by side. Everything more than two
 edges of the control graph away stays. The edit is saved as JSON: `apps/edit.py --run RUN --script edit.json` plays it.
 
     python examples/01_train_builtin.py
@@ -28,14 +28,14 @@ def main(
     lift: float = 0.3,
     size: int = 256,
 ) -> None:
-    """Lift what moves most.
+    """Lift the part that moves most.
 
     Args:
         run: folder of a run.
-        output: picture of before and after.
-        edit: where the edit is saved.
+        output: image of before and after.
+        edit: file of the saved edit.
         time: moment of the scene, from 0 to 1.
-        lift: how far up, world units.
+        lift: distance upwards in world units.
         size: longer side of each image in pixels.
     """
     session = EditSession(scgs_warp.Scene.load(run))

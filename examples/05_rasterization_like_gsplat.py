@@ -1,7 +1,7 @@
 """The rasteriser alone: gsplat's entry point, differentiable, with or without a GPU.
 
-`scgs_warp.rasterization` has the argument names, order and defaults of gsplat 1.5.3. This renders a ball of random
-Gaussians from two cameras, colour and expected depth, and sends a gradient back to every input.
+`scgs_warp.rasterization` has the argument names, order and defaults of gsplat 1.5.3. The script renders colour and
+expected depth of a ball of random Gaussians from two cameras, and computes the gradient of every input.
 
     python examples/05_rasterization_like_gsplat.py
 """
@@ -22,8 +22,8 @@ def main(output: Path = Path("ball.png"), count: int = 3000, size: int = 256) ->
     """Render a ball of Gaussians.
 
     Args:
-        output: picture: two views side by side.
-        count: Gaussians.
+        output: image of two views side by side.
+        count: number of Gaussians.
         size: width and height of each view in pixels.
     """
     random = torch.Generator().manual_seed(0)

@@ -1,4 +1,4 @@
-"""Fit Gaussians to one image: the rasteriser inside a loop of your own, with torch's Adam and the squared error.
+"""Fit Gaussians to one image: the rasteriser in a custom loop, with torch's Adam and the squared error.
 
 python examples/06_optimise_an_image.py --image photo.jpg
 """
@@ -18,7 +18,7 @@ RATES = {"means": 5e-3, "quats": 1e-2, "log_scales": 2e-2, "logits": 5e-2, "colo
 
 
 def target_image(path: Path | None, size: int) -> torch.Tensor:
-    """[size, size, 3] in [0, 1]; without a path, rings of changing colour."""
+    """Load the image, or make rings of changing colour: [size, size, 3] in [0, 1]."""
     if path is not None:
         return torch.from_numpy(np.array(Image.open(path).convert("RGB").resize((size, size))) / np.float32(255.0))
     y, x = torch.meshgrid(*(2 * [torch.linspace(-1.0, 1.0, size)]), indexing="ij")
@@ -32,10 +32,10 @@ def main(
     """Fit Gaussians to an image.
 
     Args:
-        image: what to fit; without it a pattern is made.
-        output: picture: the image beside its Gaussians.
-        count: Gaussians.
-        steps: of optimisation.
+        image: image to fit; by default a generated pattern.
+        output: image of the truth beside its Gaussians.
+        count: number of Gaussians.
+        steps: optimisation steps.
         size: width and height in pixels.
     """
     truth = target_image(image, size)
@@ -51,7 +51,7 @@ def main(
     p = {name: value.requires_grad_() for name, value in start.items()}
     optimizer = torch.optim.Adam([{"params": [p[name]], "lr": rate} for name, rate in RATES.items()], eps=1e-15)
     viewmat = torch.eye(4)
-    viewmat[2, 3] = 2.0  # the Gaussians lie two units before the camera, which sees x and y from -1 to 1
+    viewmat[2, 3] = 2.0  # the Gaussians are two units before the camera, which sees x and y from -1 to 1
     K = torch.tensor([[float(size), 0.0, size / 2], [0.0, float(size), size / 2], [0.0, 0.0, 1.0]])
 
     for step in range(steps):

@@ -1,7 +1,7 @@
-"""Follow points through time: every Gaussian is a point of the surface, and keeps its identity.
+"""Follow points through time: every Gaussian is a point of the surface and keeps its identity.
 
-Poses the scene at many moments, picks points spread over it, and writes where they go: as numbers, and as a plot of the
-paths. This is what motion analysis, physics or a second renderer would begin with.
+The script poses the scene at many moments, picks points spread over it, and writes their paths as numbers and as a
+plot. Motion analysis, physics or a second renderer can start from these data.
 
     python examples/01_train_builtin.py
     python examples/07_follow_points.py
@@ -27,13 +27,13 @@ def main(
     Args:
         run: folder of a run.
         output: .npz with `times` [T] and `tracks` [T, P, 3], world units; a plot goes beside it.
-        points: how many to follow.
-        moments: how many times from 0 to 1.
+        points: number of points to follow.
+        moments: number of times from 0 to 1.
     """
     scene = scgs_warp.Scene.load(run)
     times = np.linspace(0.0, 1.0, moments)
     opacities = scene.gaussians_at(0.0).opacities
-    chosen = torch.nonzero(opacities >= opacities.median())[:, 0]  # what is nearly transparent is no surface
+    chosen = torch.nonzero(opacities >= opacities.median())[:, 0]  # nearly transparent Gaussians are not on the surface
     chosen = chosen[torch.linspace(0, len(chosen) - 1, min(points, len(chosen))).long()]
     tracks = np.stack([scene.gaussians_at(float(time)).means[chosen].numpy() for time in times])
     np.savez_compressed(output, times=times, tracks=tracks)

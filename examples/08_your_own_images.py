@@ -1,8 +1,8 @@
 """Your own images and cameras: the smallest data set that trains.
 
-Images with known cameras and times go into a folder in D-NeRF layout. Here a trained scene is filmed to have some; put
-your own in their place. Three things matter: the file names, the times from 0 to 1, and that a frame's matrix is
-camera-to-world with OpenGL's axes (x right, y up, z backwards).
+The script writes images with known cameras and times into a folder in D-NeRF layout. It renders them from a trained
+scene; put your own in their place. Three things matter: the file names, the times from 0 to 1, and the matrix of a
+frame, which is camera-to-world with OpenGL's axes (x right, y up, z backwards).
 
     python examples/01_train_builtin.py
     python examples/08_your_own_images.py
@@ -31,9 +31,9 @@ def main(run: Path = Path("runs/example"), output: Path = Path("data/mine"), fra
     """Write a data set.
 
     Args:
-        run: folder of a run, the source of the images.
-        output: the new folder.
-        frames: images to train on; a fifth as many are held out.
+        run: folder of the run from which the images are rendered.
+        output: folder to create.
+        frames: number of training images; a fifth as many are held out.
         size: longer side in pixels.
     """
     scene = scgs_warp.Scene.load(run)
