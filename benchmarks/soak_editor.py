@@ -201,7 +201,7 @@ class RandomUser:
 
     def load(self) -> None:
         path = self._path(".json")
-        edit = self.worker.call(lambda: edit_file.read(path, self.model.session))
+        edit = self.worker.call(lambda: edit_file.read(path, self.model.session.engine))
         with self.model.changing() as session:
             session.apply(edit)
 

@@ -7,39 +7,37 @@ import json
 import zlib
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any
 
 import numpy as np
 
 from ..errors import UserError
 from .document import Edit, Film, Shot, View
-from .field_reader import LIMIT, Node, one_line, read_object, shown
-from .handles import Handle, Lasting, Target
-from .keyframes import Easing, Keyframe
+from .engine import Engine
+from .field_reader import Node, one_line, read_object, shown
+from .handles import Handle, Target, handle_fields
+from .keyframes import MAX_SECONDS, Keyframe, keyframe_fields
 from .playback import Exaggerate, Hold, Playback
 from .rotations import from_axis
 
-if TYPE_CHECKING:
-    from .session import EditSession
-
 FORMAT = "scgs-warp edit"
 VERSION = 1
-MOST_SECONDS = 3600.0
-LARGEST = 8192
+MAX_FILM_SIZE = 8192
+"""Longer side in pixels."""
 
 
-def fingerprint(session: EditSession) -> str:
+def fingerprint(engine: Engine) -> str:
     """Tells one scene's control points from another's: numbers of control points mean nothing elsewhere."""
-    rest = session.engine.rig.positions.detach().cpu().contiguous().numpy()
+    rest = engine.rig.positions.detach().cpu().contiguous().numpy()
     return f"{zlib.crc32(np.ascontiguousarray(rest).tobytes()):08x}"
 
 
-def to_json(edit: Edit, session: EditSession) -> str:
+def to_json(edit: Edit, engine: Engine) -> str:
     """Text that ``read`` turns into the same edit."""
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
-        "scene": {"control_points": len(session), "fingerprint": fingerprint(session)},
+        "scene": {"control_points": len(engine.graph), "fingerprint": fingerprint(engine)},
         "handles": [_plain(handle) for handle in edit.handles],
         "pins": list(edit.pins),
         "targets": {name: _plain(target) for name, target in edit.targets.items()},
@@ -69,26 +67,26 @@ def _compact(value: Any) -> str:
     return json.dumps(value)
 
 
-def read(path: Path, session: EditSession) -> Edit:
+def read(path: Path, engine: Engine) -> Edit:
     """The edit in a file, for this session's scene: regions said by place become control points.
 
     Raises:
         UserError: naming the file, the field and the remedy.
     """
-    return parse(read_object(path), str(path), session)
+    return parse(read_object(path), str(path), engine)
 
 
-def parse(content: Any, source: str, session: EditSession) -> Edit:
+def parse(content: Any, source: str, engine: Engine) -> Edit:
     """As ``read``, of a JSON value; ``source`` is what errors name."""
     root = Node(content, source)
     if root.raw("format") != FORMAT:
         raise root.wrong("format", f"is {shown(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
     if root.raw("version") != VERSION:
         raise root.wrong("version", f"is {shown(root.raw('version'))}", f"this program reads version {VERSION}")
-    _check_scene(root, session)
+    _check_scene(root, engine)
     handles: list[Handle] = []
     for node in root.children("handles", 1000):
-        handle = _handle(node, session)
+        handle = _handle(node, engine)
         if any(handle.name == other.name for other in handles):
             raise node.wrong("name", f"{handle.name!r} is taken", "give every handle a name of its own")
         handles.append(handle)
@@ -100,52 +98,52 @@ def parse(content: Any, source: str, session: EditSession) -> Edit:
             raise root.wrong("keyframes", f"has two at {first.at:g} s", "leave one of them out")
     edit = Edit(
         handles=tuple(handles),
-        pins=_pins(root, handles, session),
+        pins=_pins(root, handles, engine),
         targets=_targets(root, names),
         keyframes=tuple(frames),
         playback=_playback(root.child("playback")),
-        holds=tuple(_hold(node, session) for node in root.children("hold", 1000)),
-        exaggerate=_exaggerate(root.child("exaggerate"), session),
-        film=_film(root.child("film")),
+        holds=tuple(_hold(node, engine) for node in root.children("hold", 1000)),
+        exaggerate=_exaggerate(root.child("exaggerate"), engine),
+        film=film_of(root.child("film")),
     )
     root.done("comment")
     return edit
 
 
-def _check_scene(root: Node, session: EditSession) -> None:
+def _check_scene(root: Node, engine: Engine) -> None:
     scene = root.child("scene")
     if scene is None:
         return
-    count = scene.integer("control_points", len(session), 0, 1 << 31)
-    if count != len(session):
-        remedy = f"this scene has {len(session)}: give the scene that it was made for"
-        if not session.engine.rig.moves:
+    count = scene.integer("control_points", len(engine.graph), 0, 1 << 31)
+    if count != len(engine.graph):
+        remedy = f"this scene has {len(engine.graph)}: give the scene that it was made for"
+        if not engine.rig.moves:
             remedy += f", with --nodes {count}"
         raise scene.wrong("control_points", f"is {count}", remedy)
     mark = scene.raw("fingerprint")
-    if mark is not None and mark != fingerprint(session):
+    if mark is not None and mark != fingerprint(engine):
         remedy = "give that scene, or say regions by place (point, sphere, box) and leave fingerprint out"
         raise scene.wrong("fingerprint", "is that of another scene's control points", remedy)
     scene.done()
 
 
-def _nodes(node: Node, name: str, session: EditSession, *, time: float = 0.0) -> tuple[int, ...]:
+def _nodes(node: Node, name: str, engine: Engine, *, time: float = 0.0) -> tuple[int, ...]:
     """A list of control points, or a place: {"point", "rings"}, {"sphere", "radius"}, {"box"}, at a time."""
     value = node.raw(name)
     if isinstance(value, dict):
-        return _place(Node(value, node.source, f"{node.place}.{name}".strip(".")), session, time)
+        return _place(Node(value, node.source, f"{node.place}.{name}".strip(".")), engine, time)
     if value is None or not isinstance(value, list) or not value:
         raise node.wrong(name, "is missing or empty", "list control points, or say a place: point, sphere or box")
-    last = len(session) - 1
+    last = len(engine.graph) - 1
     for index in value:
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index <= last:
             raise node.wrong(name, f"names control point {shown(index)}", f"give whole numbers from 0 to {last}")
     return tuple(sorted(set(value)))
 
 
-def _place(place: Node, session: EditSession, time: float) -> tuple[int, ...]:
+def _place(place: Node, engine: Engine, time: float) -> tuple[int, ...]:
     time = place.number("time", time, 0.0, 1.0)
-    points = session.engine.to_world(session.engine.motion_at(time).positions)
+    points = engine.to_world(engine.motion_at(time).positions)
     point, sphere, box = place.vector("point", 3), place.vector("sphere", 3), place.items("box", 2)
     rings = place.integer("rings", 0, 0, 1000)
     radius = place.number("radius", None, 0.0)
@@ -164,59 +162,14 @@ def _place(place: Node, session: EditSession, time: float) -> tuple[int, ...]:
         raise place.wrong("", "says no place", "give point, sphere with radius, or box with two corners")
     if not chosen:
         raise place.wrong("", f"holds no control point at time {time:g}", "make it larger or move it")
-    return session.graph.ring(chosen, rings)
+    return engine.graph.ring(chosen, rings)
 
 
-def _handle(node: Node, session: EditSession) -> Handle:
-    time = node.number("time", 0.0, 0.0, 1.0)
-    handle = Handle(
-        name=node.text("name"),
-        nodes=_nodes(node, "nodes", session, time=time),
-        time=time,
-        pivot=node.vector("pivot", 3),
-        stiffness=node.number("stiffness", None, 1e-6, 1e6),
-        turns=node.truth("turns"),
-        lasts=node.choice("lasts", get_args(Lasting), "motion"),
-        window=node.number("window", 0.1, 1e-6, 10.0),
-    )
+def _handle(node: Node, engine: Engine) -> Handle:
+    fields = handle_fields(node)
+    handle = Handle(nodes=_nodes(node, "nodes", engine, time=fields["time"]), **fields)
     node.done("comment")
     return handle
-
-
-def check_handle(handle: Handle, count: int) -> None:
-    """What ``_handle`` checks, for a handle that a program made.
-
-    Raises:
-        UserError: naming the field.
-    """
-    node = Node(_plain(handle), f"handle {handle.name!r}")
-    node.text("name")
-    node.number("time", 0.0, 0.0, 1.0)
-    if handle.pivot is not None and (len(handle.pivot) != 3 or not np.all(np.abs(handle.pivot) <= LIMIT)):
-        raise node.wrong("pivot", f"is {list(handle.pivot)}", f"give 3 finite numbers from {-LIMIT:g} to {LIMIT:g}")
-    node.number("stiffness", None, 1e-6, 1e6)
-    node.choice("lasts", get_args(Lasting), "motion")
-    node.number("window", 0.1, 1e-6, 10.0)
-
-
-def check_keyframe(at: float, easing: str) -> None:
-    """What ``_keyframe`` checks.
-
-    Raises:
-        UserError: naming the field.
-    """
-    node = Node({"at": at, "easing": easing}, "keyframe")
-    node.number("at", None, 0.0, MOST_SECONDS)
-    node.choice("easing", get_args(Easing), "smooth")
-
-
-def check_size(size: int) -> None:
-    """What ``_film`` checks of a film's size.
-
-    Raises:
-        UserError: naming the field.
-    """
-    Node({"size": size}, "film").integer("size", 512, 16, LARGEST)
 
 
 def _too_short(direction: tuple[float, ...]) -> bool:
@@ -224,7 +177,7 @@ def _too_short(direction: tuple[float, ...]) -> bool:
     return not sum(x * x for x in direction) > 1e-200
 
 
-def _pins(root: Node, handles: list[Handle], session: EditSession) -> tuple[int, ...]:
+def _pins(root: Node, handles: list[Handle], engine: Engine) -> tuple[int, ...]:
     value = root.raw("pins")
     if value is None or value == []:
         return ()
@@ -232,8 +185,8 @@ def _pins(root: Node, handles: list[Handle], session: EditSession) -> tuple[int,
         node = Node(value, root.source, "pins")
         rings = node.integer("beyond", 2, 0, 1000)
         node.done()
-        return session.graph.beyond({n for handle in handles for n in handle.nodes}, rings)
-    return _nodes(root, "pins", session)
+        return engine.graph.beyond({n for handle in handles for n in handle.nodes}, rings)
+    return _nodes(root, "pins", engine)
 
 
 def _target(node: Node) -> Target:
@@ -264,13 +217,9 @@ def _targets(root: Node, names: set[str]) -> dict[str, Target]:
 
 
 def _keyframe(node: Node, names: set[str]) -> Keyframe:
-    at = node.number("at", None, 0.0, MOST_SECONDS)
-    if at is None:
-        raise node.wrong("at", "is missing", "give seconds from the film's beginning")
-    easing = node.choice("easing", get_args(Easing), "smooth")
-    found = Keyframe(at, _targets(node, names), easing)
+    frame = Keyframe(**keyframe_fields(node), targets=_targets(node, names))
     node.done("comment")
-    return found
+    return frame
 
 
 def _playback(node: Node | None) -> Playback:
@@ -283,7 +232,7 @@ def _playback(node: Node | None) -> Playback:
             raise node.wrong(f"map[{index}]", f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]")
         pairs.append((at, time))
     found = Playback(
-        seconds=node.number("seconds", None, 1e-3, MOST_SECONDS),
+        seconds=node.number("seconds", None, 1e-3, MAX_SECONDS),
         speed=node.number("speed", 1.0, -1000.0, 1000.0),
         start=node.number("start", 0.0, 0.0, 1.0),
         repeat=node.choice("repeat", ("once", "loop", "swing"), "once"),
@@ -294,30 +243,35 @@ def _playback(node: Node | None) -> Playback:
     return found
 
 
-def _hold(node: Node, session: EditSession) -> Hold:
+def _hold(node: Node, engine: Engine) -> Hold:
     time = node.number("time", 0.0, 0.0, 1.0)
     frame = node.choice("frame", ("body", "world"), "body")
-    found = Hold(_nodes(node, "nodes", session, time=time), time, frame, node.integer("rings", 2, 0, 100))
+    found = Hold(_nodes(node, "nodes", engine, time=time), time, frame, node.integer("rings", 2, 0, 100))
     node.done("comment")
     return found
 
 
-def _exaggerate(node: Node | None, session: EditSession) -> Exaggerate | None:
+def _exaggerate(node: Node | None, engine: Engine) -> Exaggerate | None:
     if node is None:
         return None
-    nodes = _nodes(node, "nodes", session) if node.raw("nodes") else ()
+    nodes = _nodes(node, "nodes", engine) if node.raw("nodes") else ()
     found = Exaggerate(node.number("factor", 1.5, -10.0, 10.0), node.number("about", None, 0.0, 1.0), nodes)
     node.done("comment")
     return found
 
 
-def _film(node: Node | None) -> Film:
+def film_of(node: Node | None) -> Film:
+    """Read a film's settings.
+
+    Raises:
+        UserError: naming the field.
+    """
     if node is None:
         return Film()
     found = Film(
-        seconds=node.number("seconds", 4.0, 1e-3, MOST_SECONDS),
+        seconds=node.number("seconds", 4.0, 1e-3, MAX_SECONDS),
         fps=node.number("fps", 30.0, 0.01, 1000.0),
-        size=node.integer("size", 512, 16, LARGEST),
+        size=node.integer("size", 512, 16, MAX_FILM_SIZE),
         background=node.vector("background", 3, None, 0.0, 1.0),
         shot=_shot(node.child("shot")),
     )
@@ -332,7 +286,7 @@ def _shot(node: Node | None) -> Shot:
     for view in node.children("views"):
         views.append(
             View(
-                at=view.number("at", 0.0, 0.0, MOST_SECONDS),
+                at=view.number("at", 0.0, 0.0, MAX_SECONDS),
                 azimuth=view.number("azimuth", None, -1e5, 1e5),
                 elevation=view.number("elevation", None, -80.0, 80.0),
                 distance=view.number("distance", None, 1e-9),

@@ -136,7 +136,7 @@ class Node:
         value = self.raw(name)
         if value is None:
             return default
-        fits = isinstance(value, list) and len(value) == size and all(map(_is_number, value))
+        fits = isinstance(value, list | tuple) and len(value) == size and all(map(_is_number, value))
         if not fits or not all(low <= x <= high for x in value):
             limits = "" if high == LIMIT else f" from {low:g} to {high:g}"
             raise self.wrong(name, f"is {shown(value)}", f"give {size} numbers{limits}")

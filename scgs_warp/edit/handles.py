@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from ..errors import UserError
-from .field_reader import LIMIT
+from .field_reader import LIMIT, Node
 from .graph import ControlGraph
 from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
 from .solver import Anchors
@@ -84,6 +84,15 @@ class Handle:
     window: float = 0.1
     """Scene time after which a fading handle has no effect."""
 
+    def __post_init__(self) -> None:
+        """Check and convert all fields but the nodes, of which only a scene knows how many there are.
+
+        Raises:
+            UserError: naming the field.
+        """
+        for name, value in handle_fields(Node(vars(self), f"handle {self.name!r}")).items():
+            object.__setattr__(self, name, value)
+
     @property
     def gives_rotation(self) -> bool:
         return len(self.nodes) > 1 if self.turns is None else self.turns
@@ -97,6 +106,23 @@ class Handle:
             return 1.0 if away <= frame else 0.0
         share = 1.0 - away / self.window if self.window > 0 else 0.0
         return 0.0 if share <= 0 else share * share * (3.0 - 2.0 * share)
+
+
+def handle_fields(node: Node) -> dict[str, Any]:
+    """Read a handle's fields, all but its nodes.
+
+    Raises:
+        UserError: naming the field.
+    """
+    return {
+        "name": node.text("name"),
+        "time": node.number("time", 0.0, 0.0, 1.0),
+        "pivot": node.vector("pivot", 3),
+        "stiffness": node.number("stiffness", None, WEAKEST, STRONGEST),
+        "turns": node.truth("turns"),
+        "lasts": node.choice("lasts", get_args(Lasting), "motion"),
+        "window": node.number("window", 0.1, 1e-6, 10.0),
+    }
 
 
 class Goal(NamedTuple):

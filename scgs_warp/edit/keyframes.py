@@ -6,14 +6,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from .field_reader import Node
 from .handles import Target
 from .rotations import IDENTITY, conjugate, exponential, logarithm, multiply, power, slerp, unit
 
 Easing = Literal["smooth", "linear", "ease", "step"]
+
+MAX_SECONDS = 3600.0
+"""Length of the longest film."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,27 @@ class Keyframe:
     easing: Easing = "smooth"
     """The way to the next one. smooth: without a stop at keyframes, and never beyond their values; linear: evenly;
     ease: from rest to rest; step: it stays, then jumps."""
+
+    def __post_init__(self) -> None:
+        """Check and convert time and easing.
+
+        Raises:
+            UserError: naming the field.
+        """
+        for name, value in keyframe_fields(Node(vars(self), "keyframe")).items():
+            object.__setattr__(self, name, value)
+
+
+def keyframe_fields(node: Node) -> dict[str, Any]:
+    """Read a keyframe's fields, all but its targets.
+
+    Raises:
+        UserError: naming the field.
+    """
+    at = node.number("at", None, 0.0, MAX_SECONDS)
+    if at is None:
+        raise node.wrong("at", "is missing", "give seconds from the film's beginning")
+    return {"at": at, "easing": node.choice("easing", get_args(Easing), "smooth")}
 
 
 def targets_at(keyframes: Sequence[Keyframe], at: float) -> dict[str, Target]:

@@ -24,6 +24,7 @@ from ..types import Camera, Gaussians, Image
 from . import edit_file
 from .document import Edit
 from .engine import Engine
+from .field_reader import Node
 from .graph import ControlGraph
 from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
@@ -158,7 +159,6 @@ class EditSession:
         if name is None:
             name = next(f"handle {i}" for i in range(1, len(taken) + 2) if f"handle {i}" not in taken)
         handle = Handle(name=name, nodes=chosen, time=float(time), **fields)
-        edit_file.check_handle(handle, len(self))
         edit = self._without(name)
         self.apply(dataclasses.replace(edit, handles=(*edit.handles, handle)))
         return handle
@@ -256,11 +256,10 @@ class EditSession:
 
     def add_keyframe(self, at: float, easing: Easing = "smooth") -> Keyframe:
         """Keep where all handles are now, for a moment of the film; one that is there already is replaced."""
-        edit_file.check_keyframe(at, easing)
         names = [handle.name for handle in self.edit.handles]
         if not names:
             raise UserError("a keyframe needs a handle; take hold of some control points first")
-        frame = Keyframe(float(at), {name: self.edit.targets.get(name, STAY) for name in names}, easing)
+        frame = Keyframe(at, {name: self.edit.targets.get(name, STAY) for name in names}, easing)
         others = [other for other in self.edit.keyframes if other.at != frame.at]
         self._change(keyframes=tuple(sorted([*others, frame], key=lambda f: f.at)))
         return frame
@@ -280,7 +279,7 @@ class EditSession:
         Raises:
             UserError: no film is that small or large.
         """
-        edit_file.check_size(size)
+        edit_file.film_of(Node({"size": size}, "film"))
         self._change(film=dataclasses.replace(self.edit.film, size=size))
 
     def scene_time(self, at: float) -> float:
@@ -334,8 +333,8 @@ class EditSession:
         Raises:
             UserError: the place cannot be written, or the edit holds something that no file may say.
         """
-        text = edit_file.to_json(self.edit, self)
-        edit_file.parse(json.loads(text), "the edit", self)
+        text = edit_file.to_json(self.edit, self.engine)
+        edit_file.parse(json.loads(text), "the edit", self.engine)
         write_atomically(Path(path), text.encode())
 
     def load(self, path: str | Path) -> None:
@@ -344,7 +343,7 @@ class EditSession:
         Raises:
             UserError: the file is missing or wrong, with the field; the edit is as before.
         """
-        self.apply(edit_file.read(Path(path), self))
+        self.apply(edit_file.read(Path(path), self.engine))
 
     def export_ply(self, path: str | Path, time: float, at: float | None = None) -> None:
         """The edited Gaussians at one moment as a 3D-GS file, world units."""

@@ -187,7 +187,8 @@ class Model:
 
     def _checked(self, edit: Edit) -> Edit:
         """What controls send is trusted no more than a file is: pages may send anything."""
-        return edit_file.parse(json.loads(edit_file.to_json(edit, self.session)), "the edit", self.session)
+        engine = self.session.engine
+        return edit_file.parse(json.loads(edit_file.to_json(edit, engine)), "the edit", engine)
 
     def change_handle(self, **fields: Any) -> None:
         """Change fields of the active handle."""

@@ -55,7 +55,7 @@ def session() -> EditSession:
 
 
 def test_a_script_is_read(session):
-    edit = parse(SCRIPT, "edit.json", session)
+    edit = parse(SCRIPT, "edit.json", session.engine)
     right, tip = edit.handles
     assert right.name == "right" and len(right.nodes) > 2 and right.pivot == (0.8, -1.0, 0.25)
     assert tip.stiffness == 0.5 and tip.lasts == "fade"
@@ -131,7 +131,7 @@ def changed(path: str, value: object) -> dict:
 )
 def test_every_mistake_names_its_field(session, path, value, words):
     with pytest.raises(UserError, match=words) as caught:
-        parse(changed(path, value), "edit.json", session)
+        parse(changed(path, value), "edit.json", session.engine)
     message = str(caught.value)
     assert message.startswith("edit.json: ") and "\n" not in message and "; " in message
 
@@ -152,10 +152,10 @@ def test_files_that_are_no_edit(session, tmp_path, text, words):
     path = tmp_path / "edit.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(UserError, match=words) as caught:
-        read(path, session)
+        read(path, session.engine)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(UserError, match="no such file"):
-        read(tmp_path / "missing.json", session)
+        read(tmp_path / "missing.json", session.engine)
 
 
 def nested(levels: int) -> list:
@@ -173,27 +173,27 @@ def nested(levels: int) -> list:
 )
 def test_whatever_stands_there_the_message_is_one_line(session, path, value):
     with pytest.raises(UserError) as caught:
-        parse(changed(path, value), "edit.json", session)
+        parse(changed(path, value), "edit.json", session.engine)
     assert str(caught.value).isprintable() and len(str(caught.value)) < 500
 
 
 def test_names_that_nobody_knows_are_cut_and_on_one_line(session):
     for inner in ({"a\n" * 1000: 1}, {"targets": {"b\n" * 1000: {"axis": 1}}}, {"film": {"\ud800" * 999: 1}}):
         with pytest.raises(UserError) as caught:
-            parse({**SCRIPT, **inner}, "edit.json", session)
+            parse({**SCRIPT, **inner}, "edit.json", session.engine)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 500
     many = [{"name": f"a handle that is called number {i}", "nodes": [1]} for i in range(900)]
     with pytest.raises(UserError, match="names no handle") as caught:
-        parse({**SCRIPT, "handles": many}, "edit.json", session)
+        parse({**SCRIPT, "handles": many}, "edit.json", session.engine)
     assert len(str(caught.value)) < 500
 
 
 def test_another_count_of_control_points_says_how_to_ask_for_it(session, ply):
     script = {"format": "scgs-warp edit", "version": 1, "scene": {"control_points": 33}}
     with pytest.raises(UserError, match="--nodes 33"):
-        parse(script, "edit.json", EditSession(open_ply(ply, nodes=20)))
+        parse(script, "edit.json", EditSession(open_ply(ply, nodes=20)).engine)
     with pytest.raises(UserError) as caught:
-        parse(script, "edit.json", session)
+        parse(script, "edit.json", session.engine)
     assert "--nodes" not in str(caught.value)
 
 
@@ -222,7 +222,7 @@ def test_what_is_saved_can_be_loaded(tmp_path):
 
 def test_a_film_shows_what_the_session_shows(tmp_path):
     session = EditSession(bar_scene())
-    session.apply(parse(SCRIPT, "edit.json", session))
+    session.apply(parse(SCRIPT, "edit.json", session.engine))
     session.save(tmp_path / "edit.json")
     assert render_film(session, tmp_path / "film") == 4
     other = EditSession(bar_scene())
@@ -242,12 +242,12 @@ def test_cameras(session):
         ({"kind": "fixed", "views": [{"azimuth": 33}]}, (33.0, 33.0, 33.0)),
         ({"kind": "orbit", "views": [{"at": 0, "azimuth": 0}, {"at": 4, "azimuth": 60}]}, (0.0, 30.0, 57.4)),
     ]:
-        own.apply(parse({**changed("film.shot", shot), "film": {"seconds": 4, "shot": shot}}, "x", own))
+        own.apply(parse({**changed("film.shot", shot), "film": {"seconds": 4, "shot": shot}}, "x", own.engine))
         for at, azimuth in zip((0.0, 2.0, 3.5), azimuths):
             x, y, _ = film_camera(own, at).position.tolist()
             assert np.degrees(np.arctan2(y, x)) == pytest.approx(azimuth, abs=0.5)
     shot = {"kind": "fixed", "fov": 20, "up": [0, 2, 0], "views": [{"distance": 7, "target": [1, 2, 3]}]}
-    own.apply(parse(changed("film.shot", shot), "x", own))
+    own.apply(parse(changed("film.shot", shot), "x", own.engine))
     camera = film_camera(own, 0.0)
     assert float((camera.position - torch.tensor([1.0, 2.0, 3.0])).norm()) == pytest.approx(7, rel=1e-5)
 

@@ -211,7 +211,7 @@ def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
         until(lambda: not model.playing)
         assert window.problems == []
 
-    assert read(editor.folder / "edit.json", session) == session.edit
+    assert read(editor.folder / "edit.json", session.engine) == session.edit
     script = EditSession(figure_scene(nodes=200, points=5000)[0])
     script.load(editor.folder / "edit.json")
     assert render_film(script, tmp_path / "script.mp4") == 4

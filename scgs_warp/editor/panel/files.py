@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...edit import Edit, edit_file
 from ...edit.field_reader import MAX_BYTES, parse_object
@@ -14,9 +14,7 @@ from ...visualization.video import write_png
 from .. import files
 from ..escape import plain
 from ..jobs import Jobs
-
-if TYPE_CHECKING:
-    from ..app import Editor
+from .host import Host
 
 NONE: str = "none yet"
 OFFERED = 64 << 20
@@ -26,10 +24,10 @@ OFFERED = 64 << 20
 class FilesSection:
     """Save, load, export."""
 
-    def __init__(self, editor: Editor, jobs: Jobs) -> None:
-        self.editor, self.model, self.jobs = editor, editor.model, jobs
-        gui, click = editor.server.gui, self._click
-        gui.add_markdown(f"Files go to **{plain(editor.folder.name)}** and to the browser.")
+    def __init__(self, host: Host, jobs: Jobs) -> None:
+        self.host, self.model, self.jobs = host, host.model, jobs
+        gui, click = host.server.gui, self._click
+        gui.add_markdown(f"Files go to **{plain(host.folder.name)}** and to the browser.")
         with gui.add_folder("The edit"):
             self.name = gui.add_text("Name", "edit")
             self.replace = gui.add_checkbox(
@@ -39,7 +37,7 @@ class FilesSection:
             self.saved = gui.add_dropdown("Saved", (NONE,))
             click(gui.add_button("Load edit"), lambda event: self.load(self.saved.value))
             self.upload = gui.add_upload_button("Load from this computer", mime_type="application/json")
-            self.upload.on_upload(editor.guarded(lambda event: self.load_bytes(event.target.value.content)))
+            self.upload.on_upload(host.guarded(lambda event: self.load_bytes(event.target.value.content)))
         with gui.add_folder("Results"):
             click(gui.add_button("Screenshot"), lambda event: self.screenshot(event.client))
             self.format = gui.add_dropdown("Film as", (".mp4", ".gif"))
@@ -47,10 +45,10 @@ class FilesSection:
             click(gui.add_button("Export PLY"), lambda event: self.export_ply(event.client))
 
     def _click(self, button: Any, action: Callable[[Any], Any]) -> None:
-        button.on_click(self.editor.guarded(action))
+        button.on_click(self.host.guarded(action))
 
     def _path(self, suffix: str) -> Path:
-        path = files.place(self.editor.folder, self.name.value, suffix)
+        path = files.place(self.host.folder, self.name.value, suffix)
         return path if self.replace.value else files.free(path)
 
     def offer(self, client: Any, path: Path) -> None:
@@ -62,7 +60,7 @@ class FilesSection:
         path = self._path(".json")
         with self.model.lock:
             self.model.session.save(path)
-        self.editor.say(client, "Saved", path.name, "green")
+        self.host.say(client, "Saved", path.name, "green")
         self.offer(client, path)
         return path
 
@@ -74,8 +72,8 @@ class FilesSection:
         """
         if name == NONE:
             raise UserError("no edit is saved here yet; save one, or load one from this computer")
-        path = files.place(self.editor.folder, name, ".json")
-        self._take(lambda: edit_file.read(path, self.model.session))
+        path = files.place(self.host.folder, name, ".json")
+        self._take(lambda: edit_file.read(path, self.model.session.engine))
 
     def load_bytes(self, content: bytes) -> None:
         """An edit that the browser sent.
@@ -89,19 +87,19 @@ class FilesSection:
             text = content.decode("utf-8")
         except UnicodeDecodeError:
             raise UserError("the file is no UTF-8 text; give an edit's JSON") from None
-        self._take(lambda: edit_file.parse(parse_object(text, "the file"), "the file", self.model.session))
+        self._take(lambda: edit_file.parse(parse_object(text, "the file"), "the file", self.model.session.engine))
 
     def _take(self, read: Callable[[], Edit]) -> None:
-        edit = self.editor.worker.call(read)  # places become control points: that needs the motion
+        edit = self.host.worker.call(read)  # places become control points: that needs the motion
         with self.model.changing() as session:
             session.apply(edit)
 
     def screenshot(self, client: Any) -> Path:
         """The picture as the client sees it, in full, without overlays."""
-        camera, moment = self.editor.camera(client), self.model.moment()
+        camera, moment = self.host.camera(client), self.model.moment()
         if not camera.usable:
             raise UserError("the browser's window has no size; open it and try again")
-        picture = self.editor.worker.call(lambda: self.editor.take(moment, camera))
+        picture = self.host.worker.call(lambda: self.host.take(moment, camera))
         path = self._path(".png")
         try:
             write_png(path, picture.rgb)
@@ -120,7 +118,7 @@ class FilesSection:
             session = self.model.session.fork()
 
         def work(advance: Callable[[], None]) -> Path:
-            compute = lambda draw: self.editor.worker.call(draw, patient=True)  # noqa: E731
+            compute = lambda draw: self.host.worker.call(draw, patient=True)  # noqa: E731
             render_film(session, path, advance, compute)
             return path
 
@@ -135,13 +133,13 @@ class FilesSection:
             session = self.model.session.fork()
 
         def work(advance: Callable[[], None]) -> Path:
-            self.editor.worker.call(lambda: session.export_ply(path, moment.time, moment.at), patient=True)
+            self.host.worker.call(lambda: session.export_ply(path, moment.time, moment.at), patient=True)
             return path
 
         self._start(client, f"PLY {path.name}", 1, work)
         return path
 
     def show(self) -> None:
-        names = files.edits(self.editor.folder) or (NONE,)
+        names = files.edits(self.host.folder) or (NONE,)
         if self.saved.options != names:
             self.saved.options = names

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...edit.keyframes import Easing
 from ...errors import UserError
 from ..film_camera import view_of
-
-if TYPE_CHECKING:
-    from ..app import Editor
+from .host import Host
 
 NONE = "none"
 EASINGS: tuple[Easing, ...] = ("smooth", "linear", "ease", "step")
@@ -25,15 +23,15 @@ REPEATS = ("once", "loop", "swing", "stand still")
 class TimeSection:
     """The slider and play."""
 
-    def __init__(self, editor: Editor) -> None:
-        gui, self.model = editor.server.gui, editor.model
+    def __init__(self, host: Host) -> None:
+        gui, self.model = host.server.gui, host.model
         film = self.model.session.edit.film
-        self.at = editor.on_value(
+        self.at = host.on_value(
             gui.add_slider("Second", 0.0, film.seconds, min(1.0 / film.fps, film.seconds), 0.0, hint="Of the film"),
             self.model.seek,
         )
         self.play = gui.add_button("Play")
-        self.play.on_click(editor.guarded(lambda event: self.model.play(not self.model.playing)))
+        self.play.on_click(host.guarded(lambda event: self.model.play(not self.model.playing)))
 
     def show(self) -> None:
         model = self.model
@@ -47,21 +45,21 @@ class TimeSection:
 class FilmSection:
     """Keyframes, playback and the film's settings."""
 
-    def __init__(self, editor: Editor) -> None:
-        self.editor, self.model = editor, editor.model
-        gui, on = editor.server.gui, editor.on_value
+    def __init__(self, host: Host) -> None:
+        self.host, self.model = host, host.model
+        gui, on = host.server.gui, host.on_value
         with gui.add_folder("Keyframes"):
             self.list = gui.add_markdown("")
             self.easing = gui.add_dropdown("Way to the next", EASINGS)
             self.add = gui.add_button("Add keyframe here")
-            self.add.on_click(editor.guarded(lambda event: self.model.add_keyframe(self.easing.value)))
+            self.add.on_click(host.guarded(lambda event: self.model.add_keyframe(self.easing.value)))
             self.chosen = on(gui.add_dropdown("Keyframe", (NONE,)), self._go)
             self.remove = gui.add_button("Remove this keyframe")
-            self.remove.on_click(editor.guarded(lambda event: self._remove()))
+            self.remove.on_click(host.guarded(lambda event: self._remove()))
         self._dress_film()
 
     def _dress_film(self) -> None:
-        gui, on, film = self.editor.server.gui, self.editor.on_value, self.model.session.edit.film
+        gui, on, film = self.host.server.gui, self.host.on_value, self.model.session.edit.film
         with gui.add_folder("Film"):
             self.seconds = on(
                 gui.add_number(
@@ -82,7 +80,7 @@ class FilmSection:
             self.repeat = on(gui.add_dropdown("The motion plays", REPEATS), self._repeat)
             self.speed = on(gui.add_number("Speed", 1.0, min=-100.0, max=100.0, step=0.1), self._speed)
             self.camera = gui.add_button_group("Camera", ("Round", "From here"))
-            self.camera.on_click(self.editor.guarded(self._shot))
+            self.camera.on_click(self.host.guarded(self._shot))
 
     def _film(self, **fields: Any) -> None:
         self.model.replace(film=dataclasses.replace(self.model.session.edit.film, **fields))
@@ -102,7 +100,7 @@ class FilmSection:
         if event.target.value == "Round":
             self._film(shot=dataclasses.replace(shot, kind="turntable"))
         else:
-            view = view_of(self.model.session, self.editor.camera(event.client))
+            view = view_of(self.model.session, self.host.camera(event.client))
             self._film(shot=dataclasses.replace(shot, kind="fixed", views=(view,), up=None))
 
     def _go(self, name: str) -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...edit.playback import Exaggerate, Hold
 from ...errors import UserError
-
-if TYPE_CHECKING:
-    from ..app import Editor
+from .host import Host
 
 NONE = "none"
 UNCHANGED = 1.0
@@ -20,13 +18,13 @@ MOST = 3.0
 class MotionSection:
     """Holds and exaggeration, for what is selected at the moment shown."""
 
-    def __init__(self, editor: Editor) -> None:
-        self.editor, self.model = editor, editor.model
+    def __init__(self, host: Host) -> None:
+        self.host, self.model = host, host.model
         self._dress_holds()
         self._dress_exaggeration()
 
     def _dress_holds(self) -> None:
-        gui = self.editor.server.gui
+        gui = self.host.server.gui
         with gui.add_folder("Hold still"):
             self.list = gui.add_markdown("")
             self.frame = gui.add_dropdown(
@@ -34,22 +32,22 @@ class MotionSection:
             )
             self.rings = gui.add_slider("Rings that bend", 0, 12, 1, Hold(()).rings)
             self.add = gui.add_button("Hold the selection as it is now")
-            self.add.on_click(self.editor.guarded(lambda event: self._hold()))
-            self.chosen = self.editor.on_value(gui.add_dropdown("Hold", (NONE,)), self._select)
+            self.add.on_click(self.host.guarded(lambda event: self._hold()))
+            self.chosen = self.host.on_value(gui.add_dropdown("Hold", (NONE,)), self._select)
             self.remove = gui.add_button("Let go of this one")
-            self.remove.on_click(self.editor.guarded(lambda event: self._release()))
+            self.remove.on_click(self.host.guarded(lambda event: self._release()))
 
     def _dress_exaggeration(self) -> None:
-        gui, on = self.editor.server.gui, self.editor.on_value
+        gui, on = self.host.server.gui, self.host.on_value
         with gui.add_folder("Exaggerate"):
             self.factor = on(
                 gui.add_slider("Motion times", 0.0, MOST, 0.05, UNCHANGED, hint="Every turn of it; 1: as it was"),
                 lambda factor: self._exaggerate(factor=float(factor)),
             )
             self.buttons = gui.add_button_group("", ("Only selection", "All", "Off"))
-            self.buttons.on_click(self.editor.guarded(lambda event: self._extent(event.target.value)))
+            self.buttons.on_click(self.host.guarded(lambda event: self._extent(event.target.value)))
             self.about = gui.add_button_group("Unchanged", ("Mean pose", "This moment"))
-            self.about.on_click(self.editor.guarded(lambda event: self._about(event.target.value)))
+            self.about.on_click(self.host.guarded(lambda event: self._about(event.target.value)))
             self.extent = gui.add_markdown("")
 
     def _hold(self) -> None:

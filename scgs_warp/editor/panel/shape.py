@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +12,7 @@ from ...edit import Target
 from ...edit.handles import STAY
 from ...edit.rotations import exponential, logarithm
 from ...errors import UserError
-
-if TYPE_CHECKING:
-    from ..app import Editor
+from .host import Host
 
 NEW = "new, from the selection"
 EXACT = 0.0
@@ -24,15 +22,15 @@ EXACT = 0.0
 class ShapeSection:
     """Selection, handle, pins."""
 
-    def __init__(self, editor: Editor) -> None:
-        self.editor, self.model = editor, editor.model
+    def __init__(self, host: Host) -> None:
+        self.host, self.model = host, host.model
         self._dress_selection()
         self._dress_handle()
         self._dress_pins()
 
     def _dress_selection(self) -> None:
-        gui, model, on = self.editor.server.gui, self.model, self.editor.on_value
-        unit = self.editor.edge_length
+        gui, model, on = self.host.server.gui, self.model, self.host.on_value
+        unit = self.host.edge_length
         with gui.add_folder("Selection"):
             self.kind = on(gui.add_dropdown("A click takes", ("rings", "brush")), lambda kind: self._region(kind=kind))
             self.rings = on(gui.add_slider("Rings", 0, 12, 1, model.region.rings), lambda n: self._region(rings=n))
@@ -45,7 +43,7 @@ class ShapeSection:
                 lambda how: model.set(combine=how),
             )
             self.buttons = gui.add_button_group("", ("Grow", "All", "None"))
-            self.buttons.on_click(self.editor.guarded(lambda event: self._select(event.target.value)))
+            self.buttons.on_click(self.host.guarded(lambda event: self._select(event.target.value)))
 
     def _region(self, **fields: Any) -> None:
         self.model.set(region=dataclasses.replace(self.model.region, **fields))
@@ -60,11 +58,11 @@ class ShapeSection:
             model.select(tuple(range(len(session))) if what == "All" else ())
 
     def _dress_handle(self) -> None:
-        gui, model, on = self.editor.server.gui, self.model, self.editor.on_value
+        gui, model, on = self.host.server.gui, self.model, self.host.on_value
         with gui.add_folder("Handle"):
             self.handle = on(gui.add_dropdown("Handle", (NEW,)), lambda label: model.activate(self._names()[label]))
             self.move = on(
-                gui.add_vector3("Move", (0.0, 0.0, 0.0), step=_round(0.1 * self.editor.edge_length)), self._moved
+                gui.add_vector3("Move", (0.0, 0.0, 0.0), step=_round(0.1 * self.host.edge_length)), self._moved
             )
             self.turn = on(
                 gui.add_vector3(
@@ -87,7 +85,7 @@ class ShapeSection:
                 lambda s: self._set(stiffness=None if s == EXACT else s),
             )
             self.remove = gui.add_button_group("", ("Put back", "Remove"))
-            self.remove.on_click(self.editor.guarded(lambda event: self._ended(event.target.value)))
+            self.remove.on_click(self.host.guarded(lambda event: self._ended(event.target.value)))
 
     def _names(self) -> dict[str, str | None]:
         """Handles by their labels; a handle may be called anything, even what stands for none."""
@@ -100,13 +98,13 @@ class ShapeSection:
         return found
 
     def _moved(self, where: tuple[float, float, float]) -> None:
-        self.editor.put(Target.of(where, self.model.target.rotation))
+        self.host.put(Target.of(where, self.model.target.rotation))
 
     def _turned(self, degrees: tuple[float, float, float]) -> None:
         if not all(map(math.isfinite, degrees)):
             raise UserError(f"turn {list(degrees)}: must be three finite numbers; the handle stays where it is")
         turn = exponential(np.radians(degrees))
-        self.editor.put(Target.of(self.model.target.translation, turn.tolist()))
+        self.host.put(Target.of(self.model.target.translation, turn.tolist()))
 
     def _set(self, **fields: Any) -> None:
         """Of the handle in hand, and of the next ones."""
@@ -116,12 +114,12 @@ class ShapeSection:
 
     def _ended(self, what: str) -> None:
         if what == "Put back":
-            self.editor.put(STAY)
+            self.host.put(STAY)
         else:
             self.model.remove_handle()
 
     def _dress_pins(self) -> None:
-        gui, model, on = self.editor.server.gui, self.model, self.editor.on_value
+        gui, model, on = self.host.server.gui, self.model, self.host.on_value
         with gui.add_folder("Pins"):
             self.rest = on(
                 gui.add_checkbox(
@@ -134,7 +132,7 @@ class ShapeSection:
                 lambda rings: model.set(pin_rings=int(rings) if self.rest.value else None),
             )
             self.pins = gui.add_button_group("", ("Pin", "Unpin", "Pin rest", "Unpin all"))
-            self.pins.on_click(self.editor.guarded(lambda event: self._pin(event.target.value)))
+            self.pins.on_click(self.host.guarded(lambda event: self._pin(event.target.value)))
 
     def _pin(self, what: str) -> None:
         model = self.model
