@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import UserError
 from .document import Edit, Film, Shot, View
 from .engine import Engine
-from .field_reader import Node, one_line, read_object, shown
+from .field_reader import FieldReader, one_line, read_object, show_value
 from .handles import Handle, Target, handle_fields
 from .keyframes import MAX_SECONDS, Keyframe, keyframe_fields
 from .playback import Exaggerate, Hold, Playback
@@ -78,20 +78,20 @@ def read(path: Path, engine: Engine) -> Edit:
 
 def parse(content: Any, source: str, engine: Engine) -> Edit:
     """As ``read``, of a JSON value; ``source`` is what errors name."""
-    root = Node(content, source)
+    root = FieldReader(content, source)
     if root.raw("format") != FORMAT:
-        raise root.wrong("format", f"is {shown(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
+        raise root.wrong("format", f"is {show_value(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
     if root.raw("version") != VERSION:
-        raise root.wrong("version", f"is {shown(root.raw('version'))}", f"this program reads version {VERSION}")
+        raise root.wrong("version", f"is {show_value(root.raw('version'))}", f"this program reads version {VERSION}")
     _check_scene(root, engine)
     handles: list[Handle] = []
-    for node in root.children("handles", 1000):
-        handle = _handle(node, engine)
+    for fields in root.children("handles", 1000):
+        handle = _handle(fields, engine)
         if any(handle.name == other.name for other in handles):
-            raise node.wrong("name", f"{handle.name!r} is taken", "give every handle a name of its own")
+            raise fields.wrong("name", f"{handle.name!r} is taken", "give every handle a name of its own")
         handles.append(handle)
     names = {handle.name for handle in handles}
-    frames = [_keyframe(node, names) for node in root.children("keyframes")]
+    frames = [_keyframe(fields, names) for fields in root.children("keyframes")]
     frames.sort(key=lambda frame: frame.at)
     for first, second in pairwise(frames):
         if first.at == second.at:
@@ -102,7 +102,7 @@ def parse(content: Any, source: str, engine: Engine) -> Edit:
         targets=_targets(root, names),
         keyframes=tuple(frames),
         playback=_playback(root.child("playback")),
-        holds=tuple(_hold(node, engine) for node in root.children("hold", 1000)),
+        holds=tuple(_hold(fields, engine) for fields in root.children("hold", 1000)),
         exaggerate=_exaggerate(root.child("exaggerate"), engine),
         film=film_of(root.child("film")),
     )
@@ -110,7 +110,7 @@ def parse(content: Any, source: str, engine: Engine) -> Edit:
     return edit
 
 
-def _check_scene(root: Node, engine: Engine) -> None:
+def _check_scene(root: FieldReader, engine: Engine) -> None:
     scene = root.child("scene")
     if scene is None:
         return
@@ -127,48 +127,48 @@ def _check_scene(root: Node, engine: Engine) -> None:
     scene.done()
 
 
-def _nodes(node: Node, name: str, engine: Engine, *, time: float = 0.0) -> tuple[int, ...]:
-    """A list of control points, or a place: {"point", "rings"}, {"sphere", "radius"}, {"box"}, at a time."""
-    value = node.raw(name)
+def _nodes(fields: FieldReader, name: str, engine: Engine, *, time: float = 0.0) -> tuple[int, ...]:
+    """A list of control points, or a region: {"point", "rings"}, {"sphere", "radius"}, {"box"}, at a time."""
+    value = fields.raw(name)
     if isinstance(value, dict):
-        return _place(Node(value, node.source, f"{node.place}.{name}".strip(".")), engine, time)
+        return _region(FieldReader(value, fields.source, f"{fields.path}.{name}".strip(".")), engine, time)
     if value is None or not isinstance(value, list) or not value:
-        raise node.wrong(name, "is missing or empty", "list control points, or say a place: point, sphere or box")
+        raise fields.wrong(name, "is missing or empty", "list control points, or say a place: point, sphere or box")
     last = len(engine.graph) - 1
     for index in value:
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index <= last:
-            raise node.wrong(name, f"names control point {shown(index)}", f"give whole numbers from 0 to {last}")
+            raise fields.wrong(name, f"names control point {show_value(index)}", f"give whole numbers from 0 to {last}")
     return tuple(sorted(set(value)))
 
 
-def _place(place: Node, engine: Engine, time: float) -> tuple[int, ...]:
-    time = place.number("time", time, 0.0, 1.0)
+def _region(region: FieldReader, engine: Engine, time: float) -> tuple[int, ...]:
+    time = region.number("time", time, 0.0, 1.0)
     points = engine.to_world(engine.motion_at(time).positions)
-    point, sphere, box = place.vector("point", 3), place.vector("sphere", 3), place.items("box", 2)
-    rings = place.integer("rings", 0, 0, 1000)
-    radius = place.number("radius", None, 0.0)
-    place.done()
+    point, sphere, box = region.vector("point", 3), region.vector("sphere", 3), region.items("box", 2)
+    rings = region.integer("rings", 0, 0, 1000)
+    radius = region.number("radius", None, 0.0)
+    region.done()
     if point is not None:
         chosen = [int(np.linalg.norm(points - point, axis=1).argmin())]
     elif sphere is not None and radius is not None:
         chosen = np.flatnonzero(np.linalg.norm(points - sphere, axis=1) <= radius).tolist()
     elif len(box) == 2:
-        corners = Node({"low": box[0], "high": box[1]}, place.source, f"{place.place}.box")
+        corners = FieldReader({"low": box[0], "high": box[1]}, region.source, f"{region.path}.box")
         low, high = corners.vector("low", 3), corners.vector("high", 3)
         if low is None or high is None:
-            raise place.wrong("box", "lacks a corner", "give two corners of 3 numbers")
+            raise region.wrong("box", "lacks a corner", "give two corners of 3 numbers")
         chosen = np.flatnonzero(((points >= np.array(low)) & (points <= np.array(high))).all(axis=1)).tolist()
     else:
-        raise place.wrong("", "says no place", "give point, sphere with radius, or box with two corners")
+        raise region.wrong("", "says no place", "give point, sphere with radius, or box with two corners")
     if not chosen:
-        raise place.wrong("", f"holds no control point at time {time:g}", "make it larger or move it")
+        raise region.wrong("", f"holds no control point at time {time:g}", "make it larger or move it")
     return engine.graph.ring(chosen, rings)
 
 
-def _handle(node: Node, engine: Engine) -> Handle:
-    fields = handle_fields(node)
-    handle = Handle(nodes=_nodes(node, "nodes", engine, time=fields["time"]), **fields)
-    node.done("comment")
+def _handle(fields: FieldReader, engine: Engine) -> Handle:
+    values = handle_fields(fields)
+    handle = Handle(nodes=_nodes(fields, "nodes", engine, time=values["time"]), **values)
+    fields.done("comment")
     return handle
 
 
@@ -177,113 +177,116 @@ def _too_short(direction: tuple[float, ...]) -> bool:
     return not sum(x * x for x in direction) > 1e-200
 
 
-def _pins(root: Node, handles: list[Handle], engine: Engine) -> tuple[int, ...]:
+def _pins(root: FieldReader, handles: list[Handle], engine: Engine) -> tuple[int, ...]:
     value = root.raw("pins")
     if value is None or value == []:
         return ()
     if isinstance(value, dict) and "beyond" in value:
-        node = Node(value, root.source, "pins")
-        rings = node.integer("beyond", 2, 0, 1000)
-        node.done()
+        fields = FieldReader(value, root.source, "pins")
+        rings = fields.integer("beyond", 2, 0, 1000)
+        fields.done()
         return engine.graph.beyond({n for handle in handles for n in handle.nodes}, rings)
     return _nodes(root, "pins", engine)
 
 
-def _target(node: Node) -> Target:
+def _target(fields: FieldReader) -> Target:
     """``rotation`` as a quaternion wxyz, or as ``axis`` and ``degrees``."""
-    rotation, axis = node.vector("rotation", 4), node.vector("axis", 3)
-    degrees = node.number("degrees", None, -180.0, 180.0)
-    translation = node.vector("translation", 3)
+    rotation, axis = fields.vector("rotation", 4), fields.vector("axis", 3)
+    degrees = fields.number("degrees", None, -180.0, 180.0)
+    translation = fields.vector("translation", 3)
     if (axis is None) != (degrees is None) or (rotation is not None and axis is not None):
-        raise node.wrong("axis", "and degrees belong together", "give both, or rotation alone")
+        raise fields.wrong("axis", "and degrees belong together", "give both, or rotation alone")
     if axis is not None:
         if _too_short(axis):
-            raise node.wrong("axis", "has no direction", "give 3 numbers, not all 0 or next to it")
+            raise fields.wrong("axis", "has no direction", "give 3 numbers, not all 0 or next to it")
         rotation = tuple(from_axis(axis, degrees).tolist())
-    node.done()
+    fields.done()
     try:
         return Target.of(translation, rotation)
     except UserError as error:
-        raise node.wrong("", f"is wrong: {error}", "correct it") from None
+        raise fields.wrong("", f"is wrong: {error}", "correct it") from None
 
 
-def _targets(root: Node, names: set[str]) -> dict[str, Target]:
+def _targets(root: FieldReader, names: set[str]) -> dict[str, Target]:
     found = {}
-    for name, node in root.entries("targets"):
+    for name, fields in root.entries("targets"):
         if name not in names:
-            raise node.wrong("", "names no handle", f"there is {one_line(', '.join(sorted(names))) or 'none'}")
-        found[name] = _target(node)
+            raise fields.wrong("", "names no handle", f"there is {one_line(', '.join(sorted(names))) or 'none'}")
+        found[name] = _target(fields)
     return found
 
 
-def _keyframe(node: Node, names: set[str]) -> Keyframe:
-    frame = Keyframe(**keyframe_fields(node), targets=_targets(node, names))
-    node.done("comment")
+def _keyframe(fields: FieldReader, names: set[str]) -> Keyframe:
+    frame = Keyframe(**keyframe_fields(fields), targets=_targets(fields, names))
+    fields.done("comment")
     return frame
 
 
-def _playback(node: Node | None) -> Playback:
-    if node is None:
+def _playback(fields: FieldReader | None) -> Playback:
+    if fields is None:
         return Playback()
     pairs = []
-    for index, pair in enumerate(node.items("map")):
-        at, time = Node({"pair": pair}, node.source, f"{node.place}.map[{index}]").vector("pair", 2) or (0.0, -1.0)
+    for index, pair in enumerate(fields.items("map")):
+        reader = FieldReader({"pair": pair}, fields.source, f"{fields.path}.map[{index}]")
+        at, time = reader.vector("pair", 2) or (0.0, -1.0)
         if not (0.0 <= time <= 1.0 and at >= 0.0 and (not pairs or at > pairs[-1][0])):
-            raise node.wrong(f"map[{index}]", f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]")
+            raise fields.wrong(
+                f"map[{index}]", f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]"
+            )
         pairs.append((at, time))
     found = Playback(
-        seconds=node.number("seconds", None, 1e-3, MAX_SECONDS),
-        speed=node.number("speed", 1.0, -1000.0, 1000.0),
-        start=node.number("start", 0.0, 0.0, 1.0),
-        repeat=node.choice("repeat", ("once", "loop", "swing"), "once"),
-        freeze=node.number("freeze", None, 0.0, 1.0),
+        seconds=fields.number("seconds", None, 1e-3, MAX_SECONDS),
+        speed=fields.number("speed", 1.0, -1000.0, 1000.0),
+        start=fields.number("start", 0.0, 0.0, 1.0),
+        repeat=fields.choice("repeat", ("once", "loop", "swing"), "once"),
+        freeze=fields.number("freeze", None, 0.0, 1.0),
         map=tuple(pairs),
     )
-    node.done()
+    fields.done()
     return found
 
 
-def _hold(node: Node, engine: Engine) -> Hold:
-    time = node.number("time", 0.0, 0.0, 1.0)
-    frame = node.choice("frame", ("body", "world"), "body")
-    found = Hold(_nodes(node, "nodes", engine, time=time), time, frame, node.integer("rings", 2, 0, 100))
-    node.done("comment")
+def _hold(fields: FieldReader, engine: Engine) -> Hold:
+    time = fields.number("time", 0.0, 0.0, 1.0)
+    frame = fields.choice("frame", ("body", "world"), "body")
+    found = Hold(_nodes(fields, "nodes", engine, time=time), time, frame, fields.integer("rings", 2, 0, 100))
+    fields.done("comment")
     return found
 
 
-def _exaggerate(node: Node | None, engine: Engine) -> Exaggerate | None:
-    if node is None:
+def _exaggerate(fields: FieldReader | None, engine: Engine) -> Exaggerate | None:
+    if fields is None:
         return None
-    nodes = _nodes(node, "nodes", engine) if node.raw("nodes") else ()
-    found = Exaggerate(node.number("factor", 1.5, -10.0, 10.0), node.number("about", None, 0.0, 1.0), nodes)
-    node.done("comment")
+    nodes = _nodes(fields, "nodes", engine) if fields.raw("nodes") else ()
+    found = Exaggerate(fields.number("factor", 1.5, -10.0, 10.0), fields.number("about", None, 0.0, 1.0), nodes)
+    fields.done("comment")
     return found
 
 
-def film_of(node: Node | None) -> Film:
+def film_of(fields: FieldReader | None) -> Film:
     """Read a film's settings.
 
     Raises:
         UserError: naming the field.
     """
-    if node is None:
+    if fields is None:
         return Film()
     found = Film(
-        seconds=node.number("seconds", 4.0, 1e-3, MAX_SECONDS),
-        fps=node.number("fps", 30.0, 0.01, 1000.0),
-        size=node.integer("size", 512, 16, MAX_FILM_SIZE),
-        background=node.vector("background", 3, None, 0.0, 1.0),
-        shot=_shot(node.child("shot")),
+        seconds=fields.number("seconds", 4.0, 1e-3, MAX_SECONDS),
+        fps=fields.number("fps", 30.0, 0.01, 1000.0),
+        size=fields.integer("size", 512, 16, MAX_FILM_SIZE),
+        background=fields.vector("background", 3, None, 0.0, 1.0),
+        shot=_shot(fields.child("shot")),
     )
-    node.done()
+    fields.done()
     return found
 
 
-def _shot(node: Node | None) -> Shot:
-    if node is None:
+def _shot(fields: FieldReader | None) -> Shot:
+    if fields is None:
         return Shot()
     views = []
-    for view in node.children("views"):
+    for view in fields.children("views"):
         views.append(
             View(
                 at=view.number("at", 0.0, 0.0, MAX_SECONDS),
@@ -296,15 +299,15 @@ def _shot(node: Node | None) -> Shot:
         view.done()
     views.sort(key=lambda view: view.at)
     found = Shot(
-        kind=node.choice("kind", ("turntable", "fixed", "orbit"), "turntable"),
+        kind=fields.choice("kind", ("turntable", "fixed", "orbit"), "turntable"),
         views=tuple(views) or (View(),),
-        turns=node.number("turns", 1.0, -1000.0, 1000.0),
-        up=node.vector("up", 3),
-        fov=node.number("fov", None, 1.0, 150.0),
+        turns=fields.number("turns", 1.0, -1000.0, 1000.0),
+        up=fields.vector("up", 3),
+        fov=fields.number("fov", None, 1.0, 150.0),
     )
     if found.up is not None and _too_short(found.up):
-        raise node.wrong("up", "has no direction", "give 3 numbers, not all 0 or next to it")
+        raise fields.wrong("up", "has no direction", "give 3 numbers, not all 0 or next to it")
     if any(a.at == b.at for a, b in pairwise(views)):
-        raise node.wrong("views", "has two at one moment", "give every view a moment of its own")
-    node.done()
+        raise fields.wrong("views", "has two at one moment", "give every view a moment of its own")
+    fields.done()
     return found

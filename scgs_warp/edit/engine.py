@@ -25,13 +25,13 @@ from .pose import MotionPose, NodePose, Rig, motion_pose, pose_gaussians
 from .rotations import from_matrix, slerp, unit
 from .solver import STEP_ITERATIONS, ArapSolver, Shape, count_steps
 
-CACHED = 64
+CACHED_INSTANTS = 64
 """Instants whose control points are remembered."""
 LIVE_STEPS = 4
 """Sub-steps that one drag update takes at most; a drag further than that catches up with the next updates."""
 LIVE_ITERATIONS = 8
 
-OPAQUE = 0.1
+MIN_OPACITY = 0.1
 """Gaussians of less opacity tie no control points together."""
 
 Value = TypeVar("Value")
@@ -85,7 +85,7 @@ class Engine:
 
     def _shared(self) -> np.ndarray:
         """[N, 2] the two nearest control points of every opaque Gaussian."""
-        opaque = (self.scene.gaussians.opacities() > OPAQUE).cpu().numpy()
+        opaque = (self.scene.gaussians.opacities() > MIN_OPACITY).cpu().numpy()
         return self.binding[0][:, :2].cpu().numpy()[opaque if opaque.any() else slice(None)]
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
@@ -260,6 +260,6 @@ def _remember(cache: OrderedDict[Any, Value], key: Any, make: Callable[[], Value
         cache.move_to_end(key)
         return cache[key]
     value = cache[key] = make()
-    while len(cache) > CACHED:
+    while len(cache) > CACHED_INSTANTS:
         cache.popitem(last=False)
     return value

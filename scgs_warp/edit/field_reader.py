@@ -13,7 +13,7 @@ from ..storage.files import parse_json
 
 MAX_BYTES = 64 << 20
 """A larger file is no edit."""
-LIMIT = 1e9
+MAX_NUMBER = 1e9
 """Of numbers that nothing else limits: beyond it float32 leaves no scene."""
 
 
@@ -65,13 +65,13 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-class Node:
+class FieldReader:
     """A JSON object and where it stands. Fields are taken by name; ``done`` refuses what nobody took."""
 
-    def __init__(self, value: Any, source: str, place: str = "") -> None:
-        self.source, self.place = source, place
+    def __init__(self, value: Any, source: str, path: str = "") -> None:
+        self.source, self.path = source, path
         if not isinstance(value, dict):
-            raise self.wrong("", f"is {shown(value)}", "give an object")
+            raise self.wrong("", f"is {show_value(value)}", "give an object")
         self._value = value
         self._taken: set[str] = set()
 
@@ -81,7 +81,7 @@ class Node:
 
     def _inside(self, name: str) -> str:
         """The place of a field; names that people made up may be anything."""
-        return ".".join(part for part in (self.place, one_line(name)) if part)
+        return ".".join(part for part in (self.path, one_line(name)) if part)
 
     def __contains__(self, name: str) -> bool:
         return self._value.get(name) is not None
@@ -96,12 +96,12 @@ class Node:
             known = ", ".join(sorted(self._taken | set(also)))
             raise self.wrong(unknown[0], "is not known", f"known here: {known}")
 
-    def number(self, name: str, default: Any = None, low: float = -LIMIT, high: float = LIMIT) -> Any:
+    def number(self, name: str, default: Any = None, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> Any:
         value = self.raw(name)
         if value is None:
             return default
         if not _is_number(value) or not low <= value <= high:
-            raise self.wrong(name, f"is {shown(value)}", f"give a number from {low:g} to {high:g}")
+            raise self.wrong(name, f"is {show_value(value)}", f"give a number from {low:g} to {high:g}")
         return float(value)
 
     def integer(self, name: str, default: int, low: int, high: int) -> int:
@@ -109,13 +109,13 @@ class Node:
         if value is None:
             return default
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.wrong(name, f"is {shown(value)}", f"give a whole number from {low} to {high}")
+            raise self.wrong(name, f"is {show_value(value)}", f"give a whole number from {low} to {high}")
         return value
 
-    def truth(self, name: str) -> bool | None:
+    def boolean(self, name: str) -> bool | None:
         value = self.raw(name)
         if value is not None and not isinstance(value, bool):
-            raise self.wrong(name, f"is {shown(value)}", "give true or false")
+            raise self.wrong(name, f"is {show_value(value)}", "give true or false")
         return value
 
     def choice(self, name: str, options: tuple[str, ...], default: str) -> Any:
@@ -123,23 +123,25 @@ class Node:
         if value is None:
             return default
         if not isinstance(value, str) or value not in options:
-            raise self.wrong(name, f"is {shown(value)}", f"choose one of {', '.join(options)}")
+            raise self.wrong(name, f"is {show_value(value)}", f"choose one of {', '.join(options)}")
         return value
 
     def text(self, name: str) -> str:
         value = self.raw(name)
         if not isinstance(value, str) or not value.strip() or len(value) > 100 or not value.isprintable():
-            raise self.wrong(name, f"is {shown(value)}", "give a name of 1 to 100 letters")
+            raise self.wrong(name, f"is {show_value(value)}", "give a name of 1 to 100 letters")
         return value
 
-    def vector(self, name: str, size: int, default: Any = None, low: float = -LIMIT, high: float = LIMIT) -> Any:
+    def vector(
+        self, name: str, size: int, default: Any = None, low: float = -MAX_NUMBER, high: float = MAX_NUMBER
+    ) -> Any:
         value = self.raw(name)
         if value is None:
             return default
         fits = isinstance(value, list | tuple) and len(value) == size and all(map(_is_number, value))
         if not fits or not all(low <= x <= high for x in value):
-            limits = "" if high == LIMIT else f" from {low:g} to {high:g}"
-            raise self.wrong(name, f"is {shown(value)}", f"give {size} numbers{limits}")
+            limits = "" if high == MAX_NUMBER else f" from {low:g} to {high:g}"
+            raise self.wrong(name, f"is {show_value(value)}", f"give {size} numbers{limits}")
         return tuple(float(x) for x in value)
 
     def items(self, name: str, most: int = 100_000) -> list[Any]:
@@ -147,18 +149,18 @@ class Node:
         if value is None:
             return []
         if not isinstance(value, list) or len(value) > most:
-            raise self.wrong(name, f"is {shown(value)}", f"give a list of at most {most}")
+            raise self.wrong(name, f"is {show_value(value)}", f"give a list of at most {most}")
         return value
 
-    def child(self, name: str) -> Node | None:
+    def child(self, name: str) -> FieldReader | None:
         value = self.raw(name)
-        return None if value is None else Node(value, self.source, self._inside(name))
+        return None if value is None else FieldReader(value, self.source, self._inside(name))
 
-    def children(self, name: str, most: int = 10_000) -> Iterator[Node]:
+    def children(self, name: str, most: int = 10_000) -> Iterator[FieldReader]:
         for index, value in enumerate(self.items(name, most)):
-            yield Node(value, self.source, f"{self._inside(name)}[{index}]")
+            yield FieldReader(value, self.source, f"{self._inside(name)}[{index}]")
 
-    def entries(self, name: str) -> Iterator[tuple[str, Node]]:
+    def entries(self, name: str) -> Iterator[tuple[str, FieldReader]]:
         """Of an object of objects."""
         inner = self.child(name)
         if inner is not None:
@@ -178,7 +180,7 @@ def _is_number(value: Any) -> bool:
         return False
 
 
-def shown(value: Any) -> str:
+def show_value(value: Any) -> str:
     """A JSON value in at most 60 characters of one line."""
     try:
         text = json.dumps(value) if value is not None else "missing"

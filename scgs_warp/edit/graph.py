@@ -16,11 +16,11 @@ from .rotations import rotate
 
 NEIGHBORS = 7
 """Control points each one asks for; the union of both sides wishes makes it some nine."""
-LONGEST = 3.0
+MAX_EDGE_RATIO = 3.0
 """An edge longer than so many times the median one ties nothing together."""
-SMALLEST = 4
+MIN_COMPONENT_SIZE = 4
 """Fewer control points than this, cut off from all others, follow the nearest ones that are not."""
-TIMES = 16
+SAMPLE_COUNT = 16
 """Instants at which trajectories are compared."""
 
 
@@ -132,13 +132,13 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.nda
     offsets = tracks[:, pairs[:, 0]] - tracks[:, pairs[:, 1]]
     lengths = np.sqrt((offsets**2).sum(-1).mean(0))
     median = float(np.median(lengths)) if len(lengths) else 1.0
-    pairs = pairs[lengths <= LONGEST * median]
+    pairs = pairs[lengths <= MAX_EDGE_RATIO * median]
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     matrix = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(nodes, nodes)).tocsr()
     matrix.sort_indices()
     component = connected_components(matrix, directed=False)[1].astype(np.int32)
     begin, columns = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32)
-    stray = _strays(tracks, component, LONGEST * median)
+    stray = _strays(tracks, component, MAX_EDGE_RATIO * median)
     return ControlGraph(begin, columns, matrix.data.astype(np.float64), component, median or 1.0, stray)
 
 
@@ -154,7 +154,7 @@ def _near(shared: np.ndarray, nodes: int) -> csr_matrix:
 def _strays(tracks: np.ndarray, component: np.ndarray, reach: float) -> np.ndarray:
     """Whom the members of tiny components follow: the nearest member of a large one, within a few edges' length."""
     stray = np.full(len(component), -1, np.int32)
-    small = np.bincount(component, minlength=1)[component] < SMALLEST
+    small = np.bincount(component, minlength=1)[component] < MIN_COMPONENT_SIZE
     if not small.any() or small.all():
         return stray
     held = np.flatnonzero(~small)
@@ -167,4 +167,4 @@ def _strays(tracks: np.ndarray, component: np.ndarray, reach: float) -> np.ndarr
 
 def sample_times(moves: bool) -> Tensor:
     """Instants for ``build_graph``."""
-    return torch.linspace(0.0, 1.0, TIMES) if moves else torch.zeros(1)
+    return torch.linspace(0.0, 1.0, SAMPLE_COUNT) if moves else torch.zeros(1)

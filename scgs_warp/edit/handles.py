@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from ..errors import UserError
-from .field_reader import LIMIT, Node
+from .field_reader import MAX_NUMBER, FieldReader
 from .graph import ControlGraph
 from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
 from .solver import Anchors
@@ -21,11 +21,11 @@ Lasting = Literal["motion", "frame", "fade"]
 
 ONE_FRAME = 5e-3
 """What lasts one frame shows this far from its time, where nobody says how far frames are apart."""
-GRIP = 10.0
+HALFWAY_STIFFNESS = 10.0
 """Stiffness of a fading handle half way: it lets go of its nodes as its strength goes to 0, so that nothing jumps."""
-WEAKEST, STRONGEST = 1e-6, 1e6
+MIN_STIFFNESS, MAX_STIFFNESS = 1e-6, 1e6
 """Limits of a stiffness."""
-FEWEST_FOR_A_FRAME = 4
+MIN_NODES_FOR_FRAME = 4
 """A region of fewer nodes takes its neighbours along to tell how it turns."""
 
 
@@ -46,8 +46,8 @@ class Target:
         """
         moved = tuple(float(x) for x in (translation if translation is not None else (0.0, 0.0, 0.0)))
         turned = tuple(float(x) for x in (rotation if rotation is not None else IDENTITY))
-        if len(moved) != 3 or not all(math.isfinite(x) and abs(x) <= LIMIT for x in moved):
-            limits = f"must be three finite numbers from {-LIMIT:g} to {LIMIT:g}"
+        if len(moved) != 3 or not all(math.isfinite(x) and abs(x) <= MAX_NUMBER for x in moved):
+            limits = f"must be three finite numbers from {-MAX_NUMBER:g} to {MAX_NUMBER:g}"
             raise UserError(f"translation {list(moved)}: {limits}; the handle stays where it is")
         if len(turned) != 4 or not all(map(math.isfinite, turned)) or not any(turned):
             raise UserError(f"rotation {list(turned)}: must be four finite numbers, not all 0; the handle stays")
@@ -90,7 +90,7 @@ class Handle:
         Raises:
             UserError: naming the field.
         """
-        for name, value in handle_fields(Node(vars(self), f"handle {self.name!r}")).items():
+        for name, value in handle_fields(FieldReader(vars(self), f"handle {self.name!r}")).items():
             object.__setattr__(self, name, value)
 
     @property
@@ -108,7 +108,7 @@ class Handle:
         return 0.0 if share <= 0 else share * share * (3.0 - 2.0 * share)
 
 
-def handle_fields(node: Node) -> dict[str, Any]:
+def handle_fields(node: FieldReader) -> dict[str, Any]:
     """Read a handle's fields, all but its nodes.
 
     Raises:
@@ -118,8 +118,8 @@ def handle_fields(node: Node) -> dict[str, Any]:
         "name": node.text("name"),
         "time": node.number("time", 0.0, 0.0, 1.0),
         "pivot": node.vector("pivot", 3),
-        "stiffness": node.number("stiffness", None, WEAKEST, STRONGEST),
-        "turns": node.truth("turns"),
+        "stiffness": node.number("stiffness", None, MIN_STIFFNESS, MAX_STIFFNESS),
+        "turns": node.boolean("turns"),
         "lasts": node.choice("lasts", get_args(Lasting), "motion"),
         "window": node.number("window", 0.1, 1e-6, 10.0),
     }
@@ -151,7 +151,7 @@ class Goal(NamedTuple):
             and (self.residual is None or not self.residual.any())
         )
 
-    def place(self, rest: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    def pose_at(self, rest: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
         """Positions [n, 3] and rotations [n, 3, 3] at ``share`` of the way."""
         quat = power(self.quat, share)
         positions = rest[self.nodes]
@@ -200,7 +200,7 @@ def carried_goal(
     translation = share * scale * np.array(target.translation)
     if now is not then:
         members = nodes
-        if len(members) < FEWEST_FOR_A_FRAME:
+        if len(members) < MIN_NODES_FOR_FRAME:
             members = np.array(graph.ring(handle.nodes, 1))
         frame, before, after = rigid_fit(then[members], now[members])
         pivot = rotate(frame, pivot - before) + after
@@ -208,13 +208,13 @@ def carried_goal(
         translation = rotate(frame, translation)
     stiffness, leaning = handle.stiffness, None
     if share < 1.0:
-        leaning = _limited(GRIP * share / (1.0 - share))
-        stiffness = leaning if stiffness is None else _limited(stiffness * share)
+        leaning = _clamp_stiffness(HALFWAY_STIFFNESS * share / (1.0 - share))
+        stiffness = leaning if stiffness is None else _clamp_stiffness(stiffness * share)
     return Goal(nodes, pivot, quat, translation, stiffness, handle.gives_rotation, leaning=leaning)
 
 
-def _limited(stiffness: float) -> float:
-    return min(max(stiffness, WEAKEST), STRONGEST)
+def _clamp_stiffness(stiffness: float) -> float:
+    return min(max(stiffness, MIN_STIFFNESS), MAX_STIFFNESS)
 
 
 def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share: float) -> Anchors:
@@ -229,7 +229,7 @@ def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share:
     positions, rotations = rest.copy(), np.tile(np.eye(3), (count, 1, 1))
     hard[pins] = turned[pins] = True
     for goal in goals:
-        at, turns = goal.place(rest, share)
+        at, turns = goal.pose_at(rest, share)
         positions[goal.nodes], rotations[goal.nodes] = at, turns
         hard[goal.nodes] = goal.stiffness is None
         soft[goal.nodes] = 0.0 if goal.stiffness is None else goal.stiffness

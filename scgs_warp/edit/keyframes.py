@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from .field_reader import Node
+from .field_reader import FieldReader
 from .handles import Target
 from .rotations import IDENTITY, conjugate, exponential, logarithm, multiply, power, slerp, unit
 
@@ -38,11 +38,11 @@ class Keyframe:
         Raises:
             UserError: naming the field.
         """
-        for name, value in keyframe_fields(Node(vars(self), "keyframe")).items():
+        for name, value in keyframe_fields(FieldReader(vars(self), "keyframe")).items():
             object.__setattr__(self, name, value)
 
 
-def keyframe_fields(node: Node) -> dict[str, Any]:
+def keyframe_fields(node: FieldReader) -> dict[str, Any]:
     """Read a keyframe's fields, all but its targets.
 
     Raises:

@@ -35,11 +35,11 @@ class Player:
         for hold in holds:
             near[list(self.graph.with_strays(self.graph.ring(hold.nodes, hold.rings)))] = True
         pins = np.flatnonzero(~near)
-        goals, looks_of = [], []
+        goals, color_turns_of = [], []
         for hold in holds:
-            goal, looks = self._goal(hold, time, now, exaggerate)
+            goal, color_turns = self._goal(hold, time, now, exaggerate)
             goals.append(goal)
-            looks_of.append(looks)
+            color_turns_of.append(color_turns)
         sweeps = [goal.sweep(rest) for goal in goals]
         steps = max(count_steps(turned, moved, self.graph.edge_length) for turned, moved in sweeps)
         shape = self.solver.solve(rest, lambda share: anchors_at(goals, pins, rest, share), steps)
@@ -47,10 +47,10 @@ class Player:
         for goal in goals:
             held[goal.nodes] = True
         positions, turns = self.graph.follow(rest, shape.positions, from_matrix(shape.rotations), held)
-        looks = turns.copy()
-        for goal, own in zip(goals, looks_of):
-            looks[goal.nodes] = own
-        return now.then(positions, turns, looks)
+        color_turns = turns.copy()
+        for goal, own in zip(goals, color_turns_of):
+            color_turns[goal.nodes] = own
+        return now.then(positions, turns, color_turns)
 
     def _goal(self, hold: Hold, time: float, now: NodePose, exaggerate: Exaggerate | None) -> tuple[Goal, np.ndarray]:
         """What holding a region, with the strays that follow it, asks for, and what its colours turn by."""
@@ -69,9 +69,9 @@ class Player:
         # The trained rotation of then, carried by the body, in place of the trained rotation of now
         trained = multiply(self.motion_at(hold.time).rotations[nodes], conjugate(self.motion_at(time).rotations[nodes]))
         total = multiply(body, multiply(multiply(then.turns[nodes], trained), conjugate(now.turns[nodes])))
-        looks = multiply(body, multiply(then.looks[nodes], conjugate(now.looks[nodes])))
+        color_turns = multiply(body, multiply(then.color_turns[nodes], conjugate(now.color_turns[nodes])))
         own = multiply(conjugate(quat), total)
-        return Goal(nodes, centre, quat, moved - centre, residual=residual, own_turns=own), looks
+        return Goal(nodes, centre, quat, moved - centre, residual=residual, own_turns=own), color_turns
 
     def _exaggerated(self, time: float, exaggerate: Exaggerate | None) -> NodePose:
         """More of every turn; positions follow from the turned edges, so that limbs keep their length."""

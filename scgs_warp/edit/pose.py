@@ -47,7 +47,7 @@ class NodePose:
     """[M, 3]"""
     turns: np.ndarray
     """[M, 4] wxyz, on top of the motion's rotation: what the Gaussians around turn by."""
-    looks: np.ndarray
+    color_turns: np.ndarray
     """[M, 4] wxyz, what their colours turn by: as ``turns``, but for what is held at another instant, whose colours
     never turned with the trained motion."""
     base: NodePose | None = None
@@ -58,10 +58,10 @@ class NodePose:
         none = np.tile(IDENTITY, (len(positions), 1))
         return NodePose(positions, none, none)
 
-    def then(self, positions: np.ndarray, turns: np.ndarray, looks: np.ndarray | None = None) -> NodePose:
+    def then(self, positions: np.ndarray, turns: np.ndarray, color_turns: np.ndarray | None = None) -> NodePose:
         """Moved to ``positions`` and turned further; exact where ``turns`` is the identity."""
-        looks = turns if looks is None else looks
-        return NodePose(positions, _further(turns, self.turns), _further(looks, self.looks))
+        color_turns = turns if color_turns is None else color_turns
+        return NodePose(positions, _further(turns, self.turns), _further(color_turns, self.color_turns))
 
 
 def _further(second: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -117,19 +117,19 @@ def pose_gaussians(
         posed = pose_gaussians(rig, gaussians, motion, bent.base, binding, masked)
         return _on_top(posed, gaussians, bent, bent.base, binding)
     posed = rig.apply_pose(gaussians, compose(motion, bent), binding)
-    if not bent.looks[:, 1:].any():
+    if not bent.color_turns[:, 1:].any():
         return posed
     sh_dc, sh_rest = posed.sh_dc, posed.sh_rest
     if gaussians.shading.shape[1]:
-        same = (bent.looks == bent.turns).all(1, keepdims=True)
-        back = np.where(same, IDENTITY, multiply(conjugate(bent.looks), bent.turns))
+        same = (bent.color_turns == bent.turns).all(1, keepdims=True)
+        back = np.where(same, IDENTITY, multiply(conjugate(bent.color_turns), bent.turns))
         lit = NodePose(motion.positions, back, back)
         sh_dc = rig.apply_pose(gaussians, compose(motion, lit), binding).sh_dc
     if sh_rest.shape[1]:
-        looks = _blend(bent.looks, gaussians, binding)
+        color_turns = _blend(bent.color_turns, gaussians, binding)
         if masked:
-            looks = _share_of(looks, gaussians)
-        sh_rest = rotate_harmonics(sh_rest, looks)
+            color_turns = _share_of(color_turns, gaussians)
+        sh_rest = rotate_harmonics(sh_rest, color_turns)
     return Gaussians(posed.means, posed.quats, posed.scales, posed.opacities, sh_dc, sh_rest)
 
 

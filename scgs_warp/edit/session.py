@@ -24,7 +24,7 @@ from ..types import Camera, Gaussians, Image
 from . import edit_file
 from .document import Edit
 from .engine import Engine
-from .field_reader import Node
+from .field_reader import FieldReader
 from .graph import ControlGraph
 from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
@@ -279,7 +279,7 @@ class EditSession:
         Raises:
             UserError: no film is that small or large.
         """
-        edit_file.film_of(Node({"size": size}, "film"))
+        edit_file.film_of(FieldReader({"size": size}, "film"))
         self._change(film=dataclasses.replace(self.edit.film, size=size))
 
     def scene_time(self, at: float) -> float:

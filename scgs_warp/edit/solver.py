@@ -32,14 +32,14 @@ STEP_ANGLE = math.radians(15.0)
 """A handle turns at most so far between two solutions: beyond some 90 degrees the energy has other minima."""
 STEP_LENGTH = 2.0
 """... and moves at most so many edge lengths."""
-MOST_STEPS = 48
+MAX_STEPS = 48
 """A handle dragged to the horizon gets there in so many steps, however long they are."""
 STEP_ITERATIONS = 6
 FINAL_ITERATIONS = 60
 TURN_ITERATIONS = 8
 TOLERANCE = 1e-4
 """Iterations end when nothing moves by more than so many edge lengths."""
-CACHED = 16
+CACHED_FACTORS = 16
 """Factorisations kept."""
 
 
@@ -109,7 +109,7 @@ class ArapSolver:
         found = self._systems.get(key)
         if found is None:
             found = self._systems[key] = self._factorise(anchors)
-            while len(self._systems) > CACHED:
+            while len(self._systems) > CACHED_FACTORS:
                 self._systems.popitem(last=False)
         self._systems.move_to_end(key)
         return found
@@ -257,4 +257,4 @@ class ArapSolver:
 def count_steps(angle: float, distance: float, edge_length: float) -> int:
     """Sub-steps for a handle that turns by ``angle`` (radians) and moves by ``distance``."""
     wanted = max(angle / STEP_ANGLE, distance / (STEP_LENGTH * edge_length))
-    return min(MOST_STEPS, max(1, math.ceil(wanted - 1e-9))) if math.isfinite(wanted) else MOST_STEPS
+    return min(MAX_STEPS, max(1, math.ceil(wanted - 1e-9))) if math.isfinite(wanted) else MAX_STEPS

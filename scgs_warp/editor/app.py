@@ -21,23 +21,23 @@ from ..errors import UserError
 from ..geometry.cameras import orbit_camera
 from . import gizmo_pose
 from .display import RADIUS, Display
-from .frame_image import FINE_QUALITY, QUALITY, Picture, take
-from .model import Combine, Model, Moment
+from .frame_image import FINE_QUALITY, QUALITY, Picture, take_picture
+from .model import Combine, EditorModel, Moment
 from .overlays import GIZMO, Overlays
 from .panel.panel import Panel
 from .proxy import guarded
-from .views import FULL, ClientCamera, Pace, Views
+from .views import FULL, ClientCamera, Pace, PictureSchedule
 from .worker import Worker
 
 if TYPE_CHECKING:
     import viser
 
 HOST = "127.0.0.1"
-QUICK, PATIENT = 0.11, 0.8
+MOVING_SECONDS, STILL_SECONDS = 0.11, 0.8
 """Seconds that a picture may take while something moves, and when all is still."""
-LARGEST = 4096
+MAX_SCREENSHOT_SIZE = 4096
 """Pixels of a screenshot's longer side, whatever a page says of its window."""
-REPEAT = 1.5
+REPEAT_SECONDS = 1.5
 """Seconds in which the same message is not shown again."""
 
 
@@ -76,27 +76,27 @@ class Editor:
     ) -> None:
         viser = import_viser()
         self.session, self.folder = session, folder
-        self.views = Views()
-        self.quick, self.full = Pace(QUICK, 256, 512), Pace(PATIENT, min(640, size), size)
-        self.worker = Worker(self.views, self._draw, lambda: self.model.busy, failed=self._picture_failed)
-        self.model = Model(session, self.refresh)
+        self.schedule = PictureSchedule()
+        self.quick, self.full = Pace(MOVING_SECONDS, 256, 512), Pace(STILL_SECONDS, min(640, size), size)
+        self.worker = Worker(self.schedule, self._draw, lambda: self.model.busy, failed=self.picture_failed)
+        self.model = EditorModel(session, self.refresh)
         self.latency: list[float] = []
-        self._said: dict[str, float] = {}
+        self._notified: dict[str, float] = {}
         self._first = True
         """No picture was drawn yet."""
         self._waiting: dict[int, Any] = {}
         self._dragger: int | None = None
         self._dragged_at: float | None = None
-        self._place: tuple[gizmo_pose.Place, Target] | None = None
+        self.gizmo_frame: tuple[gizmo_pose.GizmoFrame, Target] | None = None
         self.display = Display.of(session.scene.overview)
         with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # its banner names the wrong door
             self.server: viser.ViserServer = viser.ViserServer(HOST, port, label="scgs_warp", verbose=False)
         self.port: int = self.server.get_port()
-        self._dress()
+        self._set_up_page()
         self.panel = Panel(self)
         self.worker.start()
-        self.server.on_client_connect(self._arrive)
-        self.server.on_client_disconnect(self._leave)
+        self.server.on_client_connect(self._connect)
+        self.server.on_client_disconnect(self._disconnect)
         self.refresh()
 
     @property
@@ -108,7 +108,7 @@ class Editor:
         self.worker.stop()
         self.server.stop()
 
-    def _dress(self) -> None:
+    def _set_up_page(self) -> None:
         """The scene's own up, camera and overlays."""
         server, overview = self.server, self.session.scene.overview
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
@@ -132,38 +132,38 @@ class Editor:
 
     # Clients
 
-    def _arrive(self, client: viser.ClientHandle) -> None:
+    def _connect(self, client: viser.ClientHandle) -> None:
         if self._first:
             text = "Kernels are compiled when they are needed first; that may take a minute."
             self._waiting[client.client_id] = client.add_notification("Drawing the scene", text, loading=True)
         client.camera.on_update(lambda camera: self._moved(client))
         self._moved(client)
 
-    def _leave(self, client: viser.ClientHandle) -> None:
+    def _disconnect(self, client: viser.ClientHandle) -> None:
         if client.client_id == self._dragger:  # a window that was closed in the middle of a drag
             self._dragger = None
             self.model.release()
         self._waiting.pop(client.client_id, None)
-        with self.worker.changing() as views:
-            views.drop(client.client_id)
+        with self.worker.changing() as schedule:
+            schedule.drop(client.client_id)
 
     def _moved(self, client: viser.ClientHandle) -> None:
         if client.client_id not in self.server.get_clients():
             return
-        with self.worker.changing() as views:
-            views.move(client.client_id, self.camera(client), time.monotonic())
+        with self.worker.changing() as schedule:
+            schedule.move(client.client_id, self.camera(client), time.monotonic())
 
     def refresh(self) -> None:
         """Something changed: new pictures for everybody."""
-        with self.worker.changing() as views:
-            views.change(time.monotonic())
+        with self.worker.changing() as schedule:
+            schedule.change(time.monotonic())
 
     def say(self, client: viser.ClientHandle | None, title: str, text: str, color: str = "red") -> None:
         """A notification, to one client or to all; the same again only after a while, as drags repeat mistakes."""
         now = time.monotonic()
-        if now - self._said.get(text, -np.inf) < REPEAT:
+        if now - self._notified.get(text, -np.inf) < REPEAT_SECONDS:
             return
-        self._said = {said: at for said, at in self._said.items() if now - at < REPEAT} | {text: now}
+        self._notified = {said: at for said, at in self._notified.items() if now - at < REPEAT_SECONDS} | {text: now}
         everybody = self.server.get_clients().values()
         for one in [client] if client is not None else list(everybody):
             one.add_notification(title, text, auto_close_seconds=8.0, color=color)  # type: ignore[arg-type]
@@ -192,7 +192,7 @@ class Editor:
         traceback.print_exc(file=sys.stderr)
         self.say(client, "Internal error", f"{type(error).__name__}: {error}")
 
-    def _picture_failed(self, number: int, error: Exception) -> None:
+    def picture_failed(self, number: int, error: Exception) -> None:
         """On the worker's thread: the picture of one client could not be drawn."""
         client = self.server.get_clients().get(number)
         if client is None:
@@ -225,23 +225,23 @@ class Editor:
         wxyz = np.asarray(camera.wxyz, np.float64)
         return ClientCamera(tuple(wxyz.tolist()), tuple(position.tolist()), float(camera.fov), width, height)
 
-    def take(self, moment: Moment, camera: ClientCamera) -> Picture:
+    def take_picture(self, moment: Moment, camera: ClientCamera) -> Picture:
         """A picture in full; on the worker's thread."""
-        return take(self.session, moment, camera, min(max(camera.width, camera.height), LARGEST))
+        return take_picture(self.session, moment, camera, min(max(camera.width, camera.height), MAX_SCREENSHOT_SIZE))
 
     def _draw(self, number: int, quality: str) -> None:
         """On the worker's thread."""
         client = self.server.get_clients().get(number)
-        with self.worker.changing() as views:
-            camera = views.camera(number)
+        with self.worker.changing() as schedule:
+            camera = schedule.camera(number)
         if client is None or camera is None:
             return
         asked = self._dragged_at
         moment = self.model.moment()
         pace = self.full if quality == FULL else self.quick
         begin = time.perf_counter()
-        picture = take(self.session, moment, camera, min(pace.size, max(camera.width, camera.height)))
-        depth = self.display.nothing
+        picture = take_picture(self.session, moment, camera, min(pace.size, max(camera.width, camera.height)))
+        depth = self.display.empty_depth
         if not self.model.through:
             behind = 0.5 * self.edge_length * self.display.scale  # control points lie inside what they move
             depth = self.display.depth(picture.depth, behind, 2 if quality == FULL else 1)
@@ -259,9 +259,9 @@ class Editor:
             self._dragged_at = None
         if asked is not None and moment.live:
             self.latency = [*self.latency[-99:], time.monotonic() - asked]
-        self._follow(moment)
+        self._update_page(moment)
 
-    def _follow(self, moment: Moment) -> None:
+    def _update_page(self, moment: Moment) -> None:
         """Overlays and panel, after the picture."""
         points = self.session.node_positions(moment.time, moment.at, live=moment.live)
         self.overlays.move(self.display.show(points))
@@ -277,17 +277,17 @@ class Editor:
             return
         handle = self.session.edit.handle(model.active or "")
         if moment.show in ("original", "side by side") or (handle is None and not model.selection):
-            self._place = None
-            self.overlays.place(None)
+            self.gizmo_frame = None
+            self.overlays.place_gizmo(None)
             return
         if handle is None:
-            self._place = gizmo_pose.place_of_selection(self.session, model.selection, moment)
+            self.gizmo_frame = gizmo_pose.frame_of_selection(self.session, model.selection, moment)
         else:
             target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
-            self._place = gizmo_pose.place_of(self.session, handle, moment.time), target
-        place, target = self._place
+            self.gizmo_frame = gizmo_pose.frame_of_handle(self.session, handle, moment.time), target
+        place, target = self.gizmo_frame
         position, wxyz = place.pose(target)
-        self.overlays.place((self.display.show(position), wxyz))
+        self.overlays.place_gizmo((self.display.show(position), wxyz))
 
     # What users do in the picture
 
@@ -316,16 +316,16 @@ class Editor:
             return
         self._dragger = None if event.phase == "end" else event.client_id
         try:
-            self._gizmo(event.phase, self.display.world(event.target.position), np.array(event.target.wxyz))
+            self.drag_gizmo(event.phase, self.display.world(event.target.position), np.array(event.target.wxyz))
         except UserError as error:
             self.say(event.client, "That does not work", str(error))
         except Exception as error:
             self._failed(event.client, error)
 
-    def _gizmo(self, phase: str, position: np.ndarray, wxyz: np.ndarray) -> None:
-        if self._place is None:
+    def drag_gizmo(self, phase: str, position: np.ndarray, wxyz: np.ndarray) -> None:
+        if self.gizmo_frame is None:
             return
-        place, target = self._place
+        place, target = self.gizmo_frame
         if phase == "start":
             self.model.grab(target)
         elif phase == "update":
@@ -339,7 +339,7 @@ class Editor:
 
     def put(self, target: Target) -> None:
         """The chosen handle, at once: what the numbers in the panel do."""
-        self.model.grab(STAY if self._place is None else self._place[1])
+        self.model.grab(STAY if self.gizmo_frame is None else self.gizmo_frame[1])
         try:
             self.model.drag(target)
         finally:

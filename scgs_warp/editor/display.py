@@ -38,6 +38,6 @@ class Display:
         return np.minimum(depth[::stride, ::stride] * np.float32(self.scale) + np.float32(behind), FARTHEST)
 
     @property
-    def nothing(self) -> np.ndarray:
+    def empty_depth(self) -> np.ndarray:
         """[2, 2] the depth of a picture that hides nothing."""
         return np.full((2, 2), FARTHEST, np.float32)

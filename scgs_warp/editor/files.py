@@ -10,7 +10,7 @@ from ..errors import UserError
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,99}")
 
 
-def place(folder: Path, name: str, suffix: str) -> Path:
+def output_path(folder: Path, name: str, suffix: str) -> Path:
     """A file in the folder, which is made; users' browsers may be anywhere, so nothing leads out of it.
 
     Args:
@@ -41,7 +41,7 @@ def _good(name: str) -> bool:
     return bool(NAME.fullmatch(name)) and not name.endswith((".", " "))
 
 
-def free(path: Path) -> Path:
+def unused_path(path: Path) -> Path:
     """The path, or, if something is there, the first of ``name 2``, ``name 3`` ... where nothing is."""
     found, number = path, 1
     while found.exists() or found.is_symlink():
@@ -51,7 +51,7 @@ def free(path: Path) -> Path:
     return found
 
 
-def edits(folder: Path) -> tuple[str, ...]:
+def saved_edits(folder: Path) -> tuple[str, ...]:
     """Names of the saved edits that ``place`` takes."""
     if not folder.is_dir():
         return ()

@@ -24,7 +24,7 @@ class Picture(NamedTuple):
     """[H, W] float32 along the view, world units; infinite where nothing is."""
 
 
-def take(session: EditSession, moment: Moment, camera: ClientCamera, size: int) -> Picture:
+def take_picture(session: EditSession, moment: Moment, camera: ClientCamera, size: int) -> Picture:
     """What a client sees.
 
     Args:

@@ -19,18 +19,18 @@ NOISE = 1e-7
 
 
 @dataclass(frozen=True)
-class Place:
+class GizmoFrame:
     """Where a handle would be if it were not moved, at the moment shown, world units."""
 
     pivot: np.ndarray
     """[3]"""
-    frame: np.ndarray
+    rotation: np.ndarray
     """[4] wxyz: how its surroundings have turned since its own time."""
 
     def pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:
         """Position [3] and wxyz [4] of the gizmo."""
-        turned = multiply(multiply(self.frame, np.array(target.rotation)), conjugate(self.frame))
-        return self.pivot + rotate(self.frame, np.array(target.translation)), turned
+        turned = multiply(multiply(self.rotation, np.array(target.rotation)), conjugate(self.rotation))
+        return self.pivot + rotate(self.rotation, np.array(target.translation)), turned
 
     def target(self, position: np.ndarray, wxyz: np.ndarray) -> Target:
         """The inverse of ``pose``.
@@ -39,15 +39,15 @@ class Place:
             UserError: a number is not finite.
         """
         Target.of(position.tolist(), wxyz.tolist())  # broken numbers are named as the browser sent them
-        shift = rotate(conjugate(self.frame), np.asarray(position, np.float64) - self.pivot)
-        turn = multiply(multiply(conjugate(self.frame), np.asarray(wxyz, np.float64)), self.frame)
+        shift = rotate(conjugate(self.rotation), np.asarray(position, np.float64) - self.pivot)
+        turn = multiply(multiply(conjugate(self.rotation), np.asarray(wxyz, np.float64)), self.rotation)
         checked = Target.of(shift.tolist(), turn.tolist())
         if all(abs(part) < NOISE for part in checked.rotation[1:]):
             return Target(checked.translation)
         return Target(checked.translation, tuple(unit(np.array(checked.rotation)).tolist()))
 
 
-def place_of(session: EditSession, handle: Handle, time: float) -> Place:
+def frame_of_handle(session: EditSession, handle: Handle, time: float) -> GizmoFrame:
     engine = session.engine
     then = engine.base_at(session.edit, handle.time).positions
     now = then if time == handle.time else engine.base_at(session.edit, time).positions
@@ -57,15 +57,15 @@ def place_of(session: EditSession, handle: Handle, time: float) -> Place:
         carried_goal(handle, Target.of(axis), 1.0, session.graph, then, now, engine.units) for axis in axes.tolist()
     ]
     frame = np.stack([goal.translation for goal in where[1:]], axis=1) / engine.units[1]
-    return Place(engine.to_world(where[0].pivot), from_matrix(frame))
+    return GizmoFrame(engine.to_world(where[0].pivot), from_matrix(frame))
 
 
-def place_of_selection(session: EditSession, nodes: tuple[int, ...], moment: Moment) -> tuple[Place, Target]:
+def frame_of_selection(session: EditSession, nodes: tuple[int, ...], moment: Moment) -> tuple[GizmoFrame, Target]:
     """Where a handle on these nodes would stand, and the target with which it would leave them where they are now."""
     chosen = list(nodes)
     base = session.engine.to_world(session.engine.base_at(session.edit, moment.time).positions)[chosen]
     now = session.node_positions(moment.time, moment.at)[chosen]
-    place = Place(base.mean(0), np.array([1.0, 0.0, 0.0, 0.0]))
+    place = GizmoFrame(base.mean(0), np.array([1.0, 0.0, 0.0, 0.0]))
     if np.allclose(base, now, rtol=0, atol=1e-9):
         return place, STAY
     turn, before, after = rigid_fit(base, now)

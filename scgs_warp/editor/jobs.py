@@ -13,12 +13,12 @@ from typing import Any
 
 from ..errors import UserError
 
-SHOWN = 0.2
+REPORT_SECONDS = 0.2
 """Seconds between two reports of progress."""
 
 
 @dataclass(frozen=True)
-class Progress:
+class JobProgress:
     """What runs, how many of its pieces are done."""
 
     name: str
@@ -41,17 +41,17 @@ class Jobs:
     """
 
     def __init__(
-        self, shown: Callable[[Progress | None], None], ended: Callable[[Any, str, Any, str | None], None]
+        self, shown: Callable[[JobProgress | None], None], ended: Callable[[Any, str, Any, str | None], None]
     ) -> None:
         self._shown, self._ended = shown, ended
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._progress: Progress | None = None
+        self._progress: JobProgress | None = None
         self._reported = 0.0
 
     @property
-    def progress(self) -> Progress | None:
+    def progress(self) -> JobProgress | None:
         return self._progress
 
     def start(self, name: str, total: int, action: Callable[[Callable[[], None]], Any], who: Any = None) -> None:
@@ -65,7 +65,7 @@ class Jobs:
             if self._progress is not None:
                 raise UserError(f"{self._progress.name} is still running; wait for it, or stop it")
             self._stop.clear()
-            self._progress = Progress(name, 0, total)
+            self._progress = JobProgress(name, 0, total)
         self._shown(self._progress)
         self._thread = threading.Thread(target=self._run, args=(name, action, who), name="job", daemon=True)
         self._thread.start()
@@ -76,7 +76,7 @@ class Jobs:
             if self._progress is None:
                 return
             self._stop.set()
-            self._progress = Progress(self._progress.name, self._progress.done, self._progress.total, True)
+            self._progress = JobProgress(self._progress.name, self._progress.done, self._progress.total, True)
         self._shown(self._progress)
 
     def stop(self) -> None:
@@ -100,8 +100,8 @@ class Jobs:
             now = self._progress
             if now is None:
                 return
-            self._progress = Progress(now.name, now.done + 1, now.total)
-        if time.monotonic() - self._reported >= SHOWN:
+            self._progress = JobProgress(now.name, now.done + 1, now.total)
+        if time.monotonic() - self._reported >= REPORT_SECONDS:
             self._reported = time.monotonic()
             self._shown(self._progress)
 

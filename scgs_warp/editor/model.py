@@ -45,7 +45,7 @@ class Region:
     """World units."""
 
 
-class Model:
+class EditorModel:
     """The state of one editor, shared by all its clients. ``lock`` guards it; nothing here solves or draws.
 
     Args:
@@ -109,9 +109,9 @@ class Model:
                 self._played_from = (time.monotonic(), self.at)
         self.changed()
 
-    def play(self, on: bool) -> None:
+    def play(self, on: bool, now: float | None = None) -> None:
         with self.lock:
-            self._played_from = (time.monotonic(), self.at) if on else None
+            self._played_from = (time.monotonic() if now is None else now, self.at) if on else None
             self._following = self._following or bool(on and self.session.edit.keyframes)
         self.changed()
 

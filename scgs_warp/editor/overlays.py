@@ -70,7 +70,7 @@ class Overlays:
         self.nodes.visible, self.graph.visible, self.nodes.point_size = nodes, graph, size
         self._draw_graph()
 
-    def place(self, pose: tuple[np.ndarray, np.ndarray] | None) -> None:
+    def place_gizmo(self, pose: tuple[np.ndarray, np.ndarray] | None) -> None:
         """Gizmo at a position and wxyz; None: away with it. One that is held in hand is not touched by callers."""
         if pose is None or not all(np.isfinite(part).all() for part in pose):
             self.gizmo.visible = False

@@ -20,19 +20,19 @@ from urllib.parse import parse_qs, urlsplit
 
 from ..errors import UserError
 
-LOCAL = {"127.0.0.1", "localhost", "::1"}
-KEY = "x-editor-key"
+LOCAL_HOSTS = {"127.0.0.1", "localhost", "::1"}
+KEY_HEADER = "x-editor-key"
 COOKIE = "scgs_editor_"
 """The port follows: cookies know hosts only, and there may be several editors on one."""
-MOST_HEAD = 32 << 10
+MAX_HEAD_BYTES = 32 << 10
 """Bytes of a request's head."""
 PATIENCE = 10.0
 """Seconds in which a request's head has to be there."""
-MOST_STRANGERS = 200
+MAX_PENDING = 200
 """Connections that have not shown the token; more are closed at once."""
 
 
-class Head(NamedTuple):
+class RequestHead(NamedTuple):
     """The beginning of an HTTP request."""
 
     method: str
@@ -50,7 +50,7 @@ class Head(NamedTuple):
         return (self.get("upgrade") or "").lower() == "websocket"
 
 
-def parse_head(text: bytes) -> Head | None:
+def parse_head(text: bytes) -> RequestHead | None:
     """None if it is no request that a browser sends: no bodies, no folded lines, no odd bytes."""
     try:
         first, *rest = text.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
@@ -61,7 +61,7 @@ def parse_head(text: bytes) -> Head | None:
         return None
     plain = all(name and ":" in line and name.replace("-", "").isalnum() for (name, _), line in zip(headers, rest))
     printable = all(" " <= character != "\x7f" for line in (first, *rest) for character in line)
-    head = Head(method, target, headers)
+    head = RequestHead(method, target, headers)
     body = head.get("content-length") not in (None, "0") or head.get("transfer-encoding") is not None
     good = method in ("GET", "HEAD") and version == "HTTP/1.1" and target.startswith("/") and not body
     return head if good and plain and printable else None
@@ -87,7 +87,7 @@ def cookies(header: str) -> dict[str, str]:
 def is_local(host: str | None) -> bool:
     """Whether a Host header names this machine: a foreign name that resolves to 127.0.0.1 does not."""
     try:
-        return urlsplit(f"//{host}").hostname in LOCAL
+        return urlsplit(f"//{host}").hostname in LOCAL_HOSTS
     except ValueError:
         return False
 
@@ -100,7 +100,7 @@ def refusal(headers: Any, key: str | None) -> str | None:
         key: if there is a proxy: what it says. Else only this machine's own pages may ask.
     """
     host, origin, given = (
-        found[0] if len(found) == 1 else None for found in map(headers.get_all, ("Host", "Origin", KEY))
+        found[0] if len(found) == 1 else None for found in map(headers.get_all, ("Host", "Origin", KEY_HEADER))
     )
     if key is not None:
         known = given is not None and hmac.compare_digest(given.encode(), key.encode())
@@ -128,13 +128,13 @@ def guarded(key: str | None) -> Iterator[None]:
         nonlocal started
         started = True
 
-        def look(connection: Any, request: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
             why = refusal(request.headers, key)
             if why is not None:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, why)
             return None if process_request is None else process_request(connection, request)
 
-        return start(*args, process_request=look, **options)
+        return start(*args, process_request=check, **options)
 
     module.serve = serve  # type: ignore[assignment]
     try:
@@ -165,7 +165,7 @@ class Proxy:
         self.token = secrets.token_urlsafe(24)
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._strangers = 0
+        self._pending = 0
         self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
         self._thread.start()
         try:
@@ -197,7 +197,7 @@ class Proxy:
             self._thread.join(10)
 
     async def _listen(self) -> asyncio.Server:
-        server = await asyncio.start_server(self._serve, self.host, self.public, limit=MOST_HEAD)
+        server = await asyncio.start_server(self._serve, self.host, self.public, limit=MAX_HEAD_BYTES)
         self.public = server.sockets[0].getsockname()[1]
         return server
 
@@ -214,13 +214,13 @@ class Proxy:
             writer.close()
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._strangers >= MOST_STRANGERS:
+        if self._pending >= MAX_PENDING:
             return
-        self._strangers += 1
+        self._pending += 1
         try:
             head = await self._admit(reader, writer)
         finally:
-            self._strangers -= 1
+            self._pending -= 1
         if head is None:
             return
         origin = head.get("origin")
@@ -232,7 +232,7 @@ class Proxy:
             return await _reply(writer, "303 See Other", "", f"Location: /\r\nSet-Cookie: {cookie}\r\n")
         await self._pass_on(head, reader, writer)
 
-    async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Head | None:
+    async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> RequestHead | None:
         """The head of a request that has the token; None if it was refused."""
         text = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
         head = parse_head(text)
@@ -245,18 +245,18 @@ class Proxy:
             return None
         return head
 
-    def _given(self, head: Head) -> str | None:
+    def _given(self, head: RequestHead) -> str | None:
         """The token of a request: in its address, once, then in the cookie."""
         asked = parse_qs(urlsplit(head.target).query).get("token")
         if asked is not None:
             return asked[0] if len(asked) == 1 else None
         return cookies(head.get("cookie") or "").get(self.cookie)
 
-    async def _pass_on(self, head: Head, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Head first, then bytes both ways. One request a connection, unless it becomes a WebSocket: what is not
+    async def _pass_on(self, head: RequestHead, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """RequestHead first, then bytes both ways. One request a connection, unless it becomes a WebSocket: what is not
         looked at is not handed on."""
-        kept = [(name, value) for name, value in head.headers if name not in (KEY, "cookie", "connection")]
-        kept += [(KEY, self.key), ("connection", "Upgrade" if head.upgrades else "close")]
+        kept = [(name, value) for name, value in head.headers if name not in (KEY_HEADER, "cookie", "connection")]
+        kept += [(KEY_HEADER, self.key), ("connection", "Upgrade" if head.upgrades else "close")]
         lines = [f"{head.method} {head.target} HTTP/1.1", *(f"{name}: {value}" for name, value in kept)]
         inside_reader, inside_writer = await asyncio.open_connection("127.0.0.1", self.port)
         try:

@@ -15,7 +15,7 @@ from ..types import Camera
 STILL = 0.25
 """Seconds without a change after which a picture is drawn in full."""
 LOW, FULL = "low", "full"
-SMALLEST = 96
+MIN_SIZE = 96
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ClientCamera:
 
 
 @dataclass
-class _View:
+class _ClientState:
     camera: ClientCamera
     changed: float
     """When it last needed another picture."""
@@ -64,38 +64,38 @@ class _View:
     quality: str = ""
 
 
-class Views:
+class PictureSchedule:
     """One entry a client. Not thread safe: the worker's lock guards it."""
 
     def __init__(self) -> None:
-        self._views: dict[int, _View] = {}
+        self._clients: dict[int, _ClientState] = {}
         self._version = 0
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self._clients)
 
     def move(self, client: int, camera: ClientCamera, now: float) -> None:
         """A client's camera, new or changed."""
-        view = self._views.get(client)
+        view = self._clients.get(client)
         if view is None:
-            self._views[client] = _View(camera, now)
+            self._clients[client] = _ClientState(camera, now)
         elif view.camera != camera:
             view.camera, view.changed = camera, now
 
     def drop(self, client: int) -> None:
-        self._views.pop(client, None)
+        self._clients.pop(client, None)
 
     def change(self, now: float) -> None:
         """The scene looks different to everybody."""
         self._version += 1
-        for view in self._views.values():
+        for view in self._clients.values():
             view.changed = now
 
     def camera(self, client: int) -> ClientCamera | None:
-        view = self._views.get(client)
+        view = self._clients.get(client)
         return None if view is None else view.camera
 
-    def _wants(self, view: _View, now: float, busy: bool) -> str | None:
+    def _wants(self, view: _ClientState, now: float, busy: bool) -> str | None:
         if not view.camera.usable:
             return None
         still = not busy and now - view.changed >= STILL
@@ -106,11 +106,11 @@ class Views:
     def next(self, now: float, busy: bool) -> tuple[int, str] | None:
         """(client, quality) of the picture that is due, of the client who has waited longest; it counts as drawn from
         here on, so that what changes meanwhile is drawn again."""
-        due = [(view.drawn, client) for client, view in self._views.items() if self._wants(view, now, busy)]
+        due = [(view.drawn, client) for client, view in self._clients.items() if self._wants(view, now, busy)]
         if not due:
             return None
         client = min(due)[1]
-        view = self._views[client]
+        view = self._clients[client]
         quality = self._wants(view, now, busy) or LOW
         view.drawn, view.state, view.quality = now, (self._version, view.camera), quality
         return client, quality
@@ -119,8 +119,8 @@ class Views:
         """Whether every client that has a window has its last and full picture."""
         return all(self._wants(view, now, busy) is None and view.quality == FULL for view in self._seen())
 
-    def _seen(self) -> list[_View]:
-        return [view for view in self._views.values() if view.camera.usable]
+    def _seen(self) -> list[_ClientState]:
+        return [view for view in self._clients.values() if view.camera.usable]
 
     def wait(self, now: float, busy: bool) -> float | None:
         """Seconds until the next picture is due if nothing happens; None: never."""
@@ -144,9 +144,9 @@ class Pace:
 
     @property
     def size(self) -> int:
-        return max(SMALLEST, min(self.limit, 16 * round(self._size / 16)))
+        return max(MIN_SIZE, min(self.limit, 16 * round(self._size / 16)))
 
     def took(self, seconds: float) -> None:
         """Learn from a picture of the present size; a single slow one counts little."""
         change = math.sqrt(self.seconds / max(seconds, 1e-4))
-        self._size = min(max(self._size * min(max(change, 0.8), 1.2), SMALLEST), self.limit)
+        self._size = min(max(self._size * min(max(change, 0.8), 1.2), MIN_SIZE), self.limit)

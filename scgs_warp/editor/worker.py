@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from .views import Views
+from .views import PictureSchedule
 
 Result = TypeVar("Result")
 PATIENCE = 1.0
@@ -37,14 +37,14 @@ class Worker:
 
     def __init__(
         self,
-        views: Views,
+        schedule: PictureSchedule,
         draw: Callable[[int, str], None],
         busy: Callable[[], bool],
         clock: Callable[[], float] = time.monotonic,
         failed: Callable[[int, Exception], None] | None = None,
     ) -> None:
         self._failed = failed
-        self.views, self._draw, self._busy, self._clock = views, draw, busy, clock
+        self.schedule, self._draw, self._busy, self._clock = schedule, draw, busy, clock
         self._condition = threading.Condition()
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._patient: deque[tuple[float, Future[Any], Callable[[], Any]]] = deque()
@@ -61,7 +61,7 @@ class Worker:
         with self._condition:
             if self._working or self._calls or self._patient:
                 return False
-            return self.views.settled(self._clock(), self._busy())
+            return self.schedule.settled(self._clock(), self._busy())
 
     def stop(self) -> None:
         """Returns when the picture under way is done; calls that still wait are cancelled."""
@@ -80,7 +80,7 @@ class Worker:
     def changing(self):
         """Hold this to change ``views``; whatever is due then is drawn."""
         with self._condition:
-            yield self.views
+            yield self.schedule
             self._condition.notify_all()
 
     def call(self, action: Callable[[], Result], *, patient: bool = False) -> Result:
@@ -109,31 +109,33 @@ class Worker:
         torch.set_flush_denormal(True)  # a property of the thread: without it bits differ from a script's
         while True:
             with self._condition:
-                task = self._next()
+                task = self.next_task()
                 while task is None:
                     if self._stopped:
                         return
                     self._working = False
-                    self._condition.wait(self.views.wait(self._clock(), self._busy()))
-                    task = self._next()
+                    self._condition.wait(self.schedule.wait(self._clock(), self._busy()))
+                    task = self.next_task()
                 self._working = True
             task()
 
-    def _next(self) -> Callable[[], None] | None:
-        if self._stopped:
-            return None
-        if self._calls:
-            future, action = self._calls.popleft()
-            return lambda: _fulfil(future, action)
-        now = self._clock()
-        due = self.views.next(now, self._busy())
-        if self._patient and (due is None or now - self._patient[0][0] > PATIENCE):
-            _, future, action = self._patient.popleft()
-            return lambda: _fulfil(future, action)
-        if due is None:
-            return None
-        client, quality = due
-        return lambda: self._picture(client, quality)
+    def next_task(self) -> Callable[[], None] | None:
+        """Take the next piece of work; the worker's thread runs it. None: nothing is due, or the worker was stopped."""
+        with self._condition:
+            if self._stopped:
+                return None
+            if self._calls:
+                future, action = self._calls.popleft()
+                return lambda: _fulfil(future, action)
+            now = self._clock()
+            due = self.schedule.next(now, self._busy())
+            if self._patient and (due is None or now - self._patient[0][0] > PATIENCE):
+                _, future, action = self._patient.popleft()
+                return lambda: _fulfil(future, action)
+            if due is None:
+                return None
+            client, quality = due
+            return lambda: self._picture(client, quality)
 
     def _picture(self, client: int, quality: str) -> None:
         try:

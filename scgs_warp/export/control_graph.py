@@ -8,7 +8,7 @@ import numpy as np
 
 from ..visualization.overlay import position_colors
 from .glb import point_colors
-from .gltf import INDICES, VERTICES, Document, add_skeleton
+from .gltf import INDICES, VERTICES, GltfDocument, add_skeleton
 from .skeleton import Skeleton
 
 POINT, EDGE = 0.12, 0.02
@@ -42,7 +42,7 @@ def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[flo
     joints = np.concatenate([np.repeat(np.arange(count), 6), np.repeat(edges.reshape(-1), 3)])
     colors = position_colors(rest).astype(np.float64) / 255.0
     colors = np.concatenate([np.repeat(colors, 6, axis=0), np.full((len(bars), 3), GREY)])
-    document = Document()
+    document = GltfDocument()
     bound = np.zeros((len(joints), 4), "<u2")
     bound[:, 0] = joints
     weights = np.zeros((len(joints), 4), "<f4")

@@ -9,11 +9,11 @@ import numpy as np
 
 from ..gaussians import SH_C0
 from ..types import Gaussians
-from .gltf import VERTICES, Document, add_skeleton, influences, upright, xyzw
+from .gltf import VERTICES, GltfDocument, add_skeleton, influences, upright, xyzw
 from .skeleton import Skeleton
 
 EXTENSION = "KHR_gaussian_splatting"
-HOW = {
+RENDERING = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",  # training images are sRGB, and so is what is blended
     "sortingMethod": "cameraDistance",
@@ -33,7 +33,7 @@ def write_glb(
     Raises:
         UserError: the place cannot be written, or the file would be too large.
     """
-    document = Document()
+    document = GltfDocument()
     document.json["extensionsUsed"] = [EXTENSION]
     attributes = _attributes(document, gaussians)
     # A bound mesh's own node turns nothing, by the standard; this one is for programs that leave points unbound.
@@ -43,13 +43,13 @@ def write_glb(
             attributes[f"JOINTS_{index}"] = document.accessor(joints, target=VERTICES)
             attributes[f"WEIGHTS_{index}"] = document.accessor(weights, target=VERTICES)
         node["skin"] = add_skeleton(document, skeleton, up, "motion")
-    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: HOW}}
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: RENDERING}}
     node["mesh"] = document.append("meshes", {"name": "Gaussians", "primitives": [primitive]})
     document.json["scenes"][0]["nodes"].insert(0, document.append("nodes", node))
     document.write(path)
 
 
-def _attributes(document: Document, gaussians: Gaussians) -> dict[str, int]:
+def _attributes(document: GltfDocument, gaussians: Gaussians) -> dict[str, int]:
     def add(values: np.ndarray, **options: Any) -> int:
         return document.accessor(values, target=VERTICES, **options)
 

@@ -19,10 +19,10 @@ COMPONENTS = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}
 KINDS = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 VERTICES, INDICES = 34962, 34963
 """Targets of buffer views."""
-LARGEST = 2**32 - 1
+MAX_BYTES = 2**32 - 1
 
 
-class Document:
+class GltfDocument:
     """A glTF file in the making. ``json`` may be filled by hand; what is appended gets the index that is returned."""
 
     def __init__(self) -> None:
@@ -93,7 +93,7 @@ class Document:
             raise UserError("the .glb would hold numbers that are not finite; train again with a lower rate") from None
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + self._size
-        if total > LARGEST:
+        if total > MAX_BYTES:
             raise UserError(f"the .glb would have {total / 2**30:.1f} GiB; the format ends at 4: give fewer --frames")
         head = struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A)
         return b"".join([head, text, struct.pack("<II", self._size, 0x004E4942), *self._parts])
@@ -122,7 +122,7 @@ def xyzw(quats: np.ndarray) -> np.ndarray:
     return unit(quats)[..., [1, 2, 3, 0]].astype("<f4")
 
 
-def add_skeleton(document: Document, skeleton: Skeleton, up: tuple[float, float, float], name: str) -> int:
+def add_skeleton(document: GltfDocument, skeleton: Skeleton, up: tuple[float, float, float], name: str) -> int:
     """Joints ``node_0000`` and so on under one root, their animation, and the skin that binds vertices at rest.
 
     Returns:

@@ -17,7 +17,7 @@ from .page_scene import page_scene
 
 SCRIPTS = ("data", "camera", "renderer", "player", "controls", "main")
 SHADERS = ("splat.frag", "draw.vert", "draw.frag", "screen.vert", "screen.frag")
-MOST_DEGREE = 3
+MAX_DEGREE = 3
 WEB = Path(__file__).parent / "web"
 TITLE = "Moving scene"
 MIB = 2**20
@@ -59,7 +59,7 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
 def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> tuple[bytes, int]:
     """The page of the highest degree that is small enough, and how many Gaussians it holds."""
     page = b""
-    for degree in range(min(scene.gaussians.sh_degree, MOST_DEGREE), -1, -1):
+    for degree in range(min(scene.gaussians.sh_degree, MAX_DEGREE), -1, -1):
         content = page_scene(scene, degree)
         page = assemble(pack(content.facts, content.columns), title)
         if max_mib is None or len(page) <= max_mib * MIB:
@@ -73,7 +73,7 @@ def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> tup
 
 def assemble(data: bytes, title: str = "") -> bytes:
     """The page around its packed data: program, style and data in one UTF-8 text."""
-    program, style = _program(), _read("style.css")
+    program, style = program_text(), _read("style.css")
     policy = (
         # Nothing from the network, and no script but this one, whatever a title may hold
         f"default-src 'none'; script-src {_hash(program)} blob:; worker-src blob:; style-src {_hash(style)}; "
@@ -90,7 +90,7 @@ def assemble(data: bytes, title: str = "") -> bytes:
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], _read("index.html")).encode()
 
 
-def _program() -> str:
+def program_text() -> str:
     """All scripts as one, with the shaders and the worker's text as strings."""
     shaders = json.dumps({name: _read(f"{name}.glsl") for name in SHADERS})
     sort = _read("sort.js")

@@ -17,7 +17,7 @@ from ..motion.static_nodes import StaticNodes
 from ..scene.scene import Scene
 from .page_data import Column, common_size, integers, quantise
 
-FEWEST_SAMPLES, MOST_SAMPLES = 33, 257
+MIN_SAMPLES, MAX_SAMPLES = 33, 257
 """Times at which control points are sampled: twice as many, again and again ..."""
 COARSE_ERROR = 8e-4
 """... until they were off by no more than this (root mean square, normalised units and radians) halfway between two
@@ -195,9 +195,9 @@ def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
     Raises:
         UserError: a pose is not finite.
     """
-    count = FEWEST_SAMPLES
+    count = MIN_SAMPLES
     poses = _poses_at(motion, torch.linspace(0.0, 1.0, count))
-    while count < MOST_SAMPLES:
+    while count < MAX_SAMPLES:
         between = _poses_at(motion, (torch.arange(count - 1) + 0.5) / (count - 1))
         errors = [(2.0 if name in QUATERNIONS else 1.0) * _error(poses[name], between[name]) for name in poses]
         poses = {name: _interleaved(poses[name], between[name]) for name in poses}

@@ -24,13 +24,13 @@ SUFFIXES: dict[Format, str] = {
 """How the output's name ends; the first format of a suffix is what the suffix alone means."""
 OTHER_SUFFIXES = {".htm": ".html"}
 """Endings that stand for others."""
-STILL = ("ply", "splat", "spz", "glb")
+STILL_FORMATS = ("ply", "splat", "spz", "glb")
 """Formats that hold Gaussians at one instant; ``glb`` holds the motion where no instant is given."""
-MOST_FRAMES = 100_000
+MAX_FRAMES = 100_000
 
 
 @dataclass(frozen=True)
-class Request:
+class ExportRequest:
     """Write a scene as a file that other programs open (docs/formats.md)."""
 
     output: Path
@@ -82,11 +82,11 @@ class Request:
     def still(self) -> bool:
         """Whether Gaussians at one instant are wanted."""
         if self.kind != "glb":
-            return self.kind in STILL
+            return self.kind in STILL_FORMATS
         return self.time is not None or self.at is not None or (self.run is None and self.edit is None)
 
 
-def check(request: Request) -> None:
+def check_request(request: ExportRequest) -> None:
     """Refuse what cannot work before anything is loaded.
 
     Raises:
@@ -97,34 +97,34 @@ def check(request: Request) -> None:
         raise UserError("export.py: give one of --run and --ply")
     if request.run is None and kind in ("cameras", "html"):
         raise UserError(f"--format {kind}: needs --run; a file of Gaussians has no cameras and no motion")
-    if request.run is None and request.edit is None and kind not in STILL:
+    if request.run is None and request.edit is None and kind not in STILL_FORMATS:
         raise UserError(f"--format {kind}: needs --run, or an --edit that moves the Gaussians of {request.ply}")
     if request.time is not None and not 0 <= request.time <= 1:
         raise UserError(f"--time {request.time:g}: give a time from 0 to 1")
-    if request.time is not None and (kind not in STILL or request.edit is not None):
+    if request.time is not None and (kind not in STILL_FORMATS or request.edit is not None):
         other = (
             "an edit's film is shown at --at SECONDS" if request.edit else "leave it out: the format holds all times"
         )
         raise UserError(f"--time {request.time:g}: {other}")
     if request.edit is not None and kind in ("cameras", "html"):
         raise UserError(f"--format {kind}: shows the scene as it was trained; leave --edit out, or write a glb")
-    if request.at is not None and (request.edit is None or kind not in STILL):
+    if request.at is not None and (request.edit is None or kind not in STILL_FORMATS):
         raise UserError(f"--at {request.at:g}: is a second of an edit's film; give it with --edit and a still format")
     if request.at is not None and not 0 <= request.at <= 3600:
         raise UserError(f"--at {request.at:g}: give a second of the film, from 0 to 3600")
     if request.edit is not None and (request.frames, request.fps) != (None, None):
         raise UserError("--frames, --fps: an edit's film says how long it is; change film in the edit")
-    if request.frames is not None and not 1 <= request.frames <= MOST_FRAMES:
-        raise UserError(f"--frames {request.frames}: give 1 to {MOST_FRAMES}")
+    if request.frames is not None and not 1 <= request.frames <= MAX_FRAMES:
+        raise UserError(f"--frames {request.frames}: give 1 to {MAX_FRAMES}")
     if request.fps is not None and not 0 < request.fps <= 1000:
         raise UserError(f"--fps {request.fps:g}: give more than 0 and at most 1000 frames a second")
     _check_unused(request)
     if request.max_mib is not None and not request.max_mib > 0:
         raise UserError(f"--max-mib {request.max_mib:g}: give more than 0 MiB")
-    check_place(request.output, kind)
+    check_output(request.output, kind)
 
 
-def _check_unused(request: Request) -> None:
+def _check_unused(request: ExportRequest) -> None:
     """Refuse options that would change nothing."""
     kind = request.kind
     if request.time is not None and request.run is None:
@@ -142,7 +142,7 @@ def _check_unused(request: Request) -> None:
         raise UserError("--fps: a ply-sequence does not say how fast it is; leave it out, and give --frames")
 
 
-def check_place(path: Path, kind: Format) -> None:
+def check_output(path: Path, kind: Format) -> None:
     """Whether the output can be written there; missing folders above are made.
 
     Raises:

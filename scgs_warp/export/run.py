@@ -1,4 +1,4 @@
-"""What :class:`Request` asks for, done: open, pose, write."""
+"""What :class:`ExportRequest` asks for, done: open, pose, write."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from .cameras import write_cameras
 from .control_graph import write_graph
 from .glb import write_glb
 from .npz import write_npz
-from .request import Request, check
+from .request import ExportRequest, check_request
 from .sequence import check_folder, write_sequence
 from .skeleton import (
-    Moment,
+    AnimationMoment,
     Skeleton,
     at_rest,
     build_skeleton,
     even_moments,
     film_moments,
     finite_rows,
-    kept,
-    posed,
-    select,
+    keep_finite,
+    posed_gaussians,
+    select_gaussians,
 )
 
 FILE_UP = (0.0, -1.0, 0.0)
@@ -43,13 +43,13 @@ FILE_UP = (0.0, -1.0, 0.0)
 FRAMES, FPS = 60, 30.0
 
 
-def export(request: Request, device: str = "cpu") -> str:
+def export(request: ExportRequest, device: str = "cpu") -> str:
     """Write a file, and say in one line what it holds.
 
     Raises:
         UserError: it cannot be; what was there is left alone.
     """
-    check(request)
+    check_request(request)
     if request.kind == "ply-sequence":
         check_folder(request.output)
     if request.still:
@@ -68,21 +68,21 @@ def _size(path: Path) -> str:
     return f"{sum(file.stat().st_size for file in files) / 2**20:.1f} MiB"
 
 
-def _open(request: Request, device: str) -> Scene:
+def _open(request: ExportRequest, device: str) -> Scene:
     if request.run is not None:
         return Scene.load(request.run, device=device)
     assert request.ply is not None
     return open_ply(request.ply, device)
 
 
-def _open_session(request: Request, scene: Scene) -> EditSession:
+def _open_session(request: ExportRequest, scene: Scene) -> EditSession:
     session = EditSession(scene)
     if request.edit is not None:
         session.load(request.edit)
     return session
 
 
-def _export_still(request: Request, device: str) -> str:
+def _export_still(request: ExportRequest, device: str) -> str:
     up, antialiased, when = FILE_UP, False, "at rest"
     if request.run is None and request.edit is None:
         assert request.ply is not None
@@ -90,7 +90,7 @@ def _export_still(request: Request, device: str) -> str:
         with torch.no_grad():
             found = read_gaussians(request.ply)
             with fitting(request.ply):
-                gaussians, when = kept(found.activate()), f"as in {request.ply}"
+                gaussians, when = keep_finite(found.activate()), f"as in {request.ply}"
     else:
         scene = _open(request, device)
         up, antialiased = scene.overview.up, scene.config.antialiased
@@ -101,7 +101,7 @@ def _export_still(request: Request, device: str) -> str:
             gaussians, when = scene.gaussians_at(request.time), f"at time {request.time:g}"
         else:
             gaussians = at_rest(scene)
-    gaussians = kept(gaussians)
+    gaussians = keep_finite(gaussians)
     clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased)
     note = f" ({clipped:,} values clipped to what .spz can hold)" if clipped else ""
     return f"{len(gaussians.means):,} Gaussians {when}{note}"
@@ -136,13 +136,13 @@ def write_still(
     return 0
 
 
-def _export_moving(request: Request, device: str) -> str:
+def _export_moving(request: ExportRequest, device: str) -> str:
     scene = _open(request, device)
     session = None
     if request.edit is not None or (request.kind != "ply-sequence" and scene.motion.moves):
         session = _open_session(request, scene)
     if session is None and request.kind == "glb":
-        gaussians = kept(at_rest(scene))
+        gaussians = keep_finite(at_rest(scene))
         write_glb(request.output, gaussians, scene.overview.up)
         return f"{len(gaussians.means):,} Gaussians that stand still"
     if session is None and request.kind != "ply-sequence":
@@ -155,13 +155,16 @@ def _export_moving(request: Request, device: str) -> str:
     return _write_skeleton(request, session, moments)
 
 
-def _write_frames(request: Request, scene: Scene, session: EditSession | None, moments: list[Moment]) -> str:
+def _write_frames(
+    request: ExportRequest, scene: Scene, session: EditSession | None, moments: list[AnimationMoment]
+) -> str:
     counts, rows = [], _usable(scene)  # the same in every frame: row i is one Gaussian
 
     def frames() -> Iterator[Gaussians]:
         for moment in moments:
-            counts.append(len((found := kept(select(posed(scene, session, moment), rows))).means))
-            yield found
+            finite = keep_finite(select_gaussians(posed_gaussians(scene, session, moment), rows))
+            counts.append(len(finite.means))
+            yield finite
 
     with progress(len(moments), "export") as shown:
         count = write_sequence(request.output, frames(), shown.advance)
@@ -170,7 +173,7 @@ def _write_frames(request: Request, scene: Scene, session: EditSession | None, m
     return f"{count} frames of {held} Gaussians"
 
 
-def _write_skeleton(request: Request, session: EditSession, moments: list[Moment]) -> str:
+def _write_skeleton(request: ExportRequest, session: EditSession, moments: list[AnimationMoment]) -> str:
     scene, up = session.scene, session.scene.overview.up
     with progress(len(moments), "export") as shown:
         skeleton = build_skeleton(session, moments, shown.advance)
@@ -195,7 +198,7 @@ def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Sk
     rows = _usable(scene) & np.isfinite(skeleton.weights).all(axis=1)
     if not rows.any():
         raise UserError("no Gaussian of the scene is finite; train again with a lower rate")
-    return select(at_rest(scene), rows), rows, skeleton.select(rows)
+    return select_gaussians(at_rest(scene), rows), rows, skeleton.select(rows)
 
 
 def _usable(scene: Scene) -> np.ndarray:
@@ -206,7 +209,7 @@ def _usable(scene: Scene) -> np.ndarray:
     return rows
 
 
-def mean_colors(session: EditSession, moments: list[Moment]) -> np.ndarray:
+def mean_colors(session: EditSession, moments: list[AnimationMoment]) -> np.ndarray:
     """[N, 3] harmonics of degree 0 over all moments: the brightness that follows the turn of a surface, at its mean,
     for formats that hold one colour."""
     scene = session.scene
@@ -214,11 +217,11 @@ def mean_colors(session: EditSession, moments: list[Moment]) -> np.ndarray:
         return scene.gaussians.sh_dc.detach().cpu().numpy()
     total = np.zeros((scene.gaussian_count, 3))
     for moment in moments:
-        total += posed(scene, session, moment).sh_dc.detach().cpu().double().numpy()
+        total += posed_gaussians(scene, session, moment).sh_dc.detach().cpu().double().numpy()
     return (total / len(moments)).astype(np.float32)
 
 
-def _export_cameras(request: Request, device: str) -> str:
+def _export_cameras(request: ExportRequest, device: str) -> str:
     from ..training.camera_refinement import refined
 
     assert request.run is not None
@@ -234,7 +237,7 @@ def _export_cameras(request: Request, device: str) -> str:
     return f"{count} cameras"
 
 
-def _export_page(request: Request, device: str) -> str:
+def _export_page(request: ExportRequest, device: str) -> str:
     try:
         from .page import write_page
     except ImportError as error:

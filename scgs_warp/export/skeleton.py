@@ -22,7 +22,7 @@ from ..scene.scene import Scene
 from ..types import Gaussians, Pose
 
 
-class Moment(NamedTuple):
+class AnimationMoment(NamedTuple):
     """One frame of an animation."""
 
     seconds: float
@@ -62,18 +62,18 @@ class Skeleton:
         return Skeleton(**fields)
 
 
-def even_moments(frames: int, fps: float) -> list[Moment]:
+def even_moments(frames: int, fps: float) -> list[AnimationMoment]:
     """Evenly from time 0 to 1."""
-    return [Moment(frame / fps, frame / max(frames - 1, 1)) for frame in range(frames)]
+    return [AnimationMoment(frame / fps, frame / max(frames - 1, 1)) for frame in range(frames)]
 
 
-def film_moments(session: EditSession) -> list[Moment]:
+def film_moments(session: EditSession) -> list[AnimationMoment]:
     """Every frame of an edit's film."""
     film = session.edit.film
-    return [Moment(i / film.fps, session.scene_time(i / film.fps), i / film.fps) for i in range(film.frames)]
+    return [AnimationMoment(i / film.fps, session.scene_time(i / film.fps), i / film.fps) for i in range(film.frames)]
 
 
-def posed(scene: Scene, session: EditSession | None, moment: Moment) -> Gaussians:
+def posed_gaussians(scene: Scene, session: EditSession | None, moment: AnimationMoment) -> Gaussians:
     """Activated Gaussians, world units, under the edit if there is one."""
     if session is None:
         return scene.gaussians_at(moment.time)
@@ -96,13 +96,13 @@ def finite_rows(gaussians: Gaussians) -> np.ndarray:
     return (torch.stack(parts).all(dim=0) & gaussians.quats.any(dim=1)).cpu().numpy()
 
 
-def select(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+def select_gaussians(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
     """Some of the Gaussians: [N] bool, on the CPU."""
     chosen = torch.from_numpy(rows)
     return Gaussians(**{name: value.detach().cpu()[chosen] for name, value in vars(gaussians).items()})
 
 
-def kept(gaussians: Gaussians) -> Gaussians:
+def keep_finite(gaussians: Gaussians) -> Gaussians:
     """Those that are finite, on the CPU.
 
     Raises:
@@ -111,11 +111,13 @@ def kept(gaussians: Gaussians) -> Gaussians:
     rows = finite_rows(gaussians)
     if not rows.any():
         raise UserError(f"none of {len(rows)} Gaussians is finite; train again with a lower rate")
-    return select(gaussians, rows)
+    return select_gaussians(gaussians, rows)
 
 
 @torch.no_grad()
-def build_skeleton(session: EditSession, moments: list[Moment], advance: Callable[[], None] | None = None) -> Skeleton:
+def build_skeleton(
+    session: EditSession, moments: list[AnimationMoment], advance: Callable[[], None] | None = None
+) -> Skeleton:
     """The session's control points at some moments, under its edit.
 
     Args:
@@ -142,8 +144,8 @@ def build_skeleton(session: EditSession, moments: list[Moment], advance: Callabl
         engine.to_world(rest.numpy()),
         engine.to_world(places),
         _unit([pose.rotations for pose in poses]),
-        None if poses[0].shape_rotations is None else _unit([_there(pose.shape_rotations) for pose in poses]),
-        None if poses[0].log_scales is None else _stack([_there(pose.log_scales) for pose in poses]),
+        None if poses[0].shape_rotations is None else _unit([_require(pose.shape_rotations) for pose in poses]),
+        None if poses[0].log_scales is None else _stack([_require(pose.log_scales) for pose in poses]),
         indices,
         weights,
     )
@@ -166,7 +168,7 @@ def _not_finite(time: float) -> UserError:
     )
 
 
-def _pose(session: EditSession, moment: Moment, masked: bool) -> Pose:
+def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> Pose:
     engine, edit = session.engine, session.edit
     motion = engine.motion_at(moment.time)
     fields = motion.pose.translations, motion.pose.rotations, motion.pose.shape_rotations, motion.pose.log_scales
@@ -180,7 +182,7 @@ def _pose(session: EditSession, moment: Moment, masked: bool) -> Pose:
     return compose(motion, bent)
 
 
-def _there(value: Tensor | None) -> Tensor:
+def _require(value: Tensor | None) -> Tensor:
     assert value is not None  # a motion model's poses are all of one kind
     return value
 

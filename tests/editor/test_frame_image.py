@@ -10,23 +10,23 @@ from helpers.editor_models import chosen, client, new_model
 from scgs_warp.edit import Film, Target, film_camera
 from scgs_warp.edit.handles import STAY
 from scgs_warp.editor.film_camera import view_of
-from scgs_warp.editor.frame_image import take
+from scgs_warp.editor.frame_image import take_picture
 from scgs_warp.editor.gizmo_pose import region_at, surface_point
-from scgs_warp.editor.model import Model, Moment, Region
+from scgs_warp.editor.model import EditorModel, Moment, Region
 from scgs_warp.editor.overlays import CHOSEN, HELD, PINNED, PLAIN, node_colors
 from scgs_warp.editor.views import ClientCamera
 from scgs_warp.errors import UserError
 
 
 @pytest.fixture
-def model() -> Model:
+def model() -> EditorModel:
     return new_model()
 
 
 def test_clicks_meet_the_surface(model):
     session, moment = model.session, model.moment()
     camera = client(session)
-    picture = take(session, moment, camera, 96)
+    picture = take_picture(session, moment, camera, 96)
     assert picture.rgb.shape == (camera.height, camera.width, 3) == (*picture.depth.shape, 3)
     rows, columns = np.nonzero(np.isfinite(picture.depth))
     middle = len(rows) // 2
@@ -50,7 +50,7 @@ def test_side_by_side_and_split(model):
     pictures = {}
     for show in ("edited", "original", "side by side", "split"):
         model.set(show=show)
-        pictures[show] = take(session, model.moment(), camera, 96).rgb.astype(int)
+        pictures[show] = take_picture(session, model.moment(), camera, 96).rgb.astype(int)
         assert pictures[show].shape == pictures["edited"].shape
     middle = camera.width // 2
     assert (pictures["edited"] != pictures["original"]).any()

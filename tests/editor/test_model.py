@@ -11,13 +11,13 @@ from helpers.editor_models import LEFT, RIGHT, chosen, new_model
 from scgs_warp.edit import Film, Playback, Target
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import from_axis
-from scgs_warp.editor.gizmo_pose import Place, place_of, place_of_selection
-from scgs_warp.editor.model import Model, Moment
+from scgs_warp.editor.gizmo_pose import GizmoFrame, frame_of_handle, frame_of_selection
+from scgs_warp.editor.model import EditorModel, Moment
 from scgs_warp.errors import UserError
 
 
 @pytest.fixture
-def model() -> Model:
+def model() -> EditorModel:
     return new_model()
 
 
@@ -59,7 +59,7 @@ def test_a_broken_number_changes_nothing(model, broken):
     model.drag(Target((0.1, 0.0, 0.0)))
     before = model.session.edit
     with pytest.raises(UserError, match="finite"):
-        Place(np.zeros(3), np.array([1.0, 0, 0, 0])).target(np.array([broken, 0, 0]), np.array([1.0, 0, 0, 0]))
+        GizmoFrame(np.zeros(3), np.array([1.0, 0, 0, 0])).target(np.array([broken, 0, 0]), np.array([1.0, 0, 0, 0]))
     with pytest.raises(UserError, match="finite"):
         model.drag(Target((broken, 0.0, 0.0)))
     assert model.session.edit is before and model.dragging
@@ -111,7 +111,7 @@ def test_a_handle_taken_from_bent_surroundings_leaves_them(model):
     before = session.node_positions(0.0)
     other = tuple(sorted(set(session.ring(model.selection, 1)) - set(model.selection)))
     assert other
-    place, target = place_of_selection(session, other, at)
+    place, target = frame_of_selection(session, other, at)
     position, _ = place.pose(target)
     assert position == pytest.approx(before[list(other)].mean(0), abs=1e-9)
 
@@ -124,7 +124,7 @@ def test_the_gizmo_says_what_the_target_says(model):
     model.release()
     session = model.session
     for time in (0.0, 0.7):
-        place = place_of(session, session.edit.handles[0], time)
+        place = frame_of_handle(session, session.edit.handles[0], time)
         back = place.target(*place.pose(target))
         assert back.translation == pytest.approx(target.translation, abs=1e-9)
         assert back.rotation == pytest.approx(target.rotation, abs=1e-9)
@@ -161,8 +161,8 @@ def test_keyframes_lead_until_a_drag_begins(model):
 def test_time_plays_and_stops_at_nothing(model):
     model.replace(film=Film(seconds=2.0, fps=10), playback=Playback(repeat="loop"))
     model.seek(0.5)
-    model.play(True)
-    start = model._played_from[0]
+    start = 100.0
+    model.play(True, now=start)
     model.tick(start + 0.55)
     assert model.at == pytest.approx(1.0)
     model.tick(start + 1.7)
@@ -217,7 +217,7 @@ def test_what_a_page_sends_is_checked(model, fields, words):
     assert model.undo() and model.session.edit == before
 
 
-def hold(model: Model, point=RIGHT, rings: int = 0) -> str:
+def hold(model: EditorModel, point=RIGHT, rings: int = 0) -> str:
     model.select(chosen(model, point, rings))
     name = model.grab(STAY)
     model.drag(Target((0.0, 0.0, 0.05)))

@@ -13,7 +13,7 @@ from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession, Film, render_film
 from scgs_warp.editor import files
 from scgs_warp.editor.jobs import Jobs
-from scgs_warp.editor.views import FULL, LOW, SMALLEST, STILL, ClientCamera, Pace, Views
+from scgs_warp.editor.views import FULL, LOW, MIN_SIZE, STILL, ClientCamera, Pace, PictureSchedule
 from scgs_warp.editor.worker import PATIENCE, Worker
 from scgs_warp.errors import UserError
 
@@ -23,33 +23,33 @@ def camera(x: float = 0.0, width: int = 100) -> ClientCamera:
 
 
 def test_low_while_moving_then_full():
-    views = Views()
-    views.move(1, camera(), 10.0)
-    assert views.next(10.0, False) == (1, LOW) and views.next(10.0, False) is None
-    assert views.wait(10.1, False) == pytest.approx(STILL - 0.1)
-    views.move(1, camera(1.0), 10.2)
-    assert views.next(10.2, False) == (1, LOW)
-    assert not views.settled(10.2 + STILL / 2, False)
-    assert views.next(10.3 + STILL, False) == (1, FULL) and views.next(20.0, False) is None
-    assert views.settled(20.0, False) and views.wait(20.0, False) is None
-    views.move(1, camera(1.0), 30.0)
-    assert views.next(40.0, False) is None, "a camera that stays is no change"
-    views.change(50.0)
-    assert views.next(50.0, True) == (1, LOW) and views.next(60.0, True) is None, "while dragged never in full"
-    assert views.next(60.0, False) == (1, FULL)
+    schedule = PictureSchedule()
+    schedule.move(1, camera(), 10.0)
+    assert schedule.next(10.0, False) == (1, LOW) and schedule.next(10.0, False) is None
+    assert schedule.wait(10.1, False) == pytest.approx(STILL - 0.1)
+    schedule.move(1, camera(1.0), 10.2)
+    assert schedule.next(10.2, False) == (1, LOW)
+    assert not schedule.settled(10.2 + STILL / 2, False)
+    assert schedule.next(10.3 + STILL, False) == (1, FULL) and schedule.next(20.0, False) is None
+    assert schedule.settled(20.0, False) and schedule.wait(20.0, False) is None
+    schedule.move(1, camera(1.0), 30.0)
+    assert schedule.next(40.0, False) is None, "a camera that stays is no change"
+    schedule.change(50.0)
+    assert schedule.next(50.0, True) == (1, LOW) and schedule.next(60.0, True) is None, "while dragged never in full"
+    assert schedule.next(60.0, False) == (1, FULL)
 
 
 def test_clients_take_turns_and_leave():
-    views = Views()
+    schedule = PictureSchedule()
     for number in (1, 2):
-        views.move(number, camera(), 0.0)
+        schedule.move(number, camera(), 0.0)
     drawn = []
     for now in (1.0, 2.0, 3.0, 4.0):
-        views.change(now)
-        drawn.append(views.next(now, True)[0])
+        schedule.change(now)
+        drawn.append(schedule.next(now, True)[0])
     assert drawn == [1, 2, 1, 2]
-    views.drop(1)
-    assert len(views) == 1 and views.camera(1) is None
+    schedule.drop(1)
+    assert len(schedule) == 1 and schedule.camera(1) is None
 
 
 @pytest.mark.parametrize(
@@ -57,9 +57,9 @@ def test_clients_take_turns_and_leave():
     [camera(math.nan), camera(width=0), ClientCamera((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.7, 10, 10)],
 )
 def test_windows_that_cannot_be_drawn_wait(broken):
-    views = Views()
-    views.move(1, broken, 0.0)
-    assert views.next(1.0, False) is None and views.wait(1.0, False) is None and views.settled(1.0, False)
+    schedule = PictureSchedule()
+    schedule.move(1, broken, 0.0)
+    assert schedule.next(1.0, False) is None and schedule.wait(1.0, False) is None and schedule.settled(1.0, False)
 
 
 def test_cameras_keep_their_field_of_view():
@@ -76,7 +76,7 @@ def test_pace_finds_the_size():
     assert 290 <= pace.size <= 340
     for _ in range(60):
         pace.took(100.0)
-    assert pace.size == SMALLEST
+    assert pace.size == MIN_SIZE
     for _ in range(60):
         pace.took(0.0)
     assert pace.size == 1024
@@ -89,7 +89,7 @@ class Bench:
         self.drawn: list[tuple[int, str]] = []
         self.gate = threading.Event()
         self.gate.set()
-        self.worker = Worker(Views(), self.draw, lambda: False)
+        self.worker = Worker(PictureSchedule(), self.draw, lambda: False)
         self.worker.start()
 
     def draw(self, client: int, quality: str) -> None:
@@ -99,8 +99,8 @@ class Bench:
             raise ValueError("a picture that fails")
 
     def move(self, client: int, x: float) -> None:
-        with self.worker.changing() as views:
-            views.move(client, camera(x), time.monotonic())
+        with self.worker.changing() as schedule:
+            schedule.move(client, camera(x), time.monotonic())
 
     def settle(self) -> None:
         end = time.monotonic() + 20
@@ -166,7 +166,7 @@ def test_calls_return_raise_and_are_cancelled(bench):
 
 def test_patient_calls_wait_for_pictures_but_not_for_ever():
     now = [0.0]
-    worker = Worker(Views(), lambda client, quality: None, lambda: True, lambda: now[0])
+    worker = Worker(PictureSchedule(), lambda client, quality: None, lambda: True, lambda: now[0])
     done = []
     for index in range(2):
         waiting = threading.Thread(
@@ -174,19 +174,16 @@ def test_patient_calls_wait_for_pictures_but_not_for_ever():
         )
         waiting.start()
         time.sleep(0.05)
-    with worker.changing() as views:
-        views.move(1, camera(), 0.0)
-    with worker._condition:
-        worker._next()()
+    with worker.changing() as schedule:
+        schedule.move(1, camera(), 0.0)
+    worker.next_task()()
     assert done == [], "the picture first"
-    with worker._condition:
-        worker._next()()
+    worker.next_task()()
     assert done == [0], "then the job"
     now[0] = PATIENCE + 0.1
-    with worker.changing() as views:
-        views.change(now[0])
-    with worker._condition:
-        worker._next()()
+    with worker.changing() as schedule:
+        schedule.change(now[0])
+    worker.next_task()()
     assert done == [0, 1], "who has waited for long comes before a picture"
 
 
@@ -250,35 +247,35 @@ def test_a_job_is_stopped_and_leaves_nothing(tmp_path):
 )
 def test_names_lead_nowhere_else(tmp_path, name):
     with pytest.raises(UserError, match="file name"):
-        files.place(tmp_path / "edits", name, ".json")
+        files.output_path(tmp_path / "edits", name, ".json")
     assert not (tmp_path / "edits").exists()
 
 
 def test_names(tmp_path):
     folder = tmp_path / "edits"
-    assert files.edits(folder) == ()
-    assert files.place(folder, " raise arm.v2 ", ".json") == folder / "raise arm.v2.json"
-    path = files.place(folder, "raise.JSON", ".json")
+    assert files.saved_edits(folder) == ()
+    assert files.output_path(folder, " raise arm.v2 ", ".json") == folder / "raise arm.v2.json"
+    path = files.output_path(folder, "raise.JSON", ".json")
     assert path == folder / "raise.json"
     path.write_text("{}")
-    assert files.edits(folder) == ("raise.json",)
+    assert files.saved_edits(folder) == ("raise.json",)
     (folder / "link.json").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(UserError, match="link"):
-        files.place(folder, "link", ".json")
+        files.output_path(folder, "link", ".json")
     with pytest.raises(UserError, match="cannot be made"):
-        files.place(path, "a", ".json")
+        files.output_path(path, "a", ".json")
     for name in ("-rf.json", "caf\u00e9.json", "a..json", f"{'a' * 120}.json"):
         (folder / name).write_text("{}")
-    assert files.edits(folder) == ("raise.json",), "what is listed can be loaded"
+    assert files.saved_edits(folder) == ("raise.json",), "what is listed can be loaded"
 
 
 def test_names_that_are_taken_are_numbered(tmp_path):
     long = tmp_path / f"{'a' * 100}.mp4"
-    assert files.free(long) == long
+    assert files.unused_path(long) == long
     for path in (tmp_path / "film.mp4", tmp_path / "film 2.mp4", long):
         path.write_text("")
-    assert files.free(tmp_path / "film.mp4") == tmp_path / "film 3.mp4"
-    found = files.free(long)
-    assert found != long and files.place(tmp_path, found.name, ".mp4") == found
+    assert files.unused_path(tmp_path / "film.mp4") == tmp_path / "film 3.mp4"
+    found = files.unused_path(long)
+    assert found != long and files.output_path(tmp_path, found.name, ".mp4") == found
     (tmp_path / "gone.ply").symlink_to(tmp_path / "nowhere")
-    assert files.free(tmp_path / "gone.ply").name == "gone 2.ply"
+    assert files.unused_path(tmp_path / "gone.ply").name == "gone 2.ply"

@@ -19,8 +19,8 @@ from helpers.page_reader import read_page
 from scgs_warp.apps.cli import run
 from scgs_warp.errors import UserError
 from scgs_warp.export import run as job
-from scgs_warp.export.gltf import Document
-from scgs_warp.export.request import Format, Request
+from scgs_warp.export.gltf import GltfDocument
+from scgs_warp.export.request import ExportRequest, Format
 from scgs_warp.export.sequence import write_sequence
 from scgs_warp.export.skeleton import at_rest
 from scgs_warp.formats import gaussian_files
@@ -76,7 +76,7 @@ def test_what_does_not_fit_after_reading_is_one_line_too(tmp_path, monkeypatch, 
             open_ply(path)
     monkeypatch.setattr(GaussianParameters, "activate", refuse)
     with pytest.raises(UserError, match=r"a\.spz: .*fit into memory; export"):
-        job.export(Request(tmp_path / "b.ply", ply=path))
+        job.export(ExportRequest(tmp_path / "b.ply", ply=path))
     assert run(refuse) == 2
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "b.ply").exists()
     with pytest.raises(RuntimeError, match="another"):
@@ -112,7 +112,7 @@ def spoil_motion(scene: Scene) -> None:
 def write(scene: Scene, path: Path, kind: Format, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job, "_open", lambda *_: scene)
     monkeypatch.setattr(Scene, "load", lambda *_, **__: scene)
-    job.export(Request(path, run=Path("runs/x"), format=kind, frames=None if kind == "html" else 3))
+    job.export(ExportRequest(path, run=Path("runs/x"), format=kind, frames=None if kind == "html" else 3))
 
 
 def test_npz_leaves_out_gaussians_that_are_not_finite(scene, tmp_path, monkeypatch):
@@ -156,7 +156,7 @@ def test_a_motion_that_is_not_finite_is_one_line(scene, tmp_path, monkeypatch, n
 
 
 def test_glb_is_never_json_that_is_not_json():
-    document = Document()
+    document = GltfDocument()
     document.append("nodes", {"translation": [0.0, float("nan"), 0.0]})
     with pytest.raises(UserError, match="not finite"):
         document.content()

@@ -112,7 +112,7 @@ def test_quick_motions_are_sampled_more_often():
     swing = quick.motion.poses
     quick.motion.poses = lambda times: swing(0.5 + 0.5 * torch.sin(40 * times))  # type: ignore[method-assign]
     few, many = (page_scene.sample_poses(scene.motion)["translation"] for scene in (slow, quick))
-    assert len(few) < len(many) == page_scene.MOST_SAMPLES
+    assert len(few) < len(many) == page_scene.MAX_SAMPLES
     exact = swing(0.5 + 0.5 * torch.sin(40 * torch.tensor([100 / 256])))[0].translations
     assert np.allclose(many[100], exact, atol=1e-6)
 
@@ -185,7 +185,7 @@ def test_the_program_is_small_and_the_same_scene_gives_the_same_page(tmp_path):
         page.write_page(scene, tmp_path / f"{name}.html")
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
     assert len(page.assemble(b"")) < 64 * 1024
-    assert "http://" not in page._program() and "https://" not in page._program()
+    assert "http://" not in page.program_text() and "https://" not in page.program_text()
 
 
 def test_a_page_gives_up_degrees_until_it_fits_and_refuses_otherwise(tmp_path):

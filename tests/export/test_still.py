@@ -20,7 +20,7 @@ from scgs_warp.data.points import read_points
 from scgs_warp.edit.rotations import rotate
 from scgs_warp.errors import UserError
 from scgs_warp.export.gltf import upright
-from scgs_warp.export.request import Request
+from scgs_warp.export.request import ExportRequest
 from scgs_warp.export.run import export, write_still
 from scgs_warp.formats.gaussian_files import gaussian_points, read_gaussians
 from scgs_warp.formats.gaussian_spz import FLIPS, fraction_bits, pack_quats, read_antialiased, unpack_quats
@@ -152,7 +152,7 @@ def test_spz_of_others_is_read(tmp_path, version):
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_spz_keeps_the_mark_of_antialiasing(tmp_path, antialiased):
     write_still(tmp_path / "a.spz", cloud(), antialiased=antialiased)
-    export(Request(tmp_path / "b.spz", ply=tmp_path / "a.spz"))
+    export(ExportRequest(tmp_path / "b.spz", ply=tmp_path / "a.spz"))
     assert gzip.decompress((tmp_path / "b.spz").read_bytes())[14] == antialiased
     assert open_ply(tmp_path / "b.spz", nodes=5).config.antialiased == antialiased
     (tmp_path / "c.spz").write_bytes(b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, antialiased, 5, 32))

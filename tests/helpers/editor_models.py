@@ -8,7 +8,7 @@ import math
 from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_matrix
-from scgs_warp.editor.model import Model
+from scgs_warp.editor.model import EditorModel
 from scgs_warp.editor.views import ClientCamera
 from scgs_warp.geometry.cameras import orbit_camera
 
@@ -20,14 +20,14 @@ def loaded() -> EditSession:
     return EditSession(bar_scene(gaussians=1500))
 
 
-def new_model() -> Model:
+def new_model() -> EditorModel:
     """As the editor begins, but that nothing is pinned around what is grabbed."""
-    made = Model(loaded().fork())
+    made = EditorModel(loaded().fork())
     made.pin_rings = None
     return made
 
 
-def chosen(model: Model, point=RIGHT, rings: int = 1) -> tuple[int, ...]:
+def chosen(model: EditorModel, point=RIGHT, rings: int = 1) -> tuple[int, ...]:
     return model.session.ring([model.session.nearest(point, model.time)], rings)
 
 

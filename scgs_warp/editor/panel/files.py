@@ -17,7 +17,7 @@ from ..jobs import Jobs
 from .host import Host
 
 NONE: str = "none yet"
-OFFERED = 64 << 20
+MAX_DOWNLOAD = 64 << 20
 """Bytes; what is larger stays on the server's disk, or the page would hold it all in memory."""
 
 
@@ -48,12 +48,12 @@ class FilesSection:
         button.on_click(self.host.guarded(action))
 
     def _path(self, suffix: str) -> Path:
-        path = files.place(self.host.folder, self.name.value, suffix)
-        return path if self.replace.value else files.free(path)
+        path = files.output_path(self.host.folder, self.name.value, suffix)
+        return path if self.replace.value else files.unused_path(path)
 
     def offer(self, client: Any, path: Path) -> None:
         """Send a file to the browser, which shows a link to it."""
-        if client is not None and path.is_file() and path.stat().st_size <= OFFERED:
+        if client is not None and path.is_file() and path.stat().st_size <= MAX_DOWNLOAD:
             client.send_file_download(path.name, path.read_bytes())
 
     def save(self, client: Any = None) -> Path:
@@ -72,7 +72,7 @@ class FilesSection:
         """
         if name == NONE:
             raise UserError("no edit is saved here yet; save one, or load one from this computer")
-        path = files.place(self.host.folder, name, ".json")
+        path = files.output_path(self.host.folder, name, ".json")
         self._take(lambda: edit_file.read(path, self.model.session.engine))
 
     def load_bytes(self, content: bytes) -> None:
@@ -99,7 +99,7 @@ class FilesSection:
         camera, moment = self.host.camera(client), self.model.moment()
         if not camera.usable:
             raise UserError("the browser's window has no size; open it and try again")
-        picture = self.host.worker.call(lambda: self.host.take(moment, camera))
+        picture = self.host.worker.call(lambda: self.host.take_picture(moment, camera))
         path = self._path(".png")
         try:
             write_png(path, picture.rgb)
@@ -140,6 +140,6 @@ class FilesSection:
         return path
 
     def show(self) -> None:
-        names = files.edits(self.host.folder) or (NONE,)
+        names = files.saved_edits(self.host.folder) or (NONE,)
         if self.saved.options != names:
             self.saved.options = names

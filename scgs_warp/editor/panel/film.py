@@ -13,9 +13,9 @@ from .host import Host
 
 NONE = "none"
 EASINGS: tuple[Easing, ...] = ("smooth", "linear", "ease", "step")
-SHORTEST, LONGEST = 0.04, 600.0
+MIN_SECONDS, MAX_SECONDS = 0.04, 600.0
 """Seconds of a film that the panel offers; scripts may ask for others."""
-SLOWEST, FASTEST = 1.0, 120.0
+MIN_FPS, MAX_FPS = 1.0, 120.0
 """The same of its frames a second."""
 REPEATS = ("once", "loop", "swing", "stand still")
 
@@ -53,23 +53,27 @@ class FilmSection:
             self.easing = gui.add_dropdown("Way to the next", EASINGS)
             self.add = gui.add_button("Add keyframe here")
             self.add.on_click(host.guarded(lambda event: self.model.add_keyframe(self.easing.value)))
-            self.chosen = on(gui.add_dropdown("Keyframe", (NONE,)), self._go)
+            self.chosen = on(gui.add_dropdown("Keyframe", (NONE,)), self.seek_keyframe)
             self.remove = gui.add_button("Remove this keyframe")
             self.remove.on_click(host.guarded(lambda event: self._remove()))
-        self._dress_film()
+        self._add_film()
 
-    def _dress_film(self) -> None:
+    def _add_film(self) -> None:
         gui, on, film = self.host.server.gui, self.host.on_value, self.model.session.edit.film
         with gui.add_folder("Film"):
             self.seconds = on(
                 gui.add_number(
-                    "Seconds", film.seconds, min=min(SHORTEST, film.seconds), max=max(LONGEST, film.seconds), step=0.01
+                    "Seconds",
+                    film.seconds,
+                    min=min(MIN_SECONDS, film.seconds),
+                    max=max(MAX_SECONDS, film.seconds),
+                    step=0.01,
                 ),
                 lambda value: self._film(seconds=float(value)),
             )
             self.fps = on(
                 gui.add_number(
-                    "Frames a second", film.fps, min=min(SLOWEST, film.fps), max=max(FASTEST, film.fps), step=1.0
+                    "Frames a second", film.fps, min=min(MIN_FPS, film.fps), max=max(MAX_FPS, film.fps), step=1.0
                 ),
                 lambda value: self._film(fps=float(value)),
             )
@@ -103,18 +107,18 @@ class FilmSection:
             view = view_of(self.model.session, self.host.camera(event.client))
             self._film(shot=dataclasses.replace(shot, kind="fixed", views=(view,), up=None))
 
-    def _go(self, name: str) -> None:
+    def seek_keyframe(self, name: str) -> None:
         if name != NONE:
-            self.model.seek(self._moments()[name])
+            self.model.seek(self.keyframe_labels()[name])
 
-    def _moments(self) -> dict[str, float]:
+    def keyframe_labels(self) -> dict[str, float]:
         times = [frame.at for frame in self.model.session.edit.keyframes]
         short = [f"{at:.3f} s" for at in times]
         often = Counter(short)
         return {label if often[label] == 1 else f"{at!r} s": at for label, at in zip(short, times)}
 
     def _remove(self) -> None:
-        at = self._moments().get(self.chosen.value)
+        at = self.keyframe_labels().get(self.chosen.value)
         if at is None:
             raise UserError("no keyframe is chosen; choose one from the list first")
         with self.model.changing() as session:
@@ -126,12 +130,12 @@ class FilmSection:
         rows = [f"| {frame.at:.2f} | {len(frame.targets)} | {frame.easing} |" for frame in edit.keyframes]
         head = "| second | handles | way to the next |\n|---|---|---|\n"
         self.list.content = head + "\n".join(rows) if rows else "*None yet: move a handle, then add one.*"
-        names = (NONE, *self._moments())
+        names = (NONE, *self.keyframe_labels())
         if self.chosen.options != names:
             self.chosen.options = names
-        self.chosen.value = next((n for n, at in self._moments().items() if at == self.model.at), NONE)
-        self.seconds.min, self.seconds.max = min(SHORTEST, film.seconds), max(LONGEST, film.seconds)
-        self.fps.min, self.fps.max = min(SLOWEST, film.fps), max(FASTEST, film.fps)
+        self.chosen.value = next((n for n, at in self.keyframe_labels().items() if at == self.model.at), NONE)
+        self.seconds.min, self.seconds.max = min(MIN_SECONDS, film.seconds), max(MAX_SECONDS, film.seconds)
+        self.fps.min, self.fps.max = min(MIN_FPS, film.fps), max(MAX_FPS, film.fps)
         self.seconds.value, self.fps.value, self.size.value = film.seconds, film.fps, film.size
         self.repeat.value = playback.repeat if playback.freeze is None else "stand still"
         self.speed.min, self.speed.max = min(-100.0, playback.speed), max(100.0, playback.speed)

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from ...edit import Target
 from ..frame_image import Picture
-from ..model import Model, Moment
+from ..model import EditorModel, Moment
 from ..overlays import Overlays
 from ..views import ClientCamera
 from ..worker import Worker
@@ -19,7 +19,7 @@ class Host(Protocol):
 
     server: Any
     """viser's server."""
-    model: Model
+    model: EditorModel
     worker: Worker
     overlays: Overlays
     folder: Path
@@ -35,4 +35,4 @@ class Host(Protocol):
     def put(self, target: Target) -> None: ...
     def color_overlays(self) -> None: ...
     def camera(self, client: Any) -> ClientCamera: ...
-    def take(self, moment: Moment, camera: ClientCamera) -> Picture: ...
+    def take_picture(self, moment: Moment, camera: ClientCamera) -> Picture: ...

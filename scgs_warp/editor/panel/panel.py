@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..escape import plain
-from ..jobs import Jobs, Progress
+from ..jobs import JobProgress, Jobs
 from .files import FilesSection
 from .film import FilmSection, TimeSection
 from .host import Host
@@ -99,7 +99,7 @@ class Panel:
 
     # Jobs
 
-    def _progress(self, progress: Progress | None) -> None:
+    def _progress(self, progress: JobProgress | None) -> None:
         busy = progress is not None
         self.work.visible = self.bar.visible = self.stop.visible = busy
         if progress is not None:

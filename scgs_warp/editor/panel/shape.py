@@ -24,11 +24,11 @@ class ShapeSection:
 
     def __init__(self, host: Host) -> None:
         self.host, self.model = host, host.model
-        self._dress_selection()
-        self._dress_handle()
-        self._dress_pins()
+        self._add_selection()
+        self._add_handle()
+        self._add_pins()
 
-    def _dress_selection(self) -> None:
+    def _add_selection(self) -> None:
         gui, model, on = self.host.server.gui, self.model, self.host.on_value
         unit = self.host.edge_length
         with gui.add_folder("Selection"):
@@ -57,18 +57,20 @@ class ShapeSection:
         else:
             model.select(tuple(range(len(session))) if what == "All" else ())
 
-    def _dress_handle(self) -> None:
+    def _add_handle(self) -> None:
         gui, model, on = self.host.server.gui, self.model, self.host.on_value
         with gui.add_folder("Handle"):
-            self.handle = on(gui.add_dropdown("Handle", (NEW,)), lambda label: model.activate(self._names()[label]))
+            self.handle = on(
+                gui.add_dropdown("Handle", (NEW,)), lambda label: model.activate(self.handle_labels()[label])
+            )
             self.move = on(
-                gui.add_vector3("Move", (0.0, 0.0, 0.0), step=_round(0.1 * self.host.edge_length)), self._moved
+                gui.add_vector3("Move", (0.0, 0.0, 0.0), step=_round(0.1 * self.host.edge_length)), self.move_handle
             )
             self.turn = on(
                 gui.add_vector3(
                     "Turn, degrees", (0.0, 0.0, 0.0), step=1.0, hint="About x, y and z at once: an axis times an angle"
                 ),
-                self._turned,
+                self.turn_handle,
             )
             self.lasts = on(
                 gui.add_dropdown(
@@ -87,7 +89,7 @@ class ShapeSection:
             self.remove = gui.add_button_group("", ("Put back", "Remove"))
             self.remove.on_click(self.host.guarded(lambda event: self._ended(event.target.value)))
 
-    def _names(self) -> dict[str, str | None]:
+    def handle_labels(self) -> dict[str, str | None]:
         """Handles by their labels; a handle may be called anything, even what stands for none."""
         found: dict[str, str | None] = {NEW: None}
         for handle in self.model.session.edit.handles:
@@ -97,10 +99,10 @@ class ShapeSection:
             found[label] = handle.name
         return found
 
-    def _moved(self, where: tuple[float, float, float]) -> None:
+    def move_handle(self, where: tuple[float, float, float]) -> None:
         self.host.put(Target.of(where, self.model.target.rotation))
 
-    def _turned(self, degrees: tuple[float, float, float]) -> None:
+    def turn_handle(self, degrees: tuple[float, float, float]) -> None:
         if not all(map(math.isfinite, degrees)):
             raise UserError(f"turn {list(degrees)}: must be three finite numbers; the handle stays where it is")
         turn = exponential(np.radians(degrees))
@@ -118,7 +120,7 @@ class ShapeSection:
         else:
             self.model.remove_handle()
 
-    def _dress_pins(self) -> None:
+    def _add_pins(self) -> None:
         gui, model, on = self.host.server.gui, self.model, self.host.on_value
         with gui.add_folder("Pins"):
             self.rest = on(
@@ -154,7 +156,7 @@ class ShapeSection:
         model, edit = self.model, self.model.session.edit
         self.kind.value, self.rings.value, self.combine.value = model.region.kind, model.region.rings, model.combine
         self.rings.visible, self.radius.visible = model.region.kind == "rings", model.region.kind == "brush"
-        labels = self._names()
+        labels = self.handle_labels()
         if self.handle.options != tuple(labels):
             self.handle.options = tuple(labels)
         self.handle.value = next((label for label, name in labels.items() if name == model.active), NEW)
