@@ -11,7 +11,7 @@ from helpers.editor_models import LEFT, RIGHT, chosen, new_model
 from scgs_warp.edit import Film, Playback, Target
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import from_axis
-from scgs_warp.editor.gizmo_pose import GizmoFrame, frame_of_handle, frame_of_selection
+from scgs_warp.editor.gizmo_pose import GizmoFrame
 from scgs_warp.editor.model import EditorModel, Moment
 from scgs_warp.errors import UserError
 
@@ -100,37 +100,6 @@ def test_pinning_the_rest_makes_way_for_the_next_handle(model):
     model.drag(STAY)
     model.release()
     assert set(session.edit.pins) == set(own) - set(model.selection), "what the user pinned stays, but for the handle"
-
-
-def test_a_handle_taken_from_bent_surroundings_leaves_them(model):
-    model.select(chosen(model))
-    model.grab(STAY)
-    model.drag(Target((0.0, 0.2, 0.3), tuple(from_axis([0, 1, 0], 30).tolist())))
-    model.release()
-    session, at = model.session, model.moment()
-    before = session.node_positions(0.0)
-    other = tuple(sorted(set(session.ring(model.selection, 1)) - set(model.selection)))
-    assert other
-    place, target = frame_of_selection(session, other, at)
-    position, _ = place.pose(target)
-    assert position == pytest.approx(before[list(other)].mean(0), abs=1e-9)
-
-
-def test_the_gizmo_says_what_the_target_says(model):
-    model.select(chosen(model))
-    model.grab(STAY)
-    target = Target.of((0.1, -0.2, 0.3), from_axis([1, 2, 3], 50).tolist())
-    model.drag(target)
-    model.release()
-    session = model.session
-    for time in (0.0, 0.7):
-        place = frame_of_handle(session, session.edit.handles[0], time)
-        back = place.target(*place.pose(target))
-        assert back.translation == pytest.approx(target.translation, abs=1e-9)
-        assert back.rotation == pytest.approx(target.rotation, abs=1e-9)
-        where = session.node_positions(time)[list(model.selection)].mean(0)
-        assert place.pose(target)[0] == pytest.approx(where, abs=5e-3), "it stands on what it holds"
-    assert place.target(place.pivot, np.array([1.0, 1e-20, 0, 0])).is_identity, "noise is no rotation"
 
 
 def test_keyframes_lead_until_a_drag_begins(model):
@@ -320,3 +289,7 @@ def test_a_moment_of_a_long_film_is_known_at_once(model, monkeypatch):
     monkeypatch.setattr(Playback, "times_at", None)
     monkeypatch.setattr(Playback, "time_at", lambda playback, at, seconds: 0.25)
     assert model.moment() == Moment(0.25, None, False, "edited")
+
+
+def test_a_moment_shows_the_film_or_the_handles(model):
+    assert model.moment() == Moment(0.0, None, False, "edited")

@@ -11,12 +11,11 @@ from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import Edit, EditSession, Exaggerate, Film, Handle, Hold, Keyframe, Playback, Target
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import from_axis
+from scgs_warp.editor.app import Editor
+from scgs_warp.editor.panel.shape import NEW
 from scgs_warp.errors import UserError
 
 pytest.importorskip("viser", reason="the editor needs viser: pip install 'scgs_warp[edit]'")
-
-from scgs_warp.editor.app import Editor
-from scgs_warp.editor.panel.shape import NEW
 
 
 @pytest.fixture
@@ -179,18 +178,3 @@ def test_files_are_not_replaced_unless_asked_for(editor):
     panel.replace.value = True
     assert panel.save().name == "edit.json"
     panel.load("edit 2.json")
-
-
-def test_a_picture_that_fails_says_so(editor, monkeypatch, capsys):
-    said = []
-    monkeypatch.setattr(editor, "say", lambda client, title, text, color="red": said.append((client, title, text)))
-    monkeypatch.setattr(editor.server, "get_clients", lambda: {7: "a window"})
-    for error, title in ((UserError("no room"), "The picture cannot be drawn"), (ValueError("odd"), "Internal error")):
-        with pytest.raises(type(error)):
-            try:
-                raise error
-            finally:
-                editor.picture_failed(7, error)
-        assert said[-1][:2] == ("a window", title) and str(error) in said[-1][2]
-    editor.picture_failed(8, ValueError("a window that is gone"))
-    assert len(said) == 2 and "odd" in capsys.readouterr().err

@@ -37,3 +37,8 @@ def client(session: EditSession, azimuth: float = 40.0, size: int = 96) -> Clien
     wxyz = from_matrix(camera.viewmat[:3, :3].double().numpy().T)
     fov = 2 * math.atan(camera.height / (2 * float(camera.K[1, 1])))
     return ClientCamera(tuple(wxyz.tolist()), tuple(camera.position.tolist()), fov, camera.width, camera.height)
+
+
+def canvas_camera(x: float = 0.0, width: int = 100) -> ClientCamera:
+    """A browser of 100 x 50 pixels in front of the origin."""
+    return ClientCamera((1.0, 0.0, 0.0, 0.0), (x, 0.0, -4.0), 0.7, width, 50)
