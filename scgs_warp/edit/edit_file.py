@@ -1,4 +1,4 @@
-"""An edit as JSON: readable, versioned, checked. No paths, no code. Numbers come back as the same bits."""
+"""Edits as JSON: readable, versioned, checked, without paths or code. Numbers survive to the bit."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ MAX_FILM_SIZE = 8192
 
 
 def fingerprint(engine: Engine) -> str:
-    """Tells one scene's control points from another's: numbers of control points mean nothing elsewhere."""
+    """Return the CRC-32 of the control points' rest positions, which tells scenes apart: node indices are only valid
+    in the scene they were chosen in."""
     rest = engine.rig.positions.detach().cpu().contiguous().numpy()
     return f"{zlib.crc32(np.ascontiguousarray(rest).tobytes()):08x}"
 
 
 def to_json(edit: Edit, engine: Engine) -> str:
-    """Text that ``read`` turns into the same edit."""
+    """Write an edit as text that ``read`` turns back into the same edit."""
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
@@ -55,20 +56,19 @@ def to_json(edit: Edit, engine: Engine) -> str:
 
 
 def _plain(value: Any) -> dict[str, Any]:
-    """Fields that say something; lists for tuples."""
-    found = dataclasses.asdict(value)
-    return {name: item for name, item in found.items() if item is not None}
+    """Return the fields that are not None."""
+    return {name: item for name, item in dataclasses.asdict(value).items() if item is not None}
 
 
 def _compact(value: Any) -> str:
-    """One line an entry of a list."""
+    """Write lists of objects with one entry per line."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return "[\n  " + ",\n  ".join(json.dumps(item) for item in value) + "\n ]"
     return json.dumps(value)
 
 
 def read(path: Path, engine: Engine) -> Edit:
-    """The edit in a file, for this session's scene: regions said by place become control points.
+    """Read an edit for the engine's scene; regions given by place become lists of control points.
 
     Raises:
         UserError: naming the file, the field and the remedy.
@@ -77,7 +77,7 @@ def read(path: Path, engine: Engine) -> Edit:
 
 
 def parse(content: Any, source: str, engine: Engine) -> Edit:
-    """As ``read``, of a JSON value; ``source`` is what errors name."""
+    """Decode an edit from a JSON value, as ``read`` does; errors name ``source``."""
     root = FieldReader(content, source)
     if root.raw("format") != FORMAT:
         raise root.wrong("format", f"is {show_value(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
@@ -128,7 +128,7 @@ def _check_scene(root: FieldReader, engine: Engine) -> None:
 
 
 def _nodes(fields: FieldReader, name: str, engine: Engine, *, time: float = 0.0) -> tuple[int, ...]:
-    """A list of control points, or a region: {"point", "rings"}, {"sphere", "radius"}, {"box"}, at a time."""
+    """Read control points: a list, or a region {"point", "rings"}, {"sphere", "radius"} or {"box"} at a time."""
     value = fields.raw(name)
     if isinstance(value, dict):
         return _region(FieldReader(value, fields.source, f"{fields.path}.{name}".strip(".")), engine, time)
@@ -173,7 +173,7 @@ def _handle(fields: FieldReader, engine: Engine) -> Handle:
 
 
 def _too_short(direction: tuple[float, ...]) -> bool:
-    """Its length cannot be told."""
+    """Return whether a direction is too short to be normalised."""
     return not sum(x * x for x in direction) > 1e-200
 
 
@@ -190,7 +190,7 @@ def _pins(root: FieldReader, handles: list[Handle], engine: Engine) -> tuple[int
 
 
 def _target(fields: FieldReader) -> Target:
-    """``rotation`` as a quaternion wxyz, or as ``axis`` and ``degrees``."""
+    """Read a target, whose turn is either a quaternion (``rotation``, wxyz) or ``axis`` and ``degrees``."""
     rotation, axis = fields.vector("rotation", 4), fields.vector("axis", 3)
     degrees = fields.number("degrees", None, -180.0, 180.0)
     translation = fields.vector("translation", 3)
@@ -208,12 +208,12 @@ def _target(fields: FieldReader) -> Target:
 
 
 def _targets(root: FieldReader, names: set[str]) -> dict[str, Target]:
-    found = {}
+    targets = {}
     for name, fields in root.entries("targets"):
         if name not in names:
             raise fields.wrong("", "names no handle", f"there is {one_line(', '.join(sorted(names))) or 'none'}")
-        found[name] = _target(fields)
-    return found
+        targets[name] = _target(fields)
+    return targets
 
 
 def _keyframe(fields: FieldReader, names: set[str]) -> Keyframe:
@@ -234,7 +234,7 @@ def _playback(fields: FieldReader | None) -> Playback:
                 f"map[{index}]", f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]"
             )
         pairs.append((at, time))
-    found = Playback(
+    playback = Playback(
         seconds=fields.number("seconds", None, 1e-3, MAX_SECONDS),
         speed=fields.number("speed", 1.0, -1000.0, 1000.0),
         start=fields.number("start", 0.0, 0.0, 1.0),
@@ -243,24 +243,24 @@ def _playback(fields: FieldReader | None) -> Playback:
         map=tuple(pairs),
     )
     fields.done()
-    return found
+    return playback
 
 
 def _hold(fields: FieldReader, engine: Engine) -> Hold:
     time = fields.number("time", 0.0, 0.0, 1.0)
     frame = fields.choice("frame", ("body", "world"), "body")
-    found = Hold(_nodes(fields, "nodes", engine, time=time), time, frame, fields.integer("rings", 2, 0, 100))
+    hold = Hold(_nodes(fields, "nodes", engine, time=time), time, frame, fields.integer("rings", 2, 0, 100))
     fields.done("comment")
-    return found
+    return hold
 
 
 def _exaggerate(fields: FieldReader | None, engine: Engine) -> Exaggerate | None:
     if fields is None:
         return None
     nodes = _nodes(fields, "nodes", engine) if fields.raw("nodes") else ()
-    found = Exaggerate(fields.number("factor", 1.5, -10.0, 10.0), fields.number("about", None, 0.0, 1.0), nodes)
+    exaggerate = Exaggerate(fields.number("factor", 1.5, -10.0, 10.0), fields.number("about", None, 0.0, 1.0), nodes)
     fields.done("comment")
-    return found
+    return exaggerate
 
 
 def film_of(fields: FieldReader | None) -> Film:
@@ -271,7 +271,7 @@ def film_of(fields: FieldReader | None) -> Film:
     """
     if fields is None:
         return Film()
-    found = Film(
+    film = Film(
         seconds=fields.number("seconds", 4.0, 1e-3, MAX_SECONDS),
         fps=fields.number("fps", 30.0, 0.01, 1000.0),
         size=fields.integer("size", 512, 16, MAX_FILM_SIZE),
@@ -279,7 +279,7 @@ def film_of(fields: FieldReader | None) -> Film:
         shot=_shot(fields.child("shot")),
     )
     fields.done()
-    return found
+    return film
 
 
 def _shot(fields: FieldReader | None) -> Shot:
@@ -298,16 +298,16 @@ def _shot(fields: FieldReader | None) -> Shot:
         )
         view.done()
     views.sort(key=lambda view: view.at)
-    found = Shot(
+    shot = Shot(
         kind=fields.choice("kind", ("turntable", "fixed", "orbit"), "turntable"),
         views=tuple(views) or (View(),),
         turns=fields.number("turns", 1.0, -1000.0, 1000.0),
         up=fields.vector("up", 3),
         fov=fields.number("fov", None, 1.0, 150.0),
     )
-    if found.up is not None and _too_short(found.up):
+    if shot.up is not None and _too_short(shot.up):
         raise fields.wrong("up", "has no direction", "give 3 numbers, not all 0 or next to it")
     if any(a.at == b.at for a, b in pairwise(views)):
         raise fields.wrong("views", "has two at one moment", "give every view a moment of its own")
     fields.done()
-    return found
+    return shot

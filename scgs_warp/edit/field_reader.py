@@ -1,4 +1,4 @@
-"""Reading JSON that people write: every mistake names the file, the field and the remedy, in one line."""
+"""Checked access to JSON that people write: every error names the file, the field and the remedy in one line."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from ..errors import UserError
 from ..storage.files import parse_json
 
 MAX_BYTES = 64 << 20
-"""A larger file is no edit."""
+"""Size of the largest edit file."""
 MAX_NUMBER = 1e9
-"""Of numbers that nothing else limits: beyond it float32 leaves no scene."""
+"""Limit of numbers that have no limit of their own: beyond it float32 resolves no scene."""
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file.
+    """Read the JSON object in a file.
 
     Raises:
-        UserError: it is missing, too large, no JSON, or no object.
+        UserError: the file is missing, too large, not JSON, or not an object.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -35,10 +35,10 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def parse_object(text: str, path: str) -> dict[str, Any]:
-    """The JSON object in a text; ``path`` is what errors name.
+    """Parse a text as a JSON object; errors name ``path``.
 
     Raises:
-        UserError: it is no JSON, or no object.
+        UserError: the text is not JSON, or not an object.
     """
     try:
         content = parse_json(text, parse_constant=_no_constant, object_pairs_hook=_unique)
@@ -66,7 +66,13 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class FieldReader:
-    """A JSON object and where it stands. Fields are taken by name; ``done`` refuses what nobody took."""
+    """Reads the fields of a JSON object by name and type; ``done`` refuses fields that were not read.
+
+    Args:
+        value: the object.
+        source: file that errors name.
+        path: place of the object in the file, such as ``handles[0]``.
+    """
 
     def __init__(self, value: Any, source: str, path: str = "") -> None:
         self.source, self.path = source, path
@@ -80,7 +86,7 @@ class FieldReader:
         return UserError(f"{self.source}: {field or 'the file'} {what}; {remedy}")
 
     def _inside(self, name: str) -> str:
-        """The place of a field; names that people made up may be anything."""
+        """Return the path of a field in one line, as its name may be any text."""
         return ".".join(part for part in (self.path, one_line(name)) if part)
 
     def __contains__(self, name: str) -> bool:
@@ -161,7 +167,7 @@ class FieldReader:
             yield FieldReader(value, self.source, f"{self._inside(name)}[{index}]")
 
     def entries(self, name: str) -> Iterator[tuple[str, FieldReader]]:
-        """Of an object of objects."""
+        """Iterate over the names and readers of an object of objects."""
         inner = self.child(name)
         if inner is not None:
             for key in inner._value:
@@ -181,7 +187,7 @@ def _is_number(value: Any) -> bool:
 
 
 def show_value(value: Any) -> str:
-    """A JSON value in at most 60 characters of one line."""
+    """Quote a JSON value in at most 60 characters of one line."""
     try:
         text = json.dumps(value) if value is not None else "missing"
     except RecursionError:
@@ -190,6 +196,6 @@ def show_value(value: Any) -> str:
 
 
 def one_line(text: str) -> str:
-    """A text in at most 100 characters of one line."""
+    """Shorten a text to at most 100 characters of one line."""
     plain = text if text.isprintable() else json.dumps(text)[1:-1]
     return plain if len(plain) <= 100 else plain[:97] + "..."

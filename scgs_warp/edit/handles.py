@@ -1,4 +1,4 @@
-"""What a user takes hold of: handles, where they were moved to, and what that asks of the solver. All frozen."""
+"""Handles, their targets, and the goals and anchors that the solver gets from them."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ Quaternion = tuple[float, float, float, float]
 Lasting = Literal["motion", "frame", "fade"]
 
 ONE_FRAME = 5e-3
-"""What lasts one frame shows this far from its time, where nobody says how far frames are apart."""
+"""Scene time on either side of its own within which an edit of one frame shows, if the film's step is unknown."""
 HALFWAY_STIFFNESS = 10.0
-"""Stiffness of a fading handle half way: it lets go of its nodes as its strength goes to 0, so that nothing jumps."""
+"""Stiffness of a fading handle at half strength. It releases its nodes as its strength goes to 0, so that nothing
+jumps."""
 MIN_STIFFNESS, MAX_STIFFNESS = 1e-6, 1e6
 """Limits of a stiffness."""
 MIN_NODES_FOR_FRAME = 4
-"""A region of fewer nodes takes its neighbours along to tell how it turns."""
+"""Node count below which a region's rotation is estimated together with its neighbours."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """Where a handle was moved to: turned about its pivot, then shifted. World units, at the handle's time."""
+    """Rigid displacement of a handle: a turn about its pivot, then a shift. World units, at the handle's time."""
 
     translation: Vector3 = (0.0, 0.0, 0.0)
     rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -39,7 +40,7 @@ class Target:
 
     @staticmethod
     def of(translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None) -> Target:
-        """Checked and normalised.
+        """Check and normalise a target.
 
         Raises:
             UserError: a number is not finite or too large, or the rotation has no direction.
@@ -66,26 +67,27 @@ STAY = Target()
 
 @dataclass(frozen=True)
 class Handle:
-    """A set of control points that is moved as one."""
+    """Set of control points that moves as one."""
 
     name: str
     nodes: tuple[int, ...]
     """Ascending, at least one."""
     time: float = 0.0
-    """Scene time at which it was made; pivot and targets are said there."""
+    """Scene time at which it was made; pivot and targets refer to it."""
     pivot: Vector3 | None = None
-    """World, what it turns about; None: the mean of its nodes."""
+    """Centre of rotation, world units; None: the mean of its nodes."""
     stiffness: float | None = None
-    """None: exactly where it is put. A number: pulled there, the weaker the smaller (1: as its edges)."""
+    """None: nodes go exactly to the target. A number: nodes are pulled there, relative to their edges' stiffness 1."""
     turns: bool | None = None
-    """Whether its nodes' rotations are given, too. None: if it is more than one node."""
+    """Whether it also fixes its nodes' rotations. None: if it has more than one node."""
     lasts: Lasting = "motion"
-    """The whole motion, in the nodes' own frames; one frame; or fading out over ``window`` around its time."""
+    """motion: throughout, carried along by its nodes; frame: one frame; fade: fading out over ``window`` around its
+    time."""
     window: float = 0.1
     """Scene time after which a fading handle has no effect."""
 
     def __post_init__(self) -> None:
-        """Check and convert all fields but the nodes, of which only a scene knows how many there are.
+        """Check and convert all fields but the nodes, whose range depends on the scene.
 
         Raises:
             UserError: naming the field.
@@ -98,7 +100,7 @@ class Handle:
         return len(self.nodes) > 1 if self.turns is None else self.turns
 
     def strength(self, time: float, frame: float = ONE_FRAME) -> float:
-        """How much of its target counts at a scene time: 0 to 1, smooth for a fading one."""
+        """Return the share of its target that applies at a scene time: 0 to 1, smooth for a fading handle."""
         away = abs(time - self.time)
         if self.lasts == "motion" or away == 0.0:
             return 1.0
@@ -109,7 +111,7 @@ class Handle:
 
 
 def handle_fields(node: FieldReader) -> dict[str, Any]:
-    """Read a handle's fields, all but its nodes.
+    """Read all fields of a handle but its nodes.
 
     Raises:
         UserError: naming the field.
@@ -126,8 +128,8 @@ def handle_fields(node: FieldReader) -> dict[str, Any]:
 
 
 class Goal(NamedTuple):
-    """What a handle asks for at one instant, normalised units. On the way there (share 0 to 1) it turns about its
-    pivot; it does not cut across."""
+    """Pose that a handle requests at one instant, normalised units. Its path from the base pose (share 0 to 1) is an
+    arc about the pivot, not a straight line."""
 
     nodes: np.ndarray
     """[n]"""
@@ -137,11 +139,11 @@ class Goal(NamedTuple):
     stiffness: float | None = None
     gives_rotation: bool = True
     residual: np.ndarray | None = None
-    """[n, 3] what the rigid motion does not explain."""
+    """[n, 3] displacement beyond the rigid motion."""
     own_turns: np.ndarray | None = None
-    """[n, 4] rotations of single nodes beyond the rigid motion."""
+    """[n, 4] rotations of the nodes beyond the rigid motion."""
     leaning: float | None = None
-    """None: rotations are as given. A number: they are drawn there, as positions by a stiffness."""
+    """None: rotations are fixed. A number: they are pulled towards the goal, as a stiffness pulls positions."""
 
     @property
     def is_identity(self) -> bool:
@@ -152,7 +154,7 @@ class Goal(NamedTuple):
         )
 
     def pose_at(self, rest: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [n, 3] and rotations [n, 3, 3] at ``share`` of the way."""
+        """Return positions [n, 3] and rotations [n, 3, 3] at ``share`` of the path."""
         quat = power(self.quat, share)
         positions = rest[self.nodes]
         if quat[1:].any():
@@ -166,7 +168,7 @@ class Goal(NamedTuple):
         return positions, to_matrix(turns)
 
     def sweep(self, rest: np.ndarray) -> tuple[float, float]:
-        """(angle in radians, distance) it has to go, for the number of sub-steps."""
+        """Return the angle in radians and the distance that it covers, which decide the number of sub-steps."""
         distance = float(np.linalg.norm(self.translation))
         if self.residual is not None:
             distance += float(np.linalg.norm(self.residual, axis=1).max(initial=0.0))
@@ -182,12 +184,12 @@ def carried_goal(
     now: np.ndarray,
     to_units: tuple[np.ndarray, float],
 ) -> Goal:
-    """A handle's target, said at the handle's time, at another instant: carried by the rigid motion of its nodes.
+    """Carry a handle's target from its own time to another instant by the rigid motion of its nodes.
 
     Args:
-        share: how much of the target counts, above 0; below 1 its nodes are held less firmly, too.
-        then, now: [M, 3] control points at the handle's time and at the instant asked for, normalised units; the same
-            object where they are the same.
+        share: share of the target that applies, above 0; below 1 it also holds its nodes less firmly.
+        then, now: [M, 3] control points at the handle's time and at the requested instant, normalised units; the same
+            object if the two are equal.
         to_units: (centre, scale) of the normalised scene.
     """
     centre, scale = to_units
@@ -218,11 +220,12 @@ def _clamp_stiffness(stiffness: float) -> float:
 
 
 def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share: float) -> Anchors:
-    """What is held at ``share`` of the way. Of two goals for one node the later counts; goals count more than pins.
+    """Return what is held at ``share`` of the path. Later goals override earlier ones on the same node, and all of them
+    override pins.
 
     Args:
-        pins: nodes that stay, turned by nothing.
-        rest: [M, 3]
+        pins: nodes that stay, unturned.
+        rest: [M, 3] base positions.
     """
     count = len(rest)
     hard, turned, soft, leaning = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count), np.zeros(count)

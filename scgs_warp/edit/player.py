@@ -1,4 +1,4 @@
-"""Holds and exaggeration, applied to the control points: the motion that an edit then bends."""
+"""Playing of a scene's control points with holds and exaggeration, before handles bend them."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from .rotations import IDENTITY, conjugate, from_matrix, mean, multiply, power, 
 from .solver import ArapSolver, count_steps
 
 MEAN_TIMES = 16
-"""Instants that a motion's mean is taken over."""
+"""Number of instants over which the mean pose is taken."""
 
 
 class Player:
-    """Plays a scene's control points with holds and exaggeration; its results depend on its arguments alone."""
+    """Applies holds and exaggeration to control points; results depend on the arguments alone."""
 
     def __init__(self, graph: ControlGraph, solver: ArapSolver, motion_at: Callable[[float], MotionPose]) -> None:
         self.graph, self.solver, self.motion_at = graph, solver, motion_at
         self._mean: tuple[np.ndarray, np.ndarray] | None = None
 
     def play(self, time: float, holds: tuple[Hold, ...], exaggerate: Exaggerate | None) -> NodePose:
-        """The control points at a scene time: exaggerated, then held."""
+        """Return the control points at a scene time: exaggerated, then held."""
         now = self._exaggerated(time, exaggerate)
         active = [hold for hold in holds if hold.time != time]
         if not active:
@@ -53,7 +53,7 @@ class Player:
         return now.then(positions, turns, color_turns)
 
     def _goal(self, hold: Hold, time: float, now: NodePose, exaggerate: Exaggerate | None) -> tuple[Goal, np.ndarray]:
-        """What holding a region, with the strays that follow it, asks for, and what its colours turn by."""
+        """Return the goal of a held region with the strays that follow it, and the turns of its colours, [n, 4]."""
         nodes = np.array(self.graph.with_strays(hold.nodes), np.int64)
         still = np.tile(IDENTITY, (len(nodes), 1))
         if hold.time == time:
@@ -66,7 +66,7 @@ class Player:
         target = rotate(body, then.positions[nodes] - before) + after
         quat, centre, moved = rigid_fit(now.positions[nodes], target)
         residual = target - (rotate(quat, now.positions[nodes] - centre) + moved)
-        # The trained rotation of then, carried by the body, in place of the trained rotation of now
+        # The trained rotation at the hold's time, carried by the body, replaces the present trained rotation.
         trained = multiply(self.motion_at(hold.time).rotations[nodes], conjugate(self.motion_at(time).rotations[nodes]))
         total = multiply(body, multiply(multiply(then.turns[nodes], trained), conjugate(now.turns[nodes])))
         color_turns = multiply(body, multiply(then.color_turns[nodes], conjugate(now.color_turns[nodes])))
@@ -74,7 +74,7 @@ class Player:
         return Goal(nodes, centre, quat, moved - centre, residual=residual, own_turns=own), color_turns
 
     def _exaggerated(self, time: float, exaggerate: Exaggerate | None) -> NodePose:
-        """More of every turn; positions follow from the turned edges, so that limbs keep their length."""
+        """Scale every turn; positions follow from the turned edges, so that limbs keep their length."""
         here = self.motion_at(time).positions
         if exaggerate is None or exaggerate.factor == 1.0:
             return NodePose.of(here)
@@ -96,8 +96,8 @@ class Player:
         return NodePose.of(here).then(positions, further)
 
     def _turned(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [M, 3] at a time, and rotations [M, 4] since time 0 as the positions tell them: smoother than the
-        trained ones."""
+        """Return positions [M, 3] at a time, and rotations [M, 4] since time 0 estimated from positions, which are
+        smoother than the trained ones."""
         here = self.motion_at(time).positions
         return here, from_matrix(self.solver.turns(self.motion_at(0.0).positions, here))
 
