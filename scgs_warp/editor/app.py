@@ -1,4 +1,4 @@
-"""The editor: a scene in the browser, seen through our own renderer, with control points to take hold of."""
+"""The editor: serves an ``EditSession`` to browsers and turns clicks and drags into edits."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 MOVING_SECONDS, STILL_SECONDS = 0.11, 0.8
-"""Seconds that a picture may take while something moves, and when all is still."""
+"""Target time of a picture in seconds, while something moves and while all is still."""
 MAX_SCREENSHOT_SIZE = 4096
-"""Pixels of a screenshot's longer side, whatever a page says of its window."""
+"""Largest longer side of a screenshot in pixels, whatever window size a page reports."""
 REPEAT_SECONDS = 1.5
-"""Seconds in which the same message is not shown again."""
+"""Seconds during which the same message is not repeated."""
 
 
 def import_viser() -> Any:
-    """The package that serves the page.
+    """Import the package that serves the page.
 
     Raises:
-        UserError: it is not installed.
+        UserError: the package is not installed.
     """
     try:
         import viser
@@ -58,14 +58,14 @@ class Editor:
     """Serves one session to any number of browsers, until ``stop``.
 
     Args:
-        session: the scene under edit.
-        folder: where edits, films and exports go.
-        port: on 127.0.0.1; the next free one is taken. 0: any.
-        size: longer side of a full picture, at most.
-        key: if a proxy stands before it: what the proxy says.
+        session: scene and edit.
+        folder: folder of edits, films and exports.
+        port: port on 127.0.0.1; if it is taken, the next free one is used. 0: any.
+        size: largest longer side of a picture in pixels.
+        key: secret of the proxy in front of it, if there is one.
 
-    Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``latency`` (seconds from a drag to its picture,
-    the latest hundred).
+    Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``gizmo_frame`` (frame of the visible gizmo and
+    the target at which its drag begins), ``latency`` (seconds from a drag to its picture, the latest hundred).
 
     Raises:
         UserError: viser is not installed.
@@ -83,13 +83,13 @@ class Editor:
         self.latency: list[float] = []
         self._notified: dict[str, float] = {}
         self._first = True
-        """No picture was drawn yet."""
+        """Whether no picture has been drawn yet."""
         self._waiting: dict[int, Any] = {}
         self._dragger: int | None = None
         self._dragged_at: float | None = None
         self.gizmo_frame: tuple[gizmo_pose.GizmoFrame, Target] | None = None
         self.display = Display.of(session.scene.overview)
-        with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # its banner names the wrong door
+        with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # viser's banner names its own port
             self.server: viser.ViserServer = viser.ViserServer(HOST, port, label="scgs_warp", verbose=False)
         self.port: int = self.server.get_port()
         self._set_up_page()
@@ -109,7 +109,7 @@ class Editor:
         self.server.stop()
 
     def _set_up_page(self) -> None:
-        """The scene's own up, camera and overlays."""
+        """Set up direction, initial camera, overlays and click callbacks."""
         server, overview = self.server, self.session.scene.overview
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
         server.gui.main_panel.dock_right()  # beside the picture, not over it
@@ -140,7 +140,7 @@ class Editor:
         self._moved(client)
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
-        if client.client_id == self._dragger:  # a window that was closed in the middle of a drag
+        if client.client_id == self._dragger:  # the window was closed during a drag
             self._dragger = None
             self.model.release()
         self._waiting.pop(client.client_id, None)
@@ -154,12 +154,13 @@ class Editor:
             schedule.move(client.client_id, self.camera(client), time.monotonic())
 
     def refresh(self) -> None:
-        """Something changed: new pictures for everybody."""
+        """Request new pictures for all clients."""
         with self.worker.changing() as schedule:
             schedule.change(time.monotonic())
 
     def say(self, client: viser.ClientHandle | None, title: str, text: str, color: str = "red") -> None:
-        """A notification, to one client or to all; the same again only after a while, as drags repeat mistakes."""
+        """Notify one client or all (None). The same text is shown again only after ``REPEAT_SECONDS``, because every
+        step of a drag repeats its error."""
         now = time.monotonic()
         if now - self._notified.get(text, -np.inf) < REPEAT_SECONDS:
             return
@@ -169,8 +170,8 @@ class Editor:
             one.add_notification(title, text, auto_close_seconds=8.0, color=color)  # type: ignore[arg-type]
 
     def guarded(self, action: Callable[..., Any]) -> Callable[[Any], None]:
-        """A callback that survives: what the user did wrong is said in the page, and so is what we did wrong. Values
-        that the program itself sets in the panel call nothing."""
+        """Wrap a callback such that errors become notifications. Events without a client, which the program causes by
+        setting values in the panel, are ignored."""
 
         def callback(event: Any) -> None:
             if event.client is None:
@@ -188,12 +189,12 @@ class Editor:
         return callback
 
     def _failed(self, client: viser.ClientHandle | None, error: Exception) -> None:
-        """Our mistake, while it is being handled."""
+        """Report an internal error inside its ``except`` block."""
         traceback.print_exc(file=sys.stderr)
         self.say(client, "Internal error", f"{type(error).__name__}: {error}")
 
     def picture_failed(self, number: int, error: Exception) -> None:
-        """On the worker's thread: the picture of one client could not be drawn."""
+        """Report that a client's picture could not be drawn; on the worker's thread, inside the ``except`` block."""
         client = self.server.get_clients().get(number)
         if client is None:
             return
@@ -203,7 +204,7 @@ class Editor:
             self._failed(client, error)
 
     def on_value(self, handle: Any, action: Callable[[Any], Any]) -> Any:
-        """The handle of a control; whenever a user changes its value, ``action`` is called with it."""
+        """Call ``action`` with a control's value whenever a user changes it; return the control."""
         handle.on_update(self.guarded(lambda event: action(event.target.value)))
         return handle
 
@@ -215,7 +216,7 @@ class Editor:
     # Pictures
 
     def camera(self, client: viser.ClientHandle) -> ClientCamera:
-        """A client's view as it is now, in world units."""
+        """Return a client's present camera, world units."""
         camera = client.camera
         try:
             width, height = int(camera.image_width), int(camera.image_height)
@@ -226,11 +227,11 @@ class Editor:
         return ClientCamera(tuple(wxyz.tolist()), tuple(position.tolist()), float(camera.fov), width, height)
 
     def take_picture(self, moment: Moment, camera: ClientCamera) -> Picture:
-        """A picture in full; on the worker's thread."""
+        """Render a picture at the client's full size; call it on the worker's thread."""
         return take_picture(self.session, moment, camera, min(max(camera.width, camera.height), MAX_SCREENSHOT_SIZE))
 
     def _draw(self, number: int, quality: str) -> None:
-        """On the worker's thread."""
+        """Draw a client's picture; runs on the worker's thread."""
         client = self.server.get_clients().get(number)
         with self.worker.changing() as schedule:
             camera = schedule.camera(number)
@@ -243,7 +244,7 @@ class Editor:
         picture = take_picture(self.session, moment, camera, min(pace.size, max(camera.width, camera.height)))
         depth = self.display.empty_depth
         if not self.model.through:
-            behind = 0.5 * self.edge_length * self.display.scale  # control points lie inside what they move
+            behind = 0.5 * self.edge_length * self.display.scale  # control points lie inside the surface
             depth = self.display.depth(picture.depth, behind, 2 if quality == FULL else 1)
         client.scene.set_background_image(
             picture.rgb, format="jpeg", jpeg_quality=FINE_QUALITY if quality == FULL else QUALITY, depth=depth
@@ -262,7 +263,7 @@ class Editor:
         self._update_page(moment)
 
     def _update_page(self, moment: Moment) -> None:
-        """Overlays and panel, after the picture."""
+        """Update overlays, gizmo and panel after the picture."""
         points = self.session.node_positions(moment.time, moment.at, live=moment.live)
         self.overlays.move(self.display.show(points))
         self._place_gizmo(moment)
@@ -295,7 +296,8 @@ class Editor:
         self.guarded(lambda event: self.pick(event.client, event.screen_pos, how))(event)
 
     def pick(self, client: viser.ClientHandle, screen: tuple[float, float], how: Combine | None = None) -> None:
-        """A click on the canvas (0 to 1 from the upper left): on the surface it selects, beside it nothing is."""
+        """Select by a click at a point of the canvas (0 to 1 from the upper left); the background clears the selection
+        unless it is to be extended or reduced."""
         model, moment = self.model, self.model.moment()
         how = how or model.combine
 
@@ -311,7 +313,8 @@ class Editor:
             model.select(nodes, how)
 
     async def _gizmo_moved(self, event: Any) -> None:
-        """On the server's loop, in order; nothing here waits for a solution. One client drags at a time."""
+        """Handle gizmo events in order on the server's loop, without waiting for solutions. One client drags at a
+        time."""
         if self._dragger not in (None, event.client_id):
             return
         self._dragger = None if event.phase == "end" else event.client_id
@@ -338,7 +341,7 @@ class Editor:
             self.panel.show()
 
     def put(self, target: Target) -> None:
-        """The chosen handle, at once: what the numbers in the panel do."""
+        """Move the chosen handle to a target in one step, as the panel's numbers do."""
         self.model.grab(STAY if self.gizmo_frame is None else self.gizmo_frame[1])
         try:
             self.model.drag(target)

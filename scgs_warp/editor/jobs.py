@@ -1,4 +1,4 @@
-"""Slow work in the background, one piece at a time, with its progress for all to see and a way to stop it."""
+"""Background jobs: one at a time, with progress reports, and stoppable."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import Any
 from ..errors import UserError
 
 REPORT_SECONDS = 0.2
-"""Seconds between two reports of progress."""
+"""Shortest time between two progress reports in seconds."""
 
 
 @dataclass(frozen=True)
 class JobProgress:
-    """What runs, how many of its pieces are done."""
+    """Name of the running job and count of its finished pieces."""
 
     name: str
     done: int
@@ -35,9 +35,9 @@ class Jobs:
     """Runs one job at a time on a thread of its own.
 
     Args:
-        shown: called with the progress now and then, and with None when nothing runs any more.
-        ended: called with whoever started it, the job's name, what it returned (None: it failed or was stopped), and
-            what to say if so.
+        shown: called with the progress from time to time, and with None when the job has ended.
+        ended: called with the client that started the job, the job's name, its result (None: it failed or was
+            stopped), and the reason if it has no result.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class Jobs:
         return self._progress
 
     def start(self, name: str, total: int, action: Callable[[Callable[[], None]], Any], who: Any = None) -> None:
-        """Run ``action(advance)``; it calls ``advance`` after each of ``total`` pieces, which raises CancelledError if
-        the job is to end.
+        """Run ``action(advance)``, which calls ``advance`` after each of ``total`` pieces; ``advance`` raises
+        CancelledError once the job is cancelled.
 
         Raises:
-            UserError: another job runs.
+            UserError: another job is running.
         """
         with self._lock:
             if self._progress is not None:
@@ -71,7 +71,7 @@ class Jobs:
         self._thread.start()
 
     def cancel(self) -> None:
-        """Ask the job to end; it does so after the piece under way."""
+        """Ask the job to end after its present piece."""
         with self._lock:
             if self._progress is None:
                 return
@@ -80,14 +80,14 @@ class Jobs:
         self._shown(self._progress)
 
     def stop(self) -> None:
-        """As ``cancel``, and wait for it."""
+        """Cancel the job and wait for its end."""
         self.cancel()
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():
             thread.join(timeout=30)
 
     def wait(self, seconds: float) -> bool:
-        """Whether nothing runs, after at most so many seconds."""
+        """Wait for the job; return whether it has ended after ``seconds``."""
         thread = self._thread
         if thread is not None:
             thread.join(timeout=seconds)

@@ -1,4 +1,4 @@
-"""Controls for files: save and load the edit, screenshot, film, PLY. All in one folder, and for the browser to keep."""
+"""Controls for files: save and load edits, export screenshots, films and PLY files, to one folder and the browser."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .host import Host
 
 NONE: str = "none yet"
 MAX_DOWNLOAD = 64 << 20
-"""Bytes; what is larger stays on the server's disk, or the page would hold it all in memory."""
+"""Size in bytes of the largest file offered to the browser, because the page holds all of it in memory."""
 
 
 class FilesSection:
@@ -65,10 +65,10 @@ class FilesSection:
         return path
 
     def load(self, name: str) -> None:
-        """A saved edit.
+        """Load a saved edit.
 
         Raises:
-            UserError: none is chosen, or it is wrong; the edit is as before.
+            UserError: no edit is chosen, or a field is wrong; the edit stays unchanged.
         """
         if name == NONE:
             raise UserError("no edit is saved here yet; save one, or load one from this computer")
@@ -76,10 +76,10 @@ class FilesSection:
         self._take(lambda: edit_file.read(path, self.model.session.engine))
 
     def load_bytes(self, content: bytes) -> None:
-        """An edit that the browser sent.
+        """Load an edit that the browser sent.
 
         Raises:
-            UserError: it is wrong; the edit is as before.
+            UserError: a field is wrong; the edit stays unchanged.
         """
         if len(content) > MAX_BYTES:
             raise UserError(f"the file is larger than {MAX_BYTES >> 20} MiB; give an edit's JSON")
@@ -90,12 +90,12 @@ class FilesSection:
         self._take(lambda: edit_file.parse(parse_object(text, "the file"), "the file", self.model.session.engine))
 
     def _take(self, read: Callable[[], Edit]) -> None:
-        edit = self.host.worker.call(read)  # places become control points: that needs the motion
+        edit = self.host.worker.call(read)  # turning places into control points evaluates the motion
         with self.model.changing() as session:
             session.apply(edit)
 
     def screenshot(self, client: Any) -> Path:
-        """The picture as the client sees it, in full, without overlays."""
+        """Write the picture as the client sees it, at full size, without overlays."""
         camera, moment = self.host.camera(client), self.model.moment()
         if not camera.usable:
             raise UserError("the browser's window has no size; open it and try again")
@@ -112,7 +112,7 @@ class FilesSection:
         self.jobs.start(name, total, action, client)
 
     def export_film(self, client: Any = None) -> Path:
-        """Begin the film of the edit as it is now; what is changed meanwhile is not in it."""
+        """Start the film of the edit as it is now; later changes do not affect it."""
         path = self._path(self.format.value)
         with self.model.lock:
             session = self.model.session.fork()
@@ -126,7 +126,7 @@ class FilesSection:
         return path
 
     def export_ply(self, client: Any = None) -> Path:
-        """Begin to write the edited Gaussians at the moment shown."""
+        """Start to write the edited Gaussians at the moment shown."""
         path = self._path(".ply")
         moment = self.model.moment()
         with self.model.lock:

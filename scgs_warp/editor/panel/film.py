@@ -1,4 +1,4 @@
-"""Controls for time: the moment shown, play, keyframes, and the film that is made of it."""
+"""Controls for time: moment shown, playback, keyframes and the film's settings."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from .host import Host
 NONE = "none"
 EASINGS: tuple[Easing, ...] = ("smooth", "linear", "ease", "step")
 MIN_SECONDS, MAX_SECONDS = 0.04, 600.0
-"""Seconds of a film that the panel offers; scripts may ask for others."""
+"""Range of film lengths in seconds that the panel offers; scripts may set others."""
 MIN_FPS, MAX_FPS = 1.0, 120.0
-"""The same of its frames a second."""
+"""Range of frames per second that the panel offers; scripts may set others."""
 REPEATS = ("once", "loop", "swing", "stand still")
 
 
 class TimeSection:
-    """The slider and play."""
+    """Time slider and play button."""
 
     def __init__(self, host: Host) -> None:
         gui, self.model = host.server.gui, host.model

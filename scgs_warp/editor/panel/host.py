@@ -15,7 +15,7 @@ from ..worker import Worker
 
 
 class Host(Protocol):
-    """Provides the page, the state, and the actions that need both."""
+    """Part of the editor that the panel's sections use: the page, the model, and actions on both."""
 
     server: Any
     """viser's server."""

@@ -1,4 +1,4 @@
-"""Controls for the scene's own motion: parts of it held still, all of it exaggerated or damped."""
+"""Controls for the scene's own motion: regions held still, exaggeration and damping."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from .host import Host
 NONE = "none"
 UNCHANGED = 1.0
 MAX_FACTOR = 3.0
-"""Strongest exaggeration that the slider offers; scripts may ask for more."""
+"""Strongest exaggeration that the slider offers; scripts may set more."""
 
 
 class MotionSection:
-    """Holds and exaggeration, for what is selected at the moment shown."""
+    """Holds and exaggeration of the selection at the moment shown."""
 
     def __init__(self, host: Host) -> None:
         self.host, self.model = host, host.model

@@ -1,4 +1,4 @@
-"""The panel beside the picture: sections of controls, each of which shows the model and changes it."""
+"""The panel beside the picture: sections of controls, each of which shows and changes the model."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ HELP = (
 
 
 class Panel:
-    """Everything beside the picture.
+    """All controls beside the picture.
 
-    Attributes: ``jobs`` (films and exports in the making) and the sections ``time``, ``shape``, ``motion``, ``film``,
+    Attributes: ``jobs`` (films and exports in progress) and the sections ``time``, ``shape``, ``motion``, ``film``,
     ``view``, ``files``.
     """
 
@@ -56,7 +56,7 @@ class Panel:
         self.show()
 
     def _commands(self) -> None:
-        """Keys, where this viser knows them."""
+        """Add keyboard shortcuts if this version of viser has them."""
         add = getattr(self.host.server.gui, "add_command", None)
         if add is None:
             return
@@ -77,7 +77,7 @@ class Panel:
             self.host.say(event.client, what, f"there is nothing to {what.lower()}", "gray")
 
     def show(self) -> None:
-        """Make every control say what the model says."""
+        """Set every control to the model's state."""
         with self._lock:
             for section in (self.time, self.shape, self.motion, self.film, self.view, self.files):
                 section.show()
@@ -85,7 +85,7 @@ class Panel:
             self.host.color_overlays()
 
     def show_time(self) -> None:
-        """As ``show``, of what goes with the moment shown."""
+        """Set the controls that depend on the moment shown."""
         with self._lock:
             self.time.show()
             self.shape.show_target()

@@ -1,4 +1,4 @@
-"""Controls for the shape: what a click takes, handles and their numbers, pins."""
+"""Controls for the shape: extent of a click's selection, handles, pins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .host import Host
 
 NEW = "new, from the selection"
 EXACT = 0.0
-"""In the panel a stiffness of 0 stands for None: exactly where it is put."""
+"""Stiffness that stands for None in the panel: nodes go exactly to the target."""
 
 
 class ShapeSection:
@@ -90,7 +90,7 @@ class ShapeSection:
             self.remove.on_click(self.host.guarded(lambda event: self._ended(event.target.value)))
 
     def handle_labels(self) -> dict[str, str | None]:
-        """Handles by their labels; a handle may be called anything, even what stands for none."""
+        """Return the handles' names by unique labels, because a name may equal the label of a new handle."""
         found: dict[str, str | None] = {NEW: None}
         for handle in self.model.session.edit.handles:
             label = handle.name
@@ -109,7 +109,7 @@ class ShapeSection:
         self.host.put(Target.of(self.model.target.translation, turn.tolist()))
 
     def _set(self, **fields: Any) -> None:
-        """Of the handle in hand, and of the next ones."""
+        """Change fields of the active handle and of later ones."""
         self.model.set(**fields)
         if self.model.active is not None:
             self.model.change_handle(**fields)
@@ -169,7 +169,7 @@ class ShapeSection:
         self.rest.value = model.pin_rings is not None
 
     def show_target(self) -> None:
-        """Where the handle is that is in hand, at the moment shown."""
+        """Show the target of the active handle at the moment shown."""
         target = self.model.target
         turned = tuple(np.degrees(logarithm(np.array(target.rotation))).tolist())
         for control, value in ((self.move, target.translation), (self.turn, turned)):
@@ -178,5 +178,5 @@ class ShapeSection:
 
 
 def _round(length: float) -> float:
-    """The power of ten below it: a step that suits the scene."""
+    """Return the power of ten below a length, a step that suits the scene."""
     return 10.0 ** math.floor(math.log10(length)) if length > 0 else 0.01

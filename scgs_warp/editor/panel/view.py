@@ -1,4 +1,4 @@
-"""Controls for what is shown: edited or original, side by side, overlays."""
+"""Controls for the picture's content: edited, original or both, and overlays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .host import Host
 
 
 class ViewSection:
-    """What the picture shows."""
+    """Content of the picture and its overlays."""
 
     def __init__(self, host: Host) -> None:
         self.host, self.model = host, host.model
@@ -28,6 +28,6 @@ class ViewSection:
 
     def show(self) -> None:
         self.picture.value, self.through.value = self.model.show, self.model.through
-        # The browser draws overlays from one camera: beside two halves, or half an original, they would lie
+        # The browser draws overlays from one camera, for the edited scene; they would not fit other pictures.
         alone = self.model.show in ("edited", "split")
         self.host.overlays.show(alone and self.nodes.value, alone and self.graph.value, self.size.value)
