@@ -1,4 +1,4 @@
-"""What an export is asked for, and whether that can be; loads nothing heavy."""
+"""Export requests and their validation, without heavy imports."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ SUFFIXES: dict[Format, str] = {
     "graph": ".glb",
     "ply-sequence": "",
 }
-"""How the output's name ends; the first format of a suffix is what the suffix alone means."""
+"""Suffix of each format's output; a suffix alone stands for its first format."""
 OTHER_SUFFIXES = {".htm": ".html"}
-"""Endings that stand for others."""
+"""Alternative suffixes."""
 STILL_FORMATS = ("ply", "splat", "spz", "glb")
-"""Formats that hold Gaussians at one instant; ``glb`` holds the motion where no instant is given."""
+"""Formats of Gaussians at one instant; ``glb`` holds the motion if no instant is given."""
 MAX_FRAMES = 100_000
 
 
@@ -34,38 +34,39 @@ class ExportRequest:
     """Write a scene as a file that other programs open (docs/formats.md)."""
 
     output: Path
-    """File to write, or the folder of a ply-sequence. What is there is replaced when the new one is complete."""
+    """File to write, or the folder of a ply-sequence. An existing one is replaced when the new one is complete."""
     run: Path | None = None
     """Folder of a run, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: Gaussians in a .ply of 3D Gaussian splatting, a .splat or a .spz, to be converted."""
+    """Instead of a run: Gaussians to convert, in a .ply of 3D Gaussian splatting, a .splat or a .spz."""
     format: Format | None = None
     """ply, splat, spz: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF with Gaussians, moved
     by control points as an animated skeleton; still with --time. graph: the control points and their edges as an
     animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras as nerfstudio's
-    transforms.json. html: a page that plays the scene. By default what the output's name ends in says."""
+    transforms.json. html: a page that plays the scene. By default the output's suffix decides."""
     time: float | None = None
-    """Instant of a still, from 0 to 1; without it Gaussians are as they are at rest, before the motion."""
+    """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion."""
     edit: Path | None = None
-    """An edit (docs/editing.md) to put on the scene."""
+    """Edit (docs/editing.md) to apply to the scene."""
     at: float | None = None
     """With --edit: the second of the edit's film that a still shows; 0 by default."""
     frames: int | None = None
-    """Instants of a sequence or an animation, evenly from time 0 to 1; 60 by default, with --edit all of its film."""
+    """Frame count of a sequence or an animation, evenly from time 0 to 1; 60 by default, with --edit that of its
+    film."""
     fps: float | None = None
-    """Frames a second of an animation; 30 by default."""
+    """Frames per second of an animation; 30 by default."""
     title: str = ""
-    """Of the page; the run's name by default."""
+    """Title of the page; the run's name by default."""
     max_mib: float | None = None
-    """Largest page in MiB; colours lose their highest degrees of spherical harmonics, one by one, until it fits, and a
-    page that still does not is refused."""
+    """Largest page in MiB; colours lose their highest degrees of spherical harmonics, one by one, until it fits. A page
+    that still does not fit is refused."""
 
     @property
     def kind(self) -> Format:
-        """The format, said or told by the output's suffix.
+        """Format as requested, or by the output's suffix.
 
         Raises:
-            UserError: the suffix says nothing.
+            UserError: the suffix belongs to no format.
         """
         if self.format is not None:
             return self.format
@@ -80,14 +81,14 @@ class ExportRequest:
 
     @property
     def still(self) -> bool:
-        """Whether Gaussians at one instant are wanted."""
+        """Whether the output holds Gaussians at one instant."""
         if self.kind != "glb":
             return self.kind in STILL_FORMATS
         return self.time is not None or self.at is not None or (self.run is None and self.edit is None)
 
 
 def check_request(request: ExportRequest) -> None:
-    """Refuse what cannot work before anything is loaded.
+    """Check a request before anything is loaded.
 
     Raises:
         UserError: naming the option and the remedy.
@@ -125,7 +126,7 @@ def check_request(request: ExportRequest) -> None:
 
 
 def _check_unused(request: ExportRequest) -> None:
-    """Refuse options that would change nothing."""
+    """Refuse options that would have no effect."""
     kind = request.kind
     if request.time is not None and request.run is None:
         raise UserError(f"--time {request.time:g}: a file of Gaussians has no times; leave it out")
@@ -143,10 +144,10 @@ def _check_unused(request: ExportRequest) -> None:
 
 
 def check_output(path: Path, kind: Format) -> None:
-    """Whether the output can be written there; missing folders above are made.
+    """Check that the output can be written; make missing folders.
 
     Raises:
-        UserError: the wrong suffix, a folder in the way, a place that cannot be written.
+        UserError: the suffix is wrong, a file or folder is in the way, or the folder cannot be written.
     """
     ending = SUFFIXES[kind]
     suffix = path.suffix.lower()

@@ -1,4 +1,4 @@
-"""What :class:`ExportRequest` asks for, done: open, pose, write."""
+"""Exports from request to file: open the scene, pose it, write it."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from .skeleton import (
 )
 
 FILE_UP = (0.0, -1.0, 0.0)
-"""What is up in files of Gaussians that do not say it."""
+"""Up direction of Gaussians from files, which do not state it."""
 FRAMES, FPS = 60, 30.0
 
 
 def export(request: ExportRequest, device: str = "cpu") -> str:
-    """Write a file, and say in one line what it holds.
+    """Write the requested file and return a line that describes it.
 
     Raises:
-        UserError: it cannot be; what was there is left alone.
+        UserError: the request cannot be met; an existing file stays unchanged.
     """
     check_request(request)
     if request.kind == "ply-sequence":
@@ -110,17 +110,17 @@ def _export_still(request: ExportRequest, device: str) -> str:
 def write_still(
     path: Path, gaussians: Gaussians, *, up: tuple[float, float, float] = FILE_UP, antialiased: bool = False
 ) -> int:
-    """Write activated Gaussians, world units, in the format that the name ends in: .ply, .splat, .spz or .glb.
+    """Write activated Gaussians, world units, in the format of the suffix: .ply, .splat, .spz or .glb.
 
     Args:
-        up: unit vector; .glb alone makes use of it.
-        antialiased: whether they were trained with the antialiasing compensation; .spz alone says so.
+        up: unit vector, used by .glb alone.
+        antialiased: whether they were trained with the antialiasing compensation, which .spz alone records.
 
     Returns:
-        How many values were clipped, as a .spz demands it.
+        Number of values clipped to the range of .spz.
 
     Raises:
-        UserError: another suffix, or the place cannot be written.
+        UserError: the suffix is another one, or the file cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix == ".ply":
@@ -158,7 +158,7 @@ def _export_moving(request: ExportRequest, device: str) -> str:
 def _write_frames(
     request: ExportRequest, scene: Scene, session: EditSession | None, moments: list[AnimationMoment]
 ) -> str:
-    counts, rows = [], _usable(scene)  # the same in every frame: row i is one Gaussian
+    counts, rows = [], _usable(scene)  # the same rows in every frame, so that row i is always the same Gaussian
 
     def frames() -> Iterator[Gaussians]:
         for moment in moments:
@@ -187,14 +187,14 @@ def _write_skeleton(request: ExportRequest, session: EditSession, moments: list[
         rest = Gaussians(rest.means, rest.quats, rest.scales, rest.opacities, torch.from_numpy(colors), rest.sh_rest)
         write_glb(request.output, rest, up, skeleton)
     else:
-        edited = request.edit is not None  # an edit's turns are not what shading has learnt
+        edited = request.edit is not None  # shading has not been trained on an edit's rotations
         shading = None if edited else scene.gaussians.shading.detach().cpu().numpy()[rows]
         write_npz(request.output, rest, skeleton, shading=shading, up=up)
     return f"{len(rest.means):,} Gaussians, {length}"
 
 
 def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:
-    """The Gaussians that files may hold, at rest; which they are, [N] bool; and what they follow."""
+    """Return the finite Gaussians at rest, their rows [N] bool, and the skeleton restricted to them."""
     rows = _usable(scene) & np.isfinite(skeleton.weights).all(axis=1)
     if not rows.any():
         raise UserError("no Gaussian of the scene is finite; train again with a lower rate")
@@ -202,7 +202,7 @@ def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Sk
 
 
 def _usable(scene: Scene) -> np.ndarray:
-    """[N] bool: Gaussians all of whose parameters are finite."""
+    """Return [N] bool: Gaussians whose parameters are all finite."""
     rows = finite_rows(at_rest(scene))
     for part in (scene.gaussians.shading, scene.gaussians.hyper):
         rows &= part.detach().isfinite().all(dim=1).cpu().numpy()
@@ -210,8 +210,8 @@ def _usable(scene: Scene) -> np.ndarray:
 
 
 def mean_colors(session: EditSession, moments: list[AnimationMoment]) -> np.ndarray:
-    """[N, 3] harmonics of degree 0 over all moments: the brightness that follows the turn of a surface, at its mean,
-    for formats that hold one colour."""
+    """Return harmonics of degree 0 averaged over all moments, [N, 3], for formats that hold one colour: shading changes
+    the colour as the surface turns."""
     scene = session.scene
     if not scene.gaussians.shading.shape[1]:
         return scene.gaussians.sh_dc.detach().cpu().numpy()
