@@ -159,7 +159,7 @@ def _region(region: FieldReader, engine: Engine, time: float) -> tuple[int, ...]
             raise region.wrong("box", "lacks a corner", "give two corners of 3 numbers")
         chosen = np.flatnonzero(((points >= np.array(low)) & (points <= np.array(high))).all(axis=1)).tolist()
     else:
-        raise region.wrong("", "says no place", "give point, sphere with radius, or box with two corners")
+        raise region.wrong("", "names no place", "give point, sphere with radius, or box with two corners")
     if not chosen:
         raise region.wrong("", f"holds no control point at time {time:g}", "make it larger or move it")
     return engine.graph.ring(chosen, rings)
@@ -198,7 +198,7 @@ def _target(fields: FieldReader) -> Target:
         raise fields.wrong("axis", "and degrees belong together", "give both, or rotation alone")
     if axis is not None:
         if _too_short(axis):
-            raise fields.wrong("axis", "has no direction", "give 3 numbers, not all 0 or next to it")
+            raise fields.wrong("axis", "has no direction", "give 3 numbers, not all close to 0")
         rotation = tuple(from_axis(axis, degrees).tolist())
     fields.done()
     try:
@@ -306,7 +306,7 @@ def _shot(fields: FieldReader | None) -> Shot:
         fov=fields.number("fov", None, 1.0, 150.0),
     )
     if shot.up is not None and _too_short(shot.up):
-        raise fields.wrong("up", "has no direction", "give 3 numbers, not all 0 or next to it")
+        raise fields.wrong("up", "has no direction", "give 3 numbers, not all close to 0")
     if any(a.at == b.at for a, b in pairwise(views)):
         raise fields.wrong("views", "has two at one moment", "give every view a moment of its own")
     fields.done()

@@ -134,7 +134,7 @@ class Editor:
 
     def _connect(self, client: viser.ClientHandle) -> None:
         if self._first:
-            text = "Kernels are compiled when they are needed first; that may take a minute."
+            text = "Kernels are compiled on first use, which may take a minute."
             self._waiting[client.client_id] = client.add_notification("Drawing the scene", text, loading=True)
         client.camera.on_update(lambda camera: self._moved(client))
         self._moved(client)

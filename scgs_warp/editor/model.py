@@ -203,7 +203,7 @@ class EditorModel:
         """Remove the active handle; with the last handle, remove automatic pins, too."""
         with self.changing() as session:
             if self.active is None:
-                raise UserError("no handle is chosen; click on what it holds first")
+                raise UserError("no handle is chosen; click on its control points first")
             draft = session.fork()
             draft.remove_handle(self.active)
             if not draft.edit.handles and self._pins_are_automatic():

@@ -132,7 +132,7 @@ def write_still(
     elif suffix == ".glb":
         write_glb(path, gaussians, up)
     else:
-        raise UserError(f"{path}: Gaussians are written as .ply, .splat, .spz or .glb; end the name so")
+        raise UserError(f"{path}: Gaussians are written as .ply, .splat, .spz or .glb; end the name in one of these")
     return 0
 
 

@@ -23,7 +23,7 @@ def check_folder(path: Path) -> None:
     """
     path = path.resolve()
     if Path.cwd().is_relative_to(path):
-        raise UserError(f"--output {path}: is the current folder or one around it; name a new folder")
+        raise UserError(f"--output {path}: is the current folder or contains it; name a new folder")
     if path.is_dir() and not holds_only(path, r"frame_\d{5,}\.ply"):
         raise UserError(f"{path}: holds other files than a sequence's frames; name a new folder")
 

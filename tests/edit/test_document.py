@@ -1,4 +1,4 @@
-"""The edit as a value."""
+"""Properties of the edit as a value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Edits as files and the app: what is wrong is said in one line; what a script films is what a session shows."""
+"""Edits as files: what is read, what is refused, what is saved."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from helpers.edit_scenes import OVERVIEW, bar_scene, dress
-from helpers.edit_sessions import TURN, motion, part, same
+from helpers.edit_sessions import TURN, ends, motion, part, same
 from scgs_warp.config.presets import from_dict
 from scgs_warp.edit import Edit, EditSession, Exaggerate, Film, Hold, Playback, film_camera
 from scgs_warp.edit.filming import film_frame
@@ -71,12 +71,6 @@ def test_an_edit_of_one_frame_is_one_frame_of_the_film_everywhere(tmp_path):
     found = film_frame(session, 0.5)
     np.testing.assert_array_equal(found, to_bytes(session.render(camera, 0.5, 0.5).rgb))
     assert same(session.gaussians_at(0.54, frame=1e-3), scene.gaussians_at(0.54)), "but for those who say otherwise"
-
-
-def ends(session: EditSession) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Control points of the bar's left end, which never moves, and of its right end, at time 0."""
-    x = session.node_positions(0.0)[:, 0]
-    return tuple(np.flatnonzero(x < np.quantile(x, 0.2))), tuple(np.flatnonzero(x > np.quantile(x, 0.8)))
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The graph of control points: who is tied to whom, and who follows when tied to nobody."""
+"""The graph of control points: its edges, its gaps, and strays."""
 
 from __future__ import annotations
 

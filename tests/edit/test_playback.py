@@ -1,4 +1,4 @@
-"""A motion played differently, and keyframes between keyframes."""
+"""Scene time at moments of the film."""
 
 from __future__ import annotations
 

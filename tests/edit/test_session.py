@@ -1,4 +1,4 @@
-"""An editing session: what it leaves alone, what it remembers, and that it survives what users do."""
+"""Editing sessions: unchanged bits, history, and mistakes of users."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from helpers.edit_scenes import OVERVIEW, bar_scene
-from helpers.edit_sessions import same
+from helpers.edit_sessions import ends, same
 from scgs_warp.edit import Edit, EditSession, Exaggerate, Hold
 from scgs_warp.edit.rotations import from_axis, rotate
 from scgs_warp.edit.session import HISTORY
@@ -22,12 +22,6 @@ CAMERA = cameras.orbit_camera(dataclasses.replace(OVERVIEW, centre=(0.5, -1.0, 0
 
 
 TURN = from_axis([0, 0, 1], 40).tolist()
-
-
-def ends(session: EditSession) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Control points of the bar's left end, which never moves, and of its right end, at time 0."""
-    x = session.node_positions(0.0)[:, 0]
-    return tuple(np.flatnonzero(x < np.quantile(x, 0.2))), tuple(np.flatnonzero(x > np.quantile(x, 0.8)))
 
 
 @pytest.fixture

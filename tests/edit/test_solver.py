@@ -1,4 +1,4 @@
-"""The solver of edits: against dense float64 twins, the laws of rigid motion, and everything degenerate."""
+"""The solver of edits against dense float64 twins, the laws of rigid motion, and degenerate input."""
 
 from __future__ import annotations
 

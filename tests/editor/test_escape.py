@@ -1,4 +1,4 @@
-"""Text of strangers in the panel."""
+"""Escaping of untrusted text for the panel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of the editor's files: one folder, no way out of it, nothing replaced."""
+"""Names of the editor's files: inside one folder, nothing replaced."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the editor shows: clicks meet the surface, pictures side by side, the film seen from where the user looks."""
+"""Pictures of a client: edited, original, side by side, split."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clicks and the gizmo: from the picture to control points and targets, and back."""
+"""Clicks and gizmo: from the picture to control points and targets, and back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slow work in the background: one job at a time, with progress, until it ends or is stopped."""
+"""Background jobs: one at a time, with progress, stoppable."""
 
 from __future__ import annotations
 

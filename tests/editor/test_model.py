@@ -1,4 +1,4 @@
-"""The editor without a browser: what is chosen, held and pinned, time, undo, and where the gizmo stands."""
+"""State of the editor: selection, handles, pins, time and undo."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The panel's controls without a browser: what they do to the edit, and that they say what the edit is."""
+"""The panel's controls without a browser: their effect on the edit, and their values."""
 
 from __future__ import annotations
 

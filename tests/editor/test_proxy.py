@@ -1,4 +1,4 @@
-"""Who may talk to the editor: the token, the origin, the host; pages and WebSockets both."""
+"""Access to the editor: token, origin and host, for pages and WebSockets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which picture is due next, and how large it may be."""
+"""The schedule of pictures and their sizes."""
 
 from __future__ import annotations
 

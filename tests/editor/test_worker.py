@@ -1,4 +1,4 @@
-"""Pictures in time: the newest and never a queue, calls first, jobs in the gaps. Files stay in their folder."""
+"""The worker: calls first, newest pictures only, jobs in between."""
 
 from __future__ import annotations
 

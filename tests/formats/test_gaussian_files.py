@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.export_files import cloud, ordered
+from helpers.export_files import cloud, ordered, zeros_spz
 from scgs_warp.apps.cli import run
 from scgs_warp.data.points import read_points
 from scgs_warp.errors import UserError
@@ -80,13 +80,6 @@ def test_nothing_is_lost_when_the_disk_refuses(tmp_path, monkeypatch):
     assert path.read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == ["a.glb"]
     with pytest.raises(UserError, match=r"\.spz"):
         write_still(tmp_path / "a.obj", cloud())
-
-
-def zeros_spz(path: Path, count: int) -> Path:
-    """A file of harmonics of degree 3 that are all the same: a thousandth of what it holds."""
-    head = struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0)
-    path.write_bytes(gzip.compress(head + bytes(65 * count)))
-    return path
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])

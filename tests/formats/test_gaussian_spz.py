@@ -5,13 +5,12 @@ from __future__ import annotations
 import gzip
 import struct
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.export_files import cloud, difference, ordered, ply_columns
+from helpers.export_files import cloud, difference, ordered, ply_columns, zeros_spz
 from helpers.node_packages import splat_transform
 from scgs_warp.errors import UserError
 from scgs_warp.export.request import ExportRequest
@@ -119,13 +118,6 @@ def test_fraction_bits_leave_room():
     means[0] = 1e8
     with pytest.raises(UserError, match="smaller"):
         fraction_bits(means)
-
-
-def zeros_spz(path: Path, count: int) -> Path:
-    """A file of harmonics of degree 3 that are all the same: a thousandth of what it holds."""
-    head = struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0)
-    path.write_bytes(gzip.compress(head + bytes(65 * count)))
-    return path
 
 
 def test_reading_spz_takes_a_few_times_what_it_holds(tmp_path):

@@ -1,4 +1,4 @@
-"""Small questions that many tests of editing ask of a session, and graphs of random points."""
+"""Helpers for editing sessions, and graphs of random points."""
 
 from __future__ import annotations
 
@@ -39,3 +39,9 @@ def cloud(seed: int, count: int, spread=(1.0, 1.0, 1.0)) -> np.ndarray:
 def graph_of(points: np.ndarray, neighbors: int = 6) -> ControlGraph:
     """Build the graph of points that stand still."""
     return build_graph(torch.from_numpy(points).float()[None], neighbors)
+
+
+def ends(session: EditSession) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Control points of the bar's left end, which never moves, and of its right end, at time 0."""
+    x = session.node_positions(0.0)[:, 0]
+    return tuple(np.flatnonzero(x < np.quantile(x, 0.2))), tuple(np.flatnonzero(x > np.quantile(x, 0.8)))

@@ -1,4 +1,4 @@
-"""What the tests of the editor begin with: a bar, and a browser that looks at it."""
+"""Models and clients for tests of the editor: a bar, and a browser that looks at it."""
 
 from __future__ import annotations
 

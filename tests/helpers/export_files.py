@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -91,3 +93,10 @@ def difference(found: dict[str, np.ndarray], truth: Gaussians) -> dict[str, floa
         values = columns(found, "f_rest", rest).reshape(len(means), 3, -1).transpose(0, 2, 1)
         errors["harmonics"] = np.abs(values - truth.sh_rest.double().numpy()).max()
     return {name: float(value) for name, value in errors.items()}
+
+
+def zeros_spz(path: Path, count: int) -> Path:
+    """A file of harmonics of degree 3 that are all the same: a thousandth of what it holds."""
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0)
+    path.write_bytes(gzip.compress(head + bytes(65 * count)))
+    return path

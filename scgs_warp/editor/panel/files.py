@@ -31,7 +31,7 @@ class FilesSection:
         with gui.add_folder("The edit"):
             self.name = gui.add_text("Name", "edit")
             self.replace = gui.add_checkbox(
-                "Replace files", False, hint="Else a number is added to names that are taken"
+                "Replace files", False, hint="Otherwise a number is added to names that exist"
             )
             click(gui.add_button("Save edit"), lambda event: self.save(event.client))
             self.saved = gui.add_dropdown("Saved", (NONE,))
@@ -86,7 +86,7 @@ class FilesSection:
         try:
             text = content.decode("utf-8")
         except UnicodeDecodeError:
-            raise UserError("the file is no UTF-8 text; give an edit's JSON") from None
+            raise UserError("the file is not UTF-8 text; give an edit's JSON") from None
         self._take(lambda: edit_file.parse(parse_object(text, "the file"), "the file", self.model.session.engine))
 
     def _take(self, read: Callable[[], Edit]) -> None:

@@ -27,7 +27,9 @@ class TimeSection:
         gui, self.model = host.server.gui, host.model
         film = self.model.session.edit.film
         self.at = host.on_value(
-            gui.add_slider("Second", 0.0, film.seconds, min(1.0 / film.fps, film.seconds), 0.0, hint="Of the film"),
+            gui.add_slider(
+                "Second", 0.0, film.seconds, min(1.0 / film.fps, film.seconds), 0.0, hint="Time in the film"
+            ),
             self.model.seek,
         )
         self.play = gui.add_button("Play")

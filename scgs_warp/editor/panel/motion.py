@@ -28,7 +28,7 @@ class MotionSection:
         with gui.add_folder("Hold still"):
             self.list = gui.add_markdown("")
             self.frame = gui.add_dropdown(
-                "It stays", ("body", "world"), hint="On the body that it hangs on, or where it is in the world"
+                "It stays", ("body", "world"), hint="Follow the surrounding body, or stay in place"
             )
             self.rings = gui.add_slider("Rings that bend", 0, 12, 1, Hold(()).rings)
             self.add = gui.add_button("Hold the selection as it is now")
@@ -41,7 +41,9 @@ class MotionSection:
         gui, on = self.host.server.gui, self.host.on_value
         with gui.add_folder("Exaggerate"):
             self.factor = on(
-                gui.add_slider("Motion times", 0.0, MAX_FACTOR, 0.05, UNCHANGED, hint="Every turn of it; 1: as it was"),
+                gui.add_slider(
+                    "Motion times", 0.0, MAX_FACTOR, 0.05, UNCHANGED, hint="Scales every turn; 1 changes nothing"
+                ),
                 lambda factor: self.exaggerate(factor=float(factor)),
             )
             self.buttons = gui.add_button_group("", ("Only selection", "All", "Off"))

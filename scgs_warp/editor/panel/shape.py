@@ -83,7 +83,7 @@ class ShapeSection:
                 lambda w: self._set(window=w),
             )
             self.stiffness = on(
-                gui.add_number("Stiffness", EXACT, min=0.0, max=1e6, step=0.01, hint="0: exactly where it is put"),
+                gui.add_number("Stiffness", EXACT, min=0.0, max=1e6, step=0.01, hint="0: exactly at the target"),
                 lambda s: self._set(stiffness=None if s == EXACT else s),
             )
             self.remove = gui.add_button_group("", ("Put back", "Remove"))
@@ -125,7 +125,7 @@ class ShapeSection:
         with gui.add_folder("Pins"):
             self.rest = on(
                 gui.add_checkbox(
-                    "Pin the rest", model.pin_rings is not None, hint="Whoever takes hold pins all that is far"
+                    "Pin the rest", model.pin_rings is not None, hint="A new handle pins everything far from it"
                 ),
                 lambda pinned: model.set(pin_rings=int(self.distance.value) if pinned else None),
             )
