@@ -254,13 +254,13 @@ def _across_no_gap(
 
 
 def _between(before: Mapping[str, Target], after: Mapping[str, Target], share: float) -> dict[str, Target]:
-    found = {}
+    between = {}
     for name, target in after.items():
         old = before.get(name, STAY)
         shift = np.array(old.translation) + share * np.subtract(target.translation, old.translation)
         turn = unit(slerp(np.array(old.rotation), np.array(target.rotation), share))
-        found[name] = Target.of(shift.tolist(), turn.tolist())
-    return found
+        between[name] = Target.of(shift.tolist(), turn.tolist())
+    return between
 
 
 def _remember(cache: OrderedDict[Any, Value], key: Any, make: Callable[[], Value]) -> Value:

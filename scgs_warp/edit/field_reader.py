@@ -57,12 +57,12 @@ def _no_constant(name: str) -> float:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    content = dict(pairs)
+    if len(content) != len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{twice!r} stands there twice")
-    return found
+    return content
 
 
 class FieldReader:
@@ -171,10 +171,10 @@ class FieldReader:
         inner = self.child(name)
         if inner is not None:
             for key in inner._value:
-                found = inner.child(key)
-                if found is None:
+                reader = inner.child(key)
+                if reader is None:
                     raise inner.wrong(key, "is null", "give an object")
-                yield key, found
+                yield key, reader
 
 
 def _is_number(value: Any) -> bool:

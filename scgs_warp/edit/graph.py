@@ -123,8 +123,8 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.nda
             stay open and control points that move no Gaussian connect nothing.
     """
     nodes = trajectories.shape[1]
-    found, _ = trajectory_graph(trajectories.float().cpu().contiguous(), neighbors)
-    columns = found.numpy().astype(np.int64)
+    nearest, _ = trajectory_graph(trajectories.float().cpu().contiguous(), neighbors)
+    columns = nearest.numpy().astype(np.int64)
     rows = np.repeat(np.arange(nodes), columns.shape[1])
     columns = columns.reshape(-1)
     rows, columns = rows[columns >= 0], columns[columns >= 0]

@@ -79,7 +79,7 @@ class Handle:
     stiffness: float | None = None
     """None: nodes go exactly to the target. A number: nodes are pulled there, relative to their edges' stiffness 1."""
     turns: bool | None = None
-    """Whether it also fixes its nodes' rotations. None: if it has more than one node."""
+    """True: it also fixes its nodes' rotations. None: it does so if it has more than one node."""
     lasts: Lasting = "motion"
     """motion: throughout, carried along by its nodes; frame: one frame; fade: fading out over ``window`` around its
     time."""

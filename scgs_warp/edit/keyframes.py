@@ -88,11 +88,11 @@ def _track_at(frames: list[Keyframe], name: str, at: float) -> Target:
 
 def _aligned(quats: np.ndarray) -> np.ndarray:
     """Flip signs such that each turn from one quaternion to the next is the shorter one."""
-    found = quats.copy()
-    for i in range(1, len(found)):
-        if found[i] @ found[i - 1] < 0:
-            found[i] = -found[i]
-    return found
+    aligned = quats.copy()
+    for i in range(1, len(aligned)):
+        if aligned[i] @ aligned[i - 1] < 0:
+            aligned[i] = -aligned[i]
+    return aligned
 
 
 def _slopes(times: np.ndarray, steps: np.ndarray) -> np.ndarray:

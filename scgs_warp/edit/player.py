@@ -103,6 +103,6 @@ class Player:
 
     def _mean_pose(self) -> tuple[np.ndarray, np.ndarray]:
         if self._mean is None:
-            found = [self._turned(float(time)) for time in np.linspace(0.0, 1.0, MEAN_TIMES)]
-            self._mean = np.mean([p for p, _ in found], axis=0), mean(np.stack([q for _, q in found]))
+            poses = [self._turned(float(time)) for time in np.linspace(0.0, 1.0, MEAN_TIMES)]
+            self._mean = np.mean([p for p, _ in poses], axis=0), mean(np.stack([q for _, q in poses]))
         return self._mean

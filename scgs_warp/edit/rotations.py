@@ -65,8 +65,8 @@ def from_matrix(matrices: np.ndarray) -> np.ndarray:
         ],
         axis=1,
     )
-    found = unit(table[np.arange(len(flat)), squares.argmax(1)]) + 0.0
-    return np.where(found[:, :1] < 0, -found, found).reshape(*m.shape[:-2], 4)
+    quats = unit(table[np.arange(len(flat)), squares.argmax(1)]) + 0.0
+    return np.where(quats[:, :1] < 0, -quats, quats).reshape(*m.shape[:-2], 4)
 
 
 def from_axis(axis: ArrayLike, degrees: float) -> np.ndarray:
@@ -124,8 +124,8 @@ def angle(quats: np.ndarray) -> np.ndarray:
 def mean(quats: np.ndarray) -> np.ndarray:
     """Average quaternions [T, M, 4] over T: [M, 4], w >= 0, the principal eigenvectors of the sums of q q^T."""
     outer = np.einsum("tmi,tmj->mij", quats, quats)
-    found = np.linalg.eigh(outer)[1][..., -1]
-    return np.where(found[:, :1] < 0, -found, found)
+    means = np.linalg.eigh(outer)[1][..., -1]
+    return np.where(means[:, :1] < 0, -means, means)
 
 
 def rigid_fit(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -136,12 +136,12 @@ class EditSession:
         return viewmat[:3, :3].T @ (float(image.depth[row, column]) * ray - viewmat[:3, 3])
 
     def _nodes(self, nodes: Iterable[int]) -> tuple[int, ...]:
-        found = tuple(sorted({int(node) for node in nodes}))
-        if found and not (found[0] >= 0 and found[-1] < len(self)):
+        chosen = tuple(sorted({int(node) for node in nodes}))
+        if chosen and not (chosen[0] >= 0 and chosen[-1] < len(self)):
             raise UserError(
-                f"control point {found[0] if found[0] < 0 else found[-1]}: there are {len(self)}, from 0 on"
+                f"control point {chosen[0] if chosen[0] < 0 else chosen[-1]}: there are {len(self)}, from 0 on"
             )
-        return found
+        return chosen
 
     # Handles and pins
 
@@ -200,11 +200,11 @@ class EditSession:
         self._change(pins=self.graph.beyond(held, rings))
 
     def _handle(self, name: str) -> Handle:
-        found = self.edit.handle(name)
-        if found is None:
+        handle = self.edit.handle(name)
+        if handle is None:
             known = ", ".join(repr(handle.name) for handle in self.edit.handles) or "none"
             raise UserError(f"no handle is called {name!r}; there is {known}")
-        return found
+        return handle
 
     # Moving
 

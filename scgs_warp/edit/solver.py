@@ -106,13 +106,13 @@ class ArapSolver:
 
     def _system(self, anchors: Anchors) -> _System:
         key = anchors.hard.tobytes() + anchors.turned.tobytes() + anchors.soft.tobytes()
-        found = self._systems.get(key)
-        if found is None:
-            found = self._systems[key] = self._factorise(anchors)
+        system = self._systems.get(key)
+        if system is None:
+            system = self._systems[key] = self._factorise(anchors)
             while len(self._systems) > CACHED_FACTORS:
                 self._systems.popitem(last=False)
         self._systems.move_to_end(key)
-        return found
+        return system
 
     def _factorise(self, anchors: Anchors) -> _System:
         """Factorise the system of the free nodes. Components without anchors stay fixed."""

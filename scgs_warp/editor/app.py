@@ -83,7 +83,7 @@ class Editor:
         self.latency: list[float] = []
         self._notified: dict[str, float] = {}
         self._first = True
-        """Whether no picture has been drawn yet."""
+        """True if no picture has been drawn yet."""
         self._waiting: dict[int, Any] = {}
         self._dragger: int | None = None
         self._dragged_at: float | None = None

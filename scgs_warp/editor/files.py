@@ -45,12 +45,12 @@ def _good(name: str) -> bool:
 
 def unused_path(path: Path) -> Path:
     """Return the path, or, if it exists, the first of ``name 2``, ``name 3`` ... that does not."""
-    found, number = path, 1
-    while found.exists() or found.is_symlink():
+    candidate, number = path, 1
+    while candidate.exists() or candidate.is_symlink():
         number += 1
         ending = f" {number}{path.suffix}"
-        found = path.with_name(path.name.removesuffix(path.suffix)[: 100 - len(ending)].rstrip(". ") + ending)
-    return found
+        candidate = path.with_name(path.name.removesuffix(path.suffix)[: 100 - len(ending)].rstrip(". ") + ending)
+    return candidate
 
 
 def saved_edits(folder: Path) -> tuple[str, ...]:

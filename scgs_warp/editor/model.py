@@ -66,14 +66,14 @@ class EditorModel:
         self.stiffness: float | None = None
         self.combine: Combine = "replace"
         self.through = False
-        """Whether overlays are drawn in front of the surface."""
+        """True if overlays are drawn in front of the surface."""
         self.show: Show = "edited"
         self.at = 0.0
         self.dragging = False
         self._dragged: bool | None = None
-        """Whether the handle was moved since ``grab``; None: no drag."""
+        """True if the handle was moved since ``grab``; None: no drag."""
         self._led = False
-        """Whether keyframes placed the handles before ``grab``."""
+        """True if keyframes placed the handles before ``grab``."""
         self._automatic: deque[tuple[int, ...]] = deque(maxlen=100)
         """Sets of pins that ``grab`` made by itself."""
         self._following = False
@@ -91,7 +91,7 @@ class EditorModel:
 
     @property
     def busy(self) -> bool:
-        """Whether pictures should be fast rather than large."""
+        """True if pictures should be fast rather than large."""
         return self.dragging or self.playing
 
     @property

@@ -42,8 +42,8 @@ class RequestHead(NamedTuple):
 
     def get(self, name: str) -> str | None:
         """Return a header's value: None if it is missing, empty (which passes no check) if it is repeated."""
-        found = [value for key, value in self.headers if key == name]
-        return None if not found else found[0] if len(found) == 1 else ""
+        values = [value for key, value in self.headers if key == name]
+        return None if not values else values[0] if len(values) == 1 else ""
 
     @property
     def upgrades(self) -> bool:
@@ -100,7 +100,7 @@ def refusal(headers: Any, key: str | None) -> str | None:
         key: secret of the proxy if there is one; otherwise only pages of this machine are accepted.
     """
     host, origin, given = (
-        found[0] if len(found) == 1 else None for found in map(headers.get_all, ("Host", "Origin", KEY_HEADER))
+        values[0] if len(values) == 1 else None for values in map(headers.get_all, ("Host", "Origin", KEY_HEADER))
     )
     if key is not None:
         known = given is not None and hmac.compare_digest(given.encode(), key.encode())

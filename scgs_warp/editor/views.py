@@ -30,7 +30,7 @@ class ClientCamera:
 
     @property
     def usable(self) -> bool:
-        """Whether a picture can be drawn: a hidden window has no size, and a page may send anything."""
+        """True if a picture can be drawn: a hidden window has no size, and a page may send anything."""
         numbers = (*self.wxyz, *self.position, self.fov)
         return all(map(math.isfinite, numbers)) and any(self.wxyz) and self.width > 0 and self.height > 0
 

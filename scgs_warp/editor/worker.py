@@ -57,7 +57,7 @@ class Worker:
 
     @property
     def idle(self) -> bool:
-        """Whether there is no work now, nor later unless something changes."""
+        """True if there is no work now, nor later unless something changes."""
         with self._condition:
             if self._working or self._calls or self._patient:
                 return False

@@ -54,7 +54,7 @@ def _attributes(document: GltfDocument, gaussians: Gaussians) -> dict[str, int]:
         return document.accessor(values, target=VERTICES, **options)
 
     arrays = {name: value.detach().cpu().numpy() for name, value in vars(gaussians).items()}
-    found = {
+    attributes = {
         "POSITION": add(arrays["means"].astype("<f4"), bounds=True),
         "COLOR_0": add(point_colors(arrays["sh_dc"], arrays["opacities"]), normalized=True),
         f"{EXTENSION}:ROTATION": add(xyzw(arrays["quats"])),
@@ -65,9 +65,9 @@ def _attributes(document: GltfDocument, gaussians: Gaussians) -> dict[str, int]:
     rest, place = arrays["sh_rest"].astype("<f4"), 0
     for degree in range(1, round((rest.shape[1] + 1) ** 0.5)):
         for order in range(2 * degree + 1):
-            found[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = add(rest[:, place])
+            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = add(rest[:, place])
             place += 1
-    return found
+    return attributes
 
 
 def point_colors(sh_dc: np.ndarray, opacities: np.ndarray) -> np.ndarray:

@@ -36,9 +36,9 @@ class GltfDocument:
 
     def append(self, group: str, item: dict[str, Any]) -> int:
         """Append an item to ``nodes``, ``meshes`` or another list of the file, and return its index."""
-        found = self.json.setdefault(group, [])
-        found.append(item)
-        return len(found) - 1
+        items = self.json.setdefault(group, [])
+        items.append(item)
+        return len(items) - 1
 
     def view(self, content: bytes, target: int | None = None) -> int:
         """Append bytes as a buffer view and return its index."""

@@ -87,7 +87,7 @@ def assemble(data: bytes, title: str = "") -> bytes:
         "data": base64.b64encode(data).decode("ascii"),
         "program": program,
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], _read("index.html")).encode()
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match.group(1)], _read("index.html")).encode()
 
 
 def program_text() -> str:

@@ -36,7 +36,7 @@ class Column:
     low: float = 0.0
     step: float = 1.0
     delta: bool = False
-    """Whether differences of neighbours, modulo 2 ** bits, are stored: for values that change slowly along the rows."""
+    """True if differences of neighbours, modulo 2 ** bits, are stored: for values that change slowly along the rows."""
 
     def values(self) -> np.ndarray:
         """Return the decoded values, [R] float64."""
@@ -109,7 +109,7 @@ def unpack(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     raw = zlib.decompress(content)
     (length,) = struct.unpack_from("<I", raw)
     facts = json.loads(raw[4 : 4 + length])
-    offset, found = 4 + length, {}
+    offset, values = 4 + length, {}
     for column in facts.pop("columns"):
         rows, bits = column["rows"], column["bits"]
         codes = np.zeros(rows, np.uint32)
@@ -118,5 +118,5 @@ def unpack(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             offset += rows
         if column["delta"]:
             codes = np.cumsum(codes, dtype=np.uint32) & np.uint32((1 << bits) - 1)
-        found[column["name"]] = column["low"] + column["step"] * codes.astype(np.float64)
-    return facts, found
+        values[column["name"]] = column["low"] + column["step"] * codes.astype(np.float64)
+    return facts, values

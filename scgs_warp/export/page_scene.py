@@ -232,14 +232,14 @@ def _error(values: np.ndarray, between: np.ndarray) -> float:
 
 
 def _poses_at(motion: ControlPoints, times: Tensor) -> dict[str, np.ndarray]:
-    found: dict[str, list[np.ndarray]] = {}
+    samples: dict[str, list[np.ndarray]] = {}
     for part in times.split(TIMES_AT_ONCE):
         for pose in motion.poses(part):
             fields = pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales
             for name, value in zip(POSE_PARTS, fields, strict=True):
                 if value is not None:
-                    found.setdefault(name, []).append(_array(value))
-    poses = {name: np.stack(rows) for name, rows in found.items()}
+                    samples.setdefault(name, []).append(_array(value))
+    poses = {name: np.stack(rows) for name, rows in samples.items()}
     if not all(np.isfinite(rows).all() for rows in poses.values()):
         raise UserError(
             "--format html: the control points' motion is not finite; train again with a lower rate, or put the "

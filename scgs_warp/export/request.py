@@ -81,7 +81,7 @@ class ExportRequest:
 
     @property
     def still(self) -> bool:
-        """Whether the output holds Gaussians at one instant."""
+        """True if the output holds Gaussians at one instant."""
         if self.kind != "glb":
             return self.kind in STILL_FORMATS
         return self.time is not None or self.at is not None or (self.run is None and self.edit is None)

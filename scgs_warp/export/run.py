@@ -88,9 +88,9 @@ def _export_still(request: ExportRequest, device: str) -> str:
         assert request.ply is not None
         antialiased = read_antialiased(request.ply)
         with torch.no_grad():
-            found = read_gaussians(request.ply)
+            stored = read_gaussians(request.ply)
             with fitting(request.ply):
-                gaussians, when = keep_finite(found.activate()), f"as in {request.ply}"
+                gaussians, when = keep_finite(stored.activate()), f"as in {request.ply}"
     else:
         scene = _open(request, device)
         up, antialiased = scene.overview.up, scene.config.antialiased

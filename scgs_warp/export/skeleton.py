@@ -194,11 +194,11 @@ def _stack(values: list[Tensor]) -> np.ndarray:
 
 def _unit(rotations: list[Tensor]) -> np.ndarray:
     """Return unit quaternions [T, M, 4] with signs continuous over time, as players interpolate linearly."""
-    found = _stack(rotations)
-    found /= np.linalg.norm(found, axis=-1, keepdims=True)
-    for frame in range(1, len(found)):
-        found[frame] *= np.where((found[frame] * found[frame - 1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
-    return found
+    quats = _stack(rotations)
+    quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
+    for frame in range(1, len(quats)):
+        quats[frame] *= np.where((quats[frame] * quats[frame - 1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    return quats
 
 
 def _with_rest(skeleton: Skeleton, gaussians: GaussianParameters) -> Skeleton:

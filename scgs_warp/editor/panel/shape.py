@@ -91,13 +91,13 @@ class ShapeSection:
 
     def handle_labels(self) -> dict[str, str | None]:
         """Return the handles' names by unique labels, because a name may equal the label of a new handle."""
-        found: dict[str, str | None] = {NEW: None}
+        labels: dict[str, str | None] = {NEW: None}
         for handle in self.model.session.edit.handles:
             label = handle.name
-            while label in found:
+            while label in labels:
                 label += " (handle)"
-            found[label] = handle.name
-        return found
+            labels[label] = handle.name
+        return labels
 
     def move_handle(self, where: tuple[float, float, float]) -> None:
         self.host.put(Target.of(where, self.model.target.rotation))
