@@ -55,6 +55,15 @@ def to_json(edit: Edit, engine: Engine) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
+def checked(edit: Edit, engine: Engine) -> Edit:
+    """Return an edit as a file would hold it.
+
+    Raises:
+        UserError: naming a field that no file may hold.
+    """
+    return parse(json.loads(to_json(edit, engine)), "the edit", engine)
+
+
 def _plain(value: Any) -> dict[str, Any]:
     """Return the fields that are not None."""
     return {name: item for name, item in dataclasses.asdict(value).items() if item is not None}

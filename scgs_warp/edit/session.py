@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -337,9 +336,8 @@ class EditSession:
         Raises:
             UserError: the file cannot be written, or the edit has a field that no file may hold.
         """
-        text = edit_file.to_json(self.edit, self.engine)
-        edit_file.parse(json.loads(text), "the edit", self.engine)
-        write_atomically(Path(path), text.encode())
+        edit_file.checked(self.edit, self.engine)
+        write_atomically(Path(path), edit_file.to_json(self.edit, self.engine).encode())
 
     def load(self, path: str | Path) -> None:
         """Replace the edit with that of a file; can be undone.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import threading
 import time
 from collections import deque
@@ -14,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..edit import Edit, EditSession, Target, edit_file
+from ..edit import EditSession, Target, edit_file
 from ..edit.handles import STAY
 from ..errors import UserError
 
@@ -176,18 +175,13 @@ class EditorModel:
         self.changed()
 
     def replace(self, **fields: Any) -> None:
-        """Change fields of the edit.
+        """Change fields of the edit, checked as if they came from a file: pages may send anything.
 
         Raises:
             UserError: a field is out of range; the edit stays unchanged.
         """
         with self.changing() as session:
-            session.apply(self._checked(dataclasses.replace(session.edit, **fields)))
-
-    def _checked(self, edit: Edit) -> Edit:
-        """Check an edit as if it came from a file, because pages may send anything."""
-        engine = self.session.engine
-        return edit_file.parse(json.loads(edit_file.to_json(edit, engine)), "the edit", engine)
+            session.apply(edit_file.checked(dataclasses.replace(session.edit, **fields), session.engine))
 
     def change_handle(self, **fields: Any) -> None:
         """Change fields of the active handle."""
@@ -197,7 +191,7 @@ class EditorModel:
                 raise UserError("no handle is chosen; click on the picture, then drag")
             changed = dataclasses.replace(handle, **fields)
             handles = tuple(changed if other is handle else other for other in session.edit.handles)
-            session.apply(self._checked(dataclasses.replace(session.edit, handles=handles)))
+            session.apply(edit_file.checked(dataclasses.replace(session.edit, handles=handles), session.engine))
 
     def remove_handle(self) -> None:
         """Remove the active handle; with the last handle, remove automatic pins, too."""
