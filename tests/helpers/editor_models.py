@@ -1,4 +1,4 @@
-"""Models and clients for tests of the editor: a bar, and a browser that looks at it."""
+"""Models for tests of the editor: a bar, and a browser that shows it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def loaded() -> EditSession:
 
 
 def new_model() -> EditorModel:
-    """As the editor begins, but that nothing is pinned around what is grabbed."""
+    """Return the editor's initial model, without automatic pins around handles."""
     made = EditorModel(loaded().fork())
     made.pin_rings = None
     return made
@@ -32,7 +32,7 @@ def chosen(model: EditorModel, point=RIGHT, rings: int = 1) -> tuple[int, ...]:
 
 
 def client(session: EditSession, azimuth: float = 40.0, size: int = 96) -> ClientCamera:
-    """A browser that sees the scene as a film's camera does."""
+    """Return a browser client with the view of the film's camera."""
     camera = orbit_camera(session.scene.overview, azimuth, size)
     wxyz = from_matrix(camera.viewmat[:3, :3].double().numpy().T)
     fov = 2 * math.atan(camera.height / (2 * float(camera.K[1, 1])))
