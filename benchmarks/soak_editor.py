@@ -31,7 +31,7 @@ CLIENTS = 2
 
 
 class RandomUser:
-    """EditorModel, worker and jobs as the editor puts them together, and input for them.
+    """Model, worker and jobs as the editor puts them together, and input for them.
 
     Args:
         session: the scene.
