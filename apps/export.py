@@ -6,11 +6,11 @@ import sys
 from dataclasses import dataclass
 
 from scgs_warp.apps.cli import Device, prepare, run
-from scgs_warp.export.request import Request, check
+from scgs_warp.export.request import ExportRequest, check_request
 
 
 @dataclass(frozen=True)
-class Options(Request):
+class Options(ExportRequest):
     """Write a scene as a file that other programs open (docs/formats.md)."""
 
     device: Device = "auto"
@@ -26,7 +26,7 @@ def main(args: list[str] | None) -> None:
     import tyro
 
     options = tyro.cli(Options, args=args, prog="export.py")
-    check(options)
+    check_request(options)
     device = prepare(options.device, options.threads, options.memory_gib)
 
     from scgs_warp.export.run import export

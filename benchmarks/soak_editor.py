@@ -16,10 +16,10 @@ from scgs_warp.edit import EditSession, Target, edit_file, render_film
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import from_matrix
 from scgs_warp.editor import gizmo_pose
-from scgs_warp.editor.frame_image import take
+from scgs_warp.editor.frame_image import take_picture
 from scgs_warp.editor.jobs import Jobs
-from scgs_warp.editor.model import Model, Region
-from scgs_warp.editor.views import FULL, ClientCamera, Views
+from scgs_warp.editor.model import EditorModel, Region
+from scgs_warp.editor.views import FULL, ClientCamera, PictureSchedule
 from scgs_warp.editor.worker import Worker
 from scgs_warp.errors import UserError
 from scgs_warp.geometry.cameras import orbit_camera
@@ -43,9 +43,9 @@ class RandomUser:
         folder.mkdir(parents=True, exist_ok=True)
         self.done: Counter[str] = Counter()
         self.refused = 0
-        self.views = Views()
-        self.worker = Worker(self.views, self._draw, lambda: self.model.busy)
-        self.model = Model(session, self._changed)
+        self.schedule = PictureSchedule()
+        self.worker = Worker(self.schedule, self._draw, lambda: self.model.busy)
+        self.model = EditorModel(session, self._changed)
         self.jobs = Jobs(lambda progress: None, lambda *ended: None)
         film = dataclasses.replace(session.edit.film, seconds=0.5, fps=10.0, size=SIZE)
         self.model.replace(film=film)
@@ -89,15 +89,15 @@ class RandomUser:
     # What the page does
 
     def _changed(self) -> None:
-        with self.worker.changing() as views:
-            views.change(time.monotonic())
+        with self.worker.changing() as schedule:
+            schedule.change(time.monotonic())
 
     def _draw(self, client: int, quality: str) -> None:
-        with self.worker.changing() as views:
-            camera = views.camera(client)
+        with self.worker.changing() as schedule:
+            camera = schedule.camera(client)
         if camera is not None:
             moment = self.model.moment()
-            take(self.model.session, moment, camera, SIZE if quality == FULL else SIZE // 2)
+            take_picture(self.model.session, moment, camera, SIZE if quality == FULL else SIZE // 2)
             self.model.session.node_positions(moment.time, moment.at, live=moment.live)
 
     def _camera(self) -> ClientCamera:
@@ -108,8 +108,8 @@ class RandomUser:
 
     def _look_from(self, client: int) -> None:
         camera = self._camera()
-        with self.worker.changing() as views:
-            views.move(client, camera, time.monotonic())
+        with self.worker.changing() as schedule:
+            schedule.move(client, camera, time.monotonic())
 
     # What a user does
 
@@ -157,8 +157,8 @@ class RandomUser:
     def arrive_and_leave(self) -> None:
         self._look_from(CLIENTS)
         self.worker.call(lambda: None)
-        with self.worker.changing() as views:
-            views.drop(CLIENTS)
+        with self.worker.changing() as schedule:
+            schedule.drop(CLIENTS)
 
     def handle(self) -> None:
         if self.random.random() < 0.5:
@@ -201,7 +201,7 @@ class RandomUser:
 
     def load(self) -> None:
         path = self._path(".json")
-        edit = self.worker.call(lambda: edit_file.read(path, self.model.session))
+        edit = self.worker.call(lambda: edit_file.read(path, self.model.session.engine))
         with self.model.changing() as session:
             session.apply(edit)
 
@@ -226,5 +226,5 @@ class RandomUser:
 
     def screenshot(self) -> None:
         camera, moment = self._camera(), self.model.moment()
-        picture = self.worker.call(lambda: take(self.model.session, moment, camera, SIZE))
+        picture = self.worker.call(lambda: take_picture(self.model.session, moment, camera, SIZE))
         write_png(self._path(".png"), picture.rgb)

@@ -13,8 +13,8 @@ from ..edit import EditSession, Target, engine
 from ..edit.handles import STAY
 from ..edit.rotations import from_matrix
 from ..editor import frame_image
-from ..editor.frame_image import QUALITY, Picture, take
-from ..editor.model import Model
+from ..editor.frame_image import QUALITY, Picture, take_picture
+from ..editor.model import EditorModel
 from ..editor.views import ClientCamera
 from ..ops.sampling import farthest_points
 from ..rendering import render
@@ -31,7 +31,7 @@ STEP = 0.25
 def edit_rows(place: Place) -> list[dict[str, Any]]:
     """A drag of one of three handles at the scene's far ends, nothing pinned: every Gaussian moves and turns."""
     session = EditSession(place.scene)
-    model = Model(session)
+    model = EditorModel(session)
     model.pin_rings = None
     hold(model)
     client = client_of(scene_camera(place.scene, place.plan.size))
@@ -40,7 +40,7 @@ def edit_rows(place: Place) -> list[dict[str, Any]]:
     def drag(index: int) -> None:
         along = reach * index
         model.drag(Target((0.0, 4 * reach * math.sin(along / (4 * reach)), 0.0)))
-        encode(take(session, model.moment(), client, max(client.width, client.height)))
+        encode(take_picture(session, model.moment(), client, max(client.width, client.height)))
 
     targets = {
         "solve": [(session.engine, "bend_live")],
@@ -52,7 +52,7 @@ def edit_rows(place: Place) -> list[dict[str, Any]]:
     return place.rows("edit/drag", drag, targets)
 
 
-def hold(model: Model) -> None:
+def hold(model: EditorModel) -> None:
     """Three handles, far from each other; the first one is in hand."""
     session = model.session
     points = session.scene.gaussians.means.new_tensor(session.node_positions(0.0))

@@ -1,6 +1,6 @@
-"""Editing: take hold of control points, move them, and the scene follows.
+"""Editing: move control points by handles, and the Gaussians follow.
 
-``EditSession`` is all that an editor needs; ``Edit`` is what it makes, ``render_film`` what it is for.
+``EditSession`` holds a scene and its ``Edit``, a plain value; ``render_film`` films the result.
 """
 
 from __future__ import annotations

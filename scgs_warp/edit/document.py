@@ -1,5 +1,4 @@
-"""An edit as a value: everything that was done to a scene, and the film to be made of it. Frozen, so that undo is a
-list of these and a saved edit is the same edit."""
+"""An edit as a frozen value: everything done to a scene, and the film to make of it. Undo is a list of such values."""
 
 from __future__ import annotations
 
@@ -17,26 +16,26 @@ from .playback import Exaggerate, Hold, Playback
 
 @dataclass(frozen=True)
 class View:
-    """Where a camera stands at one moment, on the sphere around the scene; None: as the training cameras stood."""
+    """Film camera at one moment, on a sphere around its target. Fields that are None follow the training cameras."""
 
     at: float = 0.0
-    """Seconds of the film."""
+    """Time in the film, seconds."""
     azimuth: float | None = None
     """Degrees."""
     elevation: float | None = None
     distance: float | None = None
     """World units."""
     target: Vector3 | None = None
-    """World, what it looks at."""
+    """Point that the camera looks at, world units."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """How a film is filmed."""
+    """Path of the film's camera."""
 
     kind: Literal["turntable", "fixed", "orbit"] = "turntable"
-    """turntable: ``turns`` around the scene from the first view; fixed: the first view throughout; orbit: through all
-    views, smoothly."""
+    """turntable: ``turns`` around the scene from the first view; fixed: the first view throughout; orbit: smoothly
+    through all views."""
     views: tuple[View, ...] = (View(),)
     turns: float = 1.0
     up: Vector3 | None = None
@@ -46,7 +45,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Film:
-    """What an edit is shown as."""
+    """Length, size and camera of the film that shows an edit."""
 
     seconds: float = 4.0
     fps: float = 30.0
@@ -62,7 +61,8 @@ class Film:
 
 @functools.lru_cache(maxsize=16)
 def frame_reach(film: Film, playback: Playback) -> float:
-    """How far from its time an edit of one frame shows, so that one frame of the film does: half of its step."""
+    """Return the scene time on either side of a handle's own within which an edit of one frame shows: half the median
+    step between two frames of the film, so that exactly one of them shows it."""
     times = playback.times_at(np.arange(film.frames) / film.fps, film.seconds)
     steps = np.abs(np.diff(times))
     moving = steps[steps > 0]
@@ -71,16 +71,16 @@ def frame_reach(film: Film, playback: Playback) -> float:
 
 @dataclass(frozen=True)
 class Edit:
-    """The whole edit."""
+    """Everything done to a scene."""
 
     handles: tuple[Handle, ...] = ()
-    """Their order counts: of two on one node, the later has it."""
+    """In order of precedence: where two handles hold one node, the later one wins."""
     pins: tuple[int, ...] = ()
-    """Control points that stay with the motion, ascending."""
+    """Control points that follow the motion alone, ascending."""
     targets: Mapping[str, Target] = field(default_factory=dict)
-    """Where handles are now; a handle that no keyframe names stays there for the whole film."""
+    """Present targets by handle. A handle that no keyframe names stays there for the whole film."""
     keyframes: tuple[Keyframe, ...] = ()
-    """Ascending in time, no two at one moment."""
+    """Ascending in time, all at different moments."""
     playback: Playback = field(default_factory=Playback)
     holds: tuple[Hold, ...] = ()
     exaggerate: Exaggerate | None = None
@@ -88,7 +88,7 @@ class Edit:
 
     @property
     def reach(self) -> float:
-        """Scene time around its own in which an edit of one frame shows."""
+        """Scene time on either side of its own within which an edit of one frame shows."""
         return frame_reach(self.film, self.playback)
 
     def handle(self, name: str) -> Handle | None:

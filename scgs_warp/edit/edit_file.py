@@ -1,4 +1,4 @@
-"""An edit as JSON: readable, versioned, checked. No paths, no code. Numbers come back as the same bits."""
+"""Edits as JSON: readable, versioned, checked, without paths or code. Numbers survive to the bit."""
 
 from __future__ import annotations
 
@@ -7,39 +7,38 @@ import json
 import zlib
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any
 
 import numpy as np
 
 from ..errors import UserError
 from .document import Edit, Film, Shot, View
-from .field_reader import LIMIT, Node, one_line, read_object, shown
-from .handles import Handle, Lasting, Target
-from .keyframes import Easing, Keyframe
+from .engine import Engine
+from .field_reader import FieldReader, one_line, read_object, show_value
+from .handles import Handle, Target, handle_fields
+from .keyframes import MAX_SECONDS, Keyframe, keyframe_fields
 from .playback import Exaggerate, Hold, Playback
 from .rotations import from_axis
 
-if TYPE_CHECKING:
-    from .session import EditSession
-
 FORMAT = "scgs-warp edit"
 VERSION = 1
-MOST_SECONDS = 3600.0
-LARGEST = 8192
+MAX_FILM_SIZE = 8192
+"""Longer side in pixels."""
 
 
-def fingerprint(session: EditSession) -> str:
-    """Tells one scene's control points from another's: numbers of control points mean nothing elsewhere."""
-    rest = session.engine.rig.positions.detach().cpu().contiguous().numpy()
+def fingerprint(engine: Engine) -> str:
+    """Return the CRC-32 of the control points' rest positions, which tells scenes apart: node indices are only valid
+    in the scene they were chosen in."""
+    rest = engine.rig.positions.detach().cpu().contiguous().numpy()
     return f"{zlib.crc32(np.ascontiguousarray(rest).tobytes()):08x}"
 
 
-def to_json(edit: Edit, session: EditSession) -> str:
-    """Text that ``read`` turns into the same edit."""
+def to_json(edit: Edit, engine: Engine) -> str:
+    """Write an edit as text that ``read`` turns back into the same edit."""
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
-        "scene": {"control_points": len(session), "fingerprint": fingerprint(session)},
+        "scene": {"control_points": len(engine.graph), "fingerprint": fingerprint(engine)},
         "handles": [_plain(handle) for handle in edit.handles],
         "pins": list(edit.pins),
         "targets": {name: _plain(target) for name, target in edit.targets.items()},
@@ -56,283 +55,250 @@ def to_json(edit: Edit, session: EditSession) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
+def checked(edit: Edit, engine: Engine) -> Edit:
+    """Return an edit as a file would hold it.
+
+    Raises:
+        UserError: naming a field that no file may hold.
+    """
+    return parse(json.loads(to_json(edit, engine)), "the edit", engine)
+
+
 def _plain(value: Any) -> dict[str, Any]:
-    """Fields that say something; lists for tuples."""
-    found = dataclasses.asdict(value)
-    return {name: item for name, item in found.items() if item is not None}
+    """Return the fields that are not None."""
+    return {name: item for name, item in dataclasses.asdict(value).items() if item is not None}
 
 
 def _compact(value: Any) -> str:
-    """One line an entry of a list."""
+    """Write lists of objects with one entry per line."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return "[\n  " + ",\n  ".join(json.dumps(item) for item in value) + "\n ]"
     return json.dumps(value)
 
 
-def read(path: Path, session: EditSession) -> Edit:
-    """The edit in a file, for this session's scene: regions said by place become control points.
+def read(path: Path, engine: Engine) -> Edit:
+    """Read an edit for the engine's scene; regions given by place become lists of control points.
 
     Raises:
         UserError: naming the file, the field and the remedy.
     """
-    return parse(read_object(path), str(path), session)
+    return parse(read_object(path), str(path), engine)
 
 
-def parse(content: Any, source: str, session: EditSession) -> Edit:
-    """As ``read``, of a JSON value; ``source`` is what errors name."""
-    root = Node(content, source)
+def parse(content: Any, source: str, engine: Engine) -> Edit:
+    """Decode an edit from a JSON value, as ``read`` does; errors name ``source``."""
+    root = FieldReader(content, source)
     if root.raw("format") != FORMAT:
-        raise root.wrong("format", f"is {shown(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
+        raise root.wrong("format", f"is {show_value(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
     if root.raw("version") != VERSION:
-        raise root.wrong("version", f"is {shown(root.raw('version'))}", f"this program reads version {VERSION}")
-    _check_scene(root, session)
+        raise root.wrong("version", f"is {show_value(root.raw('version'))}", f"this program reads version {VERSION}")
+    _check_scene(root, engine)
     handles: list[Handle] = []
-    for node in root.children("handles", 1000):
-        handle = _handle(node, session)
+    for fields in root.children("handles", 1000):
+        handle = _handle(fields, engine)
         if any(handle.name == other.name for other in handles):
-            raise node.wrong("name", f"{handle.name!r} is taken", "give every handle a name of its own")
+            raise fields.wrong("name", f"{handle.name!r} is taken", "give every handle a name of its own")
         handles.append(handle)
     names = {handle.name for handle in handles}
-    frames = [_keyframe(node, names) for node in root.children("keyframes")]
+    frames = [_keyframe(fields, names) for fields in root.children("keyframes")]
     frames.sort(key=lambda frame: frame.at)
     for first, second in pairwise(frames):
         if first.at == second.at:
             raise root.wrong("keyframes", f"has two at {first.at:g} s", "leave one of them out")
     edit = Edit(
         handles=tuple(handles),
-        pins=_pins(root, handles, session),
+        pins=_pins(root, handles, engine),
         targets=_targets(root, names),
         keyframes=tuple(frames),
         playback=_playback(root.child("playback")),
-        holds=tuple(_hold(node, session) for node in root.children("hold", 1000)),
-        exaggerate=_exaggerate(root.child("exaggerate"), session),
-        film=_film(root.child("film")),
+        holds=tuple(_hold(fields, engine) for fields in root.children("hold", 1000)),
+        exaggerate=_exaggerate(root.child("exaggerate"), engine),
+        film=film_of(root.child("film")),
     )
     root.done("comment")
     return edit
 
 
-def _check_scene(root: Node, session: EditSession) -> None:
+def _check_scene(root: FieldReader, engine: Engine) -> None:
     scene = root.child("scene")
     if scene is None:
         return
-    count = scene.integer("control_points", len(session), 0, 1 << 31)
-    if count != len(session):
-        remedy = f"this scene has {len(session)}: give the scene that it was made for"
-        if not session.engine.rig.moves:
+    count = scene.integer("control_points", len(engine.graph), 0, 1 << 31)
+    if count != len(engine.graph):
+        remedy = f"this scene has {len(engine.graph)}: give the scene that it was made for"
+        if not engine.rig.moves:
             remedy += f", with --nodes {count}"
         raise scene.wrong("control_points", f"is {count}", remedy)
     mark = scene.raw("fingerprint")
-    if mark is not None and mark != fingerprint(session):
+    if mark is not None and mark != fingerprint(engine):
         remedy = "give that scene, or say regions by place (point, sphere, box) and leave fingerprint out"
         raise scene.wrong("fingerprint", "is that of another scene's control points", remedy)
     scene.done()
 
 
-def _nodes(node: Node, name: str, session: EditSession, *, time: float = 0.0) -> tuple[int, ...]:
-    """A list of control points, or a place: {"point", "rings"}, {"sphere", "radius"}, {"box"}, at a time."""
-    value = node.raw(name)
+def _nodes(fields: FieldReader, name: str, engine: Engine, *, time: float = 0.0) -> tuple[int, ...]:
+    """Read control points: a list, or a region {"point", "rings"}, {"sphere", "radius"} or {"box"} at a time."""
+    value = fields.raw(name)
     if isinstance(value, dict):
-        return _place(Node(value, node.source, f"{node.place}.{name}".strip(".")), session, time)
+        return _region(FieldReader(value, fields.source, f"{fields.path}.{name}".strip(".")), engine, time)
     if value is None or not isinstance(value, list) or not value:
-        raise node.wrong(name, "is missing or empty", "list control points, or say a place: point, sphere or box")
-    last = len(session) - 1
+        raise fields.wrong(name, "is missing or empty", "list control points, or say a place: point, sphere or box")
+    last = len(engine.graph) - 1
     for index in value:
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index <= last:
-            raise node.wrong(name, f"names control point {shown(index)}", f"give whole numbers from 0 to {last}")
+            raise fields.wrong(name, f"names control point {show_value(index)}", f"give whole numbers from 0 to {last}")
     return tuple(sorted(set(value)))
 
 
-def _place(place: Node, session: EditSession, time: float) -> tuple[int, ...]:
-    time = place.number("time", time, 0.0, 1.0)
-    points = session.engine.to_world(session.engine.motion_at(time).positions)
-    point, sphere, box = place.vector("point", 3), place.vector("sphere", 3), place.items("box", 2)
-    rings = place.integer("rings", 0, 0, 1000)
-    radius = place.number("radius", None, 0.0)
-    place.done()
+def _region(region: FieldReader, engine: Engine, time: float) -> tuple[int, ...]:
+    time = region.number("time", time, 0.0, 1.0)
+    points = engine.to_world(engine.motion_at(time).positions)
+    point, sphere, box = region.vector("point", 3), region.vector("sphere", 3), region.items("box", 2)
+    rings = region.integer("rings", 0, 0, 1000)
+    radius = region.number("radius", None, 0.0)
+    region.done()
     if point is not None:
         chosen = [int(np.linalg.norm(points - point, axis=1).argmin())]
     elif sphere is not None and radius is not None:
         chosen = np.flatnonzero(np.linalg.norm(points - sphere, axis=1) <= radius).tolist()
     elif len(box) == 2:
-        corners = Node({"low": box[0], "high": box[1]}, place.source, f"{place.place}.box")
+        corners = FieldReader({"low": box[0], "high": box[1]}, region.source, f"{region.path}.box")
         low, high = corners.vector("low", 3), corners.vector("high", 3)
         if low is None or high is None:
-            raise place.wrong("box", "lacks a corner", "give two corners of 3 numbers")
+            raise region.wrong("box", "lacks a corner", "give two corners of 3 numbers")
         chosen = np.flatnonzero(((points >= np.array(low)) & (points <= np.array(high))).all(axis=1)).tolist()
     else:
-        raise place.wrong("", "says no place", "give point, sphere with radius, or box with two corners")
+        raise region.wrong("", "names no place", "give point, sphere with radius, or box with two corners")
     if not chosen:
-        raise place.wrong("", f"holds no control point at time {time:g}", "make it larger or move it")
-    return session.graph.ring(chosen, rings)
+        raise region.wrong("", f"holds no control point at time {time:g}", "make it larger or move it")
+    return engine.graph.ring(chosen, rings)
 
 
-def _handle(node: Node, session: EditSession) -> Handle:
-    time = node.number("time", 0.0, 0.0, 1.0)
-    handle = Handle(
-        name=node.text("name"),
-        nodes=_nodes(node, "nodes", session, time=time),
-        time=time,
-        pivot=node.vector("pivot", 3),
-        stiffness=node.number("stiffness", None, 1e-6, 1e6),
-        turns=node.truth("turns"),
-        lasts=node.choice("lasts", get_args(Lasting), "motion"),
-        window=node.number("window", 0.1, 1e-6, 10.0),
-    )
-    node.done("comment")
+def _handle(fields: FieldReader, engine: Engine) -> Handle:
+    values = handle_fields(fields)
+    handle = Handle(nodes=_nodes(fields, "nodes", engine, time=values["time"]), **values)
+    fields.done("comment")
     return handle
 
 
-def check_handle(handle: Handle, count: int) -> None:
-    """What ``_handle`` checks, for a handle that a program made.
-
-    Raises:
-        UserError: naming the field.
-    """
-    node = Node(_plain(handle), f"handle {handle.name!r}")
-    node.text("name")
-    node.number("time", 0.0, 0.0, 1.0)
-    if handle.pivot is not None and (len(handle.pivot) != 3 or not np.all(np.abs(handle.pivot) <= LIMIT)):
-        raise node.wrong("pivot", f"is {list(handle.pivot)}", f"give 3 finite numbers from {-LIMIT:g} to {LIMIT:g}")
-    node.number("stiffness", None, 1e-6, 1e6)
-    node.choice("lasts", get_args(Lasting), "motion")
-    node.number("window", 0.1, 1e-6, 10.0)
-
-
-def check_keyframe(at: float, easing: str) -> None:
-    """What ``_keyframe`` checks.
-
-    Raises:
-        UserError: naming the field.
-    """
-    node = Node({"at": at, "easing": easing}, "keyframe")
-    node.number("at", None, 0.0, MOST_SECONDS)
-    node.choice("easing", get_args(Easing), "smooth")
-
-
-def check_size(size: int) -> None:
-    """What ``_film`` checks of a film's size.
-
-    Raises:
-        UserError: naming the field.
-    """
-    Node({"size": size}, "film").integer("size", 512, 16, LARGEST)
-
-
 def _too_short(direction: tuple[float, ...]) -> bool:
-    """Its length cannot be told."""
+    """Return whether a direction is too short to be normalised."""
     return not sum(x * x for x in direction) > 1e-200
 
 
-def _pins(root: Node, handles: list[Handle], session: EditSession) -> tuple[int, ...]:
+def _pins(root: FieldReader, handles: list[Handle], engine: Engine) -> tuple[int, ...]:
     value = root.raw("pins")
     if value is None or value == []:
         return ()
     if isinstance(value, dict) and "beyond" in value:
-        node = Node(value, root.source, "pins")
-        rings = node.integer("beyond", 2, 0, 1000)
-        node.done()
-        return session.graph.beyond({n for handle in handles for n in handle.nodes}, rings)
-    return _nodes(root, "pins", session)
+        fields = FieldReader(value, root.source, "pins")
+        rings = fields.integer("beyond", 2, 0, 1000)
+        fields.done()
+        return engine.graph.beyond({n for handle in handles for n in handle.nodes}, rings)
+    return _nodes(root, "pins", engine)
 
 
-def _target(node: Node) -> Target:
-    """``rotation`` as a quaternion wxyz, or as ``axis`` and ``degrees``."""
-    rotation, axis = node.vector("rotation", 4), node.vector("axis", 3)
-    degrees = node.number("degrees", None, -180.0, 180.0)
-    translation = node.vector("translation", 3)
+def _target(fields: FieldReader) -> Target:
+    """Read a target, whose turn is either a quaternion (``rotation``, wxyz) or ``axis`` and ``degrees``."""
+    rotation, axis = fields.vector("rotation", 4), fields.vector("axis", 3)
+    degrees = fields.number("degrees", None, -180.0, 180.0)
+    translation = fields.vector("translation", 3)
     if (axis is None) != (degrees is None) or (rotation is not None and axis is not None):
-        raise node.wrong("axis", "and degrees belong together", "give both, or rotation alone")
+        raise fields.wrong("axis", "and degrees belong together", "give both, or rotation alone")
     if axis is not None:
         if _too_short(axis):
-            raise node.wrong("axis", "has no direction", "give 3 numbers, not all 0 or next to it")
+            raise fields.wrong("axis", "has no direction", "give 3 numbers, not all close to 0")
         rotation = tuple(from_axis(axis, degrees).tolist())
-    node.done()
+    fields.done()
     try:
         return Target.of(translation, rotation)
     except UserError as error:
-        raise node.wrong("", f"is wrong: {error}", "correct it") from None
+        raise fields.wrong("", f"is wrong: {error}", "correct it") from None
 
 
-def _targets(root: Node, names: set[str]) -> dict[str, Target]:
-    found = {}
-    for name, node in root.entries("targets"):
+def _targets(root: FieldReader, names: set[str]) -> dict[str, Target]:
+    targets = {}
+    for name, fields in root.entries("targets"):
         if name not in names:
-            raise node.wrong("", "names no handle", f"there is {one_line(', '.join(sorted(names))) or 'none'}")
-        found[name] = _target(node)
-    return found
+            raise fields.wrong("", "names no handle", f"there is {one_line(', '.join(sorted(names))) or 'none'}")
+        targets[name] = _target(fields)
+    return targets
 
 
-def _keyframe(node: Node, names: set[str]) -> Keyframe:
-    at = node.number("at", None, 0.0, MOST_SECONDS)
-    if at is None:
-        raise node.wrong("at", "is missing", "give seconds from the film's beginning")
-    easing = node.choice("easing", get_args(Easing), "smooth")
-    found = Keyframe(at, _targets(node, names), easing)
-    node.done("comment")
-    return found
+def _keyframe(fields: FieldReader, names: set[str]) -> Keyframe:
+    frame = Keyframe(**keyframe_fields(fields), targets=_targets(fields, names))
+    fields.done("comment")
+    return frame
 
 
-def _playback(node: Node | None) -> Playback:
-    if node is None:
+def _playback(fields: FieldReader | None) -> Playback:
+    if fields is None:
         return Playback()
     pairs = []
-    for index, pair in enumerate(node.items("map")):
-        at, time = Node({"pair": pair}, node.source, f"{node.place}.map[{index}]").vector("pair", 2) or (0.0, -1.0)
+    for index, pair in enumerate(fields.items("map")):
+        reader = FieldReader({"pair": pair}, fields.source, f"{fields.path}.map[{index}]")
+        at, time = reader.vector("pair", 2) or (0.0, -1.0)
         if not (0.0 <= time <= 1.0 and at >= 0.0 and (not pairs or at > pairs[-1][0])):
-            raise node.wrong(f"map[{index}]", f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]")
+            raise fields.wrong(
+                f"map[{index}]", f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]"
+            )
         pairs.append((at, time))
-    found = Playback(
-        seconds=node.number("seconds", None, 1e-3, MOST_SECONDS),
-        speed=node.number("speed", 1.0, -1000.0, 1000.0),
-        start=node.number("start", 0.0, 0.0, 1.0),
-        repeat=node.choice("repeat", ("once", "loop", "swing"), "once"),
-        freeze=node.number("freeze", None, 0.0, 1.0),
+    playback = Playback(
+        seconds=fields.number("seconds", None, 1e-3, MAX_SECONDS),
+        speed=fields.number("speed", 1.0, -1000.0, 1000.0),
+        start=fields.number("start", 0.0, 0.0, 1.0),
+        repeat=fields.choice("repeat", ("once", "loop", "swing"), "once"),
+        freeze=fields.number("freeze", None, 0.0, 1.0),
         map=tuple(pairs),
     )
-    node.done()
-    return found
+    fields.done()
+    return playback
 
 
-def _hold(node: Node, session: EditSession) -> Hold:
-    time = node.number("time", 0.0, 0.0, 1.0)
-    frame = node.choice("frame", ("body", "world"), "body")
-    found = Hold(_nodes(node, "nodes", session, time=time), time, frame, node.integer("rings", 2, 0, 100))
-    node.done("comment")
-    return found
+def _hold(fields: FieldReader, engine: Engine) -> Hold:
+    time = fields.number("time", 0.0, 0.0, 1.0)
+    frame = fields.choice("frame", ("body", "world"), "body")
+    hold = Hold(_nodes(fields, "nodes", engine, time=time), time, frame, fields.integer("rings", 2, 0, 100))
+    fields.done("comment")
+    return hold
 
 
-def _exaggerate(node: Node | None, session: EditSession) -> Exaggerate | None:
-    if node is None:
+def _exaggerate(fields: FieldReader | None, engine: Engine) -> Exaggerate | None:
+    if fields is None:
         return None
-    nodes = _nodes(node, "nodes", session) if node.raw("nodes") else ()
-    found = Exaggerate(node.number("factor", 1.5, -10.0, 10.0), node.number("about", None, 0.0, 1.0), nodes)
-    node.done("comment")
-    return found
+    nodes = _nodes(fields, "nodes", engine) if fields.raw("nodes") else ()
+    exaggerate = Exaggerate(fields.number("factor", 1.5, -10.0, 10.0), fields.number("about", None, 0.0, 1.0), nodes)
+    fields.done("comment")
+    return exaggerate
 
 
-def _film(node: Node | None) -> Film:
-    if node is None:
+def film_of(fields: FieldReader | None) -> Film:
+    """Read a film's settings.
+
+    Raises:
+        UserError: naming the field.
+    """
+    if fields is None:
         return Film()
-    found = Film(
-        seconds=node.number("seconds", 4.0, 1e-3, MOST_SECONDS),
-        fps=node.number("fps", 30.0, 0.01, 1000.0),
-        size=node.integer("size", 512, 16, LARGEST),
-        background=node.vector("background", 3, None, 0.0, 1.0),
-        shot=_shot(node.child("shot")),
+    film = Film(
+        seconds=fields.number("seconds", 4.0, 1e-3, MAX_SECONDS),
+        fps=fields.number("fps", 30.0, 0.01, 1000.0),
+        size=fields.integer("size", 512, 16, MAX_FILM_SIZE),
+        background=fields.vector("background", 3, None, 0.0, 1.0),
+        shot=_shot(fields.child("shot")),
     )
-    node.done()
-    return found
+    fields.done()
+    return film
 
 
-def _shot(node: Node | None) -> Shot:
-    if node is None:
+def _shot(fields: FieldReader | None) -> Shot:
+    if fields is None:
         return Shot()
     views = []
-    for view in node.children("views"):
+    for view in fields.children("views"):
         views.append(
             View(
-                at=view.number("at", 0.0, 0.0, MOST_SECONDS),
+                at=view.number("at", 0.0, 0.0, MAX_SECONDS),
                 azimuth=view.number("azimuth", None, -1e5, 1e5),
                 elevation=view.number("elevation", None, -80.0, 80.0),
                 distance=view.number("distance", None, 1e-9),
@@ -341,16 +307,16 @@ def _shot(node: Node | None) -> Shot:
         )
         view.done()
     views.sort(key=lambda view: view.at)
-    found = Shot(
-        kind=node.choice("kind", ("turntable", "fixed", "orbit"), "turntable"),
+    shot = Shot(
+        kind=fields.choice("kind", ("turntable", "fixed", "orbit"), "turntable"),
         views=tuple(views) or (View(),),
-        turns=node.number("turns", 1.0, -1000.0, 1000.0),
-        up=node.vector("up", 3),
-        fov=node.number("fov", None, 1.0, 150.0),
+        turns=fields.number("turns", 1.0, -1000.0, 1000.0),
+        up=fields.vector("up", 3),
+        fov=fields.number("fov", None, 1.0, 150.0),
     )
-    if found.up is not None and _too_short(found.up):
-        raise node.wrong("up", "has no direction", "give 3 numbers, not all 0 or next to it")
+    if shot.up is not None and _too_short(shot.up):
+        raise fields.wrong("up", "has no direction", "give 3 numbers, not all close to 0")
     if any(a.at == b.at for a, b in pairwise(views)):
-        raise node.wrong("views", "has two at one moment", "give every view a moment of its own")
-    node.done()
-    return found
+        raise fields.wrong("views", "has two at one moment", "give every view a moment of its own")
+    fields.done()
+    return shot

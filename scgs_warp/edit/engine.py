@@ -1,5 +1,8 @@
-"""An edit, applied: which control points are where at any time, and the Gaussians that follow. Pure but for caches:
-the same edit gives the same bits, in whatever order times are asked for; only ``live`` results depend on the way."""
+"""The engine applies an edit to control points at any time, and to the Gaussians that follow them.
+
+Results depend on the edit and the time alone, to the bit, in whatever order they are requested. Live results are the
+exception: each starts from the previous one.
+"""
 
 from __future__ import annotations
 
@@ -25,30 +28,29 @@ from .pose import MotionPose, NodePose, Rig, motion_pose, pose_gaussians
 from .rotations import from_matrix, slerp, unit
 from .solver import STEP_ITERATIONS, ArapSolver, Shape, count_steps
 
-CACHED = 64
-"""Instants whose control points are remembered."""
+CACHED_INSTANTS = 64
+"""Entries that each cache of control points keeps."""
 LIVE_STEPS = 4
-"""Sub-steps that one drag update takes at most; a drag further than that catches up with the next updates."""
+"""Largest number of sub-steps in one drag update; a longer drag catches up during the next updates."""
 LIVE_ITERATIONS = 8
-
-OPAQUE = 0.1
-"""Gaussians of less opacity tie no control points together."""
+MIN_OPACITY = 0.1
+"""Opacity below which a Gaussian does not connect control points."""
 
 Value = TypeVar("Value")
 
 
 class _Problem(NamedTuple):
-    """What is to be solved at one instant."""
+    """Input of the solver at one instant."""
 
     base: NodePose
     goals: list[Goal]
     pins: np.ndarray
     stay: np.ndarray
-    """[M] bool: control points that follow nobody, as they are pinned or held."""
+    """[M] bool: control points that are pinned or held, and so follow no leader."""
 
 
 class _Live(NamedTuple):
-    """Where the last live solution stands."""
+    """State of the latest live solution."""
 
     key: Any
     targets: dict[str, Target]
@@ -56,7 +58,14 @@ class _Live(NamedTuple):
 
 
 class Engine:
-    """Bends one scene's control points. ``scene`` may have been given control points of its own (static scenes)."""
+    """Bends the control points of one scene.
+
+    Attributes: ``scene`` (a static one is given control points), ``rig``, ``binding``, ``graph``, ``units`` (centre and
+    scale of the normalised scene).
+
+    Raises:
+        UserError: the motion model has no control points.
+    """
 
     def __init__(self, scene: Scene) -> None:
         if isinstance(scene.motion, Static):
@@ -84,8 +93,8 @@ class Engine:
         self._live: _Live | None = None
 
     def _shared(self) -> np.ndarray:
-        """[N, 2] the two nearest control points of every opaque Gaussian."""
-        opaque = (self.scene.gaussians.opacities() > OPAQUE).cpu().numpy()
+        """Return the two nearest control points of every opaque Gaussian, [N, 2]."""
+        opaque = (self.scene.gaussians.opacities() > MIN_OPACITY).cpu().numpy()
         return self.binding[0][:, :2].cpu().numpy()[opaque if opaque.any() else slice(None)]
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
@@ -93,28 +102,28 @@ class Engine:
         return points / scale + centre
 
     def motion_at(self, time: float) -> MotionPose:
-        """The unedited control points."""
+        """Return the unedited control points."""
         return _remember(self._motions, time, lambda: motion_pose(self.rig, time))
 
     def base_at(self, edit: Edit, time: float) -> NodePose:
-        """Control points with holds and exaggeration, before any handle."""
+        """Return the control points under holds and exaggeration, before any handle."""
         key = time, edit.holds, edit.exaggerate
         return _remember(self._bases, key, lambda: self.player.play(time, edit.holds, edit.exaggerate))
 
     def targets(self, edit: Edit, at: float | None) -> dict[str, Target]:
-        """Every handle's target: its keyframes' at a moment of the film, else where it is now."""
+        """Return every handle's target: from its keyframes at a moment of the film, otherwise its present one."""
         led = targets_at(edit.keyframes, at) if at is not None else {}
         return {handle.name: led.get(handle.name, edit.targets.get(handle.name, STAY)) for handle in edit.handles}
 
     def bend(self, edit: Edit, time: float, at: float | None = None, *, frame: float = ONE_FRAME) -> NodePose | None:
-        """The edited control points at a scene time, from nothing but the arguments.
+        """Return the edited control points at a scene time, as a function of the arguments alone.
 
         Args:
             at: moment of the film in seconds, for keyframes. None: the handles' present targets.
-            frame: how far from its time an edit of one frame shows.
+            frame: scene time on either side of its own within which an edit of one frame shows.
 
         Returns:
-            None where the edit changes nothing: then the scene's own bits hold.
+            None where the edit changes nothing; the scene then keeps its bits.
         """
         targets = self.targets(edit, at)
         said = tuple((name, target.translation, target.rotation) for name, target in targets.items())
@@ -133,7 +142,7 @@ class Engine:
         return _remember(self._bent, key, solve)
 
     def bend_live(self, edit: Edit, time: float, *, frame: float = ONE_FRAME) -> NodePose | None:
-        """As ``bend`` with the present targets, quickly: from the last live solution. While a handle is dragged."""
+        """Do as ``bend`` with the present targets, but start from the previous live solution: fast enough for drags."""
         targets = self.targets(edit, None)
         problem = self._problem(edit, time, targets, frame)
         if problem is None:
@@ -157,11 +166,11 @@ class Engine:
         return self._finish(problem, shape)
 
     def settled(self, edit: Edit) -> bool:
-        """Whether the last live solution has caught up with the handles."""
+        """Return whether the latest live solution has caught up with the handles."""
         return self._live is None or self._live.targets == self.targets(edit, None)
 
     def gaussians(self, time: float, bent: NodePose | None) -> Gaussians:
-        """Activated Gaussians, world units; ``bent`` as ``bend`` gives it."""
+        """Return activated Gaussians, world units, for the result of ``bend``."""
         if bent is None:
             return self.scene.gaussians_at(time)
         posed = self._posed(time, bent)
@@ -172,7 +181,7 @@ class Engine:
         )  # fmt: skip
 
     def normalised(self, time: float, bent: NodePose | None) -> Gaussians:
-        """As ``gaussians``, in the normalised scene, for rendering."""
+        """Do as ``gaussians``, but in normalised units, for rendering."""
         if bent is None:
             with torch.no_grad():
                 return self.scene.motion.gaussians_at(self.scene.gaussians, time)
@@ -188,8 +197,8 @@ class Engine:
         return None if np.array_equal(base.positions, motion) and not base.turns[:, 1:].any() else base
 
     def _problem(self, edit: Edit, time: float, targets: Mapping[str, Target], frame: float) -> _Problem | None:
-        """Handles as goals at this time; None if none of them moves. Handles without strength now, and pieces of the
-        graph in which nothing is moved, are left out: they stay to the bit."""
+        """Turn handles into goals at this time; return None if nothing moves. Handles without strength now, and
+        components of the graph in which nothing moves, are left out, so that they keep their bits."""
         base = self.base_at(edit, time)
         goals = []
         for handle in edit.handles:
@@ -211,14 +220,14 @@ class Engine:
         return _Problem(base, used, pins[alive[pins]], stay)
 
     def _finish(self, problem: _Problem, shape: Shape) -> NodePose:
-        """Stray control points follow theirs."""
+        """Let strays follow their leaders, and compose the result with the base pose."""
         base = problem.base
         turns = from_matrix(shape.rotations)
         positions, turns = self.graph.follow(base.positions, shape.positions, turns, problem.stay)
         return dataclasses.replace(base.then(positions, turns), base=base)
 
     def _distance(self, before: Mapping[str, Target], after: Mapping[str, Target]) -> int:
-        """Sub-steps from one set of targets to another."""
+        """Return the number of sub-steps from one set of targets to another."""
         most = 1
         for name, target in after.items():
             old = before.get(name, STAY)
@@ -231,7 +240,7 @@ class Engine:
 def _across_no_gap(
     graph: ControlGraph, indices: torch.Tensor, weights: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """A static scene's binding, without control points that are not tied to a Gaussian's nearest one."""
+    """Restrict a static scene's binding to control points that share an edge with the Gaussian's nearest one."""
     nodes = indices.long().cpu().numpy()
     tied = (
         np.asarray(graph.matrix[nodes[:, :1].repeat(nodes.shape[1], 1).ravel(), nodes.ravel()]).reshape(nodes.shape) > 0
@@ -245,21 +254,21 @@ def _across_no_gap(
 
 
 def _between(before: Mapping[str, Target], after: Mapping[str, Target], share: float) -> dict[str, Target]:
-    found = {}
+    between = {}
     for name, target in after.items():
         old = before.get(name, STAY)
         shift = np.array(old.translation) + share * np.subtract(target.translation, old.translation)
         turn = unit(slerp(np.array(old.rotation), np.array(target.rotation), share))
-        found[name] = Target.of(shift.tolist(), turn.tolist())
-    return found
+        between[name] = Target.of(shift.tolist(), turn.tolist())
+    return between
 
 
 def _remember(cache: OrderedDict[Any, Value], key: Any, make: Callable[[], Value]) -> Value:
-    """The value under ``key``, made if it is new; the oldest ones are forgotten."""
+    """Return the cached value of ``key``, made if it is missing; evict the least recently used ones."""
     if key in cache:
         cache.move_to_end(key)
         return cache[key]
     value = cache[key] = make()
-    while len(cache) > CACHED:
+    while len(cache) > CACHED_INSTANTS:
         cache.popitem(last=False)
     return value

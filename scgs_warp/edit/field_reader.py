@@ -1,4 +1,4 @@
-"""Reading JSON that people write: every mistake names the file, the field and the remedy, in one line."""
+"""Checked access to JSON that people write: every error names the file, the field and the remedy in one line."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from ..errors import UserError
 from ..storage.files import parse_json
 
 MAX_BYTES = 64 << 20
-"""A larger file is no edit."""
-LIMIT = 1e9
-"""Of numbers that nothing else limits: beyond it float32 leaves no scene."""
+"""Size of the largest edit file."""
+MAX_NUMBER = 1e9
+"""Limit of numbers that have no limit of their own: beyond it float32 resolves no scene."""
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file.
+    """Read the JSON object in a file.
 
     Raises:
-        UserError: it is missing, too large, no JSON, or no object.
+        UserError: the file is missing, too large, not JSON, or not an object.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -35,10 +35,10 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def parse_object(text: str, path: str) -> dict[str, Any]:
-    """The JSON object in a text; ``path`` is what errors name.
+    """Parse a text as a JSON object; errors name ``path``.
 
     Raises:
-        UserError: it is no JSON, or no object.
+        UserError: the text is not JSON, or not an object.
     """
     try:
         content = parse_json(text, parse_constant=_no_constant, object_pairs_hook=_unique)
@@ -57,21 +57,27 @@ def _no_constant(name: str) -> float:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    content = dict(pairs)
+    if len(content) != len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{twice!r} stands there twice")
-    return found
+    return content
 
 
-class Node:
-    """A JSON object and where it stands. Fields are taken by name; ``done`` refuses what nobody took."""
+class FieldReader:
+    """Reads the fields of a JSON object by name and type; ``done`` refuses fields that were not read.
 
-    def __init__(self, value: Any, source: str, place: str = "") -> None:
-        self.source, self.place = source, place
+    Args:
+        value: the object.
+        source: file that errors name.
+        path: place of the object in the file, such as ``handles[0]``.
+    """
+
+    def __init__(self, value: Any, source: str, path: str = "") -> None:
+        self.source, self.path = source, path
         if not isinstance(value, dict):
-            raise self.wrong("", f"is {shown(value)}", "give an object")
+            raise self.wrong("", f"is {show_value(value)}", "give an object")
         self._value = value
         self._taken: set[str] = set()
 
@@ -80,8 +86,8 @@ class Node:
         return UserError(f"{self.source}: {field or 'the file'} {what}; {remedy}")
 
     def _inside(self, name: str) -> str:
-        """The place of a field; names that people made up may be anything."""
-        return ".".join(part for part in (self.place, one_line(name)) if part)
+        """Return the path of a field in one line, as its name may be any text."""
+        return ".".join(part for part in (self.path, one_line(name)) if part)
 
     def __contains__(self, name: str) -> bool:
         return self._value.get(name) is not None
@@ -96,12 +102,12 @@ class Node:
             known = ", ".join(sorted(self._taken | set(also)))
             raise self.wrong(unknown[0], "is not known", f"known here: {known}")
 
-    def number(self, name: str, default: Any = None, low: float = -LIMIT, high: float = LIMIT) -> Any:
+    def number(self, name: str, default: Any = None, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> Any:
         value = self.raw(name)
         if value is None:
             return default
         if not _is_number(value) or not low <= value <= high:
-            raise self.wrong(name, f"is {shown(value)}", f"give a number from {low:g} to {high:g}")
+            raise self.wrong(name, f"is {show_value(value)}", f"give a number from {low:g} to {high:g}")
         return float(value)
 
     def integer(self, name: str, default: int, low: int, high: int) -> int:
@@ -109,13 +115,13 @@ class Node:
         if value is None:
             return default
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.wrong(name, f"is {shown(value)}", f"give a whole number from {low} to {high}")
+            raise self.wrong(name, f"is {show_value(value)}", f"give a whole number from {low} to {high}")
         return value
 
-    def truth(self, name: str) -> bool | None:
+    def boolean(self, name: str) -> bool | None:
         value = self.raw(name)
         if value is not None and not isinstance(value, bool):
-            raise self.wrong(name, f"is {shown(value)}", "give true or false")
+            raise self.wrong(name, f"is {show_value(value)}", "give true or false")
         return value
 
     def choice(self, name: str, options: tuple[str, ...], default: str) -> Any:
@@ -123,23 +129,25 @@ class Node:
         if value is None:
             return default
         if not isinstance(value, str) or value not in options:
-            raise self.wrong(name, f"is {shown(value)}", f"choose one of {', '.join(options)}")
+            raise self.wrong(name, f"is {show_value(value)}", f"choose one of {', '.join(options)}")
         return value
 
     def text(self, name: str) -> str:
         value = self.raw(name)
         if not isinstance(value, str) or not value.strip() or len(value) > 100 or not value.isprintable():
-            raise self.wrong(name, f"is {shown(value)}", "give a name of 1 to 100 letters")
+            raise self.wrong(name, f"is {show_value(value)}", "give a name of 1 to 100 letters")
         return value
 
-    def vector(self, name: str, size: int, default: Any = None, low: float = -LIMIT, high: float = LIMIT) -> Any:
+    def vector(
+        self, name: str, size: int, default: Any = None, low: float = -MAX_NUMBER, high: float = MAX_NUMBER
+    ) -> Any:
         value = self.raw(name)
         if value is None:
             return default
-        fits = isinstance(value, list) and len(value) == size and all(map(_is_number, value))
+        fits = isinstance(value, list | tuple) and len(value) == size and all(map(_is_number, value))
         if not fits or not all(low <= x <= high for x in value):
-            limits = "" if high == LIMIT else f" from {low:g} to {high:g}"
-            raise self.wrong(name, f"is {shown(value)}", f"give {size} numbers{limits}")
+            limits = "" if high == MAX_NUMBER else f" from {low:g} to {high:g}"
+            raise self.wrong(name, f"is {show_value(value)}", f"give {size} numbers{limits}")
         return tuple(float(x) for x in value)
 
     def items(self, name: str, most: int = 100_000) -> list[Any]:
@@ -147,26 +155,26 @@ class Node:
         if value is None:
             return []
         if not isinstance(value, list) or len(value) > most:
-            raise self.wrong(name, f"is {shown(value)}", f"give a list of at most {most}")
+            raise self.wrong(name, f"is {show_value(value)}", f"give a list of at most {most}")
         return value
 
-    def child(self, name: str) -> Node | None:
+    def child(self, name: str) -> FieldReader | None:
         value = self.raw(name)
-        return None if value is None else Node(value, self.source, self._inside(name))
+        return None if value is None else FieldReader(value, self.source, self._inside(name))
 
-    def children(self, name: str, most: int = 10_000) -> Iterator[Node]:
+    def children(self, name: str, most: int = 10_000) -> Iterator[FieldReader]:
         for index, value in enumerate(self.items(name, most)):
-            yield Node(value, self.source, f"{self._inside(name)}[{index}]")
+            yield FieldReader(value, self.source, f"{self._inside(name)}[{index}]")
 
-    def entries(self, name: str) -> Iterator[tuple[str, Node]]:
-        """Of an object of objects."""
+    def entries(self, name: str) -> Iterator[tuple[str, FieldReader]]:
+        """Iterate over the names and readers of an object of objects."""
         inner = self.child(name)
         if inner is not None:
             for key in inner._value:
-                found = inner.child(key)
-                if found is None:
+                reader = inner.child(key)
+                if reader is None:
                     raise inner.wrong(key, "is null", "give an object")
-                yield key, found
+                yield key, reader
 
 
 def _is_number(value: Any) -> bool:
@@ -178,8 +186,8 @@ def _is_number(value: Any) -> bool:
         return False
 
 
-def shown(value: Any) -> str:
-    """A JSON value in at most 60 characters of one line."""
+def show_value(value: Any) -> str:
+    """Quote a JSON value in at most 60 characters of one line."""
     try:
         text = json.dumps(value) if value is not None else "missing"
     except RecursionError:
@@ -188,6 +196,6 @@ def shown(value: Any) -> str:
 
 
 def one_line(text: str) -> str:
-    """A text in at most 100 characters of one line."""
+    """Shorten a text to at most 100 characters of one line."""
     plain = text if text.isprintable() else json.dumps(text)[1:-1]
     return plain if len(plain) <= 100 else plain[:97] + "..."

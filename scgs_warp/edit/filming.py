@@ -1,4 +1,4 @@
-"""The film of an edit: a camera's way, frame by frame."""
+"""Filming of an edit: camera path and frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIELDS = ("azimuth", "elevation", "distance")
 
 
 def film_camera(session: EditSession, at: float, size: int | None = None) -> Camera:
-    """The camera at a moment of the session's film, on the CPU."""
+    """Return the film's camera at a moment in seconds, on the CPU."""
     settings = session.edit.film
     shot, overview = settings.shot, session.scene.overview
     changes: dict[str, Any] = {}
@@ -42,7 +42,7 @@ def film_camera(session: EditSession, at: float, size: int | None = None) -> Cam
 
 
 def _view_at(views: tuple[View, ...], at: float, overview: cameras.Overview) -> dict[str, np.ndarray]:
-    """Every quantity by itself, smooth and without overshooting; what a view leaves open is the overview's."""
+    """Interpolate each quantity by itself, smoothly and without overshoot; the overview fills in missing ones."""
     usual = {"azimuth": overview.azimuth, "elevation": overview.elevation, "distance": overview.radius}
     rows = {
         name: np.array([[usual[name] if getattr(view, name) is None else getattr(view, name)] for view in views])
@@ -60,12 +60,12 @@ def _view_at(views: tuple[View, ...], at: float, overview: cameras.Overview) -> 
 
 
 def moments(settings: Film) -> list[float]:
-    """When, in seconds, every frame of a film is."""
+    """Return the time of every frame in seconds."""
     return [index / settings.fps for index in range(settings.frames)]
 
 
 def film_frame(session: EditSession, at: float, size: int | None = None) -> np.ndarray:
-    """[H, W, 3] uint8, the film's picture at a moment in seconds."""
+    """Render the film's frame at a moment in seconds, [H, W, 3] uint8."""
     camera = film_camera(session, at, size).to(session.scene.device)
     background = session.edit.film.background
     return to_bytes(session.render(camera, session.scene_time(at), at, background).rgb)
@@ -81,19 +81,18 @@ def render_film(
     advance: Callable[[], None] | None = None,
     compute: Callable[[Callable[[], np.ndarray]], np.ndarray] = _at_once,
 ) -> int:
-    """Write the session's film; the same edit gives the same frames as the editor shows.
+    """Write the session's film, whose frames are those that the editor shows.
 
     Args:
-        output: ends in .mp4 or .gif, or a folder for numbered PNGs.
-        advance: called after each frame; what it raises ends the film, and nothing is left behind.
-        compute: calls the function that draws a frame and returns what it returned; for those who draw on another
-            thread.
+        output: name that ends in .mp4 or .gif, or a folder for numbered PNGs.
+        advance: called after each frame; an exception that it raises ends the film and removes what was written.
+        compute: calls the function that draws a frame and returns its result, so that another thread may draw.
 
     Returns:
-        Number of frames.
+        Frame count.
 
     Raises:
-        UserError: it cannot be written there, or does not fit into memory.
+        UserError: the output cannot be written, or the film does not fit into memory.
     """
     settings = session.edit.film
     first = film_camera(session, 0.0)

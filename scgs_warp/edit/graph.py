@@ -1,4 +1,4 @@
-"""Who is tied to whom: the graph of control points that an edit bends."""
+"""Graph of control points that an edit bends."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from ..ops.arap import trajectory_graph
 from .rotations import rotate
 
 NEIGHBORS = 7
-"""Control points each one asks for; the union of both sides wishes makes it some nine."""
-LONGEST = 3.0
-"""An edge longer than so many times the median one ties nothing together."""
-SMALLEST = 4
-"""Fewer control points than this, cut off from all others, follow the nearest ones that are not."""
-TIMES = 16
-"""Instants at which trajectories are compared."""
+"""Neighbours that each control point requests; the union of both directions gives about nine."""
+MAX_EDGE_RATIO = 3.0
+"""Length, in median edges, beyond which an edge is dropped."""
+MIN_COMPONENT_SIZE = 4
+"""Size below which an isolated component consists of strays, which follow the nearest larger component."""
+SAMPLE_COUNT = 16
+"""Number of instants at which trajectories are compared."""
 
 
 @dataclass(frozen=True)
 class ControlGraph:
-    """A symmetric graph: every edge stands in both of its ends' rows."""
+    """Symmetric graph in compressed rows; every edge is in the rows of both of its ends."""
 
     begin: np.ndarray
-    """[M + 1] int32, the rows of the two arrays below."""
+    """[M + 1] int32 row offsets into the two arrays below."""
     neighbors: np.ndarray
-    """[E] int32, ascending in every row."""
+    """[E] int32, ascending in each row."""
     weights: np.ndarray
     """[E] float64 > 0, the same in both directions."""
     component: np.ndarray
-    """[M] int32, which connected piece each control point belongs to."""
+    """[M] int32 label of the connected component of each control point."""
     edge_length: float
-    """Median over the edges (root mean square over time), normalised units; 1 where there is none."""
+    """Median over the edges (root mean square over time), normalised units; 1 without edges."""
     stray: np.ndarray
-    """[M] int32: whom a control point that is tied to (almost) nobody follows; -1 for all others, itself if nobody is
-    near."""
+    """[M] int32 leader of each control point in a tiny component: itself if no larger component is near. -1 for all
+    other control points."""
 
     def __len__(self) -> int:
         return len(self.begin) - 1
 
     @property
     def edges(self) -> np.ndarray:
-        """[E / 2, 2] each edge once, first end < second."""
+        """[E / 2, 2] each edge once, first end < second end."""
         first = np.repeat(np.arange(len(self)), np.diff(self.begin))
         keep = first < self.neighbors
         return np.stack([first[keep], self.neighbors[keep]], axis=1)
 
     @property
     def matrix(self) -> csr_matrix:
-        """[M, M] of weights."""
+        """[M, M] weights."""
         return csr_matrix((self.weights, self.neighbors, self.begin), shape=(len(self), len(self)))
 
     def ring(self, nodes: Iterable[int], count: int = 1) -> tuple[int, ...]:
-        """The nodes and everything at most ``count`` edges away, ascending."""
+        """Return the nodes and all that are at most ``count`` edges away, ascending."""
         inside = np.zeros(len(self), bool)
         inside[list(nodes)] = True
         matrix = self.matrix
@@ -71,11 +71,11 @@ class ControlGraph:
 
     @property
     def led(self) -> np.ndarray:
-        """Strays [S] that follow another control point."""
+        """[S] strays that follow another control point."""
         return np.flatnonzero((self.stray >= 0) & (self.stray != np.arange(len(self))))
 
     def with_strays(self, nodes: Iterable[int]) -> tuple[int, ...]:
-        """The nodes and the strays that follow them, ascending."""
+        """Return the nodes and the strays that follow them, ascending."""
         inside = np.zeros(len(self), bool)
         inside[list(nodes)] = True
         led = self.led
@@ -83,15 +83,19 @@ class ControlGraph:
         return tuple(np.flatnonzero(inside).tolist())
 
     def beyond(self, nodes: Iterable[int], rings: int) -> tuple[int, ...]:
-        """Everything more than so many edges away from the nodes, ascending; a stray is where its leader is."""
+        """Return all nodes more than ``rings`` edges away, ascending; a stray counts as being at its leader."""
         near = set(self.with_strays(self.ring(nodes, rings)))
         return tuple(node for node in range(len(self)) if node not in near)
 
     def follow(
         self, rest: np.ndarray, positions: np.ndarray, turns: np.ndarray, stay: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [M, 3] and turns [M, 4] after strays have gone along with their leaders; those in ``stay`` [M]
-        bool, and those whose leader has not moved, are as they were."""
+        """Move strays rigidly with their leaders. Those in ``stay`` [M] bool, and those whose leader stays, keep
+        their bits.
+
+        Returns:
+            Positions [M, 3] and turns [M, 4] of all nodes.
+        """
         led = self.led[~stay[self.led]]
         leaders = self.stray[led]
         moved = (positions[leaders] != rest[leaders]).any(1) | turns[leaders, 1:].any(1)
@@ -105,22 +109,22 @@ class ControlGraph:
 
 
 def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.ndarray | None = None) -> ControlGraph:
-    """Neighbours by mean squared distance over time (SC-GS, Eq. 10), so that parts which touch once and move apart
-    are not tied; made symmetric by union, overlong edges dropped.
+    """Connect neighbours by mean squared distance over time (SC-GS, Eq. 10), so that parts which touch once and move
+    apart stay separate. Edges are made symmetric by union, and overlong ones dropped.
 
-    Weights are 1: on an unstructured graph an edge's length says how finely control points happen to lie there, not
-    how stiff the body is.
+    Weights are 1: on an unstructured graph the length of an edge reflects how densely control points happen to lie,
+    not how stiff the body is.
 
     Args:
-        trajectories: [T, M, 3] control points at T times (one is enough for what stands still).
-        neighbors: that each control point asks for, 1 .. 15.
-        shared: [N, K] control points that have a Gaussian in common, row by row. Nearest neighbours are then tied only
-            through what they share (Martinetz & Schulten 1994), or through one more control point, so that a gap stays
-            a gap, and what moves nothing ties nothing.
+        trajectories: [T, M, 3] control points at T times (one is enough for a static scene).
+        neighbors: number that each control point requests, 1 .. 15.
+        shared: [N, K] control points that have a Gaussian in common, row by row. Neighbours are then connected only if
+            they share a Gaussian (Martinetz & Schulten 1994) directly or through one more control point, so that gaps
+            stay open and control points that move no Gaussian connect nothing.
     """
     nodes = trajectories.shape[1]
-    found, _ = trajectory_graph(trajectories.float().cpu().contiguous(), neighbors)
-    columns = found.numpy().astype(np.int64)
+    nearest, _ = trajectory_graph(trajectories.float().cpu().contiguous(), neighbors)
+    columns = nearest.numpy().astype(np.int64)
     rows = np.repeat(np.arange(nodes), columns.shape[1])
     columns = columns.reshape(-1)
     rows, columns = rows[columns >= 0], columns[columns >= 0]
@@ -132,18 +136,18 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.nda
     offsets = tracks[:, pairs[:, 0]] - tracks[:, pairs[:, 1]]
     lengths = np.sqrt((offsets**2).sum(-1).mean(0))
     median = float(np.median(lengths)) if len(lengths) else 1.0
-    pairs = pairs[lengths <= LONGEST * median]
+    pairs = pairs[lengths <= MAX_EDGE_RATIO * median]
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     matrix = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(nodes, nodes)).tocsr()
     matrix.sort_indices()
     component = connected_components(matrix, directed=False)[1].astype(np.int32)
     begin, columns = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32)
-    stray = _strays(tracks, component, LONGEST * median)
+    stray = _strays(tracks, component, MAX_EDGE_RATIO * median)
     return ControlGraph(begin, columns, matrix.data.astype(np.float64), component, median or 1.0, stray)
 
 
 def _near(shared: np.ndarray, nodes: int) -> csr_matrix:
-    """[M, M] bool: control points with a Gaussian in common, or with one such neighbour in common."""
+    """Return [M, M] bool: control points with a Gaussian in common, or with one such neighbour in common."""
     rows, columns = (shared[:, pick].reshape(-1) for pick in np.triu_indices(shared.shape[1], 1))
     ones = np.ones(2 * len(rows), bool)
     ends = np.concatenate([rows, columns]), np.concatenate([columns, rows])
@@ -152,9 +156,9 @@ def _near(shared: np.ndarray, nodes: int) -> csr_matrix:
 
 
 def _strays(tracks: np.ndarray, component: np.ndarray, reach: float) -> np.ndarray:
-    """Whom the members of tiny components follow: the nearest member of a large one, within a few edges' length."""
+    """Choose leaders for the members of tiny components: the nearest member of a larger one within a few edges."""
     stray = np.full(len(component), -1, np.int32)
-    small = np.bincount(component, minlength=1)[component] < SMALLEST
+    small = np.bincount(component, minlength=1)[component] < MIN_COMPONENT_SIZE
     if not small.any() or small.all():
         return stray
     held = np.flatnonzero(~small)
@@ -166,5 +170,5 @@ def _strays(tracks: np.ndarray, component: np.ndarray, reach: float) -> np.ndarr
 
 
 def sample_times(moves: bool) -> Tensor:
-    """Instants for ``build_graph``."""
-    return torch.linspace(0.0, 1.0, TIMES) if moves else torch.zeros(1)
+    """Return the instants at which ``build_graph`` compares trajectories."""
+    return torch.linspace(0.0, 1.0, SAMPLE_COUNT) if moves else torch.zeros(1)

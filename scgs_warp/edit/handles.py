@@ -1,16 +1,16 @@
-"""What a user takes hold of: handles, where they were moved to, and what that asks of the solver. All frozen."""
+"""Handles, their targets, and the goals and anchors that the solver gets from them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from ..errors import UserError
-from .field_reader import LIMIT
+from .field_reader import MAX_NUMBER, FieldReader
 from .graph import ControlGraph
 from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
 from .solver import Anchors
@@ -20,18 +20,19 @@ Quaternion = tuple[float, float, float, float]
 Lasting = Literal["motion", "frame", "fade"]
 
 ONE_FRAME = 5e-3
-"""What lasts one frame shows this far from its time, where nobody says how far frames are apart."""
-GRIP = 10.0
-"""Stiffness of a fading handle half way: it lets go of its nodes as its strength goes to 0, so that nothing jumps."""
-WEAKEST, STRONGEST = 1e-6, 1e6
+"""Scene time on either side of its own within which an edit of one frame shows, if the film's step is unknown."""
+HALFWAY_STIFFNESS = 10.0
+"""Stiffness of a fading handle at half strength. It releases its nodes as its strength goes to 0, so that nothing
+jumps."""
+MIN_STIFFNESS, MAX_STIFFNESS = 1e-6, 1e6
 """Limits of a stiffness."""
-FEWEST_FOR_A_FRAME = 4
-"""A region of fewer nodes takes its neighbours along to tell how it turns."""
+MIN_NODES_FOR_FRAME = 4
+"""Node count below which a region's rotation is estimated together with its neighbours."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """Where a handle was moved to: turned about its pivot, then shifted. World units, at the handle's time."""
+    """Rigid displacement of a handle: a turn about its pivot, then a shift. World units, at the handle's time."""
 
     translation: Vector3 = (0.0, 0.0, 0.0)
     rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -39,15 +40,15 @@ class Target:
 
     @staticmethod
     def of(translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None) -> Target:
-        """Checked and normalised.
+        """Check and normalise a target.
 
         Raises:
             UserError: a number is not finite or too large, or the rotation has no direction.
         """
         moved = tuple(float(x) for x in (translation if translation is not None else (0.0, 0.0, 0.0)))
         turned = tuple(float(x) for x in (rotation if rotation is not None else IDENTITY))
-        if len(moved) != 3 or not all(math.isfinite(x) and abs(x) <= LIMIT for x in moved):
-            limits = f"must be three finite numbers from {-LIMIT:g} to {LIMIT:g}"
+        if len(moved) != 3 or not all(math.isfinite(x) and abs(x) <= MAX_NUMBER for x in moved):
+            limits = f"must be three finite numbers from {-MAX_NUMBER:g} to {MAX_NUMBER:g}"
             raise UserError(f"translation {list(moved)}: {limits}; the handle stays where it is")
         if len(turned) != 4 or not all(map(math.isfinite, turned)) or not any(turned):
             raise UserError(f"rotation {list(turned)}: must be four finite numbers, not all 0; the handle stays")
@@ -66,30 +67,40 @@ STAY = Target()
 
 @dataclass(frozen=True)
 class Handle:
-    """A set of control points that is moved as one."""
+    """Set of control points that moves as one."""
 
     name: str
     nodes: tuple[int, ...]
     """Ascending, at least one."""
     time: float = 0.0
-    """Scene time at which it was made; pivot and targets are said there."""
+    """Scene time at which it was made; pivot and targets refer to it."""
     pivot: Vector3 | None = None
-    """World, what it turns about; None: the mean of its nodes."""
+    """Centre of rotation, world units; None: the mean of its nodes."""
     stiffness: float | None = None
-    """None: exactly where it is put. A number: pulled there, the weaker the smaller (1: as its edges)."""
+    """None: nodes go exactly to the target. A number: nodes are pulled there, relative to their edges' stiffness 1."""
     turns: bool | None = None
-    """Whether its nodes' rotations are given, too. None: if it is more than one node."""
+    """True: it also fixes its nodes' rotations. None: it does so if it has more than one node."""
     lasts: Lasting = "motion"
-    """The whole motion, in the nodes' own frames; one frame; or fading out over ``window`` around its time."""
+    """motion: throughout, carried along by its nodes; frame: one frame; fade: fading out over ``window`` around its
+    time."""
     window: float = 0.1
     """Scene time after which a fading handle has no effect."""
+
+    def __post_init__(self) -> None:
+        """Check and convert all fields but the nodes, whose range depends on the scene.
+
+        Raises:
+            UserError: naming the field.
+        """
+        for name, value in handle_fields(FieldReader(vars(self), f"handle {self.name!r}")).items():
+            object.__setattr__(self, name, value)
 
     @property
     def gives_rotation(self) -> bool:
         return len(self.nodes) > 1 if self.turns is None else self.turns
 
     def strength(self, time: float, frame: float = ONE_FRAME) -> float:
-        """How much of its target counts at a scene time: 0 to 1, smooth for a fading one."""
+        """Return the share of its target that applies at a scene time: 0 to 1, smooth for a fading handle."""
         away = abs(time - self.time)
         if self.lasts == "motion" or away == 0.0:
             return 1.0
@@ -99,9 +110,26 @@ class Handle:
         return 0.0 if share <= 0 else share * share * (3.0 - 2.0 * share)
 
 
+def handle_fields(node: FieldReader) -> dict[str, Any]:
+    """Read all fields of a handle but its nodes.
+
+    Raises:
+        UserError: naming the field.
+    """
+    return {
+        "name": node.text("name"),
+        "time": node.number("time", 0.0, 0.0, 1.0),
+        "pivot": node.vector("pivot", 3),
+        "stiffness": node.number("stiffness", None, MIN_STIFFNESS, MAX_STIFFNESS),
+        "turns": node.boolean("turns"),
+        "lasts": node.choice("lasts", get_args(Lasting), "motion"),
+        "window": node.number("window", 0.1, 1e-6, 10.0),
+    }
+
+
 class Goal(NamedTuple):
-    """What a handle asks for at one instant, normalised units. On the way there (share 0 to 1) it turns about its
-    pivot; it does not cut across."""
+    """Pose that a handle requests at one instant, normalised units. Its path from the base pose (share 0 to 1) is an
+    arc about the pivot, not a straight line."""
 
     nodes: np.ndarray
     """[n]"""
@@ -111,11 +139,11 @@ class Goal(NamedTuple):
     stiffness: float | None = None
     gives_rotation: bool = True
     residual: np.ndarray | None = None
-    """[n, 3] what the rigid motion does not explain."""
+    """[n, 3] displacement beyond the rigid motion."""
     own_turns: np.ndarray | None = None
-    """[n, 4] rotations of single nodes beyond the rigid motion."""
+    """[n, 4] rotations of the nodes beyond the rigid motion."""
     leaning: float | None = None
-    """None: rotations are as given. A number: they are drawn there, as positions by a stiffness."""
+    """None: rotations are fixed. A number: they are pulled towards the goal, as a stiffness pulls positions."""
 
     @property
     def is_identity(self) -> bool:
@@ -125,8 +153,8 @@ class Goal(NamedTuple):
             and (self.residual is None or not self.residual.any())
         )
 
-    def place(self, rest: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [n, 3] and rotations [n, 3, 3] at ``share`` of the way."""
+    def pose_at(self, rest: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions [n, 3] and rotations [n, 3, 3] at ``share`` of the path."""
         quat = power(self.quat, share)
         positions = rest[self.nodes]
         if quat[1:].any():
@@ -140,7 +168,7 @@ class Goal(NamedTuple):
         return positions, to_matrix(turns)
 
     def sweep(self, rest: np.ndarray) -> tuple[float, float]:
-        """(angle in radians, distance) it has to go, for the number of sub-steps."""
+        """Return the angle in radians and the distance that it covers, which decide the number of sub-steps."""
         distance = float(np.linalg.norm(self.translation))
         if self.residual is not None:
             distance += float(np.linalg.norm(self.residual, axis=1).max(initial=0.0))
@@ -156,12 +184,12 @@ def carried_goal(
     now: np.ndarray,
     to_units: tuple[np.ndarray, float],
 ) -> Goal:
-    """A handle's target, said at the handle's time, at another instant: carried by the rigid motion of its nodes.
+    """Carry a handle's target from its own time to another instant by the rigid motion of its nodes.
 
     Args:
-        share: how much of the target counts, above 0; below 1 its nodes are held less firmly, too.
-        then, now: [M, 3] control points at the handle's time and at the instant asked for, normalised units; the same
-            object where they are the same.
+        share: share of the target that applies, above 0; below 1 it also holds its nodes less firmly.
+        then, now: [M, 3] control points at the handle's time and at the requested instant, normalised units; the same
+            object if the two are equal.
         to_units: (centre, scale) of the normalised scene.
     """
     centre, scale = to_units
@@ -174,7 +202,7 @@ def carried_goal(
     translation = share * scale * np.array(target.translation)
     if now is not then:
         members = nodes
-        if len(members) < FEWEST_FOR_A_FRAME:
+        if len(members) < MIN_NODES_FOR_FRAME:
             members = np.array(graph.ring(handle.nodes, 1))
         frame, before, after = rigid_fit(then[members], now[members])
         pivot = rotate(frame, pivot - before) + after
@@ -182,28 +210,29 @@ def carried_goal(
         translation = rotate(frame, translation)
     stiffness, leaning = handle.stiffness, None
     if share < 1.0:
-        leaning = _limited(GRIP * share / (1.0 - share))
-        stiffness = leaning if stiffness is None else _limited(stiffness * share)
+        leaning = _clamp_stiffness(HALFWAY_STIFFNESS * share / (1.0 - share))
+        stiffness = leaning if stiffness is None else _clamp_stiffness(stiffness * share)
     return Goal(nodes, pivot, quat, translation, stiffness, handle.gives_rotation, leaning=leaning)
 
 
-def _limited(stiffness: float) -> float:
-    return min(max(stiffness, WEAKEST), STRONGEST)
+def _clamp_stiffness(stiffness: float) -> float:
+    return min(max(stiffness, MIN_STIFFNESS), MAX_STIFFNESS)
 
 
 def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share: float) -> Anchors:
-    """What is held at ``share`` of the way. Of two goals for one node the later counts; goals count more than pins.
+    """Return what is held at ``share`` of the path. Later goals override earlier ones on the same node, and all of them
+    override pins.
 
     Args:
-        pins: nodes that stay, turned by nothing.
-        rest: [M, 3]
+        pins: nodes that stay, unturned.
+        rest: [M, 3] base positions.
     """
     count = len(rest)
     hard, turned, soft, leaning = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count), np.zeros(count)
     positions, rotations = rest.copy(), np.tile(np.eye(3), (count, 1, 1))
     hard[pins] = turned[pins] = True
     for goal in goals:
-        at, turns = goal.place(rest, share)
+        at, turns = goal.pose_at(rest, share)
         positions[goal.nodes], rotations[goal.nodes] = at, turns
         hard[goal.nodes] = goal.stiffness is None
         soft[goal.nodes] = 0.0 if goal.stiffness is None else goal.stiffness

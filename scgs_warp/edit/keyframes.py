@@ -1,36 +1,61 @@
-"""From keyframes to where every handle is at any moment of a film: through the handles' own numbers, not through
-positions, so that what turns between two keyframes turns, and does not shrink."""
+"""Interpolation of handles between keyframes. It acts on their translations and rotations, not on positions of control
+points, so that a part which turns between two keyframes does not shrink."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from .field_reader import FieldReader
 from .handles import Target
 from .rotations import IDENTITY, conjugate, exponential, logarithm, multiply, power, slerp, unit
 
 Easing = Literal["smooth", "linear", "ease", "step"]
 
+MAX_SECONDS = 3600.0
+"""Limit of times in a film."""
+
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Where handles are at one moment of the film."""
+    """Targets of handles at one moment of the film."""
 
     at: float
-    """Seconds of the film."""
+    """Time in the film, seconds."""
     targets: Mapping[str, Target] = field(default_factory=dict)
-    """By the handle's name; handles not named are led by the other keyframes."""
+    """Targets by handle; the other keyframes lead handles that are missing here."""
     easing: Easing = "smooth"
-    """The way to the next one. smooth: without a stop at keyframes, and never beyond their values; linear: evenly;
-    ease: from rest to rest; step: it stays, then jumps."""
+    """Interpolation to the next keyframe. smooth: without stopping at keyframes or overshooting them; linear: at
+    constant speed; ease: from rest to rest; step: constant, then a jump."""
+
+    def __post_init__(self) -> None:
+        """Check time and easing, and convert the time.
+
+        Raises:
+            UserError: naming the field.
+        """
+        for name, value in keyframe_fields(FieldReader(vars(self), "keyframe")).items():
+            object.__setattr__(self, name, value)
+
+
+def keyframe_fields(node: FieldReader) -> dict[str, Any]:
+    """Read all fields of a keyframe but its targets.
+
+    Raises:
+        UserError: naming the field.
+    """
+    at = node.number("at", None, 0.0, MAX_SECONDS)
+    if at is None:
+        raise node.wrong("at", "is missing", "give seconds from the film's beginning")
+    return {"at": at, "easing": node.choice("easing", get_args(Easing), "smooth")}
 
 
 def targets_at(keyframes: Sequence[Keyframe], at: float) -> dict[str, Target]:
-    """Every handle's target at a moment of the film; before its first keyframe and after its last it stays."""
+    """Return every handle's target at a moment of the film, constant before its first keyframe and after its last."""
     names = sorted({name for frame in keyframes for name in frame.targets})
     ordered = sorted(keyframes, key=lambda frame: frame.at)
     return {name: _track_at([frame for frame in ordered if name in frame.targets], name, at) for name in names}
@@ -62,17 +87,17 @@ def _track_at(frames: list[Keyframe], name: str, at: float) -> Target:
 
 
 def _aligned(quats: np.ndarray) -> np.ndarray:
-    """Each on the side of the one before, so that every turn is the short one."""
-    found = quats.copy()
-    for i in range(1, len(found)):
-        if found[i] @ found[i - 1] < 0:
-            found[i] = -found[i]
-    return found
+    """Flip signs such that each turn from one quaternion to the next is the shorter one."""
+    aligned = quats.copy()
+    for i in range(1, len(aligned)):
+        if aligned[i] @ aligned[i - 1] < 0:
+            aligned[i] = -aligned[i]
+    return aligned
 
 
 def _slopes(times: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """[K, 3] velocities at the keyframes that overshoot nowhere (Fritsch & Butland): 0 where the direction turns round
-    and at the ends. ``steps`` [K - 1, 3]: the way from one keyframe to the next."""
+    """Return velocities [K, 3] at the keyframes that avoid overshoot (Fritsch & Butland): 0 at the ends and where the
+    direction reverses. ``steps`` [K - 1, 3] are the differences between keyframes."""
     spans = np.diff(times)[:, None]
     rates = steps / spans
     slopes = np.zeros((len(times), steps.shape[1]))
@@ -86,7 +111,7 @@ def _slopes(times: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def cubic(times: np.ndarray, values: np.ndarray, i: int, share: float) -> np.ndarray:
-    """Monotone cubic between keyframes i and i + 1."""
+    """Evaluate the monotone cubic between keyframes i and i + 1."""
     slopes = _slopes(times, np.diff(values, axis=0)) * (times[i + 1] - times[i])
     s2, s3 = share * share, share**3
     blend = 3 * s2 - 2 * s3
@@ -96,7 +121,7 @@ def cubic(times: np.ndarray, values: np.ndarray, i: int, share: float) -> np.nda
 
 
 def _squad(times: np.ndarray, quats: np.ndarray, i: int, share: float) -> np.ndarray:
-    """A cubic Bezier curve of rotations (Shoemake 1985), whose angular velocity at keyframes is that of ``_slopes``."""
+    """Evaluate a cubic Bezier curve of rotations (Shoemake 1985) with the angular velocities of ``_slopes``."""
     spans = np.diff(times)
     ways = logarithm(multiply(conjugate(quats[:-1]), quats[1:]))
     slopes = _slopes(times, ways) * spans[i] / 3.0
@@ -112,7 +137,7 @@ def _squad(times: np.ndarray, quats: np.ndarray, i: int, share: float) -> np.nda
 
 
 def blend(target: Target, share: float) -> Target:
-    """``share`` of a target."""
+    """Scale a target by ``share``."""
     if share == 1.0:
         return target
     turned = power(np.array(target.rotation), share) if share else IDENTITY

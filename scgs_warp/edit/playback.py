@@ -1,4 +1,4 @@
-"""A scene's own motion, played differently: slower, backwards, in a loop, with a limb held still, or exaggerated."""
+"""Changes to a scene's own motion: its speed and direction, regions held still, exaggeration."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Playback:
-    """Which moment of the motion a moment of the film shows."""
+    """Map from film time to scene time."""
 
     seconds: float | None = None
-    """How long the whole motion takes at speed 1; None: as long as the film."""
+    """Duration of the whole motion at speed 1; None: that of the film."""
     speed: float = 1.0
     """Negative: backwards."""
     start: float = 0.0
-    """Scene time with which the film begins (backwards it begins with ``1 - start``)."""
+    """Scene time at which the film begins (``1 - start`` if it plays backwards)."""
     repeat: Literal["once", "loop", "swing"] = "once"
-    """once: stops at the end; loop: jumps back to the beginning; swing: goes back the way it came."""
+    """once: stop at the end; loop: jump back to the beginning; swing: play back and forth."""
     freeze: float | None = None
-    """This scene time throughout."""
+    """Scene time to show throughout the film."""
     map: tuple[tuple[float, float], ...] = ()
-    """(second of the film, scene time) pairs instead, straight in between."""
+    """Pairs (second of the film, scene time), interpolated linearly; they replace the fields above."""
 
     def time_at(self, at: float, film_seconds: float) -> float:
-        """Scene time in [0, 1] at a moment of the film."""
+        """Return the scene time in [0, 1] at a moment of the film."""
         return float(self.times_at(np.array([at]), film_seconds)[0])
 
     def times_at(self, at: np.ndarray, film_seconds: float) -> np.ndarray:
-        """As ``time_at``, of many moments [F] at once."""
+        """Do as ``time_at`` for moments [F]."""
         if self.freeze is not None:
             return np.full(len(at), self.freeze)
         if self.map:
@@ -47,24 +47,24 @@ class Playback:
 
 @dataclass(frozen=True)
 class Hold:
-    """A region that keeps its pose of one moment while the rest moves."""
+    """Region that keeps its pose of one moment while the rest moves."""
 
     nodes: tuple[int, ...]
     time: float = 0.0
-    """Scene time whose pose it keeps."""
+    """Scene time of the pose that it keeps."""
     frame: Literal["body", "world"] = "body"
-    """body: it still goes along with what it hangs on; world: it stays in place."""
+    """body: still follow the surrounding body; world: stay in place."""
     rings: int = 2
-    """So many rings of neighbours bend to make up for it."""
+    """Number of neighbour rings that bend to compensate."""
 
 
 @dataclass(frozen=True)
 class Exaggerate:
-    """A motion with more (or less) of everything that it does."""
+    """Motion whose turns are scaled."""
 
     factor: float = 1.5
-    """1 changes nothing, 0 is the mean pose."""
+    """1 leaves the motion unchanged, 0 gives the pose that ``about`` names."""
     about: float | None = None
-    """Scene time of the pose that stays as it is; None: the mean over time."""
+    """Scene time of the pose that stays unchanged; None: the mean over time."""
     nodes: tuple[int, ...] = ()
-    """Only these; none named: all."""
+    """Control points to which it applies; empty: all."""

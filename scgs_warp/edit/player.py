@@ -1,4 +1,4 @@
-"""Holds and exaggeration, applied to the control points: the motion that an edit then bends."""
+"""Playing of a scene's control points with holds and exaggeration, before handles bend them."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from .rotations import IDENTITY, conjugate, from_matrix, mean, multiply, power, 
 from .solver import ArapSolver, count_steps
 
 MEAN_TIMES = 16
-"""Instants that a motion's mean is taken over."""
+"""Number of instants over which the mean pose is taken."""
 
 
 class Player:
-    """Plays a scene's control points with holds and exaggeration; its results depend on its arguments alone."""
+    """Applies holds and exaggeration to control points; results depend on the arguments alone."""
 
     def __init__(self, graph: ControlGraph, solver: ArapSolver, motion_at: Callable[[float], MotionPose]) -> None:
         self.graph, self.solver, self.motion_at = graph, solver, motion_at
         self._mean: tuple[np.ndarray, np.ndarray] | None = None
 
     def play(self, time: float, holds: tuple[Hold, ...], exaggerate: Exaggerate | None) -> NodePose:
-        """The control points at a scene time: exaggerated, then held."""
+        """Return the control points at a scene time: exaggerated, then held."""
         now = self._exaggerated(time, exaggerate)
         active = [hold for hold in holds if hold.time != time]
         if not active:
@@ -35,11 +35,11 @@ class Player:
         for hold in holds:
             near[list(self.graph.with_strays(self.graph.ring(hold.nodes, hold.rings)))] = True
         pins = np.flatnonzero(~near)
-        goals, looks_of = [], []
+        goals, color_turns_of = [], []
         for hold in holds:
-            goal, looks = self._goal(hold, time, now, exaggerate)
+            goal, color_turns = self._goal(hold, time, now, exaggerate)
             goals.append(goal)
-            looks_of.append(looks)
+            color_turns_of.append(color_turns)
         sweeps = [goal.sweep(rest) for goal in goals]
         steps = max(count_steps(turned, moved, self.graph.edge_length) for turned, moved in sweeps)
         shape = self.solver.solve(rest, lambda share: anchors_at(goals, pins, rest, share), steps)
@@ -47,13 +47,13 @@ class Player:
         for goal in goals:
             held[goal.nodes] = True
         positions, turns = self.graph.follow(rest, shape.positions, from_matrix(shape.rotations), held)
-        looks = turns.copy()
-        for goal, own in zip(goals, looks_of):
-            looks[goal.nodes] = own
-        return now.then(positions, turns, looks)
+        color_turns = turns.copy()
+        for goal, own in zip(goals, color_turns_of):
+            color_turns[goal.nodes] = own
+        return now.then(positions, turns, color_turns)
 
     def _goal(self, hold: Hold, time: float, now: NodePose, exaggerate: Exaggerate | None) -> tuple[Goal, np.ndarray]:
-        """What holding a region, with the strays that follow it, asks for, and what its colours turn by."""
+        """Return the goal of a held region with the strays that follow it, and the turns of its colours, [n, 4]."""
         nodes = np.array(self.graph.with_strays(hold.nodes), np.int64)
         still = np.tile(IDENTITY, (len(nodes), 1))
         if hold.time == time:
@@ -66,15 +66,15 @@ class Player:
         target = rotate(body, then.positions[nodes] - before) + after
         quat, centre, moved = rigid_fit(now.positions[nodes], target)
         residual = target - (rotate(quat, now.positions[nodes] - centre) + moved)
-        # The trained rotation of then, carried by the body, in place of the trained rotation of now
+        # The trained rotation at the hold's time, carried by the body, replaces the present trained rotation.
         trained = multiply(self.motion_at(hold.time).rotations[nodes], conjugate(self.motion_at(time).rotations[nodes]))
         total = multiply(body, multiply(multiply(then.turns[nodes], trained), conjugate(now.turns[nodes])))
-        looks = multiply(body, multiply(then.looks[nodes], conjugate(now.looks[nodes])))
+        color_turns = multiply(body, multiply(then.color_turns[nodes], conjugate(now.color_turns[nodes])))
         own = multiply(conjugate(quat), total)
-        return Goal(nodes, centre, quat, moved - centre, residual=residual, own_turns=own), looks
+        return Goal(nodes, centre, quat, moved - centre, residual=residual, own_turns=own), color_turns
 
     def _exaggerated(self, time: float, exaggerate: Exaggerate | None) -> NodePose:
-        """More of every turn; positions follow from the turned edges, so that limbs keep their length."""
+        """Scale every turn; positions follow from the turned edges, so that limbs keep their length."""
         here = self.motion_at(time).positions
         if exaggerate is None or exaggerate.factor == 1.0:
             return NodePose.of(here)
@@ -96,13 +96,13 @@ class Player:
         return NodePose.of(here).then(positions, further)
 
     def _turned(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [M, 3] at a time, and rotations [M, 4] since time 0 as the positions tell them: smoother than the
-        trained ones."""
+        """Return positions [M, 3] at a time, and rotations [M, 4] since time 0 estimated from positions, which are
+        smoother than the trained ones."""
         here = self.motion_at(time).positions
         return here, from_matrix(self.solver.turns(self.motion_at(0.0).positions, here))
 
     def _mean_pose(self) -> tuple[np.ndarray, np.ndarray]:
         if self._mean is None:
-            found = [self._turned(float(time)) for time in np.linspace(0.0, 1.0, MEAN_TIMES)]
-            self._mean = np.mean([p for p, _ in found], axis=0), mean(np.stack([q for _, q in found]))
+            poses = [self._turned(float(time)) for time in np.linspace(0.0, 1.0, MEAN_TIMES)]
+            self._mean = np.mean([p for p, _ in poses], axis=0), mean(np.stack([q for _, q in poses]))
         return self._mean

@@ -1,4 +1,4 @@
-"""From bent control points to Gaussians: the motion's pose and what an edit does to it."""
+"""Poses of control points under an edit, and the Gaussians that follow them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .rotations import IDENTITY, conjugate, multiply
 
 
 class Rig(Protocol):
-    """A motion model that has control points, as far as editing needs it."""
+    """Part of a motion model with control points that editing uses."""
 
     positions: Tensor
     moves: bool
@@ -30,7 +30,7 @@ class Rig(Protocol):
 
 
 class MotionPose(NamedTuple):
-    """The control points as the motion has them at one instant."""
+    """Unedited control points at one instant."""
 
     pose: Pose
     positions: np.ndarray
@@ -41,27 +41,27 @@ class MotionPose(NamedTuple):
 
 @dataclass(frozen=True)
 class NodePose:
-    """Where control points are, and how far an edit has turned them. Normalised units, float64."""
+    """Positions of control points, and how far an edit has turned them. Normalised units, float64."""
 
     positions: np.ndarray
     """[M, 3]"""
     turns: np.ndarray
-    """[M, 4] wxyz, on top of the motion's rotation: what the Gaussians around turn by."""
-    looks: np.ndarray
-    """[M, 4] wxyz, what their colours turn by: as ``turns``, but for what is held at another instant, whose colours
-    never turned with the trained motion."""
+    """[M, 4] wxyz, on top of the motion's rotation: turns of the Gaussians' shapes."""
+    color_turns: np.ndarray
+    """[M, 4] wxyz turns of the Gaussians' colours. They differ from ``turns`` for regions held at another instant,
+    because colours do not turn with the trained motion."""
     base: NodePose | None = None
-    """The same with holds and exaggeration alone, before any handle: what a mask weakens. None: there is no handle."""
+    """Pose under holds and exaggeration alone, before any handle, which a mask weakens. None: there is no handle."""
 
     @staticmethod
     def of(positions: np.ndarray) -> NodePose:
         none = np.tile(IDENTITY, (len(positions), 1))
         return NodePose(positions, none, none)
 
-    def then(self, positions: np.ndarray, turns: np.ndarray, looks: np.ndarray | None = None) -> NodePose:
-        """Moved to ``positions`` and turned further; exact where ``turns`` is the identity."""
-        looks = turns if looks is None else looks
-        return NodePose(positions, _further(turns, self.turns), _further(looks, self.looks))
+    def then(self, positions: np.ndarray, turns: np.ndarray, color_turns: np.ndarray | None = None) -> NodePose:
+        """Return this pose moved to ``positions`` and turned further, exact where ``turns`` is the identity."""
+        color_turns = turns if color_turns is None else color_turns
+        return NodePose(positions, _further(turns, self.turns), _further(color_turns, self.color_turns))
 
 
 def _further(second: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -70,7 +70,7 @@ def _further(second: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def motion_pose(rig: Rig, time: float) -> MotionPose:
-    """What the motion says at a time."""
+    """Evaluate the motion at a time."""
     pose = rig.poses(torch.tensor([time], dtype=torch.float32))[0]
     positions = rig.positions.detach() + pose.translations
     rotations = torch.nn.functional.normalize(pose.rotations.double(), dim=1)
@@ -78,7 +78,7 @@ def motion_pose(rig: Rig, time: float) -> MotionPose:
 
 
 def compose(motion: MotionPose, bent: NodePose) -> Pose:
-    """The pose that skinning takes. What an edit leaves alone keeps the motion's bits."""
+    """Compose motion and edit into the pose that skinning takes. Unedited control points keep the motion's bits."""
     own = motion.pose
     device = own.translations.device
     shift = torch.from_numpy(bent.positions - motion.positions).float().to(device)
@@ -102,39 +102,39 @@ def pose_gaussians(
     binding: tuple[Tensor, Tensor],
     masked: bool = False,
 ) -> Gaussians:
-    """Activated Gaussians under an edit, normalised units: skinned by its pose, harmonics turned with it.
+    """Return activated Gaussians under an edit, normalised units: skinned by its pose, harmonics turned with it.
 
-    Learnt shading goes along as well: a Gaussian keeps the brightness that its motion gave it. Asked for turns that it
-    never saw in training, it would invent one: against ray-cast truth of the built-in figure, mean over a leg and the
-    head turned by 45 and 90 degrees, 18.7 dB instead of 17.9.
+    Learnt shading is evaluated at the motion's own rotations, so that a Gaussian keeps its brightness: shading
+    extrapolates badly to turns outside the training motion. Against ray-cast truth of the built-in figure, averaged
+    over a leg and the head turned by 45 and 90 degrees, this gives 18.7 dB instead of 17.9.
 
     Args:
-        binding: what ``rig.binding(gaussians)`` gives; it depends on neither time nor edit.
-        masked: the last hyper-coordinate is the logit of a Gaussian's share in the motion. It has that share in holds
-            and exaggeration, which change the motion; handles take all of it, or what stands still could not be moved.
+        binding: result of ``rig.binding(gaussians)``, which depends on neither time nor edit.
+        masked: the last hyper-coordinate is the logit of a Gaussian's share in the motion. The share applies to holds
+            and exaggeration, which change the motion, but not to handles, which must also move static Gaussians.
     """
     if masked and bent.base is not None:
         posed = pose_gaussians(rig, gaussians, motion, bent.base, binding, masked)
         return _on_top(posed, gaussians, bent, bent.base, binding)
     posed = rig.apply_pose(gaussians, compose(motion, bent), binding)
-    if not bent.looks[:, 1:].any():
+    if not bent.color_turns[:, 1:].any():
         return posed
     sh_dc, sh_rest = posed.sh_dc, posed.sh_rest
     if gaussians.shading.shape[1]:
-        same = (bent.looks == bent.turns).all(1, keepdims=True)
-        back = np.where(same, IDENTITY, multiply(conjugate(bent.looks), bent.turns))
+        same = (bent.color_turns == bent.turns).all(1, keepdims=True)
+        back = np.where(same, IDENTITY, multiply(conjugate(bent.color_turns), bent.turns))
         lit = NodePose(motion.positions, back, back)
         sh_dc = rig.apply_pose(gaussians, compose(motion, lit), binding).sh_dc
     if sh_rest.shape[1]:
-        looks = _blend(bent.looks, gaussians, binding)
+        color_turns = _blend(bent.color_turns, gaussians, binding)
         if masked:
-            looks = _share_of(looks, gaussians)
-        sh_rest = rotate_harmonics(sh_rest, looks)
+            color_turns = _share_of(color_turns, gaussians)
+        sh_rest = rotate_harmonics(sh_rest, color_turns)
     return Gaussians(posed.means, posed.quats, posed.scales, posed.opacities, sh_dc, sh_rest)
 
 
 def _share_of(turns: Tensor, gaussians: GaussianParameters) -> Tensor:
-    """[N, 4] turns as a mask weakens them: straight from the identity, the short way, as the Gaussians' own."""
+    """Weaken turns [N, 4] by a mask: interpolate linearly from the identity along the shorter arc."""
     with one_piece():
         share = gaussians.hyper.detach()[:, -1:].sigmoid()
     none = torch.zeros_like(turns)
@@ -146,8 +146,8 @@ def _share_of(turns: Tensor, gaussians: GaussianParameters) -> Tensor:
 def _on_top(
     posed: Gaussians, gaussians: GaussianParameters, bent: NodePose, base: NodePose, binding: tuple[Tensor, Tensor]
 ) -> Gaussians:
-    """Gaussians that follow control points from ``base`` to ``bent``, whatever moved them before; to the bit as they
-    were where none of their control points has moved."""
+    """Move posed Gaussians with their control points from ``base`` to ``bent``. Gaussians whose control points have not
+    moved keep their bits."""
     device = posed.means.device
     further = multiply(bent.turns, conjugate(base.turns))
     still = (bent.turns == base.turns).all(1)
@@ -167,7 +167,7 @@ def _on_top(
 
 
 def _blend(turns: np.ndarray, gaussians: GaussianParameters, binding: tuple[Tensor, Tensor]) -> Tensor:
-    """[N, 4] the control points' turns, blended like their rotations."""
+    """Blend turns of control points to turns of Gaussians [N, 4], as skinning blends rotations."""
     means = gaussians.means.detach()
     quats = torch.zeros(len(means), 4, device=means.device)
     quats[:, 0] = 1.0

@@ -1,4 +1,4 @@
-"""Quaternions in float64 NumPy for handles, keyframes and poses. wxyz; every function takes leading dimensions."""
+"""Quaternions (wxyz) in float64 NumPy for handles, keyframes and poses; functions broadcast over leading dimensions."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def unit(quats: ArrayLike) -> np.ndarray:
-    """Unit quaternions; the identity where the norm is 0."""
+    """Normalise quaternions; a norm of 0 gives the identity."""
     quats = np.asarray(quats, np.float64)
     norm = np.linalg.norm(quats, axis=-1, keepdims=True)
     return np.where(norm > 0, quats / np.where(norm > 0, norm, 1.0), IDENTITY)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product: first ``b``, then ``a``."""
+    """Return the Hamilton product: first ``b``, then ``a``."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a, np.float64), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(b, np.float64), -1, 0)
     return np.stack(
@@ -37,7 +37,7 @@ def conjugate(quats: np.ndarray) -> np.ndarray:
 
 
 def to_matrix(quats: np.ndarray) -> np.ndarray:
-    """[..., 3, 3] of unit quaternions."""
+    """Convert unit quaternions to rotation matrices [..., 3, 3]."""
     w, x, y, z = np.moveaxis(np.asarray(quats, np.float64), -1, 0)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -48,11 +48,11 @@ def to_matrix(quats: np.ndarray) -> np.ndarray:
 
 
 def from_matrix(matrices: np.ndarray) -> np.ndarray:
-    """[..., 4] unit, w >= 0, of rotation matrices; the identity matrix gives the identity to the bit."""
+    """Convert rotation matrices to unit quaternions [..., 4], w >= 0; the identity is exact."""
     m = np.asarray(matrices, np.float64)
     flat = m.reshape(-1, 3, 3)
     a, b, c = flat[:, 0, 0], flat[:, 1, 1], flat[:, 2, 2]
-    # Four times the products of q's largest component with all four; the largest square is at least 1/4
+    # Rows are four times the products of one component of q with all four; the largest square is at least 1/4.
     squares = np.stack([1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c], axis=1)
     wx, wy, wz = flat[:, 2, 1] - flat[:, 1, 2], flat[:, 0, 2] - flat[:, 2, 0], flat[:, 1, 0] - flat[:, 0, 1]
     xy, xz, yz = flat[:, 1, 0] + flat[:, 0, 1], flat[:, 2, 0] + flat[:, 0, 2], flat[:, 2, 1] + flat[:, 1, 2]
@@ -65,12 +65,12 @@ def from_matrix(matrices: np.ndarray) -> np.ndarray:
         ],
         axis=1,
     )
-    found = unit(table[np.arange(len(flat)), squares.argmax(1)]) + 0.0
-    return np.where(found[:, :1] < 0, -found, found).reshape(*m.shape[:-2], 4)
+    quats = unit(table[np.arange(len(flat)), squares.argmax(1)]) + 0.0
+    return np.where(quats[:, :1] < 0, -quats, quats).reshape(*m.shape[:-2], 4)
 
 
 def from_axis(axis: ArrayLike, degrees: float) -> np.ndarray:
-    """Rotation about an axis of any length; the identity where it has none."""
+    """Return the rotation about an axis of any length; length 0 gives the identity."""
     axis = np.asarray(axis, np.float64)
     norm = float(np.linalg.norm(axis))
     if not norm > 0:
@@ -88,7 +88,7 @@ def rotate(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def logarithm(quats: np.ndarray) -> np.ndarray:
-    """[..., 3] rotation vectors (axis times angle, at most pi) of unit quaternions."""
+    """Convert unit quaternions to rotation vectors [..., 3]: axis times angle, at most pi."""
     quats = np.asarray(quats, np.float64)
     quats = np.where(quats[..., :1] < 0, -quats, quats)
     sine = np.linalg.norm(quats[..., 1:], axis=-1, keepdims=True)
@@ -97,7 +97,7 @@ def logarithm(quats: np.ndarray) -> np.ndarray:
 
 
 def exponential(vectors: np.ndarray) -> np.ndarray:
-    """The inverse of ``logarithm``."""
+    """Convert rotation vectors to unit quaternions, the inverse of ``logarithm``."""
     vectors = np.asarray(vectors, np.float64)
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
     factor = 0.5 * np.sinc(angle / (2.0 * np.pi))
@@ -105,32 +105,36 @@ def exponential(vectors: np.ndarray) -> np.ndarray:
 
 
 def power(quats: np.ndarray, share: float) -> np.ndarray:
-    """``share`` of the way from the identity, the short way; exactly the identity at 0 and unchanged at 1."""
+    """Scale rotations by ``share`` along the shorter arc from the identity; exact at 0 and 1."""
     if share == 1.0:
         return np.asarray(quats, np.float64)
     return exponential(share * logarithm(quats))
 
 
 def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
-    """From ``a`` to ``b``, the short way."""
+    """Interpolate from ``a`` to ``b`` along the shorter arc."""
     return multiply(a, power(multiply(conjugate(a), b), share))
 
 
 def angle(quats: np.ndarray) -> np.ndarray:
-    """[...] radians, 0 to pi."""
+    """Return rotation angles [...] in radians, 0 to pi."""
     return np.linalg.norm(logarithm(quats), axis=-1)
 
 
 def mean(quats: np.ndarray) -> np.ndarray:
-    """[M, 4] of [T, M, 4]: the quaternion nearest to all (largest eigenvector of the sum of q q^T), w >= 0."""
+    """Average quaternions [T, M, 4] over T: [M, 4], w >= 0, the principal eigenvectors of the sums of q q^T."""
     outer = np.einsum("tmi,tmj->mij", quats, quats)
-    found = np.linalg.eigh(outer)[1][..., -1]
-    return np.where(found[:, :1] < 0, -found, found)
+    means = np.linalg.eigh(outer)[1][..., -1]
+    return np.where(means[:, :1] < 0, -means, means)
 
 
 def rigid_fit(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rigid motion that best takes points [P, 3] to points [P, 3] (Kabsch): (quaternion, centre before, centre
-    after), ``x -> R (x - before) + after``. One point, or points on one another, give a pure translation."""
+    """Fit the motion ``x -> R (x - before) + after`` from points [P, 3] to points [P, 3] (Kabsch). A single point,
+    or coincident ones, give a pure translation.
+
+    Returns:
+        Quaternion of R, mean of the points before, and mean of those after.
+    """
     from_centre, to_centre = before.mean(0), after.mean(0)
     S = (after - to_centre).T @ (before - from_centre)
     if not np.abs(S).max() > 1e-60:

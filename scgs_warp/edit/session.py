@@ -1,10 +1,9 @@
-"""A scene under edit: what an editor, a script or a notebook holds on to."""
+"""Editing session: a scene, its edit and the history, for editors, scripts and notebooks."""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -24,24 +23,25 @@ from ..types import Camera, Gaussians, Image
 from . import edit_file
 from .document import Edit
 from .engine import Engine
+from .field_reader import FieldReader
 from .graph import ControlGraph
 from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
 from .pose import NodePose
 
 HISTORY = 1000
-"""Steps that can be undone: a session that is open for days must not grow for ever."""
+"""Number of steps that can be undone, so that a session which is open for days does not grow without limit."""
 
 
 class EditSession:
-    """A scene, its graph of control points, an :class:`Edit`, and the thousand edits before it.
+    """Holds a scene, its graph of control points, an :class:`Edit`, and the thousand edits before it.
 
-    All points, cameras and lengths are in world units; ``time`` is the scene's, in [0, 1]; ``at`` is a moment of the
-    film in seconds, which decides what keyframes say; without it handles are where they are now.
+    All points, cameras and lengths are in world units; ``time`` is scene time in [0, 1]; ``at`` is a moment of the film
+    in seconds, at which keyframes place the handles. If it is None, handles are at their present targets.
 
-    Whatever changes the edit can be undone; a drag counts as one change from its first ``drag`` to ``release``.
-    Results depend on the edit alone, but for those with ``live=True``: they are for the eye while something is dragged.
-    ``frame`` is how far from its time an edit of one frame shows; None: as far as in the edit's film.
+    Every change of the edit can be undone; a drag counts as one change from its first ``drag`` to ``release``. Results
+    depend on the edit alone, except those with ``live=True``, which are previews during a drag. ``frame`` is the scene
+    time on either side of its own within which an edit of one frame shows; None: as in the edit's film.
 
     Attributes: ``scene``, ``graph``, ``edit`` (replace it with :meth:`apply`).
     """
@@ -60,8 +60,8 @@ class EditSession:
         return len(self.graph)
 
     def fork(self) -> EditSession:
-        """Another session on the same scene that begins with this one's edit and without its history. Scene, graph and
-        solutions are shared, not copied: the two may not compute at the same time."""
+        """Return another session on the same scene, with this one's edit but without its history. The two share scene,
+        graph and caches, and so must not compute at the same time."""
         other = copy.copy(self)
         other._past, other._future, other._before_drag = deque(maxlen=HISTORY), [], None
         return other
@@ -69,7 +69,7 @@ class EditSession:
     # The edit and its history
 
     def apply(self, edit: Edit) -> None:
-        """Make ``edit`` the present one; undo leads back."""
+        """Replace the edit; undo restores the previous one."""
         self.release()
         if edit != self.edit:
             self._past.append(self.edit)
@@ -77,7 +77,7 @@ class EditSession:
             self.edit = edit
 
     def undo(self) -> bool:
-        """False if there was nothing to undo."""
+        """Return to the previous edit; return False if there is none."""
         self.release()
         if not self._past:
             return False
@@ -94,7 +94,7 @@ class EditSession:
         return True
 
     def reset(self) -> None:
-        """No edit; the film's settings stay."""
+        """Remove the whole edit but for the film's settings."""
         self.apply(Edit(film=self.edit.film))
 
     def _change(self, **changes: Any) -> None:
@@ -105,27 +105,27 @@ class EditSession:
     def node_positions(
         self, time: float, at: float | None = None, *, live: bool = False, frame: float | None = None
     ) -> np.ndarray:
-        """[M, 3] edited control points, world."""
+        """Return the edited control points, [M, 3], world units."""
         bent = self._bend(time, at, live, frame)
         time = min(max(float(time), 0.0), 1.0)
         positions = self.engine.motion_at(time).positions if bent is None else bent.positions
         return self.engine.to_world(positions)
 
     def nearest(self, point: Sequence[float], time: float, at: float | None = None) -> int:
-        """The edited control point nearest to a point."""
+        """Return the edited control point nearest to a point."""
         return int(np.linalg.norm(self.node_positions(time, at) - np.asarray(point, np.float64), axis=1).argmin())
 
     def ring(self, nodes: Iterable[int], count: int = 1) -> tuple[int, ...]:
-        """The nodes and all that are at most ``count`` edges away."""
+        """Return the nodes and all that are at most ``count`` edges away."""
         return self.graph.ring(self._nodes(nodes), count)
 
     def within(self, point: Sequence[float], radius: float, time: float, at: float | None = None) -> tuple[int, ...]:
-        """Control points in a ball: a brush."""
+        """Return the control points within ``radius`` of a point."""
         away = np.linalg.norm(self.node_positions(time, at) - np.asarray(point, np.float64), axis=1)
         return tuple(np.flatnonzero(away <= radius).tolist())
 
     def pick(self, camera: Camera, x: float, y: float, time: float, at: float | None = None) -> np.ndarray | None:
-        """[3] the surface point seen at a pixel, world; None where there is none."""
+        """Return the surface point seen at a pixel, [3], world units; None where the background shows."""
         image = self.render(camera, time, at)
         column, row = int(math.floor(x)), int(math.floor(y))
         if not (0 <= column < camera.width and 0 <= row < camera.height) or float(image.alpha[row, column]) < 0.5:
@@ -135,21 +135,21 @@ class EditSession:
         return viewmat[:3, :3].T @ (float(image.depth[row, column]) * ray - viewmat[:3, 3])
 
     def _nodes(self, nodes: Iterable[int]) -> tuple[int, ...]:
-        found = tuple(sorted({int(node) for node in nodes}))
-        if found and not (found[0] >= 0 and found[-1] < len(self)):
+        chosen = tuple(sorted({int(node) for node in nodes}))
+        if chosen and not (chosen[0] >= 0 and chosen[-1] < len(self)):
             raise UserError(
-                f"control point {found[0] if found[0] < 0 else found[-1]}: there are {len(self)}, from 0 on"
+                f"control point {chosen[0] if chosen[0] < 0 else chosen[-1]}: there are {len(self)}, from 0 on"
             )
-        return found
+        return chosen
 
     # Handles and pins
 
     def add_handle(self, nodes: Iterable[int], time: float, name: str | None = None, **fields: Any) -> Handle:
-        """Take hold of some control points; ``fields`` as in :class:`Handle`. A name that is taken is taken over,
-        without its target and its part in keyframes.
+        """Add a handle on some control points; ``fields`` as in :class:`Handle`. It replaces a handle of the same name,
+        whose target and keyframes are removed.
 
         Raises:
-            UserError: no node, or one that does not exist, or a field that makes no sense.
+            UserError: there is no node, a node does not exist, or a field is out of range.
         """
         chosen = self._nodes(nodes)
         if not chosen:
@@ -158,17 +158,16 @@ class EditSession:
         if name is None:
             name = next(f"handle {i}" for i in range(1, len(taken) + 2) if f"handle {i}" not in taken)
         handle = Handle(name=name, nodes=chosen, time=float(time), **fields)
-        edit_file.check_handle(handle, len(self))
         edit = self._without(name)
         self.apply(dataclasses.replace(edit, handles=(*edit.handles, handle)))
         return handle
 
     def remove_handle(self, name: str) -> None:
-        """With its target and its part in every keyframe."""
+        """Remove a handle, its target, and its part in every keyframe."""
         self.apply(self._without(self._handle(name).name))
 
     def _without(self, name: str) -> Edit:
-        """The edit without a handle of that name."""
+        """Return the edit without the handle of that name, if there is one."""
         frames = []
         for frame in self.edit.keyframes:
             rest = {n: t for n, t in frame.targets.items() if n != name}
@@ -178,7 +177,7 @@ class EditSession:
         return dataclasses.replace(self.edit, handles=handles, targets=targets, keyframes=tuple(frames))
 
     def pivot(self, name: str) -> np.ndarray:
-        """[3] what a handle turns about, world, at its own time."""
+        """Return a handle's centre of rotation at its own time, [3], world units."""
         handle = self._handle(name)
         if handle.pivot is not None:
             return np.array(handle.pivot)
@@ -186,11 +185,11 @@ class EditSession:
         return self.engine.to_world(positions[list(handle.nodes)].mean(0))
 
     def pin(self, nodes: Iterable[int]) -> None:
-        """These stay with the motion from now on."""
+        """Pin nodes, so that they follow the motion alone."""
         self._change(pins=tuple(sorted({*self.edit.pins, *self._nodes(nodes)})))
 
     def unpin(self, nodes: Iterable[int] | None = None) -> None:
-        """None: all of them."""
+        """Unpin nodes; None: all of them."""
         gone = set(self.edit.pins) if nodes is None else set(self._nodes(nodes))
         self._change(pins=tuple(node for node in self.edit.pins if node not in gone))
 
@@ -200,22 +199,22 @@ class EditSession:
         self._change(pins=self.graph.beyond(held, rings))
 
     def _handle(self, name: str) -> Handle:
-        found = self.edit.handle(name)
-        if found is None:
+        handle = self.edit.handle(name)
+        if handle is None:
             known = ", ".join(repr(handle.name) for handle in self.edit.handles) or "none"
             raise UserError(f"no handle is called {name!r}; there is {known}")
-        return found
+        return handle
 
     # Moving
 
     def drag(
         self, name: str, translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None
     ) -> Target:
-        """Put a handle somewhere: turned by ``rotation`` (wxyz) about its pivot, then shifted, both from where the
-        motion has it. What is None stays. Cheap: nothing is solved until somebody asks.
+        """Set a handle's target: turn it by ``rotation`` (wxyz) about its pivot, then shift it, both relative to the
+        motion. A part that is None stays. Nothing is solved until a result is requested.
 
         Raises:
-            UserError: there is no such handle, or a number is not finite; the edit is as before.
+            UserError: there is no such handle, or a number is not finite; the edit stays unchanged.
         """
         self._handle(name)
         old = self.edit.targets.get(name, STAY)
@@ -226,27 +225,27 @@ class EditSession:
         return target
 
     def preview(self, edit: Edit) -> None:
-        """Make ``edit`` the present one as part of a drag: ``release`` makes one step of it all."""
+        """Replace the edit as part of a drag, all of which ``release`` turns into one step for undo."""
         if self._before_drag is None:
             self._before_drag = self.edit
         self.edit = edit
 
     def release(self) -> None:
-        """The drag is over: one step for undo."""
+        """End the drag, which becomes one step for undo."""
         before, self._before_drag = self._before_drag, None
         if before is not None and before != self.edit:
             self._past.append(before)
             self._future.clear()
 
     def cancel(self) -> None:
-        """The drag has not been: the edit is what it was before."""
+        """Abandon the drag and restore the edit before it."""
         before, self._before_drag = self._before_drag, None
         self.edit = self.edit if before is None else before
 
     def move(
         self, name: str, translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None
     ) -> Target:
-        """A drag and its release in one."""
+        """Drag a handle and release it."""
         self.release()
         target = self.drag(name, translation, rotation)
         self.release()
@@ -255,12 +254,15 @@ class EditSession:
     # Keyframes
 
     def add_keyframe(self, at: float, easing: Easing = "smooth") -> Keyframe:
-        """Keep where all handles are now, for a moment of the film; one that is there already is replaced."""
-        edit_file.check_keyframe(at, easing)
+        """Store the present targets of all handles at a moment of the film; replace a keyframe that is already there.
+
+        Raises:
+            UserError: there is no handle, or ``at`` or ``easing`` is out of range.
+        """
         names = [handle.name for handle in self.edit.handles]
         if not names:
             raise UserError("a keyframe needs a handle; take hold of some control points first")
-        frame = Keyframe(float(at), {name: self.edit.targets.get(name, STAY) for name in names}, easing)
+        frame = Keyframe(at, {name: self.edit.targets.get(name, STAY) for name in names}, easing)
         others = [other for other in self.edit.keyframes if other.at != frame.at]
         self._change(keyframes=tuple(sorted([*others, frame], key=lambda f: f.at)))
         return frame
@@ -269,22 +271,22 @@ class EditSession:
         self._change(keyframes=tuple(frame for frame in self.edit.keyframes if frame.at != at))
 
     def show_keyframes(self, at: float) -> None:
-        """Put handles where keyframes have them at a moment of the film, to go on from there."""
+        """Set the handles' present targets to those of the keyframes at a moment of the film."""
         self._change(targets=self.engine.targets(self.edit, at))
 
     # Results
 
     def resize_film(self, size: int) -> None:
-        """Longer side of the film in pixels.
+        """Set the longer side of the film in pixels.
 
         Raises:
-            UserError: no film is that small or large.
+            UserError: the size is out of range.
         """
-        edit_file.check_size(size)
+        edit_file.film_of(FieldReader({"size": size}, "film"))
         self._change(film=dataclasses.replace(self.edit.film, size=size))
 
     def scene_time(self, at: float) -> float:
-        """The moment of the motion that a moment of the film shows."""
+        """Return the scene time that a moment of the film shows."""
         return self.edit.playback.time_at(at, self.edit.film.seconds)
 
     def _bend(self, time: float, at: float | None, live: bool, frame: float | None = None) -> NodePose | None:
@@ -299,7 +301,7 @@ class EditSession:
     def gaussians_at(
         self, time: float, at: float | None = None, *, live: bool = False, frame: float | None = None
     ) -> Gaussians:
-        """Activated Gaussians under the edit, world units; the scene's own bits where the edit changes nothing."""
+        """Return activated Gaussians under the edit, world units; the scene's own bits if the edit changes nothing."""
         bent = self._bend(time, at, live, frame)
         return self.engine.gaussians(min(max(float(time), 0.0), 1.0), bent)
 
@@ -314,7 +316,7 @@ class EditSession:
         live: bool = False,
         frame: float | None = None,
     ) -> Image:
-        """The edited scene, as ``Scene.render`` shows the scene; its very bits where the edit changes nothing."""
+        """Render the edited scene as ``Scene.render`` does; the same bits if the edit changes nothing."""
         bent = self._bend(time, at, live, frame)
         time = min(max(float(time), 0.0), 1.0)
         scene = self.scene
@@ -329,23 +331,22 @@ class EditSession:
     # Files
 
     def save(self, path: str | Path) -> None:
-        """As JSON; loading it gives the same edit. A drag goes on.
+        """Write the edit as JSON, which loads as the same edit. It does not end a drag.
 
         Raises:
-            UserError: the place cannot be written, or the edit holds something that no file may say.
+            UserError: the file cannot be written, or the edit has a field that no file may hold.
         """
-        text = edit_file.to_json(self.edit, self)
-        edit_file.parse(json.loads(text), "the edit", self)
-        write_atomically(Path(path), text.encode())
+        edit_file.checked(self.edit, self.engine)
+        write_atomically(Path(path), edit_file.to_json(self.edit, self.engine).encode())
 
     def load(self, path: str | Path) -> None:
-        """The edit in a file; can be undone.
+        """Replace the edit with that of a file; can be undone.
 
         Raises:
-            UserError: the file is missing or wrong, with the field; the edit is as before.
+            UserError: the file is missing, or a field is wrong; the edit stays unchanged.
         """
-        self.apply(edit_file.read(Path(path), self))
+        self.apply(edit_file.read(Path(path), self.engine))
 
     def export_ply(self, path: str | Path, time: float, at: float | None = None) -> None:
-        """The edited Gaussians at one moment as a 3D-GS file, world units."""
+        """Write the edited Gaussians at one moment as a 3D-GS file, world units."""
         write_gaussian_ply(path, self.gaussians_at(time, at))

@@ -1,9 +1,10 @@
-"""As-rigid-as-possible deformation of the control points: positions and rotations, from what holds some of them.
+"""As-rigid-as-possible deformation: positions and rotations of all control points from anchors on some of them.
 
-Local and global steps alternate (Sorkine & Alexa 2007): every node finds the rotation that best explains its edges,
-drawn a little towards its neighbours' (Levi & Gotsman 2015), then one sparse linear system finds all positions. Edges
-also keep their length (a projective spring on each), because thin limbs hang on few edges and plain ARAP shears those
-at a joint. The matrix depends on which nodes are held, not on where: it is factorised once per set of handles.
+Local and global steps alternate (Sorkine & Alexa 2007): each node fits the rotation that best explains its edges,
+regularised towards its neighbours' rotations (Levi & Gotsman 2015), then one sparse linear system gives all positions.
+A projective spring on each edge preserves its length, because thin limbs hang on few edges and plain ARAP shears those
+at a joint. The matrix depends on which nodes are held, not on where they are, and is factorised once per set of
+handles.
 """
 
 from __future__ import annotations
@@ -25,51 +26,51 @@ from .graph import ControlGraph
 from .rotations import exponential, from_matrix, logarithm, to_matrix
 
 SMOOTHNESS = 0.3
-"""Weight of neighbours' rotations, in squared edge lengths."""
+"""Weight of the neighbours' rotations, in squared edge lengths."""
 STRETCH = 2.0
-"""Weight of an edge's length, relative to its shape."""
+"""Weight of preserving an edge's length, relative to the ARAP energy."""
 STEP_ANGLE = math.radians(15.0)
-"""A handle turns at most so far between two solutions: beyond some 90 degrees the energy has other minima."""
+"""Largest turn of a handle between two solutions: beyond about 90 degrees the energy has other minima."""
 STEP_LENGTH = 2.0
-"""... and moves at most so many edge lengths."""
-MOST_STEPS = 48
-"""A handle dragged to the horizon gets there in so many steps, however long they are."""
+"""Largest shift of a handle between two solutions, in edge lengths."""
+MAX_STEPS = 48
+"""Largest number of sub-steps; a handle that is dragged very far takes longer ones."""
 STEP_ITERATIONS = 6
 FINAL_ITERATIONS = 60
 TURN_ITERATIONS = 8
 TOLERANCE = 1e-4
-"""Iterations end when nothing moves by more than so many edge lengths."""
-CACHED = 16
-"""Factorisations kept."""
+"""Largest motion in an iteration, in edge lengths, at which iterations stop."""
+CACHED_FACTORS = 16
+"""Number of cached factorisations."""
 
 
 class Anchors(NamedTuple):
-    """What is held, where, and how it is turned."""
+    """Constraints on positions and rotations of M nodes."""
 
     hard: np.ndarray
-    """[M] bool: the position is given."""
+    """[M] bool: the position is fixed."""
     soft: np.ndarray
-    """[M] >= 0: weight of a position that is asked for, relative to a node's edges; 0 where there is none."""
+    """[M] >= 0 weight that pulls a node to its position, relative to its edges; 0: no pull."""
     turned: np.ndarray
-    """[M] bool: the rotation is given."""
+    """[M] bool: the rotation is fixed."""
     positions: np.ndarray
     """[M, 3], read where hard or soft."""
     rotations: np.ndarray
     """[M, 3, 3], read where turned or leaning."""
     leaning: np.ndarray
-    """[M] >= 0: weight of a rotation that is asked for, as ``soft`` for positions; 0 where there is none."""
+    """[M] >= 0 weight that pulls a node to its rotation, as ``soft`` does for positions."""
 
 
 @dataclass
 class Shape:
-    """A state of the solver, from which the next solution starts."""
+    """State of the solver, from which the next solution starts."""
 
     positions: np.ndarray
     """[M, 3]"""
     rotations: np.ndarray
     """[M, 3, 3]"""
     anchors: Anchors | None = None
-    """What held it."""
+    """Anchors that led to this state."""
 
     @staticmethod
     def at_rest(rest: np.ndarray) -> Shape:
@@ -77,12 +78,12 @@ class Shape:
 
 
 class _System(NamedTuple):
-    """What depends on which nodes are held, not on where."""
+    """Linear system for one set of held nodes, independent of their positions."""
 
     free: torch.Tensor
-    """[F] int32 nodes whose position is unknown."""
+    """[F] int32 nodes with unknown position."""
     turning: torch.Tensor
-    """[T] int32 nodes whose rotation is unknown."""
+    """[T] int32 nodes with unknown rotation."""
     fixed: torch.Tensor
     """[M] int32"""
     pulls: torch.Tensor
@@ -92,8 +93,7 @@ class _System(NamedTuple):
 
 
 class ArapSolver:
-    """Solves for one graph; keeps the factorisations of the last few sets of anchors. Float64, on the CPU, and the
-    same bits for the same arguments."""
+    """Solves for one graph and caches factorisations. Float64 on the CPU; the same arguments give the same bits."""
 
     def __init__(self, graph: ControlGraph, smoothness: float = SMOOTHNESS, stretch: float = STRETCH) -> None:
         self.graph = graph
@@ -106,23 +106,23 @@ class ArapSolver:
 
     def _system(self, anchors: Anchors) -> _System:
         key = anchors.hard.tobytes() + anchors.turned.tobytes() + anchors.soft.tobytes()
-        found = self._systems.get(key)
-        if found is None:
-            found = self._systems[key] = self._factorise(anchors)
-            while len(self._systems) > CACHED:
+        system = self._systems.get(key)
+        if system is None:
+            system = self._systems[key] = self._factorise(anchors)
+            while len(self._systems) > CACHED_FACTORS:
                 self._systems.popitem(last=False)
         self._systems.move_to_end(key)
-        return found
+        return system
 
     def _factorise(self, anchors: Anchors) -> _System:
-        """A component that nothing holds stays where it is: its nodes are no unknowns."""
+        """Factorise the system of the free nodes. Components without anchors stay fixed."""
         component = self.graph.component
         held = anchors.hard | (anchors.soft > 0)
         alive = np.isin(component, np.unique(component[held]))
         free = alive & ~anchors.hard
         degree = self._degree
         pulls = np.where(free, anchors.soft * degree, 0.0)
-        lone = free & (degree == 0)  # an isolated node goes where its soft target is
+        lone = free & (degree == 0)  # an isolated node moves to its soft target
         pulls[lone] = np.maximum(anchors.soft[lone], 1e-12)
         factor = None
         if free.any():
@@ -138,15 +138,15 @@ class ArapSolver:
         )
 
     def relax(self, rest: np.ndarray, anchors: Anchors, shape: Shape, iterations: int) -> Shape:
-        """At most ``iterations`` local and global steps from ``shape`` towards the minimum.
+        """Take at most ``iterations`` local and global steps from ``shape`` towards the minimum.
 
-        Where anchors have moved, they begin with a guess: what turns with the handles spreads evenly between them, and
-        positions follow. A piece that hangs on one handle alone is there at once.
+        If anchors have moved, iterations start from a guess that spreads their turns smoothly between them and derives
+        positions. For a component with a single handle the guess is the solution.
 
         Args:
-            rest: [M, 3] float64, normalised units: the shape that costs nothing.
-            anchors: what is held.
-            shape: where to begin; not changed.
+            rest: [M, 3] float64 shape of zero energy, normalised units.
+            anchors: constraints.
+            shape: initial state; not modified.
         """
         system = self._system(anchors)
         start = torch.from_numpy(np.ascontiguousarray(rest))
@@ -169,7 +169,7 @@ class ArapSolver:
                 rotations, spare = spare, rotations
             if system.factor is None:
                 break
-            stretch = self.stretch if step else 0.0  # the edges of what was moved have no direction yet
+            stretch = self.stretch if step else 0.0  # edges of moved nodes have no valid direction yet
             inputs = system.free, system.fixed, start, posed, *edges, stretch, rotations
             launch(kernels.edge_sums, len(free), *inputs, system.pulls, targets, sums, grain=128)
             solved = system.factor.solve(sums.numpy())
@@ -180,13 +180,13 @@ class ArapSolver:
         return Shape(positions, rotations.numpy(), anchors)
 
     def _asked(self, anchors: Anchors) -> tuple[torch.Tensor, torch.Tensor]:
-        """Weights [M] and values [M, 3, 3] of the rotations that are asked for."""
+        """Return weights [M] and values [M, 3, 3] of the rotations that nodes are pulled to."""
         weights = anchors.leaning * self._degree * self.graph.edge_length**2
         return torch.from_numpy(weights), torch.from_numpy(np.ascontiguousarray(anchors.rotations))
 
     def _guess(self, system: _System, anchors: Anchors, shape: Shape) -> np.ndarray:
-        """[M, 3, 3] rotations: given where they are, else those of ``shape`` turned by a harmonic mean of what the
-        given ones, and those that are asked for, have turned since."""
+        """Guess rotations [M, 3, 3]: fixed ones as given; the others from ``shape``, turned by the harmonic
+        interpolation of the anchors' turns since then."""
         turns = np.where(anchors.turned[:, None, None], anchors.rotations, shape.rotations)
         further = np.zeros((len(turns), 3))
         given = np.flatnonzero(anchors.turned)
@@ -205,12 +205,12 @@ class ArapSolver:
         return turns
 
     def solve(self, rest: np.ndarray, path: Callable[[float], Anchors], steps: int) -> Shape:
-        """The deformation at the end of a path of handles, which begins at rest: a function of its arguments alone.
+        """Follow a path of anchors from rest and return the deformation at its end, a function of the arguments alone.
 
         Args:
             rest: [M, 3] float64, normalised units.
-            path: share of the way, 0 to 1, to what is held there; the same nodes everywhere.
-            steps: as ``count_steps`` says.
+            path: maps the share of the path, 0 to 1, to anchors, always on the same nodes.
+            steps: number of sub-steps, from ``count_steps``.
         """
         shape = Shape.at_rest(rest)
         for step in range(1, steps + 1):
@@ -219,7 +219,7 @@ class ArapSolver:
         return shape
 
     def turns(self, rest: np.ndarray, posed: np.ndarray) -> np.ndarray:
-        """[M, 3, 3] how every node is turned, told from its edges and, a little, from its neighbours' turns."""
+        """Estimate the rotation of each node, [M, 3, 3], from its edges, regularised by its neighbours' rotations."""
         nodes = torch.arange(len(rest), dtype=torch.int32)
         inputs = nodes, *(torch.from_numpy(np.ascontiguousarray(x)) for x in (rest, posed))
         edges = self._begin, self._neighbors, self._weights
@@ -227,14 +227,14 @@ class ArapSolver:
         spare = rotations.clone()
         none = torch.zeros(len(rest), dtype=torch.float64), rotations
         for step in range(TURN_ITERATIONS):
-            smooth = self.smoothness * self.graph.edge_length**2 if step else 0.0  # the first ones know nothing yet
+            smooth = self.smoothness * self.graph.edge_length**2 if step else 0.0  # neighbours have no estimate yet
             launch(kernels.turn_nodes, len(rest), *inputs, *edges, smooth, rotations, *none, spare, grain=64)
             rotations, spare = spare, rotations
         return rotations.numpy()
 
     def poisson(self, rest: np.ndarray, rotations: np.ndarray, held: np.ndarray) -> np.ndarray:
-        """Positions [M, 3] whose edges are those of ``rest`` turned by ``rotations`` [M, 3, 3], while nodes ``held``
-        [M] stay. A component of which nothing is held keeps its first node."""
+        """Solve for positions [M, 3] whose edges are those of ``rest`` turned by ``rotations`` [M, 3, 3], with nodes
+        ``held`` [M] fixed. In a component without held nodes the first node is fixed."""
         graph = self.graph
         own = np.repeat(np.arange(len(graph)), np.diff(graph.begin))
         edges = rest[own] - rest[graph.neighbors]
@@ -255,6 +255,6 @@ class ArapSolver:
 
 
 def count_steps(angle: float, distance: float, edge_length: float) -> int:
-    """Sub-steps for a handle that turns by ``angle`` (radians) and moves by ``distance``."""
+    """Return the number of sub-steps for a handle that turns by ``angle`` (radians) and moves by ``distance``."""
     wanted = max(angle / STEP_ANGLE, distance / (STEP_LENGTH * edge_length))
-    return min(MOST_STEPS, max(1, math.ceil(wanted - 1e-9))) if math.isfinite(wanted) else MOST_STEPS
+    return min(MAX_STEPS, max(1, math.ceil(wanted - 1e-9))) if math.isfinite(wanted) else MAX_STEPS

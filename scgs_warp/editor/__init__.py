@@ -1,4 +1,4 @@
-"""The editor in the browser: an ``EditSession`` on a page that viser serves, seen through our own renderer."""
+"""The editor in the browser: viser serves the page, and the package's own renderer draws the scene on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The editor: a scene in the browser, seen through our own renderer, with control points to take hold of."""
+"""The editor: serves an ``EditSession`` to browsers and turns clicks and drags into edits."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from ..errors import UserError
 from ..geometry.cameras import orbit_camera
 from . import gizmo_pose
 from .display import RADIUS, Display
-from .frame_image import FINE_QUALITY, QUALITY, Picture, take
-from .model import Combine, Model, Moment
+from .frame_image import FINE_QUALITY, QUALITY, Picture, take_picture
+from .model import Combine, EditorModel, Moment
 from .overlays import GIZMO, Overlays
 from .panel.panel import Panel
 from .proxy import guarded
-from .views import FULL, ClientCamera, Pace, Views
+from .views import FULL, ClientCamera, Pace, PictureSchedule
 from .worker import Worker
 
 if TYPE_CHECKING:
     import viser
 
 HOST = "127.0.0.1"
-QUICK, PATIENT = 0.11, 0.8
-"""Seconds that a picture may take while something moves, and when all is still."""
-LARGEST = 4096
-"""Pixels of a screenshot's longer side, whatever a page says of its window."""
-REPEAT = 1.5
-"""Seconds in which the same message is not shown again."""
+MOVING_SECONDS, STILL_SECONDS = 0.11, 0.8
+"""Target time of a picture in seconds, while something moves and while all is still."""
+MAX_SCREENSHOT_SIZE = 4096
+"""Largest longer side of a screenshot in pixels, whatever window size a page reports."""
+REPEAT_SECONDS = 1.5
+"""Seconds during which the same message is not repeated."""
 
 
 def import_viser() -> Any:
-    """The package that serves the page.
+    """Import the package that serves the page.
 
     Raises:
-        UserError: it is not installed.
+        UserError: the package is not installed.
     """
     try:
         import viser
@@ -58,14 +58,14 @@ class Editor:
     """Serves one session to any number of browsers, until ``stop``.
 
     Args:
-        session: the scene under edit.
-        folder: where edits, films and exports go.
-        port: on 127.0.0.1; the next free one is taken. 0: any.
-        size: longer side of a full picture, at most.
-        key: if a proxy stands before it: what the proxy says.
+        session: scene and edit.
+        folder: folder of edits, films and exports.
+        port: port on 127.0.0.1; if it is taken, the next free one is used. 0: any.
+        size: largest longer side of a picture in pixels.
+        key: secret of the proxy in front of it, if there is one.
 
-    Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``latency`` (seconds from a drag to its picture,
-    the latest hundred).
+    Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``gizmo_frame`` (frame of the visible gizmo and
+    the target at which its drag begins), ``latency`` (seconds from a drag to its picture, the latest hundred).
 
     Raises:
         UserError: viser is not installed.
@@ -76,27 +76,27 @@ class Editor:
     ) -> None:
         viser = import_viser()
         self.session, self.folder = session, folder
-        self.views = Views()
-        self.quick, self.full = Pace(QUICK, 256, 512), Pace(PATIENT, min(640, size), size)
-        self.worker = Worker(self.views, self._draw, lambda: self.model.busy, failed=self._picture_failed)
-        self.model = Model(session, self.refresh)
+        self.schedule = PictureSchedule()
+        self.quick, self.full = Pace(MOVING_SECONDS, 256, 512), Pace(STILL_SECONDS, min(640, size), size)
+        self.worker = Worker(self.schedule, self._draw, lambda: self.model.busy, failed=self.picture_failed)
+        self.model = EditorModel(session, self.refresh)
         self.latency: list[float] = []
-        self._said: dict[str, float] = {}
+        self._notified: dict[str, float] = {}
         self._first = True
-        """No picture was drawn yet."""
+        """True if no picture has been drawn yet."""
         self._waiting: dict[int, Any] = {}
         self._dragger: int | None = None
         self._dragged_at: float | None = None
-        self._place: tuple[gizmo_pose.Place, Target] | None = None
+        self.gizmo_frame: tuple[gizmo_pose.GizmoFrame, Target] | None = None
         self.display = Display.of(session.scene.overview)
-        with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # its banner names the wrong door
+        with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # viser's banner names its own port
             self.server: viser.ViserServer = viser.ViserServer(HOST, port, label="scgs_warp", verbose=False)
         self.port: int = self.server.get_port()
-        self._dress()
+        self._set_up_page()
         self.panel = Panel(self)
         self.worker.start()
-        self.server.on_client_connect(self._arrive)
-        self.server.on_client_disconnect(self._leave)
+        self.server.on_client_connect(self._connect)
+        self.server.on_client_disconnect(self._disconnect)
         self.refresh()
 
     @property
@@ -108,8 +108,8 @@ class Editor:
         self.worker.stop()
         self.server.stop()
 
-    def _dress(self) -> None:
-        """The scene's own up, camera and overlays."""
+    def _set_up_page(self) -> None:
+        """Set up direction, initial camera, overlays and click callbacks."""
         server, overview = self.server, self.session.scene.overview
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
         server.gui.main_panel.dock_right()  # beside the picture, not over it
@@ -132,45 +132,46 @@ class Editor:
 
     # Clients
 
-    def _arrive(self, client: viser.ClientHandle) -> None:
+    def _connect(self, client: viser.ClientHandle) -> None:
         if self._first:
-            text = "Kernels are compiled when they are needed first; that may take a minute."
+            text = "Kernels are compiled on first use, which may take a minute."
             self._waiting[client.client_id] = client.add_notification("Drawing the scene", text, loading=True)
         client.camera.on_update(lambda camera: self._moved(client))
         self._moved(client)
 
-    def _leave(self, client: viser.ClientHandle) -> None:
-        if client.client_id == self._dragger:  # a window that was closed in the middle of a drag
+    def _disconnect(self, client: viser.ClientHandle) -> None:
+        if client.client_id == self._dragger:  # the window was closed during a drag
             self._dragger = None
             self.model.release()
         self._waiting.pop(client.client_id, None)
-        with self.worker.changing() as views:
-            views.drop(client.client_id)
+        with self.worker.changing() as schedule:
+            schedule.drop(client.client_id)
 
     def _moved(self, client: viser.ClientHandle) -> None:
         if client.client_id not in self.server.get_clients():
             return
-        with self.worker.changing() as views:
-            views.move(client.client_id, self.camera(client), time.monotonic())
+        with self.worker.changing() as schedule:
+            schedule.move(client.client_id, self.camera(client), time.monotonic())
 
     def refresh(self) -> None:
-        """Something changed: new pictures for everybody."""
-        with self.worker.changing() as views:
-            views.change(time.monotonic())
+        """Request new pictures for all clients."""
+        with self.worker.changing() as schedule:
+            schedule.change(time.monotonic())
 
     def say(self, client: viser.ClientHandle | None, title: str, text: str, color: str = "red") -> None:
-        """A notification, to one client or to all; the same again only after a while, as drags repeat mistakes."""
+        """Notify one client or all (None). The same text is shown again only after ``REPEAT_SECONDS``, because every
+        step of a drag repeats its error."""
         now = time.monotonic()
-        if now - self._said.get(text, -np.inf) < REPEAT:
+        if now - self._notified.get(text, -np.inf) < REPEAT_SECONDS:
             return
-        self._said = {said: at for said, at in self._said.items() if now - at < REPEAT} | {text: now}
+        self._notified = {said: at for said, at in self._notified.items() if now - at < REPEAT_SECONDS} | {text: now}
         everybody = self.server.get_clients().values()
         for one in [client] if client is not None else list(everybody):
             one.add_notification(title, text, auto_close_seconds=8.0, color=color)  # type: ignore[arg-type]
 
     def guarded(self, action: Callable[..., Any]) -> Callable[[Any], None]:
-        """A callback that survives: what the user did wrong is said in the page, and so is what we did wrong. Values
-        that the program itself sets in the panel call nothing."""
+        """Wrap a callback such that errors become notifications. Events without a client, which the program causes by
+        setting values in the panel, are ignored."""
 
         def callback(event: Any) -> None:
             if event.client is None:
@@ -188,12 +189,12 @@ class Editor:
         return callback
 
     def _failed(self, client: viser.ClientHandle | None, error: Exception) -> None:
-        """Our mistake, while it is being handled."""
+        """Report an internal error inside its ``except`` block."""
         traceback.print_exc(file=sys.stderr)
         self.say(client, "Internal error", f"{type(error).__name__}: {error}")
 
-    def _picture_failed(self, number: int, error: Exception) -> None:
-        """On the worker's thread: the picture of one client could not be drawn."""
+    def picture_failed(self, number: int, error: Exception) -> None:
+        """Report that a client's picture could not be drawn; on the worker's thread, inside the ``except`` block."""
         client = self.server.get_clients().get(number)
         if client is None:
             return
@@ -203,7 +204,7 @@ class Editor:
             self._failed(client, error)
 
     def on_value(self, handle: Any, action: Callable[[Any], Any]) -> Any:
-        """The handle of a control; whenever a user changes its value, ``action`` is called with it."""
+        """Call ``action`` with a control's value whenever a user changes it; return the control."""
         handle.on_update(self.guarded(lambda event: action(event.target.value)))
         return handle
 
@@ -215,7 +216,7 @@ class Editor:
     # Pictures
 
     def camera(self, client: viser.ClientHandle) -> ClientCamera:
-        """A client's view as it is now, in world units."""
+        """Return a client's present camera, world units."""
         camera = client.camera
         try:
             width, height = int(camera.image_width), int(camera.image_height)
@@ -225,25 +226,25 @@ class Editor:
         wxyz = np.asarray(camera.wxyz, np.float64)
         return ClientCamera(tuple(wxyz.tolist()), tuple(position.tolist()), float(camera.fov), width, height)
 
-    def take(self, moment: Moment, camera: ClientCamera) -> Picture:
-        """A picture in full; on the worker's thread."""
-        return take(self.session, moment, camera, min(max(camera.width, camera.height), LARGEST))
+    def take_picture(self, moment: Moment, camera: ClientCamera) -> Picture:
+        """Render a picture at the client's full size; call it on the worker's thread."""
+        return take_picture(self.session, moment, camera, min(max(camera.width, camera.height), MAX_SCREENSHOT_SIZE))
 
     def _draw(self, number: int, quality: str) -> None:
-        """On the worker's thread."""
+        """Draw a client's picture; runs on the worker's thread."""
         client = self.server.get_clients().get(number)
-        with self.worker.changing() as views:
-            camera = views.camera(number)
+        with self.worker.changing() as schedule:
+            camera = schedule.camera(number)
         if client is None or camera is None:
             return
         asked = self._dragged_at
         moment = self.model.moment()
         pace = self.full if quality == FULL else self.quick
         begin = time.perf_counter()
-        picture = take(self.session, moment, camera, min(pace.size, max(camera.width, camera.height)))
-        depth = self.display.nothing
+        picture = take_picture(self.session, moment, camera, min(pace.size, max(camera.width, camera.height)))
+        depth = self.display.empty_depth
         if not self.model.through:
-            behind = 0.5 * self.edge_length * self.display.scale  # control points lie inside what they move
+            behind = 0.5 * self.edge_length * self.display.scale  # control points lie inside the surface
             depth = self.display.depth(picture.depth, behind, 2 if quality == FULL else 1)
         client.scene.set_background_image(
             picture.rgb, format="jpeg", jpeg_quality=FINE_QUALITY if quality == FULL else QUALITY, depth=depth
@@ -259,10 +260,10 @@ class Editor:
             self._dragged_at = None
         if asked is not None and moment.live:
             self.latency = [*self.latency[-99:], time.monotonic() - asked]
-        self._follow(moment)
+        self._update_page(moment)
 
-    def _follow(self, moment: Moment) -> None:
-        """Overlays and panel, after the picture."""
+    def _update_page(self, moment: Moment) -> None:
+        """Update overlays, gizmo and panel after the picture."""
         points = self.session.node_positions(moment.time, moment.at, live=moment.live)
         self.overlays.move(self.display.show(points))
         self._place_gizmo(moment)
@@ -277,17 +278,17 @@ class Editor:
             return
         handle = self.session.edit.handle(model.active or "")
         if moment.show in ("original", "side by side") or (handle is None and not model.selection):
-            self._place = None
-            self.overlays.place(None)
+            self.gizmo_frame = None
+            self.overlays.place_gizmo(None)
             return
         if handle is None:
-            self._place = gizmo_pose.place_of_selection(self.session, model.selection, moment)
+            self.gizmo_frame = gizmo_pose.frame_of_selection(self.session, model.selection, moment)
         else:
             target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
-            self._place = gizmo_pose.place_of(self.session, handle, moment.time), target
-        place, target = self._place
+            self.gizmo_frame = gizmo_pose.frame_of_handle(self.session, handle, moment.time), target
+        place, target = self.gizmo_frame
         position, wxyz = place.pose(target)
-        self.overlays.place((self.display.show(position), wxyz))
+        self.overlays.place_gizmo((self.display.show(position), wxyz))
 
     # What users do in the picture
 
@@ -295,7 +296,8 @@ class Editor:
         self.guarded(lambda event: self.pick(event.client, event.screen_pos, how))(event)
 
     def pick(self, client: viser.ClientHandle, screen: tuple[float, float], how: Combine | None = None) -> None:
-        """A click on the canvas (0 to 1 from the upper left): on the surface it selects, beside it nothing is."""
+        """Select by a click at a point of the canvas (0 to 1 from the upper left); the background clears the selection
+        unless it is to be extended or reduced."""
         model, moment = self.model, self.model.moment()
         how = how or model.combine
 
@@ -311,21 +313,22 @@ class Editor:
             model.select(nodes, how)
 
     async def _gizmo_moved(self, event: Any) -> None:
-        """On the server's loop, in order; nothing here waits for a solution. One client drags at a time."""
+        """Handle gizmo events in order on the server's loop, without waiting for solutions. One client drags at a
+        time."""
         if self._dragger not in (None, event.client_id):
             return
         self._dragger = None if event.phase == "end" else event.client_id
         try:
-            self._gizmo(event.phase, self.display.world(event.target.position), np.array(event.target.wxyz))
+            self.drag_gizmo(event.phase, self.display.world(event.target.position), np.array(event.target.wxyz))
         except UserError as error:
             self.say(event.client, "That does not work", str(error))
         except Exception as error:
             self._failed(event.client, error)
 
-    def _gizmo(self, phase: str, position: np.ndarray, wxyz: np.ndarray) -> None:
-        if self._place is None:
+    def drag_gizmo(self, phase: str, position: np.ndarray, wxyz: np.ndarray) -> None:
+        if self.gizmo_frame is None:
             return
-        place, target = self._place
+        place, target = self.gizmo_frame
         if phase == "start":
             self.model.grab(target)
         elif phase == "update":
@@ -338,8 +341,8 @@ class Editor:
             self.panel.show()
 
     def put(self, target: Target) -> None:
-        """The chosen handle, at once: what the numbers in the panel do."""
-        self.model.grab(STAY if self._place is None else self._place[1])
+        """Move the chosen handle to a target in one step, as the panel's numbers do."""
+        self.model.grab(STAY if self.gizmo_frame is None else self.gizmo_frame[1])
         try:
             self.model.drag(target)
         finally:

@@ -1,4 +1,4 @@
-"""The browser's units: scenes a millimetre or a kilometre wide look the same to it, and its depth ends at 167."""
+"""Conversion to the browser's units, in which scenes of any size have the same size, because its depth ends at 167."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from ..geometry.cameras import Overview
 
 RADIUS = 4.0
-"""How far the training cameras stand from the scene, in the browser."""
+"""Distance of the training cameras from the scene's centre, browser units."""
 FARTHEST = 167.0
-"""The largest depth that a picture can carry."""
+"""Largest depth that a picture can encode, browser units."""
 
 
 @dataclass(frozen=True)
 class Display:
-    """The scene's centre at 0, its cameras ``RADIUS`` away."""
+    """Map from world units to browser units: the scene's centre is the origin, its cameras are ``RADIUS`` away."""
 
     centre: tuple[float, float, float]
     scale: float
@@ -26,18 +26,19 @@ class Display:
         return Display(overview.centre, RADIUS / overview.radius)
 
     def show(self, points: np.ndarray) -> np.ndarray:
-        """[..., 3] of the world, as the browser has them."""
+        """Convert points [..., 3] from world to browser units."""
         return (np.asarray(points, np.float64) - self.centre) * self.scale
 
     def world(self, points: np.ndarray) -> np.ndarray:
-        """[..., 3] the inverse."""
+        """Convert points [..., 3] from browser to world units."""
         return np.asarray(points, np.float64) / self.scale + self.centre
 
     def depth(self, depth: np.ndarray, behind: float, stride: int = 1) -> np.ndarray:
-        """[H, W] float32 of world units, ``behind`` (browser's units) further away; what is infinite, at the end."""
+        """Convert depth [H, W], float32 world units, to browser units, ``behind`` further away and at most
+        ``FARTHEST``."""
         return np.minimum(depth[::stride, ::stride] * np.float32(self.scale) + np.float32(behind), FARTHEST)
 
     @property
-    def nothing(self) -> np.ndarray:
-        """[2, 2] the depth of a picture that hides nothing."""
+    def empty_depth(self) -> np.ndarray:
+        """[2, 2] depth of a picture that hides no overlay."""
         return np.full((2, 2), FARTHEST, np.float32)

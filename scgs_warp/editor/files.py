@@ -1,4 +1,4 @@
-"""Where the editor's files go: one folder, plain names."""
+"""Paths of the editor's files: one folder, plain names."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from ..errors import UserError
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,99}")
 
 
-def place(folder: Path, name: str, suffix: str) -> Path:
-    """A file in the folder, which is made; users' browsers may be anywhere, so nothing leads out of it.
+def output_path(folder: Path, name: str, suffix: str) -> Path:
+    """Return the path of a file in the folder, which is made. Names come from browsers anywhere, so no name may lead
+    out of the folder.
 
     Args:
-        name: with or without its suffix.
+        name: file name with or without its suffix.
 
     Raises:
-        UserError: the name has anything in it but letters, digits, spaces, dots, dashes, or the folder cannot be made.
+        UserError: the name contains other characters than letters, digits, spaces, dots and dashes, the file is a link,
+            or the folder cannot be made.
     """
     name = _bare(name, suffix)
     if not _good(name):
@@ -41,18 +43,18 @@ def _good(name: str) -> bool:
     return bool(NAME.fullmatch(name)) and not name.endswith((".", " "))
 
 
-def free(path: Path) -> Path:
-    """The path, or, if something is there, the first of ``name 2``, ``name 3`` ... where nothing is."""
-    found, number = path, 1
-    while found.exists() or found.is_symlink():
+def unused_path(path: Path) -> Path:
+    """Return the path, or, if it exists, the first of ``name 2``, ``name 3`` ... that does not."""
+    candidate, number = path, 1
+    while candidate.exists() or candidate.is_symlink():
         number += 1
         ending = f" {number}{path.suffix}"
-        found = path.with_name(path.name.removesuffix(path.suffix)[: 100 - len(ending)].rstrip(". ") + ending)
-    return found
+        candidate = path.with_name(path.name.removesuffix(path.suffix)[: 100 - len(ending)].rstrip(". ") + ending)
+    return candidate
 
 
-def edits(folder: Path) -> tuple[str, ...]:
-    """Names of the saved edits that ``place`` takes."""
+def saved_edits(folder: Path) -> tuple[str, ...]:
+    """List the saved edits whose names ``output_path`` accepts."""
     if not folder.is_dir():
         return ()
     paths = sorted(folder.glob("*.json"))

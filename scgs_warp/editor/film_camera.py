@@ -1,4 +1,4 @@
-"""The view that a user has, as a view of the film's camera."""
+"""Conversion of a client's view to a view of the film's camera."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from .views import ClientCamera
 
 
 def view_of(session: EditSession, camera: ClientCamera) -> View:
-    """Where a film's camera has to stand to see what a client sees. It looks along the client's view, at the point
-    nearest to the scene's centre, and stays upright.
+    """Return the film camera's view that shows what a client sees. Its target is the point on the client's optical axis
+    nearest to the scene's centre; the camera stays upright.
 
     Raises:
-        UserError: from straight above or below no film is made.
+        UserError: the client looks from too steeply above or below.
     """
     overview = session.scene.overview
     seen = camera.at_size(64)

@@ -1,4 +1,4 @@
-"""One picture for one client, by our own renderer, with depth for what the browser draws over it."""
+"""Rendering of one client's picture, with depth for the overlays that the browser draws."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from .model import Moment
 from .views import ClientCamera
 
 QUALITY, FINE_QUALITY = 75, 90
-"""Of the JPEG while something moves, and when all is still."""
+"""JPEG quality while something moves, and while all is still."""
 
 
 class Picture(NamedTuple):
     rgb: np.ndarray
     """[H, W, 3] uint8"""
     depth: np.ndarray
-    """[H, W] float32 along the view, world units; infinite where nothing is."""
+    """[H, W] float32 along the optical axis, world units; infinite for the background."""
 
 
-def take(session: EditSession, moment: Moment, camera: ClientCamera, size: int) -> Picture:
-    """What a client sees.
+def take_picture(session: EditSession, moment: Moment, camera: ClientCamera, size: int) -> Picture:
+    """Render a client's picture.
 
     Args:
-        size: longer side of the picture in pixels.
+        size: longer side in pixels.
     """
     if moment.show == "side by side":
         halves = [_image(session, moment, camera, size, 0.5, edited) for edited in (False, True)]
@@ -60,6 +60,6 @@ def _depth(image: Image) -> np.ndarray:
 
 
 def _line(rgb: np.ndarray) -> np.ndarray:
-    """Grey between the halves."""
+    """Draw a grey line between the halves."""
     rgb[:, rgb.shape[1] // 2] = 128
     return rgb

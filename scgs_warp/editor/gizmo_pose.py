@@ -1,5 +1,7 @@
-"""Between the picture and the edit: what a click takes, and where the gizmo of a handle stands. Solves: call it on the
-worker's thread."""
+"""Conversion between picture and edit: control points that a click selects, and the pose of a handle's gizmo.
+
+These functions solve for control points; call them on the worker's thread.
+"""
 
 from __future__ import annotations
 
@@ -15,39 +17,40 @@ from .views import ClientCamera
 
 PICK_SIZE = 512
 NOISE = 1e-7
-"""Half the angle in radians, below which a browser that was asked to shift has not turned."""
+"""Half the angle in radians below which a turn that the browser reports is noise of a shift."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a handle would be if it were not moved, at the moment shown, world units."""
+class GizmoFrame:
+    """Frame of an unmoved handle at the moment shown, world units, relative to which targets place the gizmo."""
 
     pivot: np.ndarray
     """[3]"""
-    frame: np.ndarray
-    """[4] wxyz: how its surroundings have turned since its own time."""
+    rotation: np.ndarray
+    """[4] wxyz rotation of its surroundings since the handle's own time."""
 
     def pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:
-        """Position [3] and wxyz [4] of the gizmo."""
-        turned = multiply(multiply(self.frame, np.array(target.rotation)), conjugate(self.frame))
-        return self.pivot + rotate(self.frame, np.array(target.translation)), turned
+        """Return position [3] and wxyz [4] of the gizmo for a target."""
+        turned = multiply(multiply(self.rotation, np.array(target.rotation)), conjugate(self.rotation))
+        return self.pivot + rotate(self.rotation, np.array(target.translation)), turned
 
     def target(self, position: np.ndarray, wxyz: np.ndarray) -> Target:
-        """The inverse of ``pose``.
+        """Return the target for a pose of the gizmo, the inverse of ``pose``.
 
         Raises:
             UserError: a number is not finite.
         """
-        Target.of(position.tolist(), wxyz.tolist())  # broken numbers are named as the browser sent them
-        shift = rotate(conjugate(self.frame), np.asarray(position, np.float64) - self.pivot)
-        turn = multiply(multiply(conjugate(self.frame), np.asarray(wxyz, np.float64)), self.frame)
+        Target.of(position.tolist(), wxyz.tolist())  # errors quote the numbers that the browser sent
+        shift = rotate(conjugate(self.rotation), np.asarray(position, np.float64) - self.pivot)
+        turn = multiply(multiply(conjugate(self.rotation), np.asarray(wxyz, np.float64)), self.rotation)
         checked = Target.of(shift.tolist(), turn.tolist())
         if all(abs(part) < NOISE for part in checked.rotation[1:]):
             return Target(checked.translation)
         return Target(checked.translation, tuple(unit(np.array(checked.rotation)).tolist()))
 
 
-def place_of(session: EditSession, handle: Handle, time: float) -> Place:
+def frame_of_handle(session: EditSession, handle: Handle, time: float) -> GizmoFrame:
+    """Return the frame of a handle at a scene time."""
     engine = session.engine
     then = engine.base_at(session.edit, handle.time).positions
     now = then if time == handle.time else engine.base_at(session.edit, time).positions
@@ -57,15 +60,15 @@ def place_of(session: EditSession, handle: Handle, time: float) -> Place:
         carried_goal(handle, Target.of(axis), 1.0, session.graph, then, now, engine.units) for axis in axes.tolist()
     ]
     frame = np.stack([goal.translation for goal in where[1:]], axis=1) / engine.units[1]
-    return Place(engine.to_world(where[0].pivot), from_matrix(frame))
+    return GizmoFrame(engine.to_world(where[0].pivot), from_matrix(frame))
 
 
-def place_of_selection(session: EditSession, nodes: tuple[int, ...], moment: Moment) -> tuple[Place, Target]:
-    """Where a handle on these nodes would stand, and the target with which it would leave them where they are now."""
+def frame_of_selection(session: EditSession, nodes: tuple[int, ...], moment: Moment) -> tuple[GizmoFrame, Target]:
+    """Return the frame of a new handle on these nodes, and the target that leaves them where they are."""
     chosen = list(nodes)
     base = session.engine.to_world(session.engine.base_at(session.edit, moment.time).positions)[chosen]
     now = session.node_positions(moment.time, moment.at)[chosen]
-    place = Place(base.mean(0), np.array([1.0, 0.0, 0.0, 0.0]))
+    place = GizmoFrame(base.mean(0), np.array([1.0, 0.0, 0.0, 0.0]))
     if np.allclose(base, now, rtol=0, atol=1e-9):
         return place, STAY
     turn, before, after = rigid_fit(base, now)
@@ -77,7 +80,7 @@ def place_of_selection(session: EditSession, nodes: tuple[int, ...], moment: Mom
 def surface_point(
     session: EditSession, camera: ClientCamera, screen: tuple[float, float], moment: Moment
 ) -> np.ndarray | None:
-    """[3] what is seen at a point of the canvas (0 to 1 from the upper left); None: the background."""
+    """Return the surface point [3] seen at a point of the canvas (0 to 1 from the upper left); None: background."""
     x, y = screen
     share = 1.0
     if moment.show == "side by side":
@@ -88,7 +91,7 @@ def surface_point(
 
 
 def region_at(session: EditSession, point: np.ndarray, region: Region, moment: Moment) -> tuple[int, ...]:
-    """The control points that a click at a point of the surface takes: never none."""
+    """Return the control points that a click at a surface point selects, at least one."""
     nearest = session.nearest(point.tolist(), moment.time, moment.at)
     if region.kind == "rings":
         return session.ring([nearest], region.rings)

@@ -1,4 +1,4 @@
-"""Slow work in the background, one piece at a time, with its progress for all to see and a way to stop it."""
+"""Background jobs: one at a time, with progress reports, and stoppable."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any
 
 from ..errors import UserError
 
-SHOWN = 0.2
-"""Seconds between two reports of progress."""
+REPORT_SECONDS = 0.2
+"""Shortest time between two progress reports in seconds."""
 
 
 @dataclass(frozen=True)
-class Progress:
-    """What runs, how many of its pieces are done."""
+class JobProgress:
+    """Name of the running job and count of its finished pieces."""
 
     name: str
     done: int
@@ -35,59 +35,59 @@ class Jobs:
     """Runs one job at a time on a thread of its own.
 
     Args:
-        shown: called with the progress now and then, and with None when nothing runs any more.
-        ended: called with whoever started it, the job's name, what it returned (None: it failed or was stopped), and
-            what to say if so.
+        shown: called with the progress from time to time, and with None when the job has ended.
+        ended: called with the client that started the job, the job's name, its result (None: it failed or was
+            stopped), and the reason if it has no result.
     """
 
     def __init__(
-        self, shown: Callable[[Progress | None], None], ended: Callable[[Any, str, Any, str | None], None]
+        self, shown: Callable[[JobProgress | None], None], ended: Callable[[Any, str, Any, str | None], None]
     ) -> None:
         self._shown, self._ended = shown, ended
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._progress: Progress | None = None
+        self._progress: JobProgress | None = None
         self._reported = 0.0
 
     @property
-    def progress(self) -> Progress | None:
+    def progress(self) -> JobProgress | None:
         return self._progress
 
     def start(self, name: str, total: int, action: Callable[[Callable[[], None]], Any], who: Any = None) -> None:
-        """Run ``action(advance)``; it calls ``advance`` after each of ``total`` pieces, which raises CancelledError if
-        the job is to end.
+        """Run ``action(advance)``, which calls ``advance`` after each of ``total`` pieces; ``advance`` raises
+        CancelledError once the job is cancelled.
 
         Raises:
-            UserError: another job runs.
+            UserError: another job is running.
         """
         with self._lock:
             if self._progress is not None:
                 raise UserError(f"{self._progress.name} is still running; wait for it, or stop it")
             self._stop.clear()
-            self._progress = Progress(name, 0, total)
+            self._progress = JobProgress(name, 0, total)
         self._shown(self._progress)
         self._thread = threading.Thread(target=self._run, args=(name, action, who), name="job", daemon=True)
         self._thread.start()
 
     def cancel(self) -> None:
-        """Ask the job to end; it does so after the piece under way."""
+        """Ask the job to end after its present piece."""
         with self._lock:
             if self._progress is None:
                 return
             self._stop.set()
-            self._progress = Progress(self._progress.name, self._progress.done, self._progress.total, True)
+            self._progress = JobProgress(self._progress.name, self._progress.done, self._progress.total, True)
         self._shown(self._progress)
 
     def stop(self) -> None:
-        """As ``cancel``, and wait for it."""
+        """Cancel the job and wait for its end."""
         self.cancel()
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():
             thread.join(timeout=30)
 
     def wait(self, seconds: float) -> bool:
-        """Whether nothing runs, after at most so many seconds."""
+        """Wait for the job; return whether it has ended after ``seconds``."""
         thread = self._thread
         if thread is not None:
             thread.join(timeout=seconds)
@@ -100,8 +100,8 @@ class Jobs:
             now = self._progress
             if now is None:
                 return
-            self._progress = Progress(now.name, now.done + 1, now.total)
-        if time.monotonic() - self._reported >= SHOWN:
+            self._progress = JobProgress(now.name, now.done + 1, now.total)
+        if time.monotonic() - self._reported >= REPORT_SECONDS:
             self._reported = time.monotonic()
             self._shown(self._progress)
 

@@ -1,11 +1,9 @@
-"""What the editor knows besides the edit: what is selected, which moment is shown, what is being dragged. No browser
-in here: panels call this, and tests do."""
+"""State of the editor besides the edit: selection, moment shown, drag. It is independent of the browser."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import threading
 import time
 from collections import deque
@@ -15,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..edit import Edit, EditSession, Target, edit_file
+from ..edit import EditSession, Target, edit_file
 from ..edit.handles import STAY
 from ..errors import UserError
 
@@ -25,19 +23,19 @@ Combine = Literal["replace", "add", "subtract"]
 
 @dataclass(frozen=True)
 class Moment:
-    """What a picture shows."""
+    """Content of a picture."""
 
     time: float
-    """Of the scene."""
+    """Scene time."""
     at: float | None
-    """Second of the film whose keyframes lead the handles; None: where handles are now."""
+    """Second of the film at which keyframes place the handles; None: present targets."""
     live: bool
     show: Show
 
 
 @dataclass(frozen=True)
 class Region:
-    """What a click takes."""
+    """Extent of a click's selection."""
 
     kind: Literal["rings", "brush"] = "rings"
     rings: int = 2
@@ -45,11 +43,11 @@ class Region:
     """World units."""
 
 
-class Model:
-    """The state of one editor, shared by all its clients. ``lock`` guards it; nothing here solves or draws.
+class EditorModel:
+    """State of one editor, shared by all its clients. ``lock`` guards it; no method solves or draws.
 
     Args:
-        session: the scene under edit.
+        session: scene and edit.
         changed: called after every change, without the lock.
     """
 
@@ -61,22 +59,22 @@ class Model:
         self.active: str | None = None
         self.region = Region()
         self.pin_rings: int | None = 3
-        """Whoever takes hold pins everything further than this; None: nothing."""
+        """Rings around a new handle beyond which everything is pinned; None: nothing is."""
         self.lasts: Any = "motion"
         self.window = 0.1
         self.stiffness: float | None = None
         self.combine: Combine = "replace"
         self.through = False
-        """Overlays are seen through the surface."""
+        """True if overlays are drawn in front of the surface."""
         self.show: Show = "edited"
         self.at = 0.0
         self.dragging = False
         self._dragged: bool | None = None
-        """Whether something was moved since ``grab``; None: nothing is in hand."""
+        """True if the handle was moved since ``grab``; None: no drag."""
         self._led = False
-        """Whether keyframes led before ``grab``."""
+        """True if keyframes placed the handles before ``grab``."""
         self._automatic: deque[tuple[int, ...]] = deque(maxlen=100)
-        """Pins as ``grab`` has made them: nobody else has asked for them."""
+        """Sets of pins that ``grab`` made by itself."""
         self._following = False
         self._played_from: tuple[float, float] | None = None
 
@@ -92,16 +90,16 @@ class Model:
 
     @property
     def busy(self) -> bool:
-        """Pictures had better come soon than large."""
+        """True if pictures should be fast rather than large."""
         return self.dragging or self.playing
 
     @property
     def time(self) -> float:
-        """Scene time that is shown."""
+        """Scene time shown."""
         return self.session.scene_time(self.at)
 
     def seek(self, at: float) -> None:
-        """Show a second of the film; keyframes lead the handles there."""
+        """Show a second of the film; keyframes then place the handles."""
         with self.lock:
             self.at = min(max(float(at), 0.0), self.seconds) if np.isfinite(at) else self.at
             self._following = bool(self.session.edit.keyframes)
@@ -109,14 +107,14 @@ class Model:
                 self._played_from = (time.monotonic(), self.at)
         self.changed()
 
-    def play(self, on: bool) -> None:
+    def play(self, on: bool, now: float | None = None) -> None:
         with self.lock:
-            self._played_from = (time.monotonic(), self.at) if on else None
+            self._played_from = (time.monotonic() if now is None else now, self.at) if on else None
             self._following = self._following or bool(on and self.session.edit.keyframes)
         self.changed()
 
     def tick(self, now: float | None = None) -> None:
-        """If it plays, go to the frame of the film that is due."""
+        """Advance to the film's frame that is due, if playing."""
         with self.lock:
             if self._played_from is None:
                 return
@@ -137,7 +135,7 @@ class Model:
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[EditSession]:
-        """The session, to change its edit; then everything is drawn anew."""
+        """Yield the session for a change of its edit, then report the change."""
         with self.lock:
             try:
                 yield self.session
@@ -146,7 +144,7 @@ class Model:
         self.changed()
 
     def _check(self) -> None:
-        """Forget what is no longer there."""
+        """Drop references to what the edit no longer contains."""
         edit = self.session.edit
         if edit.handle(self.active or "") is None:
             self.active = self._holder()
@@ -164,30 +162,26 @@ class Model:
             return session.redo()
 
     def reset(self) -> None:
-        """No edit; can be undone."""
+        """Remove the whole edit; can be undone."""
         with self.changing() as session:
             self._let_go()
             session.reset()
 
     def set(self, **fields: Any) -> None:
-        """Change what is no part of the edit: region, pin_rings, show ..."""
+        """Set attributes of this model, which are no part of the edit: region, pin_rings, show ..."""
         with self.lock:
             for name, value in fields.items():
                 setattr(self, name, value)
         self.changed()
 
     def replace(self, **fields: Any) -> None:
-        """Change fields of the edit.
+        """Change fields of the edit, checked as if they came from a file: pages may send anything.
 
         Raises:
-            UserError: a script could not say that either; the edit is as before.
+            UserError: a field is out of range; the edit stays unchanged.
         """
         with self.changing() as session:
-            session.apply(self._checked(dataclasses.replace(session.edit, **fields)))
-
-    def _checked(self, edit: Edit) -> Edit:
-        """What controls send is trusted no more than a file is: pages may send anything."""
-        return edit_file.parse(json.loads(edit_file.to_json(edit, self.session)), "the edit", self.session)
+            session.apply(edit_file.checked(dataclasses.replace(session.edit, **fields), session.engine))
 
     def change_handle(self, **fields: Any) -> None:
         """Change fields of the active handle."""
@@ -197,13 +191,13 @@ class Model:
                 raise UserError("no handle is chosen; click on the picture, then drag")
             changed = dataclasses.replace(handle, **fields)
             handles = tuple(changed if other is handle else other for other in session.edit.handles)
-            session.apply(self._checked(dataclasses.replace(session.edit, handles=handles)))
+            session.apply(edit_file.checked(dataclasses.replace(session.edit, handles=handles), session.engine))
 
     def remove_handle(self) -> None:
-        """The active handle, with its part in every keyframe; with the last one, pins that nobody has asked for."""
+        """Remove the active handle; with the last handle, remove automatic pins, too."""
         with self.changing() as session:
             if self.active is None:
-                raise UserError("no handle is chosen; click on what it holds first")
+                raise UserError("no handle is chosen; click on its control points first")
             draft = session.fork()
             draft.remove_handle(self.active)
             if not draft.edit.handles and self._pins_are_automatic():
@@ -212,7 +206,7 @@ class Model:
 
     @property
     def target(self) -> Target:
-        """Of the active handle, as it is shown."""
+        """Target of the active handle at the moment shown."""
         with self.lock:
             moment = self.moment()
             return self.session.engine.targets(self.session.edit, moment.at).get(self.active or "", STAY)
@@ -228,12 +222,12 @@ class Model:
         self.changed()
 
     def _holder(self) -> str | None:
-        """The handle that holds just what is selected: nobody wants a second one there."""
+        """Return the handle that holds exactly the selection, so that no second one is made there."""
         handles = self.session.edit.handles
         return next((handle.name for handle in handles if handle.nodes == self.selection), None)
 
     def activate(self, name: str | None) -> None:
-        """Take an existing handle in hand."""
+        """Choose an existing handle and select its nodes."""
         with self.lock:
             handle = self.session.edit.handle(name or "")
             self.active = None if handle is None else handle.name
@@ -243,11 +237,11 @@ class Model:
     # Dragging
 
     def grab(self, target: Target) -> str:
-        """Begin to drag: the active handle, or a new one of the selection, which starts out at ``target`` (where other
-        handles have bent it to), with the rest pinned if so wished. All part of the drag: undo takes it back at once.
+        """Begin to drag the active handle, or a new one on the selection. A new one starts at ``target``, to which
+        other handles have bent the selection, and pins the rest if ``pin_rings`` is set. One undo reverts all of it.
 
         Raises:
-            UserError: nothing is selected; the edit is as before.
+            UserError: nothing is selected; the edit stays unchanged.
         """
         with self.lock:
             self._let_go()
@@ -265,7 +259,7 @@ class Model:
         return name
 
     def _take_hold(self, draft: EditSession, target: Target) -> str:
-        """A handle on the selection; its name."""
+        """Add a handle on the selection and return its name."""
         automatic = self._pins_are_automatic()
         fields = {"lasts": self.lasts, "window": self.window, "stiffness": self.stiffness}
         handle = draft.add_handle(self.selection, self.time, **fields)
@@ -278,7 +272,7 @@ class Model:
         return handle.name
 
     def _pins_are_automatic(self) -> bool:
-        """Whether pins are those of a handle, and make way for the next one."""
+        """Return whether the pins were made by ``grab``, and so may be replaced for the next handle."""
         edit = self.session.edit
         held = {node for handle in edit.handles for node in handle.nodes}
         rings = self.pin_rings
@@ -287,14 +281,14 @@ class Model:
         )
 
     def _take_over(self) -> None:
-        """Handles go on from where keyframes have them at this moment; part of the drag that begins."""
+        """Set present targets to those of the keyframes at this moment, as part of the drag that begins."""
         if self._following:
             for name, target in self.session.engine.targets(self.session.edit, self.at).items():
                 self.session.drag(name, target.translation, target.rotation)
             self._following = False
 
     def drag(self, target: Target) -> None:
-        """Put the active handle somewhere; a broken number changes nothing.
+        """Set the active handle's target.
 
         Raises:
             UserError: a number is not finite.
@@ -308,7 +302,7 @@ class Model:
         self.changed()
 
     def release(self) -> None:
-        """The drag is over; if nothing was moved, it has not been."""
+        """End the drag; if the handle was not moved, restore the edit before it."""
         with self.lock:
             self._let_go()
         self.changed()
@@ -323,7 +317,7 @@ class Model:
         self.session.release()
 
     def add_keyframe(self, easing: Any = "smooth") -> None:
-        """At the moment shown; from then on keyframes lead."""
+        """Add a keyframe at the moment shown; from then on keyframes place the handles."""
         with self.changing() as session:
             draft = session.fork()
             if self._following:

@@ -1,4 +1,4 @@
-"""Control points, graph and gizmo, which the browser draws over the picture."""
+"""Overlays that the browser draws over the picture: control points, graph and gizmo."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 PLAIN, CHOSEN, HELD, PINNED = (235, 235, 235), (255, 190, 0), (60, 170, 255), (150, 70, 70)
 EDGE = (120, 120, 130)
 GIZMO = 0.16
-"""Length of the gizmo's arrows, in distances of the cameras from the scene."""
+"""Length of the gizmo's arrows, relative to the distance of the cameras from the scene."""
 
 
 def node_colors(count: int, chosen: Any, held: Any, pins: Any) -> np.ndarray:
-    """[count, 3] uint8: pinned dark red, held by handles blue, chosen yellow."""
+    """Return colours [count, 3] uint8: pinned nodes dark red, held by handles blue, chosen yellow."""
     colors = np.tile(np.array(PLAIN, np.uint8), (count, 1))
     for nodes, color in ((pins, PINNED), (held, HELD), (chosen, CHOSEN)):
         colors[list(nodes)] = color
@@ -24,12 +24,12 @@ def node_colors(count: int, chosen: Any, held: Any, pins: Any) -> np.ndarray:
 
 
 class Overlays:
-    """What is drawn over the picture, the same for all clients. All in the browser's units.
+    """Overlays of all clients, browser units.
 
     Args:
-        edges: [E, 2] of the graph.
+        edges: [E, 2] edges of the graph.
         points: [M, 3] control points.
-        size: of a control point.
+        size: size of a control point.
         reach: length of the gizmo.
     """
 
@@ -50,7 +50,7 @@ class Overlays:
         )  # fmt: skip
 
     def move(self, points: np.ndarray) -> None:
-        """[M, 3] where control points are now; broken ones stay."""
+        """Move control points to [M, 3]; those that are not finite stay."""
         points = np.where(np.isfinite(points), points, self._points)
         if not np.array_equal(points, self._points):
             self._points = points
@@ -70,8 +70,8 @@ class Overlays:
         self.nodes.visible, self.graph.visible, self.nodes.point_size = nodes, graph, size
         self._draw_graph()
 
-    def place(self, pose: tuple[np.ndarray, np.ndarray] | None) -> None:
-        """Gizmo at a position and wxyz; None: away with it. One that is held in hand is not touched by callers."""
+    def place_gizmo(self, pose: tuple[np.ndarray, np.ndarray] | None) -> None:
+        """Show the gizmo at a position and wxyz; None hides it. Do not call it during a drag."""
         if pose is None or not all(np.isfinite(part).all() for part in pose):
             self.gizmo.visible = False
             return

@@ -1,9 +1,9 @@
-"""Who may talk to the editor. The package that serves the page checks neither where a request comes from nor who sends
-it, so a page from anywhere could drive an editor on its visitor's machine. Two doors, both of which check:
+"""Access control of the editor. viser checks neither the origin of a request nor its sender, so any page could drive an
+editor on its visitor's machine. There are two entrances, both of which check:
 
 ``guarded`` refuses foreign pages at the editor's own port, which listens on 127.0.0.1 only. ``Proxy`` listens where
-others reach it, asks for a token, checks the origin of pages and WebSockets, and hands everything on; while it stands,
-the editor's own port takes nobody but it.
+other machines reach it, requires a token, checks the origin of pages and WebSockets, and forwards everything; while it
+runs, the editor's own port accepts requests of the proxy alone.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from urllib.parse import parse_qs, urlsplit
 
 from ..errors import UserError
 
-LOCAL = {"127.0.0.1", "localhost", "::1"}
-KEY = "x-editor-key"
+LOCAL_HOSTS = {"127.0.0.1", "localhost", "::1"}
+KEY_HEADER = "x-editor-key"
 COOKIE = "scgs_editor_"
-"""The port follows: cookies know hosts only, and there may be several editors on one."""
-MOST_HEAD = 32 << 10
-"""Bytes of a request's head."""
+"""Prefix of the cookie's name. The port follows, because cookies belong to hosts and a host may run several editors."""
+MAX_HEAD_BYTES = 32 << 10
+"""Largest head of a request."""
 PATIENCE = 10.0
-"""Seconds in which a request's head has to be there."""
-MOST_STRANGERS = 200
-"""Connections that have not shown the token; more are closed at once."""
+"""Seconds within which a request's head must arrive."""
+MAX_PENDING = 200
+"""Largest number of connections that have not shown the token yet; further ones are closed at once."""
 
 
-class Head(NamedTuple):
-    """The beginning of an HTTP request."""
+class RequestHead(NamedTuple):
+    """Request line and headers of an HTTP request."""
 
     method: str
     target: str
@@ -41,17 +41,17 @@ class Head(NamedTuple):
     """Names in lower case."""
 
     def get(self, name: str) -> str | None:
-        """The header's value; None without it, empty (which passes no check) if it is there twice."""
-        found = [value for key, value in self.headers if key == name]
-        return None if not found else found[0] if len(found) == 1 else ""
+        """Return a header's value: None if it is missing, empty (which passes no check) if it is repeated."""
+        values = [value for key, value in self.headers if key == name]
+        return None if not values else values[0] if len(values) == 1 else ""
 
     @property
     def upgrades(self) -> bool:
         return (self.get("upgrade") or "").lower() == "websocket"
 
 
-def parse_head(text: bytes) -> Head | None:
-    """None if it is no request that a browser sends: no bodies, no folded lines, no odd bytes."""
+def parse_head(text: bytes) -> RequestHead | None:
+    """Parse a request's head; return None for a body, folded lines or control characters, which browsers never send."""
     try:
         first, *rest = text.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
         method, target, version = first.split(" ")
@@ -61,14 +61,14 @@ def parse_head(text: bytes) -> Head | None:
         return None
     plain = all(name and ":" in line and name.replace("-", "").isalnum() for (name, _), line in zip(headers, rest))
     printable = all(" " <= character != "\x7f" for line in (first, *rest) for character in line)
-    head = Head(method, target, headers)
+    head = RequestHead(method, target, headers)
     body = head.get("content-length") not in (None, "0") or head.get("transfer-encoding") is not None
     good = method in ("GET", "HEAD") and version == "HTTP/1.1" and target.startswith("/") and not body
     return head if good and plain and printable else None
 
 
 def same_origin(origin: str | None, host: str | None) -> bool:
-    """Whether a page of this origin came from the host that it now asks."""
+    """Return whether a page of this origin came from the host that it sends a request to."""
     if not origin or not host:
         return False
     try:
@@ -79,28 +79,28 @@ def same_origin(origin: str | None, host: str | None) -> bool:
 
 
 def cookies(header: str) -> dict[str, str]:
-    """By name, of a Cookie header. Other pages of the host may set what they like: odd ones hide no others."""
+    """Parse a Cookie header. Malformed cookies, which other pages of the host may set, do not hide the others."""
     pairs = (part.strip().partition("=") for part in header.split(";"))
     return {name: value for name, _, value in pairs}
 
 
 def is_local(host: str | None) -> bool:
-    """Whether a Host header names this machine: a foreign name that resolves to 127.0.0.1 does not."""
+    """Return whether a Host header names this machine; a foreign name that resolves to 127.0.0.1 does not."""
     try:
-        return urlsplit(f"//{host}").hostname in LOCAL
+        return urlsplit(f"//{host}").hostname in LOCAL_HOSTS
     except ValueError:
         return False
 
 
 def refusal(headers: Any, key: str | None) -> str | None:
-    """Why a request at the editor's own port is refused; None: it is not.
+    """Return the reason to refuse a request at the editor's own port; None accepts it.
 
     Args:
-        headers: with ``get_all(name)``.
-        key: if there is a proxy: what it says. Else only this machine's own pages may ask.
+        headers: object with ``get_all(name)``.
+        key: secret of the proxy if there is one; otherwise only pages of this machine are accepted.
     """
     host, origin, given = (
-        found[0] if len(found) == 1 else None for found in map(headers.get_all, ("Host", "Origin", KEY))
+        values[0] if len(values) == 1 else None for values in map(headers.get_all, ("Host", "Origin", KEY_HEADER))
     )
     if key is not None:
         known = given is not None and hmac.compare_digest(given.encode(), key.encode())
@@ -114,11 +114,11 @@ def refusal(headers: Any, key: str | None) -> str | None:
 
 @contextlib.contextmanager
 def guarded(key: str | None) -> Iterator[None]:
-    """Servers started inside answer to nobody whom ``refusal`` refuses. viser leaves no other place to look at a
-    request than the function of ``websockets`` that it starts its server with.
+    """Make servers started inside this context refuse requests by ``refusal``. viser has no hook for requests, so the
+    function of ``websockets`` that starts its server is replaced.
 
     Raises:
-        UserError: the server was started in another way: better none than an open one.
+        UserError: the server was started in another way, and so would be open.
     """
     import websockets.asyncio.server as module
 
@@ -128,13 +128,13 @@ def guarded(key: str | None) -> Iterator[None]:
         nonlocal started
         started = True
 
-        def look(connection: Any, request: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
             why = refusal(request.headers, key)
             if why is not None:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, why)
             return None if process_request is None else process_request(connection, request)
 
-        return start(*args, process_request=look, **options)
+        return start(*args, process_request=check, **options)
 
     module.serve = serve  # type: ignore[assignment]
     try:
@@ -146,18 +146,19 @@ def guarded(key: str | None) -> Iterator[None]:
 
 
 class Proxy:
-    """Passes on to ``port`` on 127.0.0.1 who has the token. Runs on a thread of its own until ``stop``.
+    """Forwards requests that have the token to ``port`` on 127.0.0.1. Runs on a thread of its own until ``stop``.
 
     Args:
-        port: of the editor.
-        host, public: where to listen; 0 takes any port.
-        key: what the editor's ``guarded`` port knows it by.
+        port: port of the editor.
+        key: secret that identifies the proxy to the editor's ``guarded`` port.
+        host: interface to listen on.
+        public: port to listen on; 0: any.
 
-    Attributes: ``token``, ``public`` (the port), ``url`` (as seen from this machine, with the token), ``cookie`` (the
-    name of the one that keeps the token).
+    Attributes: ``token``, ``public`` (the port), ``url`` (from this machine, with the token), ``cookie`` (name of the
+    cookie that holds the token).
 
     Raises:
-        UserError: it cannot listen there.
+        UserError: the port is not available.
     """
 
     def __init__(self, port: int, key: str, host: str = "0.0.0.0", public: int = 0) -> None:
@@ -165,7 +166,7 @@ class Proxy:
         self.token = secrets.token_urlsafe(24)
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._strangers = 0
+        self._pending = 0
         self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
         self._thread.start()
         try:
@@ -183,7 +184,7 @@ class Proxy:
         return f"{COOKIE}{self.public}"
 
     def stop(self) -> None:
-        """Every connection ends."""
+        """End every connection and stop listening."""
 
         async def close() -> None:
             self._server.close()
@@ -197,7 +198,7 @@ class Proxy:
             self._thread.join(10)
 
     async def _listen(self) -> asyncio.Server:
-        server = await asyncio.start_server(self._serve, self.host, self.public, limit=MOST_HEAD)
+        server = await asyncio.start_server(self._serve, self.host, self.public, limit=MAX_HEAD_BYTES)
         self.public = server.sockets[0].getsockname()[1]
         return server
 
@@ -208,32 +209,32 @@ class Proxy:
         try:
             await self._answer(reader, writer)
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.TimeoutError):
-            pass  # whoever asked is gone, too slow or sends nonsense
+            pass  # the client is gone, too slow, or sends no valid request
         finally:
             self._tasks.discard(task)
             writer.close()
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._strangers >= MOST_STRANGERS:
+        if self._pending >= MAX_PENDING:
             return
-        self._strangers += 1
+        self._pending += 1
         try:
             head = await self._admit(reader, writer)
         finally:
-            self._strangers -= 1
+            self._pending -= 1
         if head is None:
             return
         origin = head.get("origin")
         if (head.upgrades or origin is not None) and not same_origin(origin, head.get("host")):
             return await _reply(writer, "403 Forbidden", "a page from elsewhere may not use the editor")
         if "token" in parse_qs(urlsplit(head.target).query):
-            # From here on the cookie says it: the token stands in no address, so in no history and no Referer
+            # The cookie replaces the token in the address, which would end up in the history and in Referer headers.
             cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
             return await _reply(writer, "303 See Other", "", f"Location: /\r\nSet-Cookie: {cookie}\r\n")
         await self._pass_on(head, reader, writer)
 
-    async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Head | None:
-        """The head of a request that has the token; None if it was refused."""
+    async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> RequestHead | None:
+        """Return the head of a request that has the token; None if the request was refused."""
         text = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
         head = parse_head(text)
         if head is None:
@@ -245,18 +246,18 @@ class Proxy:
             return None
         return head
 
-    def _given(self, head: Head) -> str | None:
-        """The token of a request: in its address, once, then in the cookie."""
+    def _given(self, head: RequestHead) -> str | None:
+        """Return the token of a request, from its address or from the cookie."""
         asked = parse_qs(urlsplit(head.target).query).get("token")
         if asked is not None:
             return asked[0] if len(asked) == 1 else None
         return cookies(head.get("cookie") or "").get(self.cookie)
 
-    async def _pass_on(self, head: Head, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Head first, then bytes both ways. One request a connection, unless it becomes a WebSocket: what is not
-        looked at is not handed on."""
-        kept = [(name, value) for name, value in head.headers if name not in (KEY, "cookie", "connection")]
-        kept += [(KEY, self.key), ("connection", "Upgrade" if head.upgrades else "close")]
+    async def _pass_on(self, head: RequestHead, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Forward the head, then bytes in both directions. A connection carries one request, unless it becomes a
+        WebSocket, so that no unchecked request is forwarded."""
+        kept = [(name, value) for name, value in head.headers if name not in (KEY_HEADER, "cookie", "connection")]
+        kept += [(KEY_HEADER, self.key), ("connection", "Upgrade" if head.upgrades else "close")]
         lines = [f"{head.method} {head.target} HTTP/1.1", *(f"{name}: {value}" for name, value in kept)]
         inside_reader, inside_writer = await asyncio.open_connection("127.0.0.1", self.port)
         try:

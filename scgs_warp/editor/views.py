@@ -1,4 +1,4 @@
-"""Which client needs which picture next, and how large: newest state only, never a queue."""
+"""Schedule of the clients' pictures and their sizes. Only the newest state of a client is drawn; nothing queues up."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ..edit.rotations import to_matrix
 from ..types import Camera
 
 STILL = 0.25
-"""Seconds without a change after which a picture is drawn in full."""
+"""Seconds without a change after which a picture is drawn at full size."""
 LOW, FULL = "low", "full"
-SMALLEST = 96
+MIN_SIZE = 96
 
 
 @dataclass(frozen=True)
 class ClientCamera:
-    """A browser's view: OpenCV pose, vertical field of view in radians, and its canvas."""
+    """Camera of a browser: OpenCV pose, vertical field of view in radians, canvas in pixels."""
 
     wxyz: tuple[float, ...]
     position: tuple[float, ...]
@@ -30,16 +30,16 @@ class ClientCamera:
 
     @property
     def usable(self) -> bool:
-        """A hidden window has no size, and a broken page may send anything."""
+        """True if a picture can be drawn: a hidden window has no size, and a page may send anything."""
         numbers = (*self.wxyz, *self.position, self.fov)
         return all(map(math.isfinite, numbers)) and any(self.wxyz) and self.width > 0 and self.height > 0
 
     def at_size(self, size: int, share: float = 1.0) -> Camera:
-        """A camera of the renderer, on the CPU.
+        """Return a camera of the renderer, on the CPU.
 
         Args:
-            size: longer side in pixels of the whole canvas.
-            share: of the canvas' width that is drawn; the vertical field of view stays.
+            size: longer side of the whole canvas in pixels.
+            share: share of the canvas' width to draw; the vertical field of view stays.
         """
         scale = size / max(self.width, self.height)
         height = max(1, round(self.height * scale))
@@ -54,48 +54,48 @@ class ClientCamera:
 
 
 @dataclass
-class _View:
+class _ClientState:
     camera: ClientCamera
     changed: float
-    """When it last needed another picture."""
+    """Time of the latest change that needs another picture."""
     drawn: float = -math.inf
     state: Any = None
-    """(version, camera) of the last picture."""
+    """(version, camera) of the latest picture."""
     quality: str = ""
 
 
-class Views:
-    """One entry a client. Not thread safe: the worker's lock guards it."""
+class PictureSchedule:
+    """Decides whose picture is drawn next. Not thread safe: the worker's lock guards it."""
 
     def __init__(self) -> None:
-        self._views: dict[int, _View] = {}
+        self._clients: dict[int, _ClientState] = {}
         self._version = 0
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self._clients)
 
     def move(self, client: int, camera: ClientCamera, now: float) -> None:
-        """A client's camera, new or changed."""
-        view = self._views.get(client)
+        """Register a client's camera, new or changed."""
+        view = self._clients.get(client)
         if view is None:
-            self._views[client] = _View(camera, now)
+            self._clients[client] = _ClientState(camera, now)
         elif view.camera != camera:
             view.camera, view.changed = camera, now
 
     def drop(self, client: int) -> None:
-        self._views.pop(client, None)
+        self._clients.pop(client, None)
 
     def change(self, now: float) -> None:
-        """The scene looks different to everybody."""
+        """Register a change of the scene, which all clients see."""
         self._version += 1
-        for view in self._views.values():
+        for view in self._clients.values():
             view.changed = now
 
     def camera(self, client: int) -> ClientCamera | None:
-        view = self._views.get(client)
+        view = self._clients.get(client)
         return None if view is None else view.camera
 
-    def _wants(self, view: _View, now: float, busy: bool) -> str | None:
+    def _wants(self, view: _ClientState, now: float, busy: bool) -> str | None:
         if not view.camera.usable:
             return None
         still = not busy and now - view.changed >= STILL
@@ -104,26 +104,26 @@ class Views:
         return FULL if still and view.quality == LOW else None
 
     def next(self, now: float, busy: bool) -> tuple[int, str] | None:
-        """(client, quality) of the picture that is due, of the client who has waited longest; it counts as drawn from
-        here on, so that what changes meanwhile is drawn again."""
-        due = [(view.drawn, client) for client, view in self._views.items() if self._wants(view, now, busy)]
+        """Return (client, quality) of the picture that is due, for the client that has waited longest. The picture
+        counts as drawn from now on, so that changes during its drawing request another."""
+        due = [(view.drawn, client) for client, view in self._clients.items() if self._wants(view, now, busy)]
         if not due:
             return None
         client = min(due)[1]
-        view = self._views[client]
+        view = self._clients[client]
         quality = self._wants(view, now, busy) or LOW
         view.drawn, view.state, view.quality = now, (self._version, view.camera), quality
         return client, quality
 
     def settled(self, now: float, busy: bool) -> bool:
-        """Whether every client that has a window has its last and full picture."""
+        """Return whether every visible client has its latest picture at full size."""
         return all(self._wants(view, now, busy) is None and view.quality == FULL for view in self._seen())
 
-    def _seen(self) -> list[_View]:
-        return [view for view in self._views.values() if view.camera.usable]
+    def _seen(self) -> list[_ClientState]:
+        return [view for view in self._clients.values() if view.camera.usable]
 
     def wait(self, now: float, busy: bool) -> float | None:
-        """Seconds until the next picture is due if nothing happens; None: never."""
+        """Return the seconds until the next picture is due without further changes; None: never."""
         rough = [view for view in self._seen() if view.quality == LOW]
         if not rough or busy:
             return None
@@ -131,11 +131,12 @@ class Views:
 
 
 class Pace:
-    """The size that a picture may have to be there in time, found by trying.
+    """Adapts the size of pictures to a target time.
 
     Args:
-        seconds: what a picture may take.
-        size, limit: the longer side in pixels to begin with, and at most.
+        seconds: target time of a picture.
+        size: initial longer side in pixels.
+        limit: largest longer side in pixels.
     """
 
     def __init__(self, seconds: float, size: int, limit: int) -> None:
@@ -144,9 +145,9 @@ class Pace:
 
     @property
     def size(self) -> int:
-        return max(SMALLEST, min(self.limit, 16 * round(self._size / 16)))
+        return max(MIN_SIZE, min(self.limit, 16 * round(self._size / 16)))
 
     def took(self, seconds: float) -> None:
-        """Learn from a picture of the present size; a single slow one counts little."""
+        """Adapt to the time that a picture of the present size took, by at most 20 percent."""
         change = math.sqrt(self.seconds / max(seconds, 1e-4))
-        self._size = min(max(self._size * min(max(change, 0.8), 1.2), SMALLEST), self.limit)
+        self._size = min(max(self._size * min(max(change, 0.8), 1.2), MIN_SIZE), self.limit)

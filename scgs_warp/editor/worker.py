@@ -1,7 +1,7 @@
-"""The one thread that computes: pictures for every client, what callbacks ask for, and jobs in the gaps.
+"""Worker thread that does all computation: calls of callbacks, pictures for every client, and pieces of jobs.
 
-Solving and rendering keep caches and use every core, so they happen one after the other. What a user waits for comes
-first: calls, then pictures, then the pictures of a film in the making.
+Solving and rendering share caches and use every core, and so run one after another, in this order of priority: calls,
+pictures, pieces of jobs.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from typing import Any, TypeVar
 
 import torch
 
-from .views import Views
+from .views import PictureSchedule
 
 Result = TypeVar("Result")
 PATIENCE = 1.0
-"""Seconds after which a job's call comes before the next picture."""
+"""Seconds after which a piece of a job takes precedence over pictures."""
 
 
 class Worker:
-    """Runs calls and draws the pictures that ``views`` says are due.
+    """Runs calls and draws the pictures that ``schedule`` says are due.
 
     Args:
-        views: who needs a picture; guarded by this worker's lock.
+        schedule: pictures that are due; guarded by this worker's lock.
         draw: called with (client, quality) without the lock, from this thread only.
-        busy: whether something is being dragged or played.
-        failed: called with the client and the error where ``draw`` raises, while that is being handled.
+        busy: returns whether something is being dragged or played.
+        failed: called with the client and the error if ``draw`` raises, inside the ``except`` block.
     """
 
     def __init__(
         self,
-        views: Views,
+        schedule: PictureSchedule,
         draw: Callable[[int, str], None],
         busy: Callable[[], bool],
         clock: Callable[[], float] = time.monotonic,
         failed: Callable[[int, Exception], None] | None = None,
     ) -> None:
         self._failed = failed
-        self.views, self._draw, self._busy, self._clock = views, draw, busy, clock
+        self.schedule, self._draw, self._busy, self._clock = schedule, draw, busy, clock
         self._condition = threading.Condition()
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._patient: deque[tuple[float, Future[Any], Callable[[], Any]]] = deque()
@@ -57,14 +57,14 @@ class Worker:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to do and nothing will be unless something changes."""
+        """True if there is no work now, nor later unless something changes."""
         with self._condition:
             if self._working or self._calls or self._patient:
                 return False
-            return self.views.settled(self._clock(), self._busy())
+            return self.schedule.settled(self._clock(), self._busy())
 
     def stop(self) -> None:
-        """Returns when the picture under way is done; calls that still wait are cancelled."""
+        """Finish the present task, cancel waiting calls, and return."""
         with self._condition:
             self._stopped = True
             waiting = [call[0] for call in self._calls] + [call[1] for call in self._patient]
@@ -78,16 +78,16 @@ class Worker:
 
     @contextlib.contextmanager
     def changing(self):
-        """Hold this to change ``views``; whatever is due then is drawn."""
+        """Yield the schedule for changes, under the lock; then draw what is due."""
         with self._condition:
-            yield self.views
+            yield self.schedule
             self._condition.notify_all()
 
     def call(self, action: Callable[[], Result], *, patient: bool = False) -> Result:
-        """What ``action`` returns, computed on the worker's thread.
+        """Run ``action`` on the worker's thread and return its result.
 
         Args:
-            patient: pictures for users come first, but not for ever.
+            patient: let pictures go first, for at most ``PATIENCE`` seconds.
 
         Raises:
             concurrent.futures.CancelledError: the worker was stopped; or whatever ``action`` raises.
@@ -106,39 +106,41 @@ class Worker:
         return future.result()
 
     def _run(self) -> None:
-        torch.set_flush_denormal(True)  # a property of the thread: without it bits differ from a script's
+        torch.set_flush_denormal(True)  # a setting of the thread; without it bits differ from a script's
         while True:
             with self._condition:
-                task = self._next()
+                task = self.next_task()
                 while task is None:
                     if self._stopped:
                         return
                     self._working = False
-                    self._condition.wait(self.views.wait(self._clock(), self._busy()))
-                    task = self._next()
+                    self._condition.wait(self.schedule.wait(self._clock(), self._busy()))
+                    task = self.next_task()
                 self._working = True
             task()
 
-    def _next(self) -> Callable[[], None] | None:
-        if self._stopped:
-            return None
-        if self._calls:
-            future, action = self._calls.popleft()
-            return lambda: _fulfil(future, action)
-        now = self._clock()
-        due = self.views.next(now, self._busy())
-        if self._patient and (due is None or now - self._patient[0][0] > PATIENCE):
-            _, future, action = self._patient.popleft()
-            return lambda: _fulfil(future, action)
-        if due is None:
-            return None
-        client, quality = due
-        return lambda: self._picture(client, quality)
+    def next_task(self) -> Callable[[], None] | None:
+        """Take the next piece of work; the worker's thread runs it. None: nothing is due, or the worker was stopped."""
+        with self._condition:
+            if self._stopped:
+                return None
+            if self._calls:
+                future, action = self._calls.popleft()
+                return lambda: _fulfil(future, action)
+            now = self._clock()
+            due = self.schedule.next(now, self._busy())
+            if self._patient and (due is None or now - self._patient[0][0] > PATIENCE):
+                _, future, action = self._patient.popleft()
+                return lambda: _fulfil(future, action)
+            if due is None:
+                return None
+            client, quality = due
+            return lambda: self._picture(client, quality)
 
     def _picture(self, client: int, quality: str) -> None:
         try:
             self._draw(client, quality)
-        except Exception as error:  # a picture that fails must not take the editor with it
+        except Exception as error:  # a failed picture must not end the editor
             if self._failed is None:
                 traceback.print_exc(file=sys.stderr)
                 return

@@ -1,4 +1,4 @@
-"""Files that other programs open: one Python file per family of formats, described in ``docs/formats.md``.
+"""Writers of files that other programs open, one module per family of formats; ``docs/formats.md`` describes them.
 
-:func:`scgs_warp.export.run.export` writes what a :class:`~scgs_warp.export.request.Request` asks for.
+:func:`scgs_warp.export.run.export` carries out an :class:`~scgs_warp.export.request.ExportRequest`.
 """

@@ -20,14 +20,14 @@ def write_cameras(path: Path, splits: Mapping[str, Dataset]) -> int:
     ``file_path`` is ``SPLIT/NAME.png``.
 
     Args:
-        splits: data sets by the names of their splits; cameras as the run saw them: world units, after downscaling and
-            without lens distortion.
+        splits: data sets by the names of their splits, with cameras as used in training: world units, after downscaling
+            and without lens distortion.
 
     Returns:
         Number of cameras.
 
     Raises:
-        UserError: the place cannot be written.
+        UserError: the file cannot be written.
     """
     entries, lists = [], {}
     for split, data in splits.items():

@@ -1,4 +1,4 @@
-"""The control graph as an animated glTF mesh: an octahedron for every control point, a thin bar for every edge."""
+"""The control graph as an animated glTF mesh, with an octahedron for each control point and a bar for each edge."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ import numpy as np
 
 from ..visualization.overlay import position_colors
 from .glb import point_colors
-from .gltf import INDICES, VERTICES, Document, add_skeleton
+from .gltf import INDICES, VERTICES, GltfDocument, add_skeleton
 from .skeleton import Skeleton
 
 POINT, EDGE = 0.12, 0.02
-"""Radii of octahedra and bars, in lengths of the median edge."""
+"""Radii of octahedra and bars, relative to the median edge length."""
 GREY = 0.35
 CORNERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
 FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
 SIDES = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]])
-"""Of a bar, whose corners are three at its first end, then three at its second."""
+"""Triangles of a bar, whose corners are three at its first end, then three at its second."""
 
 
 def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[float, float, float]) -> None:
     """Write control points as an animated skeleton and a mesh bound to it, which any glTF viewer plays.
 
     Args:
-        edges: [E, 2] control points that are tied to each other.
-        up: unit vector; it is +y in the file.
+        edges: [E, 2] connected control points.
+        up: unit vector that becomes +y in the file.
 
     Raises:
-        UserError: the place cannot be written, or the file would be too large.
+        UserError: the file cannot be written, or would be too large.
     """
     rest = skeleton.rest
     spans = rest[edges[:, 1]] - rest[edges[:, 0]]
@@ -42,7 +42,7 @@ def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[flo
     joints = np.concatenate([np.repeat(np.arange(count), 6), np.repeat(edges.reshape(-1), 3)])
     colors = position_colors(rest).astype(np.float64) / 255.0
     colors = np.concatenate([np.repeat(colors, 6, axis=0), np.full((len(bars), 3), GREY)])
-    document = Document()
+    document = GltfDocument()
     bound = np.zeros((len(joints), 4), "<u2")
     bound[:, 0] = joints
     weights = np.zeros((len(joints), 4), "<f4")
@@ -71,10 +71,10 @@ def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[flo
 
 
 def _bars(rest: np.ndarray, edges: np.ndarray, spans: np.ndarray, radius: float) -> np.ndarray:
-    """[6 E, 3] corners: a triangle across each edge at either end."""
+    """Return corners [6 E, 3]: a triangle across each edge at either end."""
     lengths = np.linalg.norm(spans, axis=1, keepdims=True)
     along = np.where(lengths > 0, spans / np.where(lengths > 0, lengths, 1.0), (0.0, 0.0, 1.0))
-    helper = np.eye(3)[np.abs(along).argmin(axis=1)]  # whichever axis lies most across
+    helper = np.eye(3)[np.abs(along).argmin(axis=1)]  # the axis most perpendicular to the edge
     across = np.cross(along, helper)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     third = np.cross(along, across)
@@ -84,14 +84,14 @@ def _bars(rest: np.ndarray, edges: np.ndarray, spans: np.ndarray, radius: float)
 
 
 def _away(bars: np.ndarray) -> np.ndarray:
-    """[6 E, 3] unit normals that point away from each bar's axis."""
+    """Return unit normals [6 E, 3] that point away from each bar's axis."""
     ends = bars.reshape(-1, 3, 3)
     out = ends - ends.mean(axis=1, keepdims=True)
     return (out / np.linalg.norm(out, axis=2, keepdims=True)).reshape(-1, 3)
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
-    """[V, 4] uint16 opaque linear colours."""
+    """Convert sRGB colours to opaque linear ones, [V, 4] uint16."""
     from ..gaussians import SH_C0
 
     return point_colors((srgb - 0.5) / SH_C0, np.ones(len(srgb)))

@@ -1,4 +1,4 @@
-"""Gaussians in glTF: points with the attributes of ``KHR_gaussian_splatting``, still or bound to a moving skeleton."""
+"""Gaussians in glTF: points with the attributes of ``KHR_gaussian_splatting``, static or bound to a moving skeleton."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 
 from ..gaussians import SH_C0
 from ..types import Gaussians
-from .gltf import VERTICES, Document, add_skeleton, influences, upright, xyzw
+from .gltf import VERTICES, GltfDocument, add_skeleton, influences, upright, xyzw
 from .skeleton import Skeleton
 
 EXTENSION = "KHR_gaussian_splatting"
-HOW = {
+RENDERING = {
     "kernel": "ellipse",
-    "colorSpace": "srgb_rec709_display",  # training images are sRGB, and so is what is blended
+    "colorSpace": "srgb_rec709_display",  # training images, and so the blended colours, are sRGB
     "sortingMethod": "cameraDistance",
     "projection": "perspective",
 }
@@ -24,37 +24,37 @@ HOW = {
 def write_glb(
     path: Path, gaussians: Gaussians, up: tuple[float, float, float], skeleton: Skeleton | None = None
 ) -> None:
-    """Write activated Gaussians, world units; positions are stored as they are, under a node that turns ``up`` to +y.
+    """Write activated Gaussians, world units; positions are stored unchanged, under a node that turns ``up`` to +y.
 
     Args:
         up: unit vector.
-        skeleton: what moves them; they are then at rest. None: they stand still.
+        skeleton: motion of the Gaussians, which are then at rest. None: they are static.
 
     Raises:
-        UserError: the place cannot be written, or the file would be too large.
+        UserError: the file cannot be written, or would be too large.
     """
-    document = Document()
+    document = GltfDocument()
     document.json["extensionsUsed"] = [EXTENSION]
     attributes = _attributes(document, gaussians)
-    # A bound mesh's own node turns nothing, by the standard; this one is for programs that leave points unbound.
+    # The standard ignores the node transform of a skinned mesh; this one is for programs that do not skin points.
     node: dict[str, Any] = {"name": "Gaussians", "rotation": upright(up)}
     if skeleton is not None:
         for index, (joints, weights) in enumerate(influences(skeleton.indices, skeleton.weights)):
             attributes[f"JOINTS_{index}"] = document.accessor(joints, target=VERTICES)
             attributes[f"WEIGHTS_{index}"] = document.accessor(weights, target=VERTICES)
         node["skin"] = add_skeleton(document, skeleton, up, "motion")
-    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: HOW}}
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: RENDERING}}
     node["mesh"] = document.append("meshes", {"name": "Gaussians", "primitives": [primitive]})
     document.json["scenes"][0]["nodes"].insert(0, document.append("nodes", node))
     document.write(path)
 
 
-def _attributes(document: Document, gaussians: Gaussians) -> dict[str, int]:
+def _attributes(document: GltfDocument, gaussians: Gaussians) -> dict[str, int]:
     def add(values: np.ndarray, **options: Any) -> int:
         return document.accessor(values, target=VERTICES, **options)
 
     arrays = {name: value.detach().cpu().numpy() for name, value in vars(gaussians).items()}
-    found = {
+    attributes = {
         "POSITION": add(arrays["means"].astype("<f4"), bounds=True),
         "COLOR_0": add(point_colors(arrays["sh_dc"], arrays["opacities"]), normalized=True),
         f"{EXTENSION}:ROTATION": add(xyzw(arrays["quats"])),
@@ -65,13 +65,13 @@ def _attributes(document: Document, gaussians: Gaussians) -> dict[str, int]:
     rest, place = arrays["sh_rest"].astype("<f4"), 0
     for degree in range(1, round((rest.shape[1] + 1) ** 0.5)):
         for order in range(2 * degree + 1):
-            found[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = add(rest[:, place])
+            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = add(rest[:, place])
             place += 1
-    return found
+    return attributes
 
 
 def point_colors(sh_dc: np.ndarray, opacities: np.ndarray) -> np.ndarray:
-    """[N, 4] uint16, for programs that show points: glTF wants linear light where Gaussians have sRGB."""
+    """Return linear RGB and opacity [N, 4] uint16, for programs that show points; Gaussians hold sRGB."""
     srgb = (0.5 + SH_C0 * sh_dc.astype(np.float64)).clip(0.0, 1.0)
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.rint(65535 * np.column_stack([linear, opacities.clip(0.0, 1.0)])).astype("<u2")

@@ -1,4 +1,4 @@
-"""glTF 2.0 as one binary file: accessors in, bytes out. y is up there: scenes are turned by their root nodes."""
+"""Writing of binary glTF 2.0. glTF has y up, so root nodes turn scenes upright."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .skeleton import Skeleton
 COMPONENTS = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}
 KINDS = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 VERTICES, INDICES = 34962, 34963
-"""Targets of buffer views."""
-LARGEST = 2**32 - 1
+"""Targets of buffer views: vertex attributes and indices."""
+MAX_BYTES = 2**32 - 1
 
 
-class Document:
-    """A glTF file in the making. ``json`` may be filled by hand; what is appended gets the index that is returned."""
+class GltfDocument:
+    """A glTF file under construction. Callers may edit ``json`` directly; methods that append return the new index."""
 
     def __init__(self) -> None:
         self.json: dict[str, Any] = {
@@ -35,13 +35,13 @@ class Document:
         self._size = 0
 
     def append(self, group: str, item: dict[str, Any]) -> int:
-        """Put an item into ``nodes``, ``meshes`` or another list of the file."""
-        found = self.json.setdefault(group, [])
-        found.append(item)
-        return len(found) - 1
+        """Append an item to ``nodes``, ``meshes`` or another list of the file, and return its index."""
+        items = self.json.setdefault(group, [])
+        items.append(item)
+        return len(items) - 1
 
     def view(self, content: bytes, target: int | None = None) -> int:
-        """A buffer view of its own."""
+        """Append bytes as a buffer view and return its index."""
         item = {"buffer": 0, "byteOffset": self._size, "byteLength": len(content)}
         padding = b"\0" * (-len(content) % 4)
         self._parts += [content, padding]
@@ -51,11 +51,12 @@ class Document:
     def accessor(
         self, values: np.ndarray, *, target: int | None = None, bounds: bool = False, normalized: bool = False
     ) -> int:
-        """An array [N], [N, C] or [N, 4, 4] (column by column) of float32 or unsigned integers, in a view of its own.
+        """Append an array [N], [N, C] or [N, 4, 4] (column-major) of float32 or unsigned integers; return its index.
 
         Args:
             target: ``VERTICES``, ``INDICES``, or None for neither.
-            bounds: state the smallest and largest values, as positions and times of animations must.
+            bounds: write the smallest and largest values, which positions and animation times require.
+            normalized: integers stand for fractions of their largest value.
         """
         values = np.ascontiguousarray(values)
         values = values.astype(values.dtype.newbyteorder("<"), copy=False)
@@ -66,7 +67,7 @@ class Document:
         return self.append("accessors", {**item, "normalized": True} if normalized else item)
 
     def tracks(self, values: np.ndarray) -> list[int]:
-        """One accessor for each of M tracks [M, T, C] of float32, all in one view."""
+        """Append M tracks [M, T, C] of float32 in one buffer view; return an accessor for each."""
         values = np.ascontiguousarray(values, "<f4")
         view = self.view(values.tobytes())
         step = values[0].nbytes
@@ -81,10 +82,10 @@ class Document:
         return {"bufferView": view, "componentType": kind, "count": len(values), "type": KINDS[values.shape[1:]]}
 
     def content(self) -> bytes:
-        """The file.
+        """Return the bytes of the file.
 
         Raises:
-            UserError: it is larger than the format can be, or a number is not finite.
+            UserError: the file exceeds the format's limit, or a number is not finite.
         """
         whole = {**self.json, "buffers": [{"byteLength": self._size}]}
         try:
@@ -93,23 +94,23 @@ class Document:
             raise UserError("the .glb would hold numbers that are not finite; train again with a lower rate") from None
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + self._size
-        if total > LARGEST:
+        if total > MAX_BYTES:
             raise UserError(f"the .glb would have {total / 2**30:.1f} GiB; the format ends at 4: give fewer --frames")
         head = struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A)
         return b"".join([head, text, struct.pack("<II", self._size, 0x004E4942), *self._parts])
 
     def write(self, path: Path) -> None:
-        """All of it or nothing.
+        """Write the file atomically.
 
         Raises:
-            UserError: too large, or the place cannot be written.
+            UserError: the file is too large or cannot be written.
         """
         write_atomically(path, self.content())
 
 
 def upright(up: tuple[float, float, float]) -> list[float]:
-    """xyzw of the shortest turn that brings ``up`` to +y; half a turn about x where it is -y, as of cameras that look
-    along z with y down."""
+    """Return the shortest turn from ``up`` to +y as xyzw. If ``up`` is -y, as in OpenCV's convention, it is half a turn
+    about x."""
     x, y, z = unit([*up, 0.0])[:3]
     if y < -1.0 + 1e-9:
         return [1.0, 0.0, 0.0, 0.0]
@@ -118,12 +119,12 @@ def upright(up: tuple[float, float, float]) -> list[float]:
 
 
 def xyzw(quats: np.ndarray) -> np.ndarray:
-    """Unit quaternions [..., 4] wxyz in glTF's order, float32."""
+    """Convert quaternions [..., 4] from wxyz to glTF's order, normalised, float32."""
     return unit(quats)[..., [1, 2, 3, 0]].astype("<f4")
 
 
-def add_skeleton(document: Document, skeleton: Skeleton, up: tuple[float, float, float], name: str) -> int:
-    """Joints ``node_0000`` and so on under one root, their animation, and the skin that binds vertices at rest.
+def add_skeleton(document: GltfDocument, skeleton: Skeleton, up: tuple[float, float, float], name: str) -> int:
+    """Append joints ``node_0000`` and so on under one root, their animation, and the skin that binds vertices at rest.
 
     Returns:
         Index of the skin.
@@ -140,7 +141,7 @@ def add_skeleton(document: Document, skeleton: Skeleton, up: tuple[float, float,
     root = document.append("nodes", {"name": "control points", "rotation": upright(up), "children": joints})
     document.json["scenes"][0]["nodes"].append(root)
     bind = np.tile(np.eye(4), (len(joints), 1, 1))
-    bind[:, 3, :3] = -skeleton.rest  # column by column
+    bind[:, 3, :3] = -skeleton.rest  # column-major
     skin = {"inverseBindMatrices": document.accessor(bind.astype("<f4")), "joints": joints, "skeleton": root}
     if len(skeleton.seconds) > 1:
         when = document.accessor(skeleton.seconds.astype("<f4"), bounds=True)
@@ -154,13 +155,13 @@ def add_skeleton(document: Document, skeleton: Skeleton, up: tuple[float, float,
 
 
 def influences(indices: np.ndarray, weights: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Joints [N, 4] uint16 and weights [N, 4] float32 in sets of four, the largest weights first; rows sum to 1."""
+    """Split influences into sets of joints [N, 4] uint16 and weights [N, 4] float32, largest first; rows sum to 1."""
     order = np.argsort(-weights, axis=1, kind="stable")
     joints, shares = np.take_along_axis(indices, order, 1), np.take_along_axis(weights, order, 1)
     shares = np.where(shares < 1e-8, 0.0, shares).astype(np.float32)
-    shares[:, 0] += 1.0 - shares.sum(axis=1, dtype=np.float64)  # what rounding left
+    shares[:, 0] += 1.0 - shares.sum(axis=1, dtype=np.float64)  # the remainder of rounding
     width = -shares.shape[1] % 4
-    joints = np.where(shares > 0, joints, 0)  # as the format wants it of unused ones
+    joints = np.where(shares > 0, joints, 0)  # the format requires joint 0 where the weight is 0
     joints, shares = np.pad(joints, ((0, 0), (0, width))), np.pad(shares, ((0, 0), (0, width)))
     sets = range(0, joints.shape[1], 4)
     return [(joints[:, first : first + 4].astype("<u2"), shares[:, first : first + 4]) for first in sets]

@@ -1,5 +1,7 @@
-"""A moving scene as plain arrays: Gaussians at rest, what they follow, and where that goes. ``docs/formats.md`` has a
-player of a few lines."""
+"""A moving scene as plain arrays: Gaussians at rest, skinning weights, and trajectories of control points.
+
+``docs/formats.md`` has a player of a few lines.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +30,12 @@ def write_npz(
 
     Args:
         rest: activated Gaussians before any motion.
-        skeleton: its Gaussians are these.
-        shading: [N, 10] brightness that follows the turn of the surface; None: there is none.
+        skeleton: motion of the same Gaussians.
+        shading: [N, 10] coefficients of the brightness that follows the surface's rotation; None: no shading.
         up: unit vector.
 
     Raises:
-        UserError: the place cannot be written.
+        UserError: the file cannot be written.
     """
     quats = rest.quats.detach().cpu().double().numpy()
     arrays: dict[str, np.ndarray] = {

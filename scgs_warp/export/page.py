@@ -1,4 +1,4 @@
-"""A page that plays a moving scene in a browser: one file, no server, no network. docs/page.md describes it."""
+"""A page that plays a moving scene in a browser, as one file without server or network; see docs/page.md."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .page_scene import page_scene
 
 SCRIPTS = ("data", "camera", "renderer", "player", "controls", "main")
 SHADERS = ("splat.frag", "draw.vert", "draw.frag", "screen.vert", "screen.frag")
-MOST_DEGREE = 3
+MAX_DEGREE = 3
 WEB = Path(__file__).parent / "web"
 TITLE = "Moving scene"
 MIB = 2**20
@@ -27,18 +27,18 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
     """Write one HTML file that plays ``scene``; an existing file is replaced once the new one is complete.
 
     Args:
-        scene: with control points, or static.
-        path: ends in .html or .htm; missing folders above are made.
-        title: shown on the page, any text.
-        max_mib: the file's largest size in MiB. Colours lose their highest degrees of spherical harmonics, one by one,
+        scene: scene with control points, or a static one.
+        path: name that ends in .html or .htm; missing folders are made.
+        title: text shown on the page.
+        max_mib: largest size of the file in MiB. Colours lose their highest degrees of spherical harmonics, one by one,
             until it fits.
 
     Returns:
-        Number of Gaussians on the page: those that can be seen.
+        Number of Gaussians on the page, which holds the visible ones only.
 
     Raises:
-        UserError: the name does not end in .html; the motion model has no control points; the page does not fit; the
-            place cannot be written.
+        UserError: the name does not end in .html, the motion model has no control points, the page does not fit, or the
+            file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
@@ -57,9 +57,9 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
 
 
 def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> tuple[bytes, int]:
-    """The page of the highest degree that is small enough, and how many Gaussians it holds."""
+    """Return the page of the highest degree that fits, and its Gaussian count."""
     page = b""
-    for degree in range(min(scene.gaussians.sh_degree, MOST_DEGREE), -1, -1):
+    for degree in range(min(scene.gaussians.sh_degree, MAX_DEGREE), -1, -1):
         content = page_scene(scene, degree)
         page = assemble(pack(content.facts, content.columns), title)
         if max_mib is None or len(page) <= max_mib * MIB:
@@ -72,14 +72,14 @@ def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> tup
 
 
 def assemble(data: bytes, title: str = "") -> bytes:
-    """The page around its packed data: program, style and data in one UTF-8 text."""
-    program, style = _program(), _read("style.css")
+    """Assemble the page from packed data, program and style, as UTF-8."""
+    program, style = program_text(), _read("style.css")
     policy = (
-        # Nothing from the network, and no script but this one, whatever a title may hold
+        # No network access and no other script, whatever the title contains.
         f"default-src 'none'; script-src {_hash(program)} blob:; worker-src blob:; style-src {_hash(style)}; "
         "base-uri 'none'; form-action 'none'"
     )
-    title = title.encode("utf-8", "replace").decode()  # a file's name may hold what is no text
+    title = title.encode("utf-8", "replace").decode()  # file names may contain surrogates
     parts = {
         "policy": policy,
         "title": html.escape(" ".join(title.split()) or TITLE),
@@ -87,11 +87,11 @@ def assemble(data: bytes, title: str = "") -> bytes:
         "data": base64.b64encode(data).decode("ascii"),
         "program": program,
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], _read("index.html")).encode()
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match.group(1)], _read("index.html")).encode()
 
 
-def _program() -> str:
-    """All scripts as one, with the shaders and the worker's text as strings."""
+def program_text() -> str:
+    """Return all scripts as one program, with the shaders and the worker's source as strings."""
     shaders = json.dumps({name: _read(f"{name}.glsl") for name in SHADERS})
     sort = _read("sort.js")
     texts = [f"const SHADERS = {shaders};", f"const SHARED = {json.dumps({'sort': sort})};", sort]
@@ -103,7 +103,7 @@ def _program() -> str:
 
 
 def _read(name: str) -> str:
-    return (WEB / name).read_text(encoding="utf-8")  # with \n alone, as the browser will hash it
+    return (WEB / name).read_text(encoding="utf-8")  # newlines as \n, as the browser hashes them
 
 
 def _hash(text: str) -> str:

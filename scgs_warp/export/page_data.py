@@ -1,7 +1,7 @@
-"""What a page holds, as columns of small integers: docs/page.md describes the layout.
+"""Packing of a page's data as columns of small integers; docs/page.md describes the layout.
 
-A column is quantised to as many bits as its precision needs, and its bytes are stored plane by plane: deflate then
-stores a plane whose values use a few bits in about so many, and the reader needs one loop for everything.
+A column is quantised to as many bits as its precision needs, and its bytes are stored plane by plane, so that deflate
+compresses a plane to about the bits that its values use, and the reader needs a single loop.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from ..errors import UserError
 
 VERSION = 1
 COMMON, SPREAD = 0.999, 2.0
-"""Where codes are scarce, values beyond ``SPREAD`` times this quantile of their sizes are clipped: one outlier would
-coarsen all the others."""
+"""If the bits do not suffice, values beyond ``SPREAD`` times the quantile ``COMMON`` of their magnitudes are clipped,
+because a single outlier would coarsen all the others."""
 LEVEL = 6
-"""Of deflate: the highest takes four times as long, for half a percent."""
+"""Compression level of deflate; the highest takes four times as long for half a percent."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One sequence of numbers: ``low + step * code``, codes of ``bits`` bits."""
+    """Sequence of numbers ``low + step * code`` with codes of ``bits`` bits."""
 
     name: str
     codes: np.ndarray
@@ -36,14 +36,14 @@ class Column:
     low: float = 0.0
     step: float = 1.0
     delta: bool = False
-    """Stored as differences of neighbours, modulo 2 ** bits: for what changes slowly along the rows."""
+    """True if differences of neighbours, modulo 2 ** bits, are stored: for values that change slowly along the rows."""
 
     def values(self) -> np.ndarray:
-        """[R] float64, what a reader gets."""
+        """Return the decoded values, [R] float64."""
         return self.low + self.step * self.codes.astype(np.float64)
 
     def planes(self) -> bytes:
-        """The stored bytes, lowest plane first."""
+        """Return the stored bytes, lowest plane first."""
         codes = self.codes.astype(np.uint32)
         if self.delta:
             codes = np.diff(codes, prepend=np.uint32(0)) & np.uint32((1 << self.bits) - 1)
@@ -61,8 +61,8 @@ class Column:
 
 
 def quantise(name: str, values: np.ndarray, step: float, *, most_bits: int = 24, delta: bool = False) -> Column:
-    """``values`` [R] as codes no wider than ``step``, the least and the largest exact. Where ``most_bits`` (1 to 24) do
-    not reach, outliers are clipped to the common range, and steps are wider if that is not enough.
+    """Quantise ``values`` [R] in steps of at most ``step``; the least and the largest value are exact. If ``most_bits``
+    (1 to 24) do not suffice, outliers are clipped to the common range, and steps widen if that is not enough.
 
     Raises:
         UserError: a value is not finite.
@@ -82,19 +82,19 @@ def quantise(name: str, values: np.ndarray, step: float, *, most_bits: int = 24,
 
 
 def common_size(values: np.ndarray) -> float:
-    """What no value of a sequence [R] that is not an outlier exceeds in size."""
+    """Return the magnitude beyond which values of a sequence [R] are outliers."""
     return SPREAD * float(np.quantile(np.abs(values), COMMON))
 
 
 def integers(name: str, values: np.ndarray, *, delta: bool = False) -> Column:
-    """Whole numbers >= 0, [R], kept exactly."""
+    """Store whole numbers >= 0, [R], exactly."""
     largest = int(values.max()) if len(values) else 0
     return Column(name, values.astype(np.uint32), max(1, largest.bit_length()), delta=delta)
 
 
 def pack(facts: dict[str, Any], columns: list[Column]) -> bytes:
-    """Length of the header (little endian, 4 bytes), the header (JSON: the facts and the columns), the planes; all of
-    it deflated. The same input gives the same bytes."""
+    """Pack facts and columns: length of the header (little endian, 4 bytes), header (JSON), planes, all deflated. The
+    same input gives the same bytes."""
     described = {"version": VERSION, **facts, "columns": [column.header() for column in columns]}
     header = json.dumps(described, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     header += b" " * (-len(header) % 4)
@@ -105,11 +105,11 @@ def pack(facts: dict[str, Any], columns: list[Column]) -> bytes:
 
 
 def unpack(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Inverse of :func:`pack`, as the page does it: the facts, and the values [R] float64 of every column by name."""
+    """Invert :func:`pack` as the page does: return the facts, and the values [R] float64 of every column by name."""
     raw = zlib.decompress(content)
     (length,) = struct.unpack_from("<I", raw)
     facts = json.loads(raw[4 : 4 + length])
-    offset, found = 4 + length, {}
+    offset, values = 4 + length, {}
     for column in facts.pop("columns"):
         rows, bits = column["rows"], column["bits"]
         codes = np.zeros(rows, np.uint32)
@@ -118,5 +118,5 @@ def unpack(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             offset += rows
         if column["delta"]:
             codes = np.cumsum(codes, dtype=np.uint32) & np.uint32((1 << bits) - 1)
-        found[column["name"]] = column["low"] + column["step"] * codes.astype(np.float64)
-    return facts, found
+        values[column["name"]] = column["low"] + column["step"] * codes.astype(np.float64)
+    return facts, values

@@ -1,4 +1,4 @@
-"""A scene as a page's columns: one set of Gaussians, their control points, and the control points' way through time."""
+"""A scene as a page's columns: Gaussians, their control points, and the trajectories of the control points."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ..motion.static_nodes import StaticNodes
 from ..scene.scene import Scene
 from .page_data import Column, common_size, integers, quantise
 
-FEWEST_SAMPLES, MOST_SAMPLES = 33, 257
-"""Times at which control points are sampled: twice as many, again and again ..."""
+MIN_SAMPLES, MAX_SAMPLES = 33, 257
+"""Number of times at which control points are sampled; it doubles until the error is below ``COARSE_ERROR``."""
 COARSE_ERROR = 8e-4
-"""... until they were off by no more than this (root mean square, normalised units and radians) halfway between two
-times before the last doubling, which leaves about a quarter of it."""
+"""Largest error (root mean square, normalised units and radians) halfway between two times before the last doubling,
+after which about a quarter of it remains."""
 POSE_PARTS = ("translation", "rotation", "shape", "log_scale")
 QUATERNIONS = ("rotation", "shape")
 TIMES_AT_ONCE = 16
-"""Of the network's evaluations, so that many control points do not need much memory."""
+"""Times per evaluation of the network, which limits memory for many control points."""
 STEPS = {
-    "mean": 2.5e-5,  # normalised units (what cameras saw has a radius of 1.4): a hundredth of a pixel at 800 x 800
+    "mean": 2.5e-5,  # normalised units (the visible scene has a radius of 1.4): a hundredth of a pixel at 800 x 800
     "quat": 1.4e-3,
     "log_scale": 0.02,
     "opacity": 1 / 255,
@@ -38,17 +38,17 @@ STEPS = {
     "rest": 1e-6,
     "pose": 1e-4,
 }
-"""How finely each part is stored; docs/page.md says what that costs."""
+"""Quantisation step of each part; docs/page.md gives the loss of quality."""
 FAR = 200.0
-"""Normalised units, as far as 24 bits reach in steps of a position: what lies farther than this, and more than twice as
-far as 99.9 % of the Gaussians, is left out."""
+"""Distance, normalised units, that 24 bits span in steps of a position. Gaussians beyond it that are also more than
+twice as far as 99.9 % of all are left out."""
 BYTE = 8
-"""Bits of ``sh_rest`` at most: the page unpacks bytes."""
+"""Largest number of bits of ``sh_rest``, because the page unpacks bytes."""
 
 
 @dataclass(frozen=True)
 class PageScene:
-    """Facts for the page's header, and its columns."""
+    """Facts for a page's header, and its columns."""
 
     facts: dict[str, Any]
     columns: list[Column]
@@ -58,7 +58,7 @@ def page_scene(scene: Scene, sh_degree: int) -> PageScene:
     """Quantise a scene for a page.
 
     Args:
-        sh_degree: of the colours; at most the scene's own.
+        sh_degree: degree of the spherical harmonics, at most the scene's own.
 
     Raises:
         UserError: the motion model has no control points to skin by, or no Gaussian can be seen.
@@ -84,7 +84,7 @@ def page_scene(scene: Scene, sh_degree: int) -> PageScene:
 
 
 def visible(gaussians: GaussianParameters) -> Tensor:
-    """[V] int64, the Gaussians that can be drawn at all: finite, and opaque enough to change an 8-bit picture."""
+    """Return indices [V] int64 of the Gaussians that are finite and opaque enough to change an 8-bit picture."""
     parts = (
         gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest.flatten(1),
         gaussians.shading, gaussians.hyper,
@@ -95,13 +95,13 @@ def visible(gaussians: GaussianParameters) -> Tensor:
 
 
 def near(points: Tensor) -> Tensor:
-    """[N] bool: all but strays, which would coarsen the places of all others."""
+    """Return [N] bool: all points but far outliers, which would coarsen the positions of all others."""
     sizes = points.abs().amax(dim=1)
     return sizes <= max(FAR, common_size(_array(sizes)))
 
 
 def morton_order(points: Tensor) -> Tensor:
-    """[N] int64 along a curve that keeps neighbours together: deflate stores what resembles its neighbour in less."""
+    """Return indices [N] int64 along a curve that keeps neighbours together, so that deflate compresses better."""
     cloud = points.cpu().double().numpy()
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     cells = ((cloud - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.uint64)
@@ -152,7 +152,7 @@ def _gaussian_columns(gaussians: GaussianParameters, kept: Tensor, sh_degree: in
 
 
 def _quaternion_columns(name: str, quats: np.ndarray) -> list[Column]:
-    """The largest of the four, as an index, is left out and made positive; the others lie within 1 / sqrt 2."""
+    """Store the index of the largest component, which is made positive, and the other three, within 1 / sqrt 2."""
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))
@@ -165,7 +165,7 @@ def _quaternion_columns(name: str, quats: np.ndarray) -> list[Column]:
 def _binding_columns(
     motion: ControlPoints, gaussians: GaussianParameters, kept: Tensor, facts: dict[str, Any]
 ) -> list[Column]:
-    """Which control points move a Gaussian, and the weights of all but the first: they sum to one."""
+    """Store each Gaussian's control points and all weights but the first, as they sum to one."""
     indices, weights = (value[kept] for value in motion.binding(gaussians))
     count = indices.shape[1]
     facts.update(nodes=len(motion), neighbors=count, masked=bool(motion.config.mask))
@@ -177,7 +177,7 @@ def _binding_columns(
 
 
 def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
-    """Rest positions, and the poses at evenly spaced times: of each node, one time after the other."""
+    """Store rest positions, and poses at evenly spaced times, node by node."""
     poses = sample_poses(motion)
     facts.update(samples=len(poses["translation"]), shapes="shape" in poses, scaled="log_scale" in poses)
     rest = _array(motion.positions)
@@ -189,15 +189,15 @@ def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
 
 
 def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
-    """[T, M, 3] ``translation``, [T, M, 4] ``rotation``, and where the model has them ``shape`` [T, M, 4] and
-    ``log_scale`` [T, M, 3], at T evenly spaced times; quaternions keep to their side from time to time.
+    """Sample ``translation`` [T, M, 3], ``rotation`` [T, M, 4], and if the model has them ``shape`` [T, M, 4] and
+    ``log_scale`` [T, M, 3], at T evenly spaced times, with quaternion signs continuous over time.
 
     Raises:
         UserError: a pose is not finite.
     """
-    count = FEWEST_SAMPLES
+    count = MIN_SAMPLES
     poses = _poses_at(motion, torch.linspace(0.0, 1.0, count))
-    while count < MOST_SAMPLES:
+    while count < MAX_SAMPLES:
         between = _poses_at(motion, (torch.arange(count - 1) + 0.5) / (count - 1))
         errors = [(2.0 if name in QUATERNIONS else 1.0) * _error(poses[name], between[name]) for name in poses]
         poses = {name: _interleaved(poses[name], between[name]) for name in poses}
@@ -208,14 +208,14 @@ def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
 
 
 def _interleaved(values: np.ndarray, between: np.ndarray) -> np.ndarray:
-    """[2 T - 1, ...] of [T, ...] and [T - 1, ...], by time."""
+    """Interleave [T, ...] and [T - 1, ...] to [2 T - 1, ...]."""
     merged = np.empty((len(values) + len(between), *values.shape[1:]))
     merged[::2], merged[1::2] = values, between
     return merged
 
 
 def _one_sided(quats: np.ndarray) -> np.ndarray:
-    """[T, M, 4] with signs such that no quaternion turns over from one time to the next."""
+    """Flip signs of quaternions [T, M, 4] such that they are continuous over time."""
     flips = (quats[1:] * quats[:-1]).sum(axis=2, keepdims=True) < 0
     quats = quats.copy()
     quats[1:] *= np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
@@ -223,8 +223,8 @@ def _one_sided(quats: np.ndarray) -> np.ndarray:
 
 
 def _error(values: np.ndarray, between: np.ndarray) -> float:
-    """Root mean square distance of the rows halfway between two times from the mean of the two; quaternions may lie on
-    either side."""
+    """Return the root mean square distance of the rows halfway between two times from the mean of the two; signs of
+    quaternions do not matter."""
     before, after = values[:-1], values[1:]
     if values.shape[2] == 4:
         before, after = (np.where((x * between).sum(2, keepdims=True) < 0, -x, x) for x in (before, after))
@@ -232,14 +232,14 @@ def _error(values: np.ndarray, between: np.ndarray) -> float:
 
 
 def _poses_at(motion: ControlPoints, times: Tensor) -> dict[str, np.ndarray]:
-    found: dict[str, list[np.ndarray]] = {}
+    samples: dict[str, list[np.ndarray]] = {}
     for part in times.split(TIMES_AT_ONCE):
         for pose in motion.poses(part):
             fields = pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales
             for name, value in zip(POSE_PARTS, fields, strict=True):
                 if value is not None:
-                    found.setdefault(name, []).append(_array(value))
-    poses = {name: np.stack(rows) for name, rows in found.items()}
+                    samples.setdefault(name, []).append(_array(value))
+    poses = {name: np.stack(rows) for name, rows in samples.items()}
     if not all(np.isfinite(rows).all() for rows in poses.values()):
         raise UserError(
             "--format html: the control points' motion is not finite; train again with a lower rate, or put the "

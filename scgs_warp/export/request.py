@@ -1,4 +1,4 @@
-"""What an export is asked for, and whether that can be; loads nothing heavy."""
+"""Export requests and their validation, without heavy imports."""
 
 from __future__ import annotations
 
@@ -21,51 +21,52 @@ SUFFIXES: dict[Format, str] = {
     "graph": ".glb",
     "ply-sequence": "",
 }
-"""How the output's name ends; the first format of a suffix is what the suffix alone means."""
+"""Suffix of each format's output; a suffix alone stands for its first format."""
 OTHER_SUFFIXES = {".htm": ".html"}
-"""Endings that stand for others."""
-STILL = ("ply", "splat", "spz", "glb")
-"""Formats that hold Gaussians at one instant; ``glb`` holds the motion where no instant is given."""
-MOST_FRAMES = 100_000
+"""Alternative suffixes."""
+STILL_FORMATS = ("ply", "splat", "spz", "glb")
+"""Formats of Gaussians at one instant; ``glb`` holds the motion if no instant is given."""
+MAX_FRAMES = 100_000
 
 
 @dataclass(frozen=True)
-class Request:
+class ExportRequest:
     """Write a scene as a file that other programs open (docs/formats.md)."""
 
     output: Path
-    """File to write, or the folder of a ply-sequence. What is there is replaced when the new one is complete."""
+    """File to write, or the folder of a ply-sequence. An existing one is replaced when the new one is complete."""
     run: Path | None = None
     """Folder of a run, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: Gaussians in a .ply of 3D Gaussian splatting, a .splat or a .spz, to be converted."""
+    """Instead of a run: Gaussians to convert, in a .ply of 3D Gaussian splatting, a .splat or a .spz."""
     format: Format | None = None
     """ply, splat, spz: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF with Gaussians, moved
     by control points as an animated skeleton; still with --time. graph: the control points and their edges as an
     animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras as nerfstudio's
-    transforms.json. html: a page that plays the scene. By default what the output's name ends in says."""
+    transforms.json. html: a page that plays the scene. By default the output's suffix decides."""
     time: float | None = None
-    """Instant of a still, from 0 to 1; without it Gaussians are as they are at rest, before the motion."""
+    """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion."""
     edit: Path | None = None
-    """An edit (docs/editing.md) to put on the scene."""
+    """Edit (docs/editing.md) to apply to the scene."""
     at: float | None = None
     """With --edit: the second of the edit's film that a still shows; 0 by default."""
     frames: int | None = None
-    """Instants of a sequence or an animation, evenly from time 0 to 1; 60 by default, with --edit all of its film."""
+    """Frame count of a sequence or an animation, evenly from time 0 to 1; 60 by default, with --edit that of its
+    film."""
     fps: float | None = None
-    """Frames a second of an animation; 30 by default."""
+    """Frames per second of an animation; 30 by default."""
     title: str = ""
-    """Of the page; the run's name by default."""
+    """Title of the page; the run's name by default."""
     max_mib: float | None = None
-    """Largest page in MiB; colours lose their highest degrees of spherical harmonics, one by one, until it fits, and a
-    page that still does not is refused."""
+    """Largest page in MiB; colours lose their highest degrees of spherical harmonics, one by one, until it fits. A page
+    that still does not fit is refused."""
 
     @property
     def kind(self) -> Format:
-        """The format, said or told by the output's suffix.
+        """Format as requested, or by the output's suffix.
 
         Raises:
-            UserError: the suffix says nothing.
+            UserError: the suffix belongs to no format.
         """
         if self.format is not None:
             return self.format
@@ -80,14 +81,14 @@ class Request:
 
     @property
     def still(self) -> bool:
-        """Whether Gaussians at one instant are wanted."""
+        """True if the output holds Gaussians at one instant."""
         if self.kind != "glb":
-            return self.kind in STILL
+            return self.kind in STILL_FORMATS
         return self.time is not None or self.at is not None or (self.run is None and self.edit is None)
 
 
-def check(request: Request) -> None:
-    """Refuse what cannot work before anything is loaded.
+def check_request(request: ExportRequest) -> None:
+    """Check a request before anything is loaded.
 
     Raises:
         UserError: naming the option and the remedy.
@@ -97,35 +98,35 @@ def check(request: Request) -> None:
         raise UserError("export.py: give one of --run and --ply")
     if request.run is None and kind in ("cameras", "html"):
         raise UserError(f"--format {kind}: needs --run; a file of Gaussians has no cameras and no motion")
-    if request.run is None and request.edit is None and kind not in STILL:
+    if request.run is None and request.edit is None and kind not in STILL_FORMATS:
         raise UserError(f"--format {kind}: needs --run, or an --edit that moves the Gaussians of {request.ply}")
     if request.time is not None and not 0 <= request.time <= 1:
         raise UserError(f"--time {request.time:g}: give a time from 0 to 1")
-    if request.time is not None and (kind not in STILL or request.edit is not None):
+    if request.time is not None and (kind not in STILL_FORMATS or request.edit is not None):
         other = (
             "an edit's film is shown at --at SECONDS" if request.edit else "leave it out: the format holds all times"
         )
         raise UserError(f"--time {request.time:g}: {other}")
     if request.edit is not None and kind in ("cameras", "html"):
         raise UserError(f"--format {kind}: shows the scene as it was trained; leave --edit out, or write a glb")
-    if request.at is not None and (request.edit is None or kind not in STILL):
+    if request.at is not None and (request.edit is None or kind not in STILL_FORMATS):
         raise UserError(f"--at {request.at:g}: is a second of an edit's film; give it with --edit and a still format")
     if request.at is not None and not 0 <= request.at <= 3600:
         raise UserError(f"--at {request.at:g}: give a second of the film, from 0 to 3600")
     if request.edit is not None and (request.frames, request.fps) != (None, None):
         raise UserError("--frames, --fps: an edit's film says how long it is; change film in the edit")
-    if request.frames is not None and not 1 <= request.frames <= MOST_FRAMES:
-        raise UserError(f"--frames {request.frames}: give 1 to {MOST_FRAMES}")
+    if request.frames is not None and not 1 <= request.frames <= MAX_FRAMES:
+        raise UserError(f"--frames {request.frames}: give 1 to {MAX_FRAMES}")
     if request.fps is not None and not 0 < request.fps <= 1000:
         raise UserError(f"--fps {request.fps:g}: give more than 0 and at most 1000 frames a second")
     _check_unused(request)
     if request.max_mib is not None and not request.max_mib > 0:
         raise UserError(f"--max-mib {request.max_mib:g}: give more than 0 MiB")
-    check_place(request.output, kind)
+    check_output(request.output, kind)
 
 
-def _check_unused(request: Request) -> None:
-    """Refuse options that would change nothing."""
+def _check_unused(request: ExportRequest) -> None:
+    """Refuse options that would have no effect."""
     kind = request.kind
     if request.time is not None and request.run is None:
         raise UserError(f"--time {request.time:g}: a file of Gaussians has no times; leave it out")
@@ -142,11 +143,11 @@ def _check_unused(request: Request) -> None:
         raise UserError("--fps: a ply-sequence does not say how fast it is; leave it out, and give --frames")
 
 
-def check_place(path: Path, kind: Format) -> None:
-    """Whether the output can be written there; missing folders above are made.
+def check_output(path: Path, kind: Format) -> None:
+    """Check that the output can be written; make missing folders.
 
     Raises:
-        UserError: the wrong suffix, a folder in the way, a place that cannot be written.
+        UserError: the suffix is wrong, a file or folder is in the way, or the folder cannot be written.
     """
     ending = SUFFIXES[kind]
     suffix = path.suffix.lower()

@@ -1,4 +1,4 @@
-"""What :class:`Request` asks for, done: open, pose, write."""
+"""Exports from request to file: open the scene, pose it, write it."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from .cameras import write_cameras
 from .control_graph import write_graph
 from .glb import write_glb
 from .npz import write_npz
-from .request import Request, check
+from .request import ExportRequest, check_request
 from .sequence import check_folder, write_sequence
 from .skeleton import (
-    Moment,
+    AnimationMoment,
     Skeleton,
     at_rest,
     build_skeleton,
     even_moments,
     film_moments,
     finite_rows,
-    kept,
-    posed,
-    select,
+    keep_finite,
+    posed_gaussians,
+    select_gaussians,
 )
 
 FILE_UP = (0.0, -1.0, 0.0)
-"""What is up in files of Gaussians that do not say it."""
+"""Up direction of Gaussians from files, which do not state it."""
 FRAMES, FPS = 60, 30.0
 
 
-def export(request: Request, device: str = "cpu") -> str:
-    """Write a file, and say in one line what it holds.
+def export(request: ExportRequest, device: str = "cpu") -> str:
+    """Write the requested file and return a line that describes it.
 
     Raises:
-        UserError: it cannot be; what was there is left alone.
+        UserError: the request cannot be met; an existing file stays unchanged.
     """
-    check(request)
+    check_request(request)
     if request.kind == "ply-sequence":
         check_folder(request.output)
     if request.still:
@@ -68,29 +68,29 @@ def _size(path: Path) -> str:
     return f"{sum(file.stat().st_size for file in files) / 2**20:.1f} MiB"
 
 
-def _open(request: Request, device: str) -> Scene:
+def _open(request: ExportRequest, device: str) -> Scene:
     if request.run is not None:
         return Scene.load(request.run, device=device)
     assert request.ply is not None
     return open_ply(request.ply, device)
 
 
-def _open_session(request: Request, scene: Scene) -> EditSession:
+def _open_session(request: ExportRequest, scene: Scene) -> EditSession:
     session = EditSession(scene)
     if request.edit is not None:
         session.load(request.edit)
     return session
 
 
-def _export_still(request: Request, device: str) -> str:
+def _export_still(request: ExportRequest, device: str) -> str:
     up, antialiased, when = FILE_UP, False, "at rest"
     if request.run is None and request.edit is None:
         assert request.ply is not None
         antialiased = read_antialiased(request.ply)
         with torch.no_grad():
-            found = read_gaussians(request.ply)
+            stored = read_gaussians(request.ply)
             with fitting(request.ply):
-                gaussians, when = kept(found.activate()), f"as in {request.ply}"
+                gaussians, when = keep_finite(stored.activate()), f"as in {request.ply}"
     else:
         scene = _open(request, device)
         up, antialiased = scene.overview.up, scene.config.antialiased
@@ -101,7 +101,7 @@ def _export_still(request: Request, device: str) -> str:
             gaussians, when = scene.gaussians_at(request.time), f"at time {request.time:g}"
         else:
             gaussians = at_rest(scene)
-    gaussians = kept(gaussians)
+    gaussians = keep_finite(gaussians)
     clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased)
     note = f" ({clipped:,} values clipped to what .spz can hold)" if clipped else ""
     return f"{len(gaussians.means):,} Gaussians {when}{note}"
@@ -110,17 +110,17 @@ def _export_still(request: Request, device: str) -> str:
 def write_still(
     path: Path, gaussians: Gaussians, *, up: tuple[float, float, float] = FILE_UP, antialiased: bool = False
 ) -> int:
-    """Write activated Gaussians, world units, in the format that the name ends in: .ply, .splat, .spz or .glb.
+    """Write activated Gaussians, world units, in the format of the suffix: .ply, .splat, .spz or .glb.
 
     Args:
-        up: unit vector; .glb alone makes use of it.
-        antialiased: whether they were trained with the antialiasing compensation; .spz alone says so.
+        up: unit vector, used by .glb alone.
+        antialiased: whether they were trained with the antialiasing compensation, which .spz alone records.
 
     Returns:
-        How many values were clipped, as a .spz demands it.
+        Number of values clipped to the range of .spz.
 
     Raises:
-        UserError: another suffix, or the place cannot be written.
+        UserError: the suffix is another one, or the file cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix == ".ply":
@@ -132,17 +132,17 @@ def write_still(
     elif suffix == ".glb":
         write_glb(path, gaussians, up)
     else:
-        raise UserError(f"{path}: Gaussians are written as .ply, .splat, .spz or .glb; end the name so")
+        raise UserError(f"{path}: Gaussians are written as .ply, .splat, .spz or .glb; end the name in one of these")
     return 0
 
 
-def _export_moving(request: Request, device: str) -> str:
+def _export_moving(request: ExportRequest, device: str) -> str:
     scene = _open(request, device)
     session = None
     if request.edit is not None or (request.kind != "ply-sequence" and scene.motion.moves):
         session = _open_session(request, scene)
     if session is None and request.kind == "glb":
-        gaussians = kept(at_rest(scene))
+        gaussians = keep_finite(at_rest(scene))
         write_glb(request.output, gaussians, scene.overview.up)
         return f"{len(gaussians.means):,} Gaussians that stand still"
     if session is None and request.kind != "ply-sequence":
@@ -155,13 +155,16 @@ def _export_moving(request: Request, device: str) -> str:
     return _write_skeleton(request, session, moments)
 
 
-def _write_frames(request: Request, scene: Scene, session: EditSession | None, moments: list[Moment]) -> str:
-    counts, rows = [], _usable(scene)  # the same in every frame: row i is one Gaussian
+def _write_frames(
+    request: ExportRequest, scene: Scene, session: EditSession | None, moments: list[AnimationMoment]
+) -> str:
+    counts, rows = [], _usable(scene)  # the same rows in every frame, so that row i is always the same Gaussian
 
     def frames() -> Iterator[Gaussians]:
         for moment in moments:
-            counts.append(len((found := kept(select(posed(scene, session, moment), rows))).means))
-            yield found
+            finite = keep_finite(select_gaussians(posed_gaussians(scene, session, moment), rows))
+            counts.append(len(finite.means))
+            yield finite
 
     with progress(len(moments), "export") as shown:
         count = write_sequence(request.output, frames(), shown.advance)
@@ -170,7 +173,7 @@ def _write_frames(request: Request, scene: Scene, session: EditSession | None, m
     return f"{count} frames of {held} Gaussians"
 
 
-def _write_skeleton(request: Request, session: EditSession, moments: list[Moment]) -> str:
+def _write_skeleton(request: ExportRequest, session: EditSession, moments: list[AnimationMoment]) -> str:
     scene, up = session.scene, session.scene.overview.up
     with progress(len(moments), "export") as shown:
         skeleton = build_skeleton(session, moments, shown.advance)
@@ -184,41 +187,41 @@ def _write_skeleton(request: Request, session: EditSession, moments: list[Moment
         rest = Gaussians(rest.means, rest.quats, rest.scales, rest.opacities, torch.from_numpy(colors), rest.sh_rest)
         write_glb(request.output, rest, up, skeleton)
     else:
-        edited = request.edit is not None  # an edit's turns are not what shading has learnt
+        edited = request.edit is not None  # shading has not been trained on an edit's rotations
         shading = None if edited else scene.gaussians.shading.detach().cpu().numpy()[rows]
         write_npz(request.output, rest, skeleton, shading=shading, up=up)
     return f"{len(rest.means):,} Gaussians, {length}"
 
 
 def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:
-    """The Gaussians that files may hold, at rest; which they are, [N] bool; and what they follow."""
+    """Return the finite Gaussians at rest, their rows [N] bool, and the skeleton restricted to them."""
     rows = _usable(scene) & np.isfinite(skeleton.weights).all(axis=1)
     if not rows.any():
         raise UserError("no Gaussian of the scene is finite; train again with a lower rate")
-    return select(at_rest(scene), rows), rows, skeleton.select(rows)
+    return select_gaussians(at_rest(scene), rows), rows, skeleton.select(rows)
 
 
 def _usable(scene: Scene) -> np.ndarray:
-    """[N] bool: Gaussians all of whose parameters are finite."""
+    """Return [N] bool: Gaussians whose parameters are all finite."""
     rows = finite_rows(at_rest(scene))
     for part in (scene.gaussians.shading, scene.gaussians.hyper):
         rows &= part.detach().isfinite().all(dim=1).cpu().numpy()
     return rows
 
 
-def mean_colors(session: EditSession, moments: list[Moment]) -> np.ndarray:
-    """[N, 3] harmonics of degree 0 over all moments: the brightness that follows the turn of a surface, at its mean,
-    for formats that hold one colour."""
+def mean_colors(session: EditSession, moments: list[AnimationMoment]) -> np.ndarray:
+    """Return harmonics of degree 0 averaged over all moments, [N, 3], for formats that hold one colour: shading changes
+    the colour as the surface turns."""
     scene = session.scene
     if not scene.gaussians.shading.shape[1]:
         return scene.gaussians.sh_dc.detach().cpu().numpy()
     total = np.zeros((scene.gaussian_count, 3))
     for moment in moments:
-        total += posed(scene, session, moment).sh_dc.detach().cpu().double().numpy()
+        total += posed_gaussians(scene, session, moment).sh_dc.detach().cpu().double().numpy()
     return (total / len(moments)).astype(np.float32)
 
 
-def _export_cameras(request: Request, device: str) -> str:
+def _export_cameras(request: ExportRequest, device: str) -> str:
     from ..training.camera_refinement import refined
 
     assert request.run is not None
@@ -234,7 +237,7 @@ def _export_cameras(request: Request, device: str) -> str:
     return f"{count} cameras"
 
 
-def _export_page(request: Request, device: str) -> str:
+def _export_page(request: ExportRequest, device: str) -> str:
     try:
         from .page import write_page
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""A moving scene as a folder of 3D-GS files, one a frame."""
+"""A moving scene as a folder of 3D-GS files, one per frame."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ NAME = "frame_{:05d}.ply"
 
 
 def check_folder(path: Path) -> None:
-    """Whether a sequence may be written there.
+    """Check that a sequence may replace a folder.
 
     Raises:
-        UserError: it is the current folder or one around it, or holds anything else than an earlier sequence.
+        UserError: it is the current folder or contains it, or it holds other files than an earlier sequence.
     """
     path = path.resolve()
     if Path.cwd().is_relative_to(path):
-        raise UserError(f"--output {path}: is the current folder or one around it; name a new folder")
+        raise UserError(f"--output {path}: is the current folder or contains it; name a new folder")
     if path.is_dir() and not holds_only(path, r"frame_\d{5,}\.ply"):
         raise UserError(f"{path}: holds other files than a sequence's frames; name a new folder")
 
 
 def write_sequence(path: Path, frames: Iterable[Gaussians], advance: Callable[[], None] | None = None) -> int:
-    """Write activated Gaussians, world units, as ``frame_00000.ply`` and so on; an earlier sequence in the same folder
-    is replaced as a whole, once the new one is complete.
+    """Write activated Gaussians, world units, as ``frame_00000.ply`` and so on. An earlier sequence in the same folder
+    is replaced as a whole once the new one is complete.
 
     Returns:
-        Number of frames.
+        Frame count.
 
     Raises:
-        UserError: as :func:`check_folder`, or the place cannot be written.
+        UserError: as :func:`check_folder`, or the folder cannot be written.
     """
-    path = path.resolve()  # a link's folder is replaced, not the link
+    path = path.resolve()  # replace the folder that a link points to, not the link
     check_folder(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     shutil.rmtree(temporary, ignore_errors=True)

@@ -1,7 +1,7 @@
 """A moving scene as a skeleton: control points as joints, Gaussians bound to them at rest. World units, float64.
 
 SC-GS's skinning (Eq. 6) of a Gaussian at rest x, ``sum_k w_k (R_k (x - p_k) + p_k + T_k)``, is linear blend skinning: a
-joint stands at ``p_k + T_k``, turned by ``R_k``, and its inverse bind matrix shifts by ``-p_k``.
+joint is at ``p_k + T_k``, turned by ``R_k``, and its inverse bind matrix shifts by ``-p_k``.
 """
 
 from __future__ import annotations
@@ -22,59 +22,59 @@ from ..scene.scene import Scene
 from ..types import Gaussians, Pose
 
 
-class Moment(NamedTuple):
-    """One frame of an animation."""
+class AnimationMoment(NamedTuple):
+    """Times of one frame of an animation."""
 
     seconds: float
-    """Since the animation began."""
+    """Time since the animation's beginning."""
     time: float
-    """Of the scene, in [0, 1]."""
+    """Scene time in [0, 1]."""
     at: float | None = None
-    """Of an edit's film, in seconds."""
+    """Time in an edit's film in seconds."""
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """T moments of M joints, and what N Gaussians follow."""
+    """Poses of M joints at T moments, and the binding of N Gaussians to them."""
 
     seconds: np.ndarray
     """[T]"""
     times: np.ndarray
-    """[T] of the scene, in [0, 1]."""
+    """[T] scene times in [0, 1]."""
     rest: np.ndarray
-    """[M, 3] where joints are when every Gaussian is at rest."""
+    """[M, 3] positions of joints at rest."""
     positions: np.ndarray
     """[T, M, 3]"""
     rotations: np.ndarray
-    """[T, M, 4] wxyz, unit; neighbours in time lie on the same side."""
+    """[T, M, 4] wxyz, unit, with signs continuous over time."""
     shape_rotations: np.ndarray | None
-    """[T, M, 4] what turns the Gaussians' shapes, where that is something else."""
+    """[T, M, 4] rotations of the Gaussians' shapes, if they differ from ``rotations``."""
     log_scales: np.ndarray | None
-    """[T, M, 3] change of the logarithms of scales, where there is any."""
+    """[T, M, 3] changes of the logarithms of scales, if there are any."""
     indices: np.ndarray
     """[N, K] int32"""
     weights: np.ndarray
     """[N, K] rows sum to 1."""
 
     def select(self, rows: np.ndarray) -> Skeleton:
-        """Some of the Gaussians: [N] bool."""
+        """Restrict the binding to the Gaussians of ``rows`` [N] bool."""
         fields = {**vars(self), "indices": self.indices[rows], "weights": self.weights[rows]}
         return Skeleton(**fields)
 
 
-def even_moments(frames: int, fps: float) -> list[Moment]:
-    """Evenly from time 0 to 1."""
-    return [Moment(frame / fps, frame / max(frames - 1, 1)) for frame in range(frames)]
+def even_moments(frames: int, fps: float) -> list[AnimationMoment]:
+    """Return moments spaced evenly from scene time 0 to 1."""
+    return [AnimationMoment(frame / fps, frame / max(frames - 1, 1)) for frame in range(frames)]
 
 
-def film_moments(session: EditSession) -> list[Moment]:
-    """Every frame of an edit's film."""
+def film_moments(session: EditSession) -> list[AnimationMoment]:
+    """Return the moments of all frames of an edit's film."""
     film = session.edit.film
-    return [Moment(i / film.fps, session.scene_time(i / film.fps), i / film.fps) for i in range(film.frames)]
+    return [AnimationMoment(i / film.fps, session.scene_time(i / film.fps), i / film.fps) for i in range(film.frames)]
 
 
-def posed(scene: Scene, session: EditSession | None, moment: Moment) -> Gaussians:
-    """Activated Gaussians, world units, under the edit if there is one."""
+def posed_gaussians(scene: Scene, session: EditSession | None, moment: AnimationMoment) -> Gaussians:
+    """Return activated Gaussians, world units, under the edit if there is a session."""
     if session is None:
         return scene.gaussians_at(moment.time)
     return session.gaussians_at(moment.time, moment.at)
@@ -82,7 +82,7 @@ def posed(scene: Scene, session: EditSession | None, moment: Moment) -> Gaussian
 
 @torch.no_grad()
 def at_rest(scene: Scene) -> Gaussians:
-    """Activated Gaussians before any motion, world units."""
+    """Return activated Gaussians before any motion, world units."""
     rest, undo = scene.gaussians.activate(), scene.normalisation
     return Gaussians(
         undo.undo(rest.means), rest.quats, undo.undo_scale(rest.scales), rest.opacities, rest.sh_dc, rest.sh_rest
@@ -90,40 +90,43 @@ def at_rest(scene: Scene) -> Gaussians:
 
 
 def finite_rows(gaussians: Gaussians) -> np.ndarray:
-    """[N] bool: Gaussians that files may hold."""
+    """Return [N] bool: Gaussians that are finite and have a rotation."""
     count = len(gaussians.means)
     parts = [part.detach().reshape(count, -1).isfinite().all(dim=1) for part in vars(gaussians).values()]
     return (torch.stack(parts).all(dim=0) & gaussians.quats.any(dim=1)).cpu().numpy()
 
 
-def select(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
-    """Some of the Gaussians: [N] bool, on the CPU."""
+def select_gaussians(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+    """Return the Gaussians of ``rows`` [N] bool, on the CPU."""
     chosen = torch.from_numpy(rows)
     return Gaussians(**{name: value.detach().cpu()[chosen] for name, value in vars(gaussians).items()})
 
 
-def kept(gaussians: Gaussians) -> Gaussians:
-    """Those that are finite, on the CPU.
+def keep_finite(gaussians: Gaussians) -> Gaussians:
+    """Return the finite Gaussians, on the CPU.
 
     Raises:
-        UserError: there is none.
+        UserError: no Gaussian is finite.
     """
     rows = finite_rows(gaussians)
     if not rows.any():
         raise UserError(f"none of {len(rows)} Gaussians is finite; train again with a lower rate")
-    return select(gaussians, rows)
+    return select_gaussians(gaussians, rows)
 
 
 @torch.no_grad()
-def build_skeleton(session: EditSession, moments: list[Moment], advance: Callable[[], None] | None = None) -> Skeleton:
-    """The session's control points at some moments, under its edit.
+def build_skeleton(
+    session: EditSession, moments: list[AnimationMoment], advance: Callable[[], None] | None = None
+) -> Skeleton:
+    """Build the skeleton of a session's control points under its edit.
 
     Args:
+        moments: moments of the animation.
         advance: called after each moment.
 
     Raises:
-        UserError: an edit of a scene with a mask, whose Gaussians do not simply follow their control points; a motion
-            that is not finite.
+        UserError: the motion is not finite, or the scene has a mask and an edit: masked Gaussians do not follow edited
+            control points by skinning alone.
     """
     engine, scene = session.engine, session.scene
     masked = bool(scene.config.motion.mask) and engine.rig.moves
@@ -142,8 +145,8 @@ def build_skeleton(session: EditSession, moments: list[Moment], advance: Callabl
         engine.to_world(rest.numpy()),
         engine.to_world(places),
         _unit([pose.rotations for pose in poses]),
-        None if poses[0].shape_rotations is None else _unit([_there(pose.shape_rotations) for pose in poses]),
-        None if poses[0].log_scales is None else _stack([_there(pose.log_scales) for pose in poses]),
+        None if poses[0].shape_rotations is None else _unit([_require(pose.shape_rotations) for pose in poses]),
+        None if poses[0].log_scales is None else _stack([_require(pose.log_scales) for pose in poses]),
         indices,
         weights,
     )
@@ -166,7 +169,7 @@ def _not_finite(time: float) -> UserError:
     )
 
 
-def _pose(session: EditSession, moment: Moment, masked: bool) -> Pose:
+def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> Pose:
     engine, edit = session.engine, session.edit
     motion = engine.motion_at(moment.time)
     fields = motion.pose.translations, motion.pose.rotations, motion.pose.shape_rotations, motion.pose.log_scales
@@ -180,8 +183,8 @@ def _pose(session: EditSession, moment: Moment, masked: bool) -> Pose:
     return compose(motion, bent)
 
 
-def _there(value: Tensor | None) -> Tensor:
-    assert value is not None  # a motion model's poses are all of one kind
+def _require(value: Tensor | None) -> Tensor:
+    assert value is not None  # all poses of a motion model have the same fields
     return value
 
 
@@ -190,16 +193,16 @@ def _stack(values: list[Tensor]) -> np.ndarray:
 
 
 def _unit(rotations: list[Tensor]) -> np.ndarray:
-    """[T, M, 4] unit, each on the side of the one before: players interpolate along the shorter way."""
-    found = _stack(rotations)
-    found /= np.linalg.norm(found, axis=-1, keepdims=True)
-    for frame in range(1, len(found)):
-        found[frame] *= np.where((found[frame] * found[frame - 1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
-    return found
+    """Return unit quaternions [T, M, 4] with signs continuous over time, as players interpolate linearly."""
+    quats = _stack(rotations)
+    quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
+    for frame in range(1, len(quats)):
+        quats[frame] *= np.where((quats[frame] * quats[frame - 1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    return quats
 
 
 def _with_rest(skeleton: Skeleton, gaussians: GaussianParameters) -> Skeleton:
-    """One more joint, which never moves and takes what a mask leaves of every Gaussian."""
+    """Append a static joint that takes the share of each Gaussian which a mask excludes from the motion."""
     share = gaussians.hyper.detach()[:, -1:].sigmoid().cpu().double().numpy()
     frames, joints = skeleton.positions.shape[:2]
     still = np.zeros((frames, 1, 4))

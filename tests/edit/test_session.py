@@ -1,4 +1,4 @@
-"""An editing session: what it leaves alone, what it remembers, and that it survives what users do."""
+"""Editing sessions: unchanged bits, history, and mistakes of users."""
 
 from __future__ import annotations
 
@@ -9,34 +9,19 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.edit_scenes import OVERVIEW, bar_scene, dress
-from scgs_warp.config.presets import from_dict
-from scgs_warp.edit import Edit, EditSession, Exaggerate, Hold, Target
+from helpers.edit_scenes import OVERVIEW, bar_scene
+from helpers.edit_sessions import ends, same
+from scgs_warp.edit import Edit, EditSession, Exaggerate, Hold
 from scgs_warp.edit.rotations import from_axis, rotate
 from scgs_warp.edit.session import HISTORY
 from scgs_warp.errors import UserError
 from scgs_warp.geometry import cameras
-from scgs_warp.geometry.normalisation import Normalisation
-from scgs_warp.motion import Static
-from scgs_warp.motion.per_gaussian import PerGaussian
 from scgs_warp.runtime import environment
-from scgs_warp.scene.from_gaussians import rig_static
-from scgs_warp.scene.scene import Scene
-from scgs_warp.types import Gaussians, Image
 
 CAMERA = cameras.orbit_camera(dataclasses.replace(OVERVIEW, centre=(0.5, -1.0, 0.25), radius=2.0), 20.0, 48)
+
+
 TURN = from_axis([0, 0, 1], 40).tolist()
-
-
-def same(first: Gaussians | Image, second: Gaussians | Image) -> bool:
-    pairs = zip(dataclasses.astuple(first), dataclasses.astuple(second))
-    return all(torch.equal(a, b) for a, b in pairs)
-
-
-def ends(session: EditSession) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Control points of the bar's left end, which never moves, and of its right end, at time 0."""
-    x = session.node_positions(0.0)[:, 0]
-    return tuple(np.flatnonzero(x < np.quantile(x, 0.2))), tuple(np.flatnonzero(x > np.quantile(x, 0.8)))
 
 
 @pytest.fixture
@@ -278,31 +263,6 @@ def test_choosing(session):
     assert set(session.edit.pins) == set(range(len(session))) - set(session.ring([17], 1))
 
 
-def test_a_static_scene_is_given_control_points():
-    moving = bar_scene()
-    still = Scene(moving.gaussians, Static(), Normalisation.identity(), moving.config, OVERVIEW)
-    session = EditSession(still)
-    assert 1 < len(session) <= 400
-    assert same(session.gaussians_at(0.5), still.gaussians_at(0.5))
-    left, right = ends(session)
-    session.add_handle(right, 0.0, "right")
-    session.pin(left)
-    session.move("right", [0, 0.5, 0])
-    assert same(session.gaussians_at(0.1), session.gaussians_at(0.9))
-    kept = (session.gaussians_at(0.0).means == still.gaussians_at(0.0).means).all(1)
-    assert 20 < int(kept.sum()) < 380
-    assert len(rig_static(still, 7).motion.positions) == 7
-
-
-def test_other_motion_models_say_so():
-    config = from_dict({"preset": "paper"})
-    scene = bar_scene()
-    motion = PerGaussian.__new__(PerGaussian)
-    torch.nn.Module.__init__(motion)
-    with pytest.raises(UserError, match="control points"):
-        EditSession(Scene(dress(torch.rand(5, 3)), motion, scene.normalisation, config, OVERVIEW))
-
-
 def test_a_name_that_is_taken_is_taken_over_at_rest(bent):
     bent.add_keyframe(0.0)
     bent.add_handle([1, 2], 0.0, "right")
@@ -320,12 +280,6 @@ def test_saving_does_not_end_a_drag(bent, tmp_path):
     assert bent.undo() and bent.edit == before
     bent.load(tmp_path / "edit.json")
     assert bent.edit.targets["right"].translation == (0.2, 0.0, 0.0)
-
-
-def test_target_is_unit():
-    target = Target.of(None, [2.0, 0.0, 0.0, 0.0])
-    assert target.rotation == (1.0, 0.0, 0.0, 0.0) and target.is_identity
-    assert Target.of(None, [1e300, 0, 0, 1e300]).rotation == pytest.approx((2**-0.5, 0, 0, 2**-0.5))
 
 
 def test_history_has_an_end(session, monkeypatch):

@@ -1,32 +1,24 @@
-"""The solver of edits: against dense float64 twins, the laws of rigid motion, and everything degenerate."""
+"""The solver of edits against dense float64 twins, the laws of rigid motion, and degenerate input."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.edit_scenes import figure_scene
+from helpers.edit_sessions import cloud, graph_of
 from helpers.limb_bending import LIMBS, bend, grab
 from reference import editing as twin
-from scgs_warp.edit import ArapSolver, EditSession, build_graph
+from scgs_warp.edit import ArapSolver, EditSession
 from scgs_warp.edit.graph import ControlGraph
 from scgs_warp.edit.handles import Goal, anchors_at
-from scgs_warp.edit.rotations import IDENTITY, angle, from_axis, from_matrix, rotate, to_matrix
+from scgs_warp.edit.rotations import IDENTITY, angle, from_axis, from_matrix, rotate
 from scgs_warp.edit.solver import Anchors, Shape, count_steps
 from scgs_warp.runtime import environment
 
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-
-
-def cloud(seed: int, count: int, spread=(1.0, 1.0, 1.0)) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=(count, 3)) * spread
-
-
-def graph_of(points: np.ndarray, neighbors: int = 6) -> ControlGraph:
-    return build_graph(torch.from_numpy(points).float()[None], neighbors)
 
 
 def solve(graph: ControlGraph, rest: np.ndarray, goals: list[Goal], pins=(), steps: int = 8) -> Shape:
@@ -163,37 +155,6 @@ def test_same_bits_on_any_number_of_threads(all_threads):
     assert results[0] == results[1]
 
 
-def test_the_graph_is_symmetric_and_parts_that_move_apart_are_not_tied():
-    left, right = cloud(12, 40, (0.3, 1, 1)), cloud(13, 40, (0.3, 1, 1)) + 0.5 * X
-    still = np.concatenate([left, right])
-    apart = np.concatenate([left, right + 20 * X])
-    tied = graph_of(still)
-    assert (tied.matrix != tied.matrix.T).nnz == 0
-    assert any((a < 40) != (b < 40) for a, b in tied.edges)
-    free = build_graph(torch.from_numpy(np.stack([still, apart])).float())
-    assert not any((a < 40) != (b < 40) for a, b in free.edges)
-    assert set(tied.ring([0], 1)) == {0, *tied.neighbors[tied.begin[0] : tied.begin[1]].tolist()}
-    assert tied.ring([0], 0) == (0,) and tied.ring([], 3) == ()
-
-
-def test_a_gap_stays_a_gap_where_nothing_moves():
-    """Two plates face each other, about as far apart as their control points: Gaussians say that they are two."""
-    grid = np.stack(np.meshgrid(np.arange(8), np.arange(8), [0.0]), -1).reshape(-1, 3)
-    plates = np.concatenate([grid, grid + 1.2 * Z])
-    fine = np.stack(np.meshgrid(np.linspace(0, 7, 50), np.linspace(0, 7, 50), [0.0, 1.2]), -1).reshape(-1, 3)
-    shared = np.argsort(np.linalg.norm(fine[:, None] - plates[None], axis=-1), axis=1)[:, :2]
-    near = build_graph(torch.from_numpy(plates).float()[None])
-    apart = build_graph(torch.from_numpy(plates).float()[None], shared=shared)
-    crossing = [sum((a < 64) != (b < 64) for a, b in graph.edges) for graph in (near, apart)]
-    assert crossing[0] > 50 and crossing[1] == 0
-
-
-def test_strays_follow_their_nearest_neighbour():
-    rest = np.concatenate([cloud(14, 60), [[9.0, 0, 0]], [[500.0, 0, 0]]])
-    graph = graph_of(rest)
-    assert graph.stray[60] in range(60) and graph.stray[61] == 61 and (graph.stray[:60] == -1).all()
-
-
 BOUNDS = {
     "arm": {
         15: (0.08, 0.08, 0.95, 0.02),
@@ -227,18 +188,6 @@ def test_a_limb_of_the_figure_turns_about_its_joint(limb):
         assert bent.determinant > determinant, (degrees, bent)
     for small, large in ((15, 45), (45, 90), (90, 135)):
         assert found[small].edges < found[large].edges
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.integers(0, 2**31))
-def test_quaternions_and_matrices(seed):
-    random = np.random.default_rng(seed)
-    quats = random.normal(size=(5, 4))
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    back = from_matrix(to_matrix(quats))
-    np.testing.assert_allclose(np.abs((back * quats).sum(1)), 1.0, atol=1e-12)
-    vectors = random.normal(size=(5, 3))
-    np.testing.assert_allclose(rotate(quats, vectors), (to_matrix(quats) @ vectors[..., None])[..., 0], atol=1e-12)
 
 
 def test_a_pair_tied_by_one_edge_is_turned_no_further_than_it_has_to_be():

@@ -54,7 +54,7 @@ class Window:
         self.page.goto(url)
         self.page.set_default_timeout(1e3 * PATIENCE)
         self.page.get_by_text("Undo", exact=True).wait_for(timeout=1e3 * PATIENCE)
-        until(lambda: len(editor.views))
+        until(lambda: len(editor.schedule))
         still(editor)
 
     def picture(self) -> np.ndarray:
@@ -211,7 +211,7 @@ def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
         until(lambda: not model.playing)
         assert window.problems == []
 
-    assert read(editor.folder / "edit.json", session) == session.edit
+    assert read(editor.folder / "edit.json", session.engine) == session.edit
     script = EditSession(figure_scene(nodes=200, points=5000)[0])
     script.load(editor.folder / "edit.json")
     assert render_film(script, tmp_path / "script.mp4") == 4
@@ -248,12 +248,12 @@ def test_mistakes_are_said_and_the_shared_editor_survives(tmp_path):
             assert list(tmp_path.rglob("*.json")) == []
 
             take_arm(window)
-            place = editor._place[0]
+            place = editor.gizmo_frame[0]
             with pytest.raises(UserError, match="finite"):
-                editor._gizmo("start", np.zeros(3), np.array([1.0, 0, 0, 0]))
-                editor._gizmo("update", np.array([np.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
-            editor._gizmo("update", place.pivot + np.array([0, 0, 1000.0]), np.array([1.0, 0, 0, 0]))
-            editor._gizmo("end", place.pivot, np.array([1.0, 0, 0, 0]))
+                editor.drag_gizmo("start", np.zeros(3), np.array([1.0, 0, 0, 0]))
+                editor.drag_gizmo("update", np.array([np.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
+            editor.drag_gizmo("update", place.pivot + np.array([0, 0, 1000.0]), np.array([1.0, 0, 0, 0]))
+            editor.drag_gizmo("end", place.pivot, np.array([1.0, 0, 0, 0]))
             still(editor)
             assert session.edit.targets["handle 1"].translation == pytest.approx((0, 0, 1000))
             window.page.mouse.click(5, 600)

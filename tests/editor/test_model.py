@@ -1,4 +1,4 @@
-"""The editor without a browser: what is chosen, held and pinned, time, undo, and where the gizmo stands."""
+"""State of the editor: selection, handles, pins, time and undo."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from helpers.editor_models import LEFT, RIGHT, chosen, new_model
 from scgs_warp.edit import Film, Playback, Target
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import from_axis
-from scgs_warp.editor.gizmo_pose import Place, place_of, place_of_selection
-from scgs_warp.editor.model import Model, Moment
+from scgs_warp.editor.gizmo_pose import GizmoFrame
+from scgs_warp.editor.model import EditorModel, Moment
 from scgs_warp.errors import UserError
 
 
 @pytest.fixture
-def model() -> Model:
+def model() -> EditorModel:
     return new_model()
 
 
@@ -59,7 +59,7 @@ def test_a_broken_number_changes_nothing(model, broken):
     model.drag(Target((0.1, 0.0, 0.0)))
     before = model.session.edit
     with pytest.raises(UserError, match="finite"):
-        Place(np.zeros(3), np.array([1.0, 0, 0, 0])).target(np.array([broken, 0, 0]), np.array([1.0, 0, 0, 0]))
+        GizmoFrame(np.zeros(3), np.array([1.0, 0, 0, 0])).target(np.array([broken, 0, 0]), np.array([1.0, 0, 0, 0]))
     with pytest.raises(UserError, match="finite"):
         model.drag(Target((broken, 0.0, 0.0)))
     assert model.session.edit is before and model.dragging
@@ -102,37 +102,6 @@ def test_pinning_the_rest_makes_way_for_the_next_handle(model):
     assert set(session.edit.pins) == set(own) - set(model.selection), "what the user pinned stays, but for the handle"
 
 
-def test_a_handle_taken_from_bent_surroundings_leaves_them(model):
-    model.select(chosen(model))
-    model.grab(STAY)
-    model.drag(Target((0.0, 0.2, 0.3), tuple(from_axis([0, 1, 0], 30).tolist())))
-    model.release()
-    session, at = model.session, model.moment()
-    before = session.node_positions(0.0)
-    other = tuple(sorted(set(session.ring(model.selection, 1)) - set(model.selection)))
-    assert other
-    place, target = place_of_selection(session, other, at)
-    position, _ = place.pose(target)
-    assert position == pytest.approx(before[list(other)].mean(0), abs=1e-9)
-
-
-def test_the_gizmo_says_what_the_target_says(model):
-    model.select(chosen(model))
-    model.grab(STAY)
-    target = Target.of((0.1, -0.2, 0.3), from_axis([1, 2, 3], 50).tolist())
-    model.drag(target)
-    model.release()
-    session = model.session
-    for time in (0.0, 0.7):
-        place = place_of(session, session.edit.handles[0], time)
-        back = place.target(*place.pose(target))
-        assert back.translation == pytest.approx(target.translation, abs=1e-9)
-        assert back.rotation == pytest.approx(target.rotation, abs=1e-9)
-        where = session.node_positions(time)[list(model.selection)].mean(0)
-        assert place.pose(target)[0] == pytest.approx(where, abs=5e-3), "it stands on what it holds"
-    assert place.target(place.pivot, np.array([1.0, 1e-20, 0, 0])).is_identity, "noise is no rotation"
-
-
 def test_keyframes_lead_until_a_drag_begins(model):
     model.replace(film=Film(seconds=2.0, fps=10))
     model.select(chosen(model))
@@ -161,8 +130,8 @@ def test_keyframes_lead_until_a_drag_begins(model):
 def test_time_plays_and_stops_at_nothing(model):
     model.replace(film=Film(seconds=2.0, fps=10), playback=Playback(repeat="loop"))
     model.seek(0.5)
-    model.play(True)
-    start = model._played_from[0]
+    start = 100.0
+    model.play(True, now=start)
     model.tick(start + 0.55)
     assert model.at == pytest.approx(1.0)
     model.tick(start + 1.7)
@@ -217,7 +186,7 @@ def test_what_a_page_sends_is_checked(model, fields, words):
     assert model.undo() and model.session.edit == before
 
 
-def hold(model: Model, point=RIGHT, rings: int = 0) -> str:
+def hold(model: EditorModel, point=RIGHT, rings: int = 0) -> str:
     model.select(chosen(model, point, rings))
     name = model.grab(STAY)
     model.drag(Target((0.0, 0.0, 0.05)))
@@ -320,3 +289,7 @@ def test_a_moment_of_a_long_film_is_known_at_once(model, monkeypatch):
     monkeypatch.setattr(Playback, "times_at", None)
     monkeypatch.setattr(Playback, "time_at", lambda playback, at, seconds: 0.25)
     assert model.moment() == Moment(0.25, None, False, "edited")
+
+
+def test_a_moment_shows_the_film_or_the_handles(model):
+    assert model.moment() == Moment(0.0, None, False, "edited")

@@ -1,4 +1,4 @@
-"""The panel's controls without a browser: what they do to the edit, and that they say what the edit is."""
+"""The panel's controls without a browser: their effect on the edit, and their values."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import Edit, EditSession, Exaggerate, Film, Handle, Hold, Keyframe, Playback, Target
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import from_axis
+from scgs_warp.editor.app import Editor
+from scgs_warp.editor.panel.shape import NEW
 from scgs_warp.errors import UserError
 
 pytest.importorskip("viser", reason="the editor needs viser: pip install 'scgs_warp[edit]'")
-
-from scgs_warp.editor.app import Editor
-from scgs_warp.editor.panel.shape import NEW
 
 
 @pytest.fixture
@@ -29,49 +28,49 @@ def editor(tmp_path) -> Iterator[Editor]:
 def test_what_is_selected_is_held_once_and_let_go(editor):
     model, motion = editor.model, editor.panel.motion
     with pytest.raises(UserError, match="nothing is chosen"):
-        motion._hold()
+        motion.hold_selection()
     model.seek(1.0)
     model.select((3, 1))
-    motion._hold()
+    motion.hold_selection()
     motion.frame.value, motion.rings.value = "world", 4
-    motion._hold()
+    motion.hold_selection()
     assert model.session.edit.holds == (Hold((1, 3), model.time, "world", 4),)  # the same region again: one hold
     editor.panel.show()
     assert motion.chosen.value == "hold 1" and f"| 2 | {model.time:.2f} | world |" in motion.list.content
     model.select((5,))
-    motion._hold()
-    motion._select("hold 1")
+    motion.hold_selection()
+    motion.select_hold("hold 1")
     assert model.selection == (1, 3)
     editor.panel.show()
-    motion._release()
+    motion.release_hold()
     assert [hold.nodes for hold in model.session.edit.holds] == [(5,)]
     model.undo()
     assert len(model.session.edit.holds) == 2
     motion.chosen.value = "none"
     with pytest.raises(UserError, match="no hold is chosen"):
-        motion._release()
+        motion.release_hold()
 
 
 def test_motion_is_exaggerated_for_some_or_all_about_a_pose(editor):
     model, motion = editor.model, editor.panel.motion
-    motion._exaggerate(factor=2.0)
+    motion.exaggerate(factor=2.0)
     assert model.session.edit.exaggerate == Exaggerate(2.0)
     model.seek(1.0)
-    motion._about("This moment")
+    motion.set_reference("This moment")
     assert model.session.edit.exaggerate == Exaggerate(2.0, model.time)
     with pytest.raises(UserError, match="nothing is chosen"):
-        motion._extent("Only selection")
+        motion.set_extent("Only selection")
     model.select((2, 4))
-    motion._extent("Only selection")
+    motion.set_extent("Only selection")
     assert model.session.edit.exaggerate == Exaggerate(2.0, model.time, (2, 4))
     editor.panel.show()
     assert motion.factor.value == 2.0 and "2 control points" in motion.extent.content
-    motion._extent("All")
-    motion._about("Mean pose")
+    motion.set_extent("All")
+    motion.set_reference("Mean pose")
     assert model.session.edit.exaggerate == Exaggerate(2.0)
     with pytest.raises(UserError, match="factor"):
-        motion._exaggerate(factor=float("nan"))
-    motion._extent("Off")
+        motion.exaggerate(factor=float("nan"))
+    motion.set_extent("Off")
     assert model.session.edit.exaggerate is None
     editor.panel.show()
     assert motion.factor.value == 1.0 and "Off" in motion.extent.content
@@ -121,7 +120,7 @@ def test_numbers_are_those_of_the_moment_shown(editor):
     model.seek(0.0)
     editor.panel.show_time()
     assert shape.turn.value == (0.0, 0.0, 0.0) and shape.move.value == (0.0, 0.0, 0.0)
-    shape._moved((0.0, 0.1, 0.0))
+    shape.move_handle((0.0, 0.1, 0.0))
     assert model.session.edit.targets["handle 1"] == Target((0.0, 0.1, 0.0))
 
 
@@ -133,8 +132,8 @@ def test_numbers_move_the_handle_whatever_is_shown(editor, show):
     model.select((3, 4, 5))
     editor.put(Target((0.1, 0.0, 0.0)))
     model.set(show=show)
-    editor._place = None  # no gizmo is shown there
-    editor.panel.shape._moved((0.0, 0.2, 0.0))
+    editor.gizmo_frame = None  # no gizmo is shown there
+    editor.panel.shape.move_handle((0.0, 0.2, 0.0))
     assert model.session.edit.targets["handle 1"].translation == (0.0, 0.2, 0.0)
 
 
@@ -152,17 +151,21 @@ def test_every_handle_and_keyframe_can_be_chosen(tmp_path):
     try:
         model, shape, film = editor.model, editor.panel.shape, editor.panel.film
         assert len(set(shape.handle.options)) == 4 and shape.handle.options[0] == NEW
-        assert sorted(name for name in shape._names().values() if name) == sorted(handle.name for handle in handles)
-        for label, name in shape._names().items():
+        assert sorted(name for name in shape.handle_labels().values() if name) == sorted(
+            handle.name for handle in handles
+        )
+        for label, name in shape.handle_labels().items():
             model.activate(name)
             model.selection = () if name is None else model.selection
             editor.panel.show()
             assert shape.handle.value == label
         for label in film.chosen.options[1:]:
-            film._go(label)
+            film.seek_keyframe(label)
             editor.panel.show()
             assert film.chosen.value == label
-        assert sorted(film._moments().values()) == [0.5, 0.5001, 0.5002, 1.0] and "1.000 s" in film.chosen.options
+        assert (
+            sorted(film.keyframe_labels().values()) == [0.5, 0.5001, 0.5002, 1.0] and "1.000 s" in film.chosen.options
+        )
     finally:
         editor.stop()
 
@@ -175,15 +178,3 @@ def test_files_are_not_replaced_unless_asked_for(editor):
     panel.replace.value = True
     assert panel.save().name == "edit.json"
     panel.load("edit 2.json")
-
-
-def test_a_picture_that_fails_says_so(editor, monkeypatch, capsys):
-    said = []
-    monkeypatch.setattr(editor, "say", lambda client, title, text, color="red": said.append((client, title, text)))
-    monkeypatch.setattr(editor.server, "get_clients", lambda: {7: "a window"})
-    for error, title in ((UserError("no room"), "The picture cannot be drawn"), (ValueError("odd"), "Internal error")):
-        monkeypatch.setattr(editor.worker, "_draw", lambda client, quality, error=error: (_ for _ in ()).throw(error))
-        editor.worker._picture(7, "full")
-        assert said[-1][:2] == ("a window", title) and str(error) in said[-1][2]
-    editor.worker._picture(8, "full")  # a window that is gone
-    assert len(said) == 2 and "odd" in capsys.readouterr().err

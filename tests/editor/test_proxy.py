@@ -1,4 +1,4 @@
-"""Who may talk to the editor: the token, the origin, the host; pages and WebSockets both."""
+"""Access to the editor: token, origin and host, for pages and WebSockets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession
 from scgs_warp.editor import Editor, Proxy
-from scgs_warp.editor.proxy import KEY, MOST_STRANGERS, cookies, guarded, is_local, parse_head, same_origin
+from scgs_warp.editor.proxy import KEY_HEADER, MAX_PENDING, cookies, guarded, is_local, parse_head, same_origin
 from scgs_warp.errors import UserError
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
 
@@ -136,8 +136,10 @@ def test_with_the_token_foreign_pages_are_refused(shared, origin):
 def test_behind_a_proxy_the_editors_own_port_takes_nobody_else(shared):
     origin = f"http://127.0.0.1:{shared.port}"
     assert get(shared.port).status == 403
-    assert not opens(shared.port, origin) and not opens(shared.port, origin, **{KEY: "a guess"})
-    assert not opens(shared.public, f"http://127.0.0.1:{shared.public}", **{KEY: "a key that only the proxy knows"})
+    assert not opens(shared.port, origin) and not opens(shared.port, origin, **{KEY_HEADER: "a guess"})
+    assert not opens(
+        shared.public, f"http://127.0.0.1:{shared.public}", **{KEY_HEADER: "a key that only the proxy knows"}
+    )
 
 
 @pytest.mark.parametrize(
@@ -188,7 +190,7 @@ def test_origins_that_are_no_address_are_refused(editor, shared, origin, capfd):
 
 def test_strangers_are_not_waited_for_without_end(shared):
     page = f"{shared.cookie}={shared.token}"
-    waiting = [socket.create_connection(("127.0.0.1", shared.public), 20) for _ in range(MOST_STRANGERS)]
+    waiting = [socket.create_connection(("127.0.0.1", shared.public), 20) for _ in range(MAX_PENDING)]
     try:
         with socket.create_connection(("127.0.0.1", shared.public), 20) as one_more:
             one_more.settimeout(5)

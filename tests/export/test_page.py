@@ -7,18 +7,14 @@ import hashlib
 from html.parser import HTMLParser
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from helpers.edit_scenes import bar_scene, rich_scene
-from helpers.page_reader import PagePlayer, gaussians_of, read_page
+from helpers.page_reader import PagePlayer, read_page
 from scgs_warp.errors import UserError
-from scgs_warp.export import page, page_scene
-from scgs_warp.export.page_data import Column, integers, pack, quantise, unpack
+from scgs_warp.export import page
 from scgs_warp.geometry.cameras import orbit_camera
-from scgs_warp.motion import build_motion
-from scgs_warp.types import Pose
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -35,101 +31,6 @@ def test_what_a_page_holds_renders_as_the_scene(make, tmp_path):
     for time in (0.0, 0.41, 1.0):
         camera = orbit_camera(scene.overview, 70.0 + 200 * time, 96)
         assert psnr(player.render(camera, time).rgb, scene.render(camera, time, (0, 0, 0)).rgb) > 50
-
-
-def test_columns_come_back(tmp_path):
-    random = np.random.default_rng(3)
-    walk = random.normal(size=500).cumsum()
-    columns = [
-        quantise("fine", walk, 1e-4, delta=True),
-        quantise("coarse", walk, 1e-4, most_bits=5),
-        quantise("constant", np.full(500, 2.5), 1e-3),
-        integers("whole", random.integers(0, 700, 500)),
-        integers("none", np.zeros(0, int)),
-    ]
-    facts, values = unpack(pack({"fact": 1.5}, columns))
-    assert facts["fact"] == 1.5
-    for column in columns:
-        assert np.array_equal(values[column.name], column.values()), column.name
-    assert np.abs(values["fine"] - walk).max() <= 0.51e-4 and 16 < columns[0].bits < 24
-    assert 0.4 * np.ptp(walk) / 31 < np.abs(values["coarse"] - walk).max() <= 0.51 * np.ptp(walk) / 31
-    assert (values["constant"] == 2.5).all()
-    assert pack({"fact": 1.5}, columns) == pack({"fact": 1.5}, columns)
-
-
-def test_differences_may_pass_zero():
-    codes = np.array([5, 0, 1023, 1], np.uint32)
-    _, values = unpack(pack({}, [Column("x", codes, 10, delta=True)]))
-    assert values["x"].tolist() == [5, 0, 1023, 1]
-
-
-def test_what_cannot_be_seen_is_left_out():
-    scene = bar_scene(nodes=12, gaussians=50)
-    with torch.no_grad():
-        scene.gaussians.opacity_logits[3] = -7.0
-        scene.gaussians.means[5, 1] = float("nan")
-        scene.gaussians.quats[8] = 0.0
-    content = page_scene.page_scene(scene, 0)
-    assert content.facts["gaussians"] == 47
-    made = gaussians_of(*unpack(pack(content.facts, content.columns)))
-    assert made.opacities().min() > 1 / 255 and made.means.isfinite().all()
-    with torch.no_grad():
-        scene.gaussians.opacity_logits.fill_(-9.0)
-    with pytest.raises(UserError, match="no Gaussian that can be seen"):
-        page_scene.page_scene(scene, 0)
-
-
-def test_one_outlier_does_not_coarsen_the_others():
-    plain, spoilt = (bar_scene(nodes=12, gaussians=3000) for _ in range(2))
-    with torch.no_grad():
-        spoilt.gaussians.sh_rest[7] = 80.0
-        spoilt.gaussians.means[11] = torch.tensor([4e5, -1e7, 3.0])
-    contents = [page_scene.page_scene(scene, 1) for scene in (plain, spoilt)]
-    assert contents[0].facts["gaussians"] == 3000 and contents[1].facts["gaussians"] == 2999  # a stray is left out
-    steps = [{column.name: column.step for column in content.columns} for content in contents]
-    for name, step in steps[0].items():
-        if name.startswith(("mean", "sh")):
-            assert steps[1][name] < 1.7 * step and steps[1][name] <= 1.01 * page_scene.STEPS["sh_rest"], name
-    made = gaussians_of(*unpack(pack(contents[1].facts, contents[1].columns)))
-    assert 0.9 < made.sh_rest.max() < 1.7  # the outlier, clipped
-    with torch.no_grad():
-        spoilt.gaussians.means.add_(1e6)  # all are far: one is a stray
-    assert page_scene.page_scene(spoilt, 0).facts["gaussians"] == 2999
-
-
-def test_scarce_codes_are_for_what_is_common():
-    values = np.random.default_rng(1).normal(size=5000)
-    for outlier in (1e4, -1e4):
-        column = quantise("x", np.append(values, outlier), 1e-3, most_bits=8)
-        most = np.abs(values).max()
-        assert column.step < 3 * most / 255 and np.abs(column.values()[:-1] - values).max() < 0.51 * column.step
-    far = quantise("x", 1e3 + values, 1e-3, most_bits=8)
-    assert np.abs(far.values() - values - 1e3).max() < 0.51 * np.ptp(values) / 255
-
-
-def test_quick_motions_are_sampled_more_often():
-    slow, quick = bar_scene(), bar_scene()
-    swing = quick.motion.poses
-    quick.motion.poses = lambda times: swing(0.5 + 0.5 * torch.sin(40 * times))  # type: ignore[method-assign]
-    few, many = (page_scene.sample_poses(scene.motion)["translation"] for scene in (slow, quick))
-    assert len(few) < len(many) == page_scene.MOST_SAMPLES
-    exact = swing(0.5 + 0.5 * torch.sin(40 * torch.tensor([100 / 256])))[0].translations
-    assert np.allclose(many[100], exact, atol=1e-6)
-
-
-def test_rotations_do_not_turn_over_between_samples():
-    scene = rich_scene()
-    plain = scene.motion.poses
-
-    def flipping(times: torch.Tensor) -> list[Pose]:
-        return [
-            Pose(pose.translations, pose.rotations * (-1.0) ** round(97 * time), pose.shape_rotations, pose.log_scales)
-            for time, pose in zip(times.tolist(), plain(times))
-        ]
-
-    scene.motion.poses = flipping  # type: ignore[method-assign]
-    found = page_scene.sample_poses(scene.motion)["rotation"]
-    assert ((found[1:] * found[:-1]).sum(axis=2) > 0.5).all()
 
 
 class Parts(HTMLParser):
@@ -185,7 +86,7 @@ def test_the_program_is_small_and_the_same_scene_gives_the_same_page(tmp_path):
         page.write_page(scene, tmp_path / f"{name}.html")
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
     assert len(page.assemble(b"")) < 64 * 1024
-    assert "http://" not in page._program() and "https://" not in page._program()
+    assert "http://" not in page.program_text() and "https://" not in page.program_text()
 
 
 def test_a_page_gives_up_degrees_until_it_fits_and_refuses_otherwise(tmp_path):
@@ -202,15 +103,6 @@ def test_a_page_gives_up_degrees_until_it_fits_and_refuses_otherwise(tmp_path):
     assert path.read_bytes() == smaller and [p.name for p in tmp_path.iterdir()] == ["page.html"]
     with pytest.raises(UserError, match="above 0"):
         page.write_page(scene, path, max_mib=0)
-
-
-@pytest.mark.parametrize("name", ["hexplane", "per-gaussian"])
-def test_motions_without_control_points_are_refused(name, tmp_path):
-    scene = bar_scene(nodes=12, gaussians=20)
-    scene.motion = build_motion(name, scene.config)
-    with pytest.raises(UserError, match=f"{name} has no control points"):
-        page.write_page(scene, tmp_path / "page.html")
-    assert not list(tmp_path.iterdir())
 
 
 def test_bad_places_are_refused(tmp_path):

@@ -7,12 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from plyfile import PlyData, PlyElement
 
 from helpers.edit_scenes import dress
+from helpers.export_files import cloud, difference, ordered, picture, ply_columns
+from helpers.node_packages import splat_transform
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_axis
 from scgs_warp.errors import UserError
+from scgs_warp.export.run import write_still
+from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from scgs_warp.geometry import cameras
 from scgs_warp.scene.from_gaussians import open_ply
@@ -151,3 +156,14 @@ def test_a_header_that_counts_more_than_there_is(tmp_path):
     path.write_bytes("\n".join([*head, "property list uint float y", "end_header", ""]).encode() + bytes(12))
     with pytest.raises(UserError, match="no PLY file with vertices"):
         read_gaussian_ply(path)
+
+
+def test_ply_is_read_by_plyfile_trimesh_and_splat_transform(tmp_path):
+    truth = ordered(cloud())
+    write_still(tmp_path / "a.ply", truth)
+    assert max(difference(ply_columns(tmp_path / "a.ply"), truth).values()) < 2e-5
+    loaded = trimesh.load(tmp_path / "a.ply")
+    np.testing.assert_array_equal(loaded.vertices, truth.means.double().numpy())
+    assert float((picture(read_gaussians(tmp_path / "a.ply").activate()) - picture(truth)).abs().max()) < 1e-5
+    other = splat_transform(tmp_path / "a.ply", tmp_path / "b.ply")
+    assert max(difference(ply_columns(other), truth).values()) < 2e-5

@@ -8,7 +8,7 @@ import math
 from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_matrix
-from scgs_warp.editor.model import Model
+from scgs_warp.editor.model import EditorModel
 from scgs_warp.editor.views import ClientCamera
 from scgs_warp.geometry.cameras import orbit_camera
 
@@ -20,14 +20,14 @@ def loaded() -> EditSession:
     return EditSession(bar_scene(gaussians=1500))
 
 
-def new_model() -> Model:
+def new_model() -> EditorModel:
     """Return the editor's initial model, without automatic pins around handles."""
-    made = Model(loaded().fork())
+    made = EditorModel(loaded().fork())
     made.pin_rings = None
     return made
 
 
-def chosen(model: Model, point=RIGHT, rings: int = 1) -> tuple[int, ...]:
+def chosen(model: EditorModel, point=RIGHT, rings: int = 1) -> tuple[int, ...]:
     return model.session.ring([model.session.nearest(point, model.time)], rings)
 
 
@@ -37,3 +37,8 @@ def client(session: EditSession, azimuth: float = 40.0, size: int = 96) -> Clien
     wxyz = from_matrix(camera.viewmat[:3, :3].double().numpy().T)
     fov = 2 * math.atan(camera.height / (2 * float(camera.K[1, 1])))
     return ClientCamera(tuple(wxyz.tolist()), tuple(camera.position.tolist()), fov, camera.width, camera.height)
+
+
+def canvas_camera(x: float = 0.0, width: int = 100) -> ClientCamera:
+    """A browser of 100 x 50 pixels in front of the origin."""
+    return ClientCamera((1.0, 0.0, 0.0, 0.0), (x, 0.0, -4.0), 0.7, width, 50)

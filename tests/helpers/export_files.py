@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import gzip
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 
+from helpers.edit_scenes import dress
 from helpers.scenes import look_at
+from scgs_warp.gaussians import SH_C0
 from scgs_warp.rendering.render import render
 from scgs_warp.types import Camera, Gaussians
 
@@ -38,3 +43,60 @@ def picture(gaussians: Gaussians) -> torch.Tensor:
     K = torch.tensor([[80.0, 0, 32], [0, 80, 32], [0, 0, 1]])
     camera = Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), up).float(), K, 64, 64)
     return render(gaussians, camera, torch.zeros(3)).rgb
+
+
+@torch.no_grad()
+def cloud(count: int = 300, degree: int = 3) -> Gaussians:
+    generator = torch.Generator().manual_seed(5)
+    made = dress(0.5 * torch.randn(count, 3, generator=generator) + torch.tensor([0.3, -0.2, 0.1]), degree=degree)
+    made.opacity_logits.copy_(2.0 * torch.randn(count, generator=generator))
+    made.log_scales.add_(0.4 * torch.randn(count, 3, generator=generator))
+    return made.activate()
+
+
+def ordered(gaussians: Gaussians) -> Gaussians:
+    """By x, so that files which sort can be compared; quaternions unit, w positive."""
+    order = gaussians.means[:, 0].argsort()
+    quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
+    quats = torch.where(quats[:, :1] < 0, -quats, quats)
+    parts = {**vars(gaussians), "quats": quats}
+    return Gaussians(**{name: value.detach()[order] for name, value in parts.items()})
+
+
+def ply_columns(path: Path, sort: bool = False) -> dict[str, np.ndarray]:
+    """A .ply by plyfile; ``sort``: in the order of :func:`ordered`."""
+    data = PlyData.read(str(path))["vertex"].data
+    order = np.argsort(data["x"], kind="stable") if sort else np.arange(len(data))
+    return {name: np.asarray(data[name], np.float64)[order] for name in data.dtype.names}
+
+
+def columns(found: dict[str, np.ndarray], name: str, count: int) -> np.ndarray:
+    return np.stack([found[f"{name}_{i}"] for i in range(count)], 1)
+
+
+def difference(found: dict[str, np.ndarray], truth: Gaussians) -> dict[str, float]:
+    """Largest differences of a .ply's activated columns; rotations in degrees."""
+    quats = columns(found, "rot", 4)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    other = torch.nn.functional.normalize(truth.quats.double(), dim=1).numpy()
+    chord = np.minimum(np.linalg.norm(quats - other, axis=1), np.linalg.norm(quats + other, axis=1))
+    means = np.stack([found[axis] for axis in "xyz"], 1)
+    errors = {
+        "means": np.abs(means - truth.means.double().numpy()).max(),
+        "scales": np.abs(columns(found, "scale", 3) - truth.scales.double().log().numpy()).max(),
+        "opacities": np.abs(1 / (1 + np.exp(-found["opacity"])) - truth.opacities.double().numpy()).max(),
+        "colors": np.abs(SH_C0 * (columns(found, "f_dc", 3) - truth.sh_dc.double().numpy())).max(),
+        "degrees": np.degrees(4 * np.arcsin(chord / 2)).max(),
+    }
+    rest = 3 * truth.sh_rest.shape[1]
+    if rest and "f_rest_0" in found:
+        values = columns(found, "f_rest", rest).reshape(len(means), 3, -1).transpose(0, 2, 1)
+        errors["harmonics"] = np.abs(values - truth.sh_rest.double().numpy()).max()
+    return {name: float(value) for name, value in errors.items()}
+
+
+def zeros_spz(path: Path, count: int) -> Path:
+    """A file of harmonics of degree 3 that are all the same: a thousandth of what it holds."""
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0)
+    path.write_bytes(gzip.compress(head + bytes(65 * count)))
+    return path

@@ -295,7 +295,7 @@ def test_paths_in_an_edit_are_refused(tmp_path, more):
 
 @pytest.mark.parametrize("name", ["../x", "a/b", "/etc/x", "..", "", "a\0b", "a\nb", ".hidden", "x" * 200, "\u202ea"])
 def test_names_in_the_editor_stay_in_its_folder(tmp_path, name):
-    refused(lambda: files.place(tmp_path / "edits", name, ".json"), "file name")
+    refused(lambda: files.output_path(tmp_path / "edits", name, ".json"), "file name")
     assert not (tmp_path / "edits").exists()
 
 

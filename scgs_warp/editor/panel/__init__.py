@@ -1,1 +1,1 @@
-"""Sections of the panel beside the picture."""
+"""The panel beside the picture, one file per tab. Sections know the editor through ``host.Host`` alone."""

@@ -1,10 +1,10 @@
-"""Controls for files: save and load the edit, screenshot, film, PLY. All in one folder, and for the browser to keep."""
+"""Controls for files: save and load edits, export screenshots, films and PLY files, to one folder and the browser."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...edit import Edit, edit_file
 from ...edit.field_reader import MAX_BYTES, parse_object
@@ -14,32 +14,30 @@ from ...visualization.video import write_png
 from .. import files
 from ..escape import plain
 from ..jobs import Jobs
-
-if TYPE_CHECKING:
-    from ..app import Editor
+from .host import Host
 
 NONE: str = "none yet"
-OFFERED = 64 << 20
-"""Bytes; what is larger stays on the server's disk, or the page would hold it all in memory."""
+MAX_DOWNLOAD = 64 << 20
+"""Size in bytes of the largest file offered to the browser, because the page holds all of it in memory."""
 
 
 class FilesSection:
     """Save, load, export."""
 
-    def __init__(self, editor: Editor, jobs: Jobs) -> None:
-        self.editor, self.model, self.jobs = editor, editor.model, jobs
-        gui, click = editor.server.gui, self._click
-        gui.add_markdown(f"Files go to **{plain(editor.folder.name)}** and to the browser.")
+    def __init__(self, host: Host, jobs: Jobs) -> None:
+        self.host, self.model, self.jobs = host, host.model, jobs
+        gui, click = host.server.gui, self._click
+        gui.add_markdown(f"Files go to **{plain(host.folder.name)}** and to the browser.")
         with gui.add_folder("The edit"):
             self.name = gui.add_text("Name", "edit")
             self.replace = gui.add_checkbox(
-                "Replace files", False, hint="Else a number is added to names that are taken"
+                "Replace files", False, hint="Otherwise a number is added to names that exist"
             )
             click(gui.add_button("Save edit"), lambda event: self.save(event.client))
             self.saved = gui.add_dropdown("Saved", (NONE,))
             click(gui.add_button("Load edit"), lambda event: self.load(self.saved.value))
             self.upload = gui.add_upload_button("Load from this computer", mime_type="application/json")
-            self.upload.on_upload(editor.guarded(lambda event: self.load_bytes(event.target.value.content)))
+            self.upload.on_upload(host.guarded(lambda event: self.load_bytes(event.target.value.content)))
         with gui.add_folder("Results"):
             click(gui.add_button("Screenshot"), lambda event: self.screenshot(event.client))
             self.format = gui.add_dropdown("Film as", (".mp4", ".gif"))
@@ -47,61 +45,61 @@ class FilesSection:
             click(gui.add_button("Export PLY"), lambda event: self.export_ply(event.client))
 
     def _click(self, button: Any, action: Callable[[Any], Any]) -> None:
-        button.on_click(self.editor.guarded(action))
+        button.on_click(self.host.guarded(action))
 
     def _path(self, suffix: str) -> Path:
-        path = files.place(self.editor.folder, self.name.value, suffix)
-        return path if self.replace.value else files.free(path)
+        path = files.output_path(self.host.folder, self.name.value, suffix)
+        return path if self.replace.value else files.unused_path(path)
 
     def offer(self, client: Any, path: Path) -> None:
         """Send a file to the browser, which shows a link to it."""
-        if client is not None and path.is_file() and path.stat().st_size <= OFFERED:
+        if client is not None and path.is_file() and path.stat().st_size <= MAX_DOWNLOAD:
             client.send_file_download(path.name, path.read_bytes())
 
     def save(self, client: Any = None) -> Path:
         path = self._path(".json")
         with self.model.lock:
             self.model.session.save(path)
-        self.editor.say(client, "Saved", path.name, "green")
+        self.host.say(client, "Saved", path.name, "green")
         self.offer(client, path)
         return path
 
     def load(self, name: str) -> None:
-        """A saved edit.
+        """Load a saved edit.
 
         Raises:
-            UserError: none is chosen, or it is wrong; the edit is as before.
+            UserError: no edit is chosen, or a field is wrong; the edit stays unchanged.
         """
         if name == NONE:
             raise UserError("no edit is saved here yet; save one, or load one from this computer")
-        path = files.place(self.editor.folder, name, ".json")
-        self._take(lambda: edit_file.read(path, self.model.session))
+        path = files.output_path(self.host.folder, name, ".json")
+        self._take(lambda: edit_file.read(path, self.model.session.engine))
 
     def load_bytes(self, content: bytes) -> None:
-        """An edit that the browser sent.
+        """Load an edit that the browser sent.
 
         Raises:
-            UserError: it is wrong; the edit is as before.
+            UserError: a field is wrong; the edit stays unchanged.
         """
         if len(content) > MAX_BYTES:
             raise UserError(f"the file is larger than {MAX_BYTES >> 20} MiB; give an edit's JSON")
         try:
             text = content.decode("utf-8")
         except UnicodeDecodeError:
-            raise UserError("the file is no UTF-8 text; give an edit's JSON") from None
-        self._take(lambda: edit_file.parse(parse_object(text, "the file"), "the file", self.model.session))
+            raise UserError("the file is not UTF-8 text; give an edit's JSON") from None
+        self._take(lambda: edit_file.parse(parse_object(text, "the file"), "the file", self.model.session.engine))
 
     def _take(self, read: Callable[[], Edit]) -> None:
-        edit = self.editor.worker.call(read)  # places become control points: that needs the motion
+        edit = self.host.worker.call(read)  # turning places into control points evaluates the motion
         with self.model.changing() as session:
             session.apply(edit)
 
     def screenshot(self, client: Any) -> Path:
-        """The picture as the client sees it, in full, without overlays."""
-        camera, moment = self.editor.camera(client), self.model.moment()
+        """Write the picture as the client sees it, at full size, without overlays."""
+        camera, moment = self.host.camera(client), self.model.moment()
         if not camera.usable:
             raise UserError("the browser's window has no size; open it and try again")
-        picture = self.editor.worker.call(lambda: self.editor.take(moment, camera))
+        picture = self.host.worker.call(lambda: self.host.take_picture(moment, camera))
         path = self._path(".png")
         try:
             write_png(path, picture.rgb)
@@ -114,13 +112,13 @@ class FilesSection:
         self.jobs.start(name, total, action, client)
 
     def export_film(self, client: Any = None) -> Path:
-        """Begin the film of the edit as it is now; what is changed meanwhile is not in it."""
+        """Start the film of the edit as it is now; later changes do not affect it."""
         path = self._path(self.format.value)
         with self.model.lock:
             session = self.model.session.fork()
 
         def work(advance: Callable[[], None]) -> Path:
-            compute = lambda draw: self.editor.worker.call(draw, patient=True)  # noqa: E731
+            compute = lambda draw: self.host.worker.call(draw, patient=True)  # noqa: E731
             render_film(session, path, advance, compute)
             return path
 
@@ -128,20 +126,20 @@ class FilesSection:
         return path
 
     def export_ply(self, client: Any = None) -> Path:
-        """Begin to write the edited Gaussians at the moment shown."""
+        """Start to write the edited Gaussians at the moment shown."""
         path = self._path(".ply")
         moment = self.model.moment()
         with self.model.lock:
             session = self.model.session.fork()
 
         def work(advance: Callable[[], None]) -> Path:
-            self.editor.worker.call(lambda: session.export_ply(path, moment.time, moment.at), patient=True)
+            self.host.worker.call(lambda: session.export_ply(path, moment.time, moment.at), patient=True)
             return path
 
         self._start(client, f"PLY {path.name}", 1, work)
         return path
 
     def show(self) -> None:
-        names = files.edits(self.editor.folder) or (NONE,)
+        names = files.saved_edits(self.host.folder) or (NONE,)
         if self.saved.options != names:
             self.saved.options = names

@@ -1,39 +1,39 @@
-"""Controls for time: the moment shown, play, keyframes, and the film that is made of it."""
+"""Controls for time: moment shown, playback, keyframes and the film's settings."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...edit.keyframes import Easing
 from ...errors import UserError
 from ..film_camera import view_of
-
-if TYPE_CHECKING:
-    from ..app import Editor
+from .host import Host
 
 NONE = "none"
 EASINGS: tuple[Easing, ...] = ("smooth", "linear", "ease", "step")
-SHORTEST, LONGEST = 0.04, 600.0
-"""Seconds of a film that the panel offers; scripts may ask for others."""
-SLOWEST, FASTEST = 1.0, 120.0
-"""The same of its frames a second."""
+MIN_SECONDS, MAX_SECONDS = 0.04, 600.0
+"""Range of film lengths in seconds that the panel offers; scripts may set others."""
+MIN_FPS, MAX_FPS = 1.0, 120.0
+"""Range of frames per second that the panel offers; scripts may set others."""
 REPEATS = ("once", "loop", "swing", "stand still")
 
 
 class TimeSection:
-    """The slider and play."""
+    """Time slider and play button."""
 
-    def __init__(self, editor: Editor) -> None:
-        gui, self.model = editor.server.gui, editor.model
+    def __init__(self, host: Host) -> None:
+        gui, self.model = host.server.gui, host.model
         film = self.model.session.edit.film
-        self.at = editor.on_value(
-            gui.add_slider("Second", 0.0, film.seconds, min(1.0 / film.fps, film.seconds), 0.0, hint="Of the film"),
+        self.at = host.on_value(
+            gui.add_slider(
+                "Second", 0.0, film.seconds, min(1.0 / film.fps, film.seconds), 0.0, hint="Time in the film"
+            ),
             self.model.seek,
         )
         self.play = gui.add_button("Play")
-        self.play.on_click(editor.guarded(lambda event: self.model.play(not self.model.playing)))
+        self.play.on_click(host.guarded(lambda event: self.model.play(not self.model.playing)))
 
     def show(self) -> None:
         model = self.model
@@ -47,31 +47,35 @@ class TimeSection:
 class FilmSection:
     """Keyframes, playback and the film's settings."""
 
-    def __init__(self, editor: Editor) -> None:
-        self.editor, self.model = editor, editor.model
-        gui, on = editor.server.gui, editor.on_value
+    def __init__(self, host: Host) -> None:
+        self.host, self.model = host, host.model
+        gui, on = host.server.gui, host.on_value
         with gui.add_folder("Keyframes"):
             self.list = gui.add_markdown("")
             self.easing = gui.add_dropdown("Way to the next", EASINGS)
             self.add = gui.add_button("Add keyframe here")
-            self.add.on_click(editor.guarded(lambda event: self.model.add_keyframe(self.easing.value)))
-            self.chosen = on(gui.add_dropdown("Keyframe", (NONE,)), self._go)
+            self.add.on_click(host.guarded(lambda event: self.model.add_keyframe(self.easing.value)))
+            self.chosen = on(gui.add_dropdown("Keyframe", (NONE,)), self.seek_keyframe)
             self.remove = gui.add_button("Remove this keyframe")
-            self.remove.on_click(editor.guarded(lambda event: self._remove()))
-        self._dress_film()
+            self.remove.on_click(host.guarded(lambda event: self._remove()))
+        self._add_film()
 
-    def _dress_film(self) -> None:
-        gui, on, film = self.editor.server.gui, self.editor.on_value, self.model.session.edit.film
+    def _add_film(self) -> None:
+        gui, on, film = self.host.server.gui, self.host.on_value, self.model.session.edit.film
         with gui.add_folder("Film"):
             self.seconds = on(
                 gui.add_number(
-                    "Seconds", film.seconds, min=min(SHORTEST, film.seconds), max=max(LONGEST, film.seconds), step=0.01
+                    "Seconds",
+                    film.seconds,
+                    min=min(MIN_SECONDS, film.seconds),
+                    max=max(MAX_SECONDS, film.seconds),
+                    step=0.01,
                 ),
                 lambda value: self._film(seconds=float(value)),
             )
             self.fps = on(
                 gui.add_number(
-                    "Frames a second", film.fps, min=min(SLOWEST, film.fps), max=max(FASTEST, film.fps), step=1.0
+                    "Frames a second", film.fps, min=min(MIN_FPS, film.fps), max=max(MAX_FPS, film.fps), step=1.0
                 ),
                 lambda value: self._film(fps=float(value)),
             )
@@ -82,7 +86,7 @@ class FilmSection:
             self.repeat = on(gui.add_dropdown("The motion plays", REPEATS), self._repeat)
             self.speed = on(gui.add_number("Speed", 1.0, min=-100.0, max=100.0, step=0.1), self._speed)
             self.camera = gui.add_button_group("Camera", ("Round", "From here"))
-            self.camera.on_click(self.editor.guarded(self._shot))
+            self.camera.on_click(self.host.guarded(self._shot))
 
     def _film(self, **fields: Any) -> None:
         self.model.replace(film=dataclasses.replace(self.model.session.edit.film, **fields))
@@ -102,21 +106,21 @@ class FilmSection:
         if event.target.value == "Round":
             self._film(shot=dataclasses.replace(shot, kind="turntable"))
         else:
-            view = view_of(self.model.session, self.editor.camera(event.client))
+            view = view_of(self.model.session, self.host.camera(event.client))
             self._film(shot=dataclasses.replace(shot, kind="fixed", views=(view,), up=None))
 
-    def _go(self, name: str) -> None:
+    def seek_keyframe(self, name: str) -> None:
         if name != NONE:
-            self.model.seek(self._moments()[name])
+            self.model.seek(self.keyframe_labels()[name])
 
-    def _moments(self) -> dict[str, float]:
+    def keyframe_labels(self) -> dict[str, float]:
         times = [frame.at for frame in self.model.session.edit.keyframes]
         short = [f"{at:.3f} s" for at in times]
         often = Counter(short)
         return {label if often[label] == 1 else f"{at!r} s": at for label, at in zip(short, times)}
 
     def _remove(self) -> None:
-        at = self._moments().get(self.chosen.value)
+        at = self.keyframe_labels().get(self.chosen.value)
         if at is None:
             raise UserError("no keyframe is chosen; choose one from the list first")
         with self.model.changing() as session:
@@ -128,12 +132,12 @@ class FilmSection:
         rows = [f"| {frame.at:.2f} | {len(frame.targets)} | {frame.easing} |" for frame in edit.keyframes]
         head = "| second | handles | way to the next |\n|---|---|---|\n"
         self.list.content = head + "\n".join(rows) if rows else "*None yet: move a handle, then add one.*"
-        names = (NONE, *self._moments())
+        names = (NONE, *self.keyframe_labels())
         if self.chosen.options != names:
             self.chosen.options = names
-        self.chosen.value = next((n for n, at in self._moments().items() if at == self.model.at), NONE)
-        self.seconds.min, self.seconds.max = min(SHORTEST, film.seconds), max(LONGEST, film.seconds)
-        self.fps.min, self.fps.max = min(SLOWEST, film.fps), max(FASTEST, film.fps)
+        self.chosen.value = next((n for n, at in self.keyframe_labels().items() if at == self.model.at), NONE)
+        self.seconds.min, self.seconds.max = min(MIN_SECONDS, film.seconds), max(MAX_SECONDS, film.seconds)
+        self.fps.min, self.fps.max = min(MIN_FPS, film.fps), max(MAX_FPS, film.fps)
         self.seconds.value, self.fps.value, self.size.value = film.seconds, film.fps, film.size
         self.repeat.value = playback.repeat if playback.freeze is None else "stand still"
         self.speed.min, self.speed.max = min(-100.0, playback.speed), max(100.0, playback.speed)

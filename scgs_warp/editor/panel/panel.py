@@ -1,21 +1,19 @@
-"""The panel beside the picture: sections of controls, each of which shows the model and changes it."""
+"""The panel beside the picture: sections of controls, each of which shows and changes the model."""
 
 from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..escape import plain
-from ..jobs import Jobs, Progress
+from ..jobs import JobProgress, Jobs
 from .files import FilesSection
 from .film import FilmSection, TimeSection
+from .host import Host
 from .motion import MotionSection
 from .shape import ShapeSection
 from .view import ViewSection
-
-if TYPE_CHECKING:
-    from ..app import Editor
 
 HELP = (
     "**Click** the scene to choose control points (shift: more, ctrl: fewer), then drag the **gizmo**: arrows move, "
@@ -24,76 +22,76 @@ HELP = (
 
 
 class Panel:
-    """Everything beside the picture.
+    """All controls beside the picture.
 
-    Attributes: ``jobs`` (films and exports in the making) and the sections ``time``, ``shape``, ``motion``, ``film``,
+    Attributes: ``jobs`` (films and exports in progress) and the sections ``time``, ``shape``, ``motion``, ``film``,
     ``view``, ``files``.
     """
 
-    def __init__(self, editor: Editor) -> None:
-        self.editor = editor
+    def __init__(self, host: Host) -> None:
+        self.host = host
         self.jobs = Jobs(self._progress, self._ended)
         self._lock = threading.RLock()
-        gui = editor.server.gui
+        gui = host.server.gui
         self.status = gui.add_markdown(HELP)
         self.work = gui.add_markdown("", visible=False)
         self.bar = gui.add_progress_bar(0.0, animated=True, visible=False)
         self.stop = gui.add_button("Stop the job", icon=None, color="red", visible=False)
-        self.stop.on_click(editor.guarded(lambda event: self.jobs.cancel()))
+        self.stop.on_click(host.guarded(lambda event: self.jobs.cancel()))
         self.history = gui.add_button_group("Edit", ("Undo", "Redo", "Reset"))
-        self.history.on_click(editor.guarded(self._history))
+        self.history.on_click(host.guarded(self._history))
         self._commands()
-        self.time = TimeSection(editor)
+        self.time = TimeSection(host)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Shape"):
-            self.shape = ShapeSection(editor)
+            self.shape = ShapeSection(host)
         with tabs.add_tab("Motion"):
-            self.motion = MotionSection(editor)
+            self.motion = MotionSection(host)
         with tabs.add_tab("Film"):
-            self.film = FilmSection(editor)
+            self.film = FilmSection(host)
         with tabs.add_tab("View"):
-            self.view = ViewSection(editor)
+            self.view = ViewSection(host)
         with tabs.add_tab("Files"):
-            self.files = FilesSection(editor, self.jobs)
+            self.files = FilesSection(host, self.jobs)
         self.show()
 
     def _commands(self) -> None:
-        """Keys, where this viser knows them."""
-        add = getattr(self.editor.server.gui, "add_command", None)
+        """Add keyboard shortcuts if this version of viser has them."""
+        add = getattr(self.host.server.gui, "add_command", None)
         if add is None:
             return
         for label, key, modifier, action in (
-            ("Undo", "Z", "cmd/ctrl", self.editor.model.undo),
-            ("Redo", "Z", "cmd/ctrl+shift", self.editor.model.redo),
+            ("Undo", "Z", "cmd/ctrl", self.host.model.undo),
+            ("Redo", "Z", "cmd/ctrl+shift", self.host.model.redo),
         ):
             add(label, hotkey=key, modifier=modifier).on_trigger(
-                self.editor.guarded(lambda event, action=action: action())
+                self.host.guarded(lambda event, action=action: action())
             )
 
     def _history(self, event: Any) -> None:
-        model = self.editor.model
+        model = self.host.model
         what = event.target.value
         if what == "Reset":
             model.reset()
         elif not (model.undo() if what == "Undo" else model.redo()):
-            self.editor.say(event.client, what, f"there is nothing to {what.lower()}", "gray")
+            self.host.say(event.client, what, f"there is nothing to {what.lower()}", "gray")
 
     def show(self) -> None:
-        """Make every control say what the model says."""
+        """Set every control to the model's state."""
         with self._lock:
             for section in (self.time, self.shape, self.motion, self.film, self.view, self.files):
                 section.show()
             self.status.content = f"{HELP}\n\n{self._said()}"
-            self.editor.color_overlays()
+            self.host.color_overlays()
 
     def show_time(self) -> None:
-        """As ``show``, of what goes with the moment shown."""
+        """Set the controls that depend on the moment shown."""
         with self._lock:
             self.time.show()
             self.shape.show_target()
 
     def _said(self) -> str:
-        model = self.editor.model
+        model = self.host.model
         edit = model.session.edit
         chosen = f"**{plain(model.active)}**" if model.active else f"{len(model.selection)} control points chosen"
         counts = f"handles: {len(edit.handles)}, pinned: {len(edit.pins)}, keyframes: {len(edit.keyframes)}"
@@ -101,7 +99,7 @@ class Panel:
 
     # Jobs
 
-    def _progress(self, progress: Progress | None) -> None:
+    def _progress(self, progress: JobProgress | None) -> None:
         busy = progress is not None
         self.work.visible = self.bar.visible = self.stop.visible = busy
         if progress is not None:
@@ -112,8 +110,8 @@ class Panel:
 
     def _ended(self, client: Any, name: str, result: Path | None, problem: str | None) -> None:
         if problem is not None or result is None:
-            self.editor.say(client, name, problem or "nothing was written", "orange")
+            self.host.say(client, name, problem or "nothing was written", "orange")
             return
-        self.editor.say(client, name, f"done: {result}", "green")
+        self.host.say(client, name, f"done: {result}", "green")
         self.files.offer(client, result)
         self.show()

@@ -1,10 +1,10 @@
-"""Controls for the shape: what a click takes, handles and their numbers, pins."""
+"""Controls for the shape: extent of a click's selection, handles, pins."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,27 +12,25 @@ from ...edit import Target
 from ...edit.handles import STAY
 from ...edit.rotations import exponential, logarithm
 from ...errors import UserError
-
-if TYPE_CHECKING:
-    from ..app import Editor
+from .host import Host
 
 NEW = "new, from the selection"
 EXACT = 0.0
-"""In the panel a stiffness of 0 stands for None: exactly where it is put."""
+"""Stiffness that stands for None in the panel: nodes go exactly to the target."""
 
 
 class ShapeSection:
     """Selection, handle, pins."""
 
-    def __init__(self, editor: Editor) -> None:
-        self.editor, self.model = editor, editor.model
-        self._dress_selection()
-        self._dress_handle()
-        self._dress_pins()
+    def __init__(self, host: Host) -> None:
+        self.host, self.model = host, host.model
+        self._add_selection()
+        self._add_handle()
+        self._add_pins()
 
-    def _dress_selection(self) -> None:
-        gui, model, on = self.editor.server.gui, self.model, self.editor.on_value
-        unit = self.editor.edge_length
+    def _add_selection(self) -> None:
+        gui, model, on = self.host.server.gui, self.model, self.host.on_value
+        unit = self.host.edge_length
         with gui.add_folder("Selection"):
             self.kind = on(gui.add_dropdown("A click takes", ("rings", "brush")), lambda kind: self._region(kind=kind))
             self.rings = on(gui.add_slider("Rings", 0, 12, 1, model.region.rings), lambda n: self._region(rings=n))
@@ -45,7 +43,7 @@ class ShapeSection:
                 lambda how: model.set(combine=how),
             )
             self.buttons = gui.add_button_group("", ("Grow", "All", "None"))
-            self.buttons.on_click(self.editor.guarded(lambda event: self._select(event.target.value)))
+            self.buttons.on_click(self.host.guarded(lambda event: self._select(event.target.value)))
 
     def _region(self, **fields: Any) -> None:
         self.model.set(region=dataclasses.replace(self.model.region, **fields))
@@ -59,18 +57,20 @@ class ShapeSection:
         else:
             model.select(tuple(range(len(session))) if what == "All" else ())
 
-    def _dress_handle(self) -> None:
-        gui, model, on = self.editor.server.gui, self.model, self.editor.on_value
+    def _add_handle(self) -> None:
+        gui, model, on = self.host.server.gui, self.model, self.host.on_value
         with gui.add_folder("Handle"):
-            self.handle = on(gui.add_dropdown("Handle", (NEW,)), lambda label: model.activate(self._names()[label]))
+            self.handle = on(
+                gui.add_dropdown("Handle", (NEW,)), lambda label: model.activate(self.handle_labels()[label])
+            )
             self.move = on(
-                gui.add_vector3("Move", (0.0, 0.0, 0.0), step=_round(0.1 * self.editor.edge_length)), self._moved
+                gui.add_vector3("Move", (0.0, 0.0, 0.0), step=_round(0.1 * self.host.edge_length)), self.move_handle
             )
             self.turn = on(
                 gui.add_vector3(
                     "Turn, degrees", (0.0, 0.0, 0.0), step=1.0, hint="About x, y and z at once: an axis times an angle"
                 ),
-                self._turned,
+                self.turn_handle,
             )
             self.lasts = on(
                 gui.add_dropdown(
@@ -83,49 +83,49 @@ class ShapeSection:
                 lambda w: self._set(window=w),
             )
             self.stiffness = on(
-                gui.add_number("Stiffness", EXACT, min=0.0, max=1e6, step=0.01, hint="0: exactly where it is put"),
+                gui.add_number("Stiffness", EXACT, min=0.0, max=1e6, step=0.01, hint="0: exactly at the target"),
                 lambda s: self._set(stiffness=None if s == EXACT else s),
             )
             self.remove = gui.add_button_group("", ("Put back", "Remove"))
-            self.remove.on_click(self.editor.guarded(lambda event: self._ended(event.target.value)))
+            self.remove.on_click(self.host.guarded(lambda event: self._ended(event.target.value)))
 
-    def _names(self) -> dict[str, str | None]:
-        """Handles by their labels; a handle may be called anything, even what stands for none."""
-        found: dict[str, str | None] = {NEW: None}
+    def handle_labels(self) -> dict[str, str | None]:
+        """Return the handles' names by unique labels, because a name may equal the label of a new handle."""
+        labels: dict[str, str | None] = {NEW: None}
         for handle in self.model.session.edit.handles:
             label = handle.name
-            while label in found:
+            while label in labels:
                 label += " (handle)"
-            found[label] = handle.name
-        return found
+            labels[label] = handle.name
+        return labels
 
-    def _moved(self, where: tuple[float, float, float]) -> None:
-        self.editor.put(Target.of(where, self.model.target.rotation))
+    def move_handle(self, where: tuple[float, float, float]) -> None:
+        self.host.put(Target.of(where, self.model.target.rotation))
 
-    def _turned(self, degrees: tuple[float, float, float]) -> None:
+    def turn_handle(self, degrees: tuple[float, float, float]) -> None:
         if not all(map(math.isfinite, degrees)):
             raise UserError(f"turn {list(degrees)}: must be three finite numbers; the handle stays where it is")
         turn = exponential(np.radians(degrees))
-        self.editor.put(Target.of(self.model.target.translation, turn.tolist()))
+        self.host.put(Target.of(self.model.target.translation, turn.tolist()))
 
     def _set(self, **fields: Any) -> None:
-        """Of the handle in hand, and of the next ones."""
+        """Change fields of the active handle and of later ones."""
         self.model.set(**fields)
         if self.model.active is not None:
             self.model.change_handle(**fields)
 
     def _ended(self, what: str) -> None:
         if what == "Put back":
-            self.editor.put(STAY)
+            self.host.put(STAY)
         else:
             self.model.remove_handle()
 
-    def _dress_pins(self) -> None:
-        gui, model, on = self.editor.server.gui, self.model, self.editor.on_value
+    def _add_pins(self) -> None:
+        gui, model, on = self.host.server.gui, self.model, self.host.on_value
         with gui.add_folder("Pins"):
             self.rest = on(
                 gui.add_checkbox(
-                    "Pin the rest", model.pin_rings is not None, hint="Whoever takes hold pins all that is far"
+                    "Pin the rest", model.pin_rings is not None, hint="A new handle pins everything far from it"
                 ),
                 lambda pinned: model.set(pin_rings=int(self.distance.value) if pinned else None),
             )
@@ -134,7 +134,7 @@ class ShapeSection:
                 lambda rings: model.set(pin_rings=int(rings) if self.rest.value else None),
             )
             self.pins = gui.add_button_group("", ("Pin", "Unpin", "Pin rest", "Unpin all"))
-            self.pins.on_click(self.editor.guarded(lambda event: self._pin(event.target.value)))
+            self.pins.on_click(self.host.guarded(lambda event: self._pin(event.target.value)))
 
     def _pin(self, what: str) -> None:
         model = self.model
@@ -156,7 +156,7 @@ class ShapeSection:
         model, edit = self.model, self.model.session.edit
         self.kind.value, self.rings.value, self.combine.value = model.region.kind, model.region.rings, model.combine
         self.rings.visible, self.radius.visible = model.region.kind == "rings", model.region.kind == "brush"
-        labels = self._names()
+        labels = self.handle_labels()
         if self.handle.options != tuple(labels):
             self.handle.options = tuple(labels)
         self.handle.value = next((label for label, name in labels.items() if name == model.active), NEW)
@@ -169,7 +169,7 @@ class ShapeSection:
         self.rest.value = model.pin_rings is not None
 
     def show_target(self) -> None:
-        """Where the handle is that is in hand, at the moment shown."""
+        """Show the target of the active handle at the moment shown."""
         target = self.model.target
         turned = tuple(np.degrees(logarithm(np.array(target.rotation))).tolist())
         for control, value in ((self.move, target.translation), (self.turn, turned)):
@@ -178,5 +178,5 @@ class ShapeSection:
 
 
 def _round(length: float) -> float:
-    """The power of ten below it: a step that suits the scene."""
+    """Return the power of ten below a length, a step that suits the scene."""
     return 10.0 ** math.floor(math.log10(length)) if length > 0 else 0.01

@@ -1,21 +1,19 @@
-"""Controls for what is shown: edited or original, side by side, overlays."""
+"""Controls for the picture's content: edited, original or both, and overlays."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 from ..model import Show
-
-if TYPE_CHECKING:
-    from ..app import Editor
+from .host import Host
 
 
 class ViewSection:
-    """What the picture shows."""
+    """Content of the picture and its overlays."""
 
-    def __init__(self, editor: Editor) -> None:
-        self.editor, self.model = editor, editor.model
-        gui, on, unit = editor.server.gui, editor.on_value, editor.node_size
+    def __init__(self, host: Host) -> None:
+        self.host, self.model = host, host.model
+        gui, on, unit = host.server.gui, host.on_value, host.node_size
         self.picture = on(gui.add_dropdown("Show", get_args(Show)), lambda show: self.model.set(show=show))
         self.nodes = on(gui.add_checkbox("Control points", True), self._overlays)
         self.graph = on(gui.add_checkbox("Graph", False), self._overlays)
@@ -30,6 +28,6 @@ class ViewSection:
 
     def show(self) -> None:
         self.picture.value, self.through.value = self.model.show, self.model.through
-        # The browser draws overlays from one camera: beside two halves, or half an original, they would lie
+        # The browser draws overlays from one camera, for the edited scene; they would not fit other pictures.
         alone = self.model.show in ("edited", "split")
-        self.editor.overlays.show(alone and self.nodes.value, alone and self.graph.value, self.size.value)
+        self.host.overlays.show(alone and self.nodes.value, alone and self.graph.value, self.size.value)

@@ -1,4 +1,4 @@
-"""A moving scene in one file: skeleton, glTF, arrays, sequences, cameras; and the app around it all."""
+"""Exports of a run, an edit, or a file of Gaussians, from the request to the bytes."""
 
 from __future__ import annotations
 
@@ -14,50 +14,27 @@ from plyfile import PlyData
 from helpers.edit_scenes import bar_scene
 from helpers.export_files import gltf_arrays, picture
 from helpers.node_packages import gltf_errors
+from helpers.page_reader import read_page
 from helpers.paths import ROOT
 from scgs_warp.apps import edit as edit_app
 from scgs_warp.apps import export as app
 from scgs_warp.apps import view as view_app
 from scgs_warp.config.presets import from_dict
-from scgs_warp.data import load
 from scgs_warp.edit import EditSession
-from scgs_warp.edit.rotations import from_axis, rotate, unit
+from scgs_warp.edit.rotations import from_axis, unit
 from scgs_warp.errors import UserError
-from scgs_warp.export.cameras import write_cameras
+from scgs_warp.export import run as job
 from scgs_warp.export.control_graph import write_graph
-from scgs_warp.export.gltf import influences
+from scgs_warp.export.request import ExportRequest, Format
 from scgs_warp.export.run import write_still
-from scgs_warp.export.skeleton import Skeleton, at_rest, build_skeleton, even_moments
+from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
 from scgs_warp.motion import Static, build_motion
 from scgs_warp.motion.control_points import ControlPoints
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
-from scgs_warp.types import Gaussians
+from scgs_warp.types import Gaussians, Pose
 
 DOCS = ROOT / "docs" / "formats.md"
-TIMES = (0.0, 0.5, 1.0)
-
-
-def skinned(skeleton: Skeleton, rest: np.ndarray, frame: int) -> np.ndarray:
-    """[N, 3] linear blend skinning as glTF defines it."""
-    arms = rest[:, None] - skeleton.rest[skeleton.indices]
-    moved = rotate(skeleton.rotations[frame][skeleton.indices], arms) + skeleton.positions[frame][skeleton.indices]
-    return (skeleton.weights[..., None] * moved).sum(1)
-
-
-@pytest.mark.parametrize("share", [None, 0.7])
-def test_the_skeleton_moves_gaussians_as_the_scene_does(share):
-    scene = bar_scene(share=share)
-    skeleton = build_skeleton(EditSession(scene), even_moments(3, 2.0))
-    np.testing.assert_array_equal(skeleton.seconds, [0.0, 0.5, 1.0])
-    np.testing.assert_allclose(skeleton.weights.sum(1), 1.0, atol=1e-12)
-    rest = at_rest(scene).means.double().numpy()
-    for frame, time in enumerate(TIMES):
-        truth = scene.gaussians_at(time).means.double().numpy()
-        assert np.abs(skinned(skeleton, rest, frame) - truth).max() < 2e-6
-        nodes = scene.control_points_at(time).double().numpy()
-        assert np.abs(skeleton.positions[frame, : len(nodes)] - nodes).max() < 1e-6
-    assert np.abs(skinned(skeleton, rest, 0) - skinned(skeleton, rest, 2)).max() > 0.05
 
 
 def bent(scene: Scene) -> EditSession:
@@ -67,33 +44,6 @@ def bent(scene: Scene) -> EditSession:
     session.pin(np.flatnonzero(x < np.quantile(x, 0.4)))
     session.move("end", [0, 0, 0.3], from_axis([0, 1, 0], 40))
     return session
-
-
-def test_the_skeleton_follows_an_edit():
-    session = bent(bar_scene())
-    skeleton = build_skeleton(session, even_moments(3, 2.0))
-    rest = at_rest(session.scene).means.double().numpy()
-    for frame, time in enumerate(TIMES):
-        truth = session.gaussians_at(time).means.double().numpy()
-        assert np.abs(skinned(skeleton, rest, frame) - truth).max() < 2e-6
-    with pytest.raises(UserError, match="mask"):
-        build_skeleton(bent(bar_scene(share=0.5)), even_moments(2, 2.0))
-
-
-def test_influences_are_what_gltf_wants():
-    weights = np.random.default_rng(0).dirichlet(np.ones(6), 500)
-    weights[:10, 3:] = 0.0
-    weights[:10] /= weights[:10].sum(1, keepdims=True)
-    joints = np.tile(np.arange(1, 7), (500, 1))
-    found = influences(joints, weights)
-    assert len(found) == 2 and found[0][0].dtype == np.dtype("<u2")
-    shares = np.concatenate([part for _, part in found], 1)
-    owners = np.concatenate([part for part, _ in found], 1)
-    assert np.abs(shares.sum(1, dtype=np.float64) - 1).max() < 2e-7 and (owners[shares == 0] == 0).all()
-    dense = np.zeros((500, 7))
-    for k in range(8):
-        dense[np.arange(500), owners[:, k]] += shares[:, k]
-    np.testing.assert_allclose(dense[:, 1:], weights, atol=1e-7)
 
 
 def save(scene: Scene, folder: Path) -> Path:
@@ -251,32 +201,6 @@ def test_an_edit_is_exported(run, tmp_path):
         np.testing.assert_allclose(player()["play"](played, second)[0], truth.means, atol=2e-6)
 
 
-def test_cameras_are_read_back(tmp_path):
-    from helpers.tiny import write_dnerf
-
-    folder = write_dnerf(tmp_path / "blobs")
-    splits = {split: load(folder, split) for split in ("train", "test")}
-    assert write_cameras(tmp_path / "transforms.json", splits) == 11
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    for name in content["train_filenames"]:  # its images are where the file says
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    for name in content["test_filenames"]:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    again = tmp_path / "again"
-    again.mkdir()
-    for name in ("transforms.json", "train", "test"):
-        (tmp_path / name).rename(again / name)
-    for split, truth in splits.items():
-        found = load(again, split)
-        assert len(found) == len(truth)
-        for ours, theirs in zip(found.entries, truth.entries):
-            assert ours.time == theirs.time and ours.name == theirs.name
-            torch.testing.assert_close(ours.camera.viewmat, theirs.camera.viewmat, atol=1e-6, rtol=0)
-            torch.testing.assert_close(ours.camera.K, theirs.camera.K)
-
-
 def test_files_are_filmed_and_edited(run, tmp_path):
     write_still(tmp_path / "a.spz", Scene.load(run).gaussians_at(0.0))
     film = tmp_path / "film"
@@ -351,3 +275,75 @@ def test_what_is_said_counts_what_is_written(run, tmp_path, capsys):
 def still_scene() -> Scene:
     scene = bar_scene(nodes=8, gaussians=20)
     return Scene(scene.gaussians, Static(), scene.normalisation, scene.config, scene.overview)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return bar_scene(nodes=12, gaussians=50, shaded=True, share=0.8)
+
+
+def spoil(scene: Scene) -> None:
+    """Two Gaussians whose shading and hyper-coordinates are no numbers."""
+    with torch.no_grad():
+        scene.gaussians.shading[3, 2] = float("nan")
+        scene.gaussians.hyper[7, -1] = float("inf")
+
+
+def spoil_motion(scene: Scene) -> None:
+    assert isinstance(scene.motion, ControlPoints)
+    plain = scene.motion.poses
+
+    def poses(times: torch.Tensor) -> list[Pose]:
+        found = plain(times)
+        for time, pose in zip(times.tolist(), found):
+            if time > 0.9:
+                pose.translations[4] = float("nan")
+        return found
+
+    scene.motion.poses = poses  # type: ignore[method-assign]
+
+
+def write(scene: Scene, path: Path, kind: Format, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job, "_open", lambda *_: scene)
+    monkeypatch.setattr(Scene, "load", lambda *_, **__: scene)
+    job.export(ExportRequest(path, run=Path("runs/x"), format=kind, frames=None if kind == "html" else 3))
+
+
+def test_npz_leaves_out_gaussians_that_are_not_finite(scene, tmp_path, monkeypatch):
+    spoil(scene)
+    write(scene, tmp_path / "a.npz", "npz", monkeypatch)
+    found = dict(np.load(tmp_path / "a.npz"))
+    assert found["shading"].shape == (48, 10)
+    assert all(np.isfinite(values).all() for values in found.values() if values.dtype.kind == "f")
+
+
+def test_glb_leaves_out_gaussians_that_are_not_finite(scene, tmp_path, monkeypatch):
+    spoil(scene)
+    write(scene, tmp_path / "a.glb", "glb", monkeypatch)
+    for name, values in gltf_arrays(tmp_path / "a.glb")[0].items():
+        assert len(values) == 48 and np.isfinite(values).all(), name
+
+
+def test_sequences_leave_out_gaussians_that_are_not_finite(scene, tmp_path, monkeypatch):
+    spoil(scene)
+    with torch.no_grad():
+        scene.gaussians.sh_dc[5, 1] = float("nan")
+    write(scene, tmp_path / "frames", "ply-sequence", monkeypatch)
+    for path in sorted((tmp_path / "frames").iterdir()):
+        data = PlyData.read(str(path))["vertex"].data
+        assert len(data) == 47 and all(np.isfinite(data[name]).all() for name in data.dtype.names)
+
+
+def test_pages_leave_out_gaussians_that_are_not_finite(scene, tmp_path, monkeypatch):
+    spoil(scene)
+    write(scene, tmp_path / "a.html", "html", monkeypatch)
+    facts, columns = read_page(tmp_path / "a.html")
+    assert facts["gaussians"] == 48 and all(np.isfinite(values).all() for values in columns.values())
+
+
+@pytest.mark.parametrize(("name", "kind"), [("a.glb", "glb"), ("a.glb", "graph"), ("a.npz", "npz"), ("a.html", "html")])
+def test_a_motion_that_is_not_finite_is_one_line(scene, tmp_path, monkeypatch, name, kind):
+    spoil_motion(scene)
+    with pytest.raises(UserError, match=r"motion is not finite.*; train again") as caught:
+        write(scene, tmp_path / name, kind, monkeypatch)
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())

@@ -1,0 +1,75 @@
+"""``apps/edit.py``: films and exports, and mistakes in one line."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from helpers.edit_scenes import dress
+from helpers.edit_scripts import SCRIPT
+from scgs_warp.apps import edit as app
+from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from scgs_warp.scene.from_gaussians import open_ply
+
+
+@pytest.fixture
+def ply(tmp_path) -> Path:
+    path = tmp_path / "scene.ply"
+    generator = torch.Generator().manual_seed(0)
+    write_gaussian_ply(path, dress(torch.randn(300, 3, generator=generator), degree=1).activate())
+    return path
+
+
+def test_the_app_films_and_exports(tmp_path, ply, capsys):
+    script = {k: SCRIPT[k] for k in ("format", "version", "film")}
+    script["handles"] = [{"name": "a", "nodes": {"point": [2, 0, 0], "rings": 1}}]
+    script["keyframes"] = [{"at": 0, "targets": {"a": {}}}, {"at": 0.5, "targets": {"a": {"translation": [1, 0, 0]}}}]
+    (tmp_path / "edit.json").write_text(json.dumps(script))
+    arguments = ["--ply", str(ply), "--script", str(tmp_path / "edit.json"), "--nodes", "40", "--size", "32"]
+    output, export = str(tmp_path / "film.mp4"), str(tmp_path / "out.ply")
+    assert app.cli([*arguments, "--output", output, "--export", export, "--at", "0.5"]) == 0
+    assert "4 frames of 32 x 32" in capsys.readouterr().out and Path(output).stat().st_size > 500
+    moved = (read_gaussian_ply(export).means - read_gaussian_ply(ply).means).norm(dim=1)
+    assert float(moved.max()) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "one of --run and --ply"),
+        (["--run", "a", "--ply", "b"], "one of --run and --ply"),
+        (["--ply", "missing.ply", "--script", "x", "--output", "film.mp4"], "missing.ply"),
+        (["--run", "missing", "--script", "x", "--output", "film.mp4"], "missing"),
+        (["--run", "a", "--output", "film.mp4"], "--script"),
+        (["--run", "a", "--port", "-1"], "--port -1"),
+        (["--run", "a", "--script", "x", "--output", "film.avi"], "film.avi"),
+        (["--run", "a", "--script", "x", "--export", "out.obj"], "out.obj"),
+        (["--run", "a", "--nodes", "0"], "--nodes 0"),
+        (["--run", "a", "--size", "5"], "--size 5"),
+        (["--run", "a", "--at", "-1"], "--at -1"),
+    ],
+)
+def test_mistakes_are_one_line_and_status_2(tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert app.cli(arguments) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
+    (tmp_path / "edit.json").write_text('{"format": "scgs-warp edit", "version": 1, "film": {"fps": -1}}')
+    arguments = ["--ply", str(ply), "--script", str(tmp_path / "edit.json"), "--output", str(tmp_path / "film.mp4")]
+    assert app.cli(arguments) == 2
+    assert "film.fps" in capsys.readouterr().err and not (tmp_path / "film.mp4").exists()
+    assert open_ply(ply).gaussian_count == 300
+
+
+def test_without_viser_the_editor_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert app.cli(["--run", str(tmp_path)]) == 2
+    assert "pip install 'scgs_warp[edit]'" in capsys.readouterr().err

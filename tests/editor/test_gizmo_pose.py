@@ -1,0 +1,68 @@
+"""Clicks and gizmo: from the picture to control points and targets, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from helpers.editor_models import chosen, client, new_model
+from scgs_warp.edit import Target
+from scgs_warp.edit.handles import STAY
+from scgs_warp.edit.rotations import from_axis
+from scgs_warp.editor.frame_image import take_picture
+from scgs_warp.editor.gizmo_pose import frame_of_handle, frame_of_selection, region_at, surface_point
+from scgs_warp.editor.model import EditorModel, Region
+
+
+@pytest.fixture
+def model() -> EditorModel:
+    return new_model()
+
+
+def test_clicks_meet_the_surface(model):
+    session, moment = model.session, model.moment()
+    camera = client(session)
+    picture = take_picture(session, moment, camera, 96)
+    assert picture.rgb.shape == (camera.height, camera.width, 3) == (*picture.depth.shape, 3)
+    rows, columns = np.nonzero(np.isfinite(picture.depth))
+    middle = len(rows) // 2
+    screen = (columns[middle] + 0.5) / camera.width, (rows[middle] + 0.5) / camera.height
+    point = surface_point(session, camera, screen, moment)
+    assert point is not None and np.linalg.norm(point - session.node_positions(0.0), axis=1).min() < 0.2
+    assert surface_point(session, camera, (0.0, 0.0), moment) is None
+    assert surface_point(session, camera, (-3.0, 7.0), moment) is None, "beside the canvas"
+    rings = region_at(session, point, Region("rings", 1), moment)
+    assert rings == session.ring([session.nearest(point.tolist(), 0.0)], 1)
+    assert len(region_at(session, point, Region("brush", radius=1e-6), moment)) == 1, "never none"
+    assert len(region_at(session, point, Region("brush", radius=10.0), moment)) == len(session)
+
+
+def test_a_handle_taken_from_bent_surroundings_leaves_them(model):
+    model.select(chosen(model))
+    model.grab(STAY)
+    model.drag(Target((0.0, 0.2, 0.3), tuple(from_axis([0, 1, 0], 30).tolist())))
+    model.release()
+    session, at = model.session, model.moment()
+    before = session.node_positions(0.0)
+    other = tuple(sorted(set(session.ring(model.selection, 1)) - set(model.selection)))
+    assert other
+    place, target = frame_of_selection(session, other, at)
+    position, _ = place.pose(target)
+    assert position == pytest.approx(before[list(other)].mean(0), abs=1e-9)
+
+
+def test_the_gizmo_says_what_the_target_says(model):
+    model.select(chosen(model))
+    model.grab(STAY)
+    target = Target.of((0.1, -0.2, 0.3), from_axis([1, 2, 3], 50).tolist())
+    model.drag(target)
+    model.release()
+    session = model.session
+    for time in (0.0, 0.7):
+        place = frame_of_handle(session, session.edit.handles[0], time)
+        back = place.target(*place.pose(target))
+        assert back.translation == pytest.approx(target.translation, abs=1e-9)
+        assert back.rotation == pytest.approx(target.rotation, abs=1e-9)
+        where = session.node_positions(time)[list(model.selection)].mean(0)
+        assert place.pose(target)[0] == pytest.approx(where, abs=5e-3), "it stands on what it holds"
+    assert place.target(place.pivot, np.array([1.0, 1e-20, 0, 0])).is_identity, "noise is no rotation"

@@ -1,0 +1,83 @@
+"""A scene as a page's columns: what is kept, how poses are sampled."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.edit_scenes import bar_scene, rich_scene
+from helpers.page_reader import gaussians_of
+from scgs_warp.errors import UserError
+from scgs_warp.export import page, page_scene
+from scgs_warp.export.page_data import pack, unpack
+from scgs_warp.motion import build_motion
+from scgs_warp.types import Pose
+
+
+def test_what_cannot_be_seen_is_left_out():
+    scene = bar_scene(nodes=12, gaussians=50)
+    with torch.no_grad():
+        scene.gaussians.opacity_logits[3] = -7.0
+        scene.gaussians.means[5, 1] = float("nan")
+        scene.gaussians.quats[8] = 0.0
+    content = page_scene.page_scene(scene, 0)
+    assert content.facts["gaussians"] == 47
+    made = gaussians_of(*unpack(pack(content.facts, content.columns)))
+    assert made.opacities().min() > 1 / 255 and made.means.isfinite().all()
+    with torch.no_grad():
+        scene.gaussians.opacity_logits.fill_(-9.0)
+    with pytest.raises(UserError, match="no Gaussian that can be seen"):
+        page_scene.page_scene(scene, 0)
+
+
+def test_one_outlier_does_not_coarsen_the_others():
+    plain, spoilt = (bar_scene(nodes=12, gaussians=3000) for _ in range(2))
+    with torch.no_grad():
+        spoilt.gaussians.sh_rest[7] = 80.0
+        spoilt.gaussians.means[11] = torch.tensor([4e5, -1e7, 3.0])
+    contents = [page_scene.page_scene(scene, 1) for scene in (plain, spoilt)]
+    assert contents[0].facts["gaussians"] == 3000 and contents[1].facts["gaussians"] == 2999  # a stray is left out
+    steps = [{column.name: column.step for column in content.columns} for content in contents]
+    for name, step in steps[0].items():
+        if name.startswith(("mean", "sh")):
+            assert steps[1][name] < 1.7 * step and steps[1][name] <= 1.01 * page_scene.STEPS["sh_rest"], name
+    made = gaussians_of(*unpack(pack(contents[1].facts, contents[1].columns)))
+    assert 0.9 < made.sh_rest.max() < 1.7  # the outlier, clipped
+    with torch.no_grad():
+        spoilt.gaussians.means.add_(1e6)  # all are far: one is a stray
+    assert page_scene.page_scene(spoilt, 0).facts["gaussians"] == 2999
+
+
+def test_quick_motions_are_sampled_more_often():
+    slow, quick = bar_scene(), bar_scene()
+    swing = quick.motion.poses
+    quick.motion.poses = lambda times: swing(0.5 + 0.5 * torch.sin(40 * times))  # type: ignore[method-assign]
+    few, many = (page_scene.sample_poses(scene.motion)["translation"] for scene in (slow, quick))
+    assert len(few) < len(many) == page_scene.MAX_SAMPLES
+    exact = swing(0.5 + 0.5 * torch.sin(40 * torch.tensor([100 / 256])))[0].translations
+    assert np.allclose(many[100], exact, atol=1e-6)
+
+
+def test_rotations_do_not_turn_over_between_samples():
+    scene = rich_scene()
+    plain = scene.motion.poses
+
+    def flipping(times: torch.Tensor) -> list[Pose]:
+        return [
+            Pose(pose.translations, pose.rotations * (-1.0) ** round(97 * time), pose.shape_rotations, pose.log_scales)
+            for time, pose in zip(times.tolist(), plain(times))
+        ]
+
+    scene.motion.poses = flipping  # type: ignore[method-assign]
+    found = page_scene.sample_poses(scene.motion)["rotation"]
+    assert ((found[1:] * found[:-1]).sum(axis=2) > 0.5).all()
+
+
+@pytest.mark.parametrize("name", ["hexplane", "per-gaussian"])
+def test_motions_without_control_points_are_refused(name, tmp_path):
+    scene = bar_scene(nodes=12, gaussians=20)
+    scene.motion = build_motion(name, scene.config)
+    with pytest.raises(UserError, match=f"{name} has no control points"):
+        page.write_page(scene, tmp_path / "page.html")
+    assert not list(tmp_path.iterdir())
