@@ -7,6 +7,9 @@ import warp as wp
 TILE_SIZE = 16
 """Side of a tile in pixels: one row of it is one 512-bit SIMD register, its 256 pixels are one CUDA block."""
 
+LANES = 16
+"""Floats of a vector in the CPU's kernels, one AVX-512 register."""
+
 ALPHA_MIN = wp.constant(1.0 / 255.0)
 """A splat is skipped at a pixel where its alpha is smaller: it could not change an 8-bit image."""
 
@@ -34,3 +37,15 @@ PACKED_GEOMETRY = 8
 
 CHANNEL_GROUP = 8
 """Channels of a splat packed for the CPU are padded with zeros to a multiple of this."""
+
+ADAM_CHUNK = 4096
+"""Elements of a chunk, the share of a tensor that one grid index of the CPU's Adam updates."""
+
+ADAM_GRADIENT_MAX = wp.constant(1.0e19)
+"""Adam clamps finite gradients here: their square would overflow, and the value would never move again."""
+
+ROOFLINE_CHAINS = 12
+"""Independent sums of a thread: enough to hide the latency of a multiply-add, few enough to stay in registers."""
+
+ROOFLINE_BLOCK = 1 << 18
+"""Floats that one grid index copies: 1 MiB."""

@@ -26,9 +26,13 @@ from .. import types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
+    "ADAM_CHUNK": types.ADAM_CHUNK,
+    "ADAM_GRADIENT_MAX": types.ADAM_GRADIENT_MAX,
     "ALPHA_MAX": types.ALPHA_MAX,
     "CHANNEL_GROUP": types.CHANNEL_GROUP,
     "PACKED_GEOMETRY": types.PACKED_GEOMETRY,
+    "ROOFLINE_BLOCK": types.ROOFLINE_BLOCK,
+    "ROOFLINE_CHAINS": types.ROOFLINE_CHAINS,
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
 }
 """Macros by name; a header sees those that its text names."""
