@@ -49,3 +49,9 @@ ROOFLINE_CHAINS = 12
 
 ROOFLINE_BLOCK = 1 << 18
 """Floats that one grid index copies: 1 MiB."""
+
+NETWORK_PANEL = 32
+"""Columns of a panel of the network's matrices on a CPU. Widths of hidden layers are multiples of it."""
+
+NETWORK_BLOCK = 32
+"""Rows that one grid index takes through all layers on a CPU; matrices have a multiple of 8 rows."""

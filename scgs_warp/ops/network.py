@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..kernels.cpu import network as kernels
 from ..kernels.cpu import network_adjoint as kernels_adjoint
-from ..kernels.cpu.network_panels import BLOCK, PANEL
+from ..kernels.types import NETWORK_BLOCK as BLOCK
+from ..kernels.types import NETWORK_PANEL as PANEL
 from ..runtime.launch import launch
 
 ROWS = 8
