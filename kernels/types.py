@@ -55,3 +55,9 @@ NETWORK_PANEL = 32
 
 NETWORK_BLOCK = 32
 """Rows that one grid index takes through all layers on a CPU; matrices have a multiple of 8 rows."""
+
+SSIM_BAND = 64
+"""Rows that one grid index of the CPU's photometric loss computes; 10 more rows are blurred horizontally per band."""
+
+SSIM_BLOCK = 128
+"""Columns that it works on at once: 4 maps x 11 rows x 128 columns are 22 KiB."""

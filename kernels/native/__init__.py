@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import types
+from .. import ssim, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -34,6 +34,11 @@ CONSTANTS: dict[str, int | float] = {
     "PACKED_GEOMETRY": types.PACKED_GEOMETRY,
     "ROOFLINE_BLOCK": types.ROOFLINE_BLOCK,
     "ROOFLINE_CHAINS": types.ROOFLINE_CHAINS,
+    "SSIM_BAND": types.SSIM_BAND,
+    "SSIM_BLOCK": types.SSIM_BLOCK,
+    "SSIM_C1": ssim.C1,
+    "SSIM_C2": ssim.C2,
+    **{f"SSIM_TAP_{distance}": tap for distance, tap in enumerate(ssim.TAPS)},
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
 }
 """Macros by name; a header sees those that its text names."""

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reference.ssim import photometric_loss as reference_loss
-from scgs_warp.kernels.cpu.ssim import BAND, BLOCK
+from scgs_warp.kernels.types import SSIM_BAND as BAND
+from scgs_warp.kernels.types import SSIM_BLOCK as BLOCK
 from scgs_warp.ops.ssim import photometric_loss, ssim
 from scgs_warp.runtime import environment
 
