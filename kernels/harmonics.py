@@ -16,6 +16,8 @@ C32 = wp.constant(2.890611442640554)
 C31 = wp.constant(0.4570457994644658)
 C30 = wp.constant(0.3731763325901154)
 C3Z = wp.constant(1.445305721320277)
+FACTORS = ("C0", "C1", "C2", "C20", "C22", "C33", "C32", "C31", "C30", "C3Z")
+"""Names of the basis functions' factors."""
 
 
 @wp.func

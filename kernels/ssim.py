@@ -22,8 +22,8 @@ wp.set_module_options({"enable_backward": False})
 
 RADIUS = 5
 SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
 
 _taps = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(RADIUS + 1)]
 TAPS = [tap / (_taps[0] + 2.0 * sum(_taps[1:])) for tap in _taps]
@@ -31,8 +31,8 @@ TAPS = [tap / (_taps[0] + 2.0 * sum(_taps[1:])) for tap in _taps]
 
 Taps = wp.types.vector(length=RADIUS + 1, dtype=wp.float32)
 _WINDOW = wp.constant(Taps(*TAPS))
-_C1 = wp.constant(wp.float32(C1))
-_C2 = wp.constant(wp.float32(C2))
+_C1 = wp.constant(wp.float32(SSIM_C1))
+_C2 = wp.constant(wp.float32(SSIM_C2))
 
 
 @wp.kernel

@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import ssim, types
+from .. import harmonics, ssim, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -30,14 +30,16 @@ CONSTANTS: dict[str, int | float] = {
     "ADAM_GRADIENT_MAX": types.ADAM_GRADIENT_MAX,
     "ALPHA_MAX": types.ALPHA_MAX,
     "CHANNEL_GROUP": types.CHANNEL_GROUP,
+    "GRADIENT_MAX": types.GRADIENT_MAX,
     "NETWORK_PANEL": types.NETWORK_PANEL,
     "PACKED_GEOMETRY": types.PACKED_GEOMETRY,
     "ROOFLINE_BLOCK": types.ROOFLINE_BLOCK,
     "ROOFLINE_CHAINS": types.ROOFLINE_CHAINS,
+    **{f"SH_{name}": getattr(harmonics, name) for name in harmonics.FACTORS},
     "SSIM_BAND": types.SSIM_BAND,
     "SSIM_BLOCK": types.SSIM_BLOCK,
-    "SSIM_C1": ssim.C1,
-    "SSIM_C2": ssim.C2,
+    "SSIM_C1": ssim.SSIM_C1,
+    "SSIM_C2": ssim.SSIM_C2,
     **{f"SSIM_TAP_{distance}": tap for distance, tap in enumerate(ssim.TAPS)},
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
 }
