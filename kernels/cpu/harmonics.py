@@ -40,7 +40,7 @@ def spherical_harmonics(
     camera_in: wp.array[wp.vec3],  # [1] centre of projection
     degree: int,
     # Out:
-    colors_out: wp.array[wp.vec3],  # [N] >= 0, or not finite where a coefficient is not
+    colors_out: wp.array[wp.vec3],  # [N] >= 0, or non-finite where a coefficient is
 ):
     """Grid: ceil(N / 16)."""
     begin = (first + wp.tid()) * _LANES

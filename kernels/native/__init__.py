@@ -1,15 +1,15 @@
-"""C++ bodies of kernels: the headers of this folder, spliced into Warp's functions.
+"""C++ bodies of kernels: headers in this folder that become Warp functions.
 
-A header holds ``static inline`` functions, structures and enumerations. Warp compiles a native function from a piece of
-text that becomes the function's body, so :func:`native_function` puts a header, with what it includes, into a local
-structure there and calls the function of the same name. Two rules follow for headers:
+A header holds ``static inline`` functions, structures and enumerations. Warp compiles a native function from a text
+that becomes the function's body, so :func:`native_function` puts a header and its includes into a local structure there
+and calls the function of the same name. This sets two rules for headers:
 
-- no templates and no static data members, which local structures may not have: use generic lambdas inside a function,
-  and functions or enumerations for constants;
-- include other headers of this folder with ``#include "name.h"`` alone on a line.
+- Use no templates and no static data members, which local structures may not have. Use generic lambdas inside
+  functions, functions that return one, and functions or enumerations for constants.
+- Include other headers of this folder with ``#include "name.h"`` alone on a line.
 
-Warp hashes the text it is given: an edited header is compiled again. Constants that Python and C++ share stand in
-``CONSTANTS`` and reach a header as macros. ``tests/kernels/test_native.py`` compiles every header by itself.
+Warp hashes the text, so it compiles an edited header again. ``CONSTANTS`` holds the constants that Python and C++
+share; they reach a header as macros. ``tests/kernels/test_native.py`` compiles every header by itself.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ CONSTANTS: dict[str, int | float] = {
     **{f"SSIM_TAP_{distance}": tap for distance, tap in enumerate(ssim.TAPS)},
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
 }
-"""Macros by name; a header sees those that its text names."""
+"""Values of macros by name; a header gets those that its text names."""
 
 _INCLUDE = re.compile(r'^#include "([\w./]+)"\n', re.MULTILINE)
 _GUARDS = {"cpu": "#if !defined(__CUDA_ARCH__)", "cuda": "#if defined(__CUDA_ARCH__)"}
 
 
 def header_text(name: str, folder: Path = FOLDER) -> str:
-    """Return a header of ``folder`` with every header it includes in place of its first ``#include``."""
+    """Return a header of ``folder``, with each included header in place of its first ``#include``."""
     seen: set[str] = set()
 
     def read(file: str) -> str:
@@ -76,7 +76,7 @@ def snippet(header: str, call: str, device: Literal["cpu", "cuda"], otherwise: s
     """Return the body of a native function that runs ``call``, a call of a function of ``header``.
 
     Args:
-        device: where the header compiles; for the other device the body is ``otherwise``.
+        device: device that the header is compiled for; on the other one the body is ``otherwise``.
     """
     text = header_text(header, folder)
     macros = constant_macros(text)
@@ -99,7 +99,7 @@ def native_function(
 
     Args:
         header: file name in ``folder``.
-        device: where the function runs; a kernel that calls it compiles for the other device, but does nothing there.
+        device: device that the function runs on; on the other one it compiles, but does nothing.
         otherwise: statement for the other device, needed where a value is returned.
     """
 
