@@ -2,8 +2,9 @@
 
 A header holds ``static inline`` functions, structures and enumerations. Warp compiles a native function from a text
 that becomes the function's body, so :func:`native_function` puts a header and its includes into a local structure there
-and calls the function of the same name. This sets two rules for headers:
+and calls the function of the same name. This sets three rules:
 
+- Write results to arrays: Warp sees a return type under its own decorator alone.
 - Use no templates and no static data members, which local structures may not have. Use generic lambdas inside
   functions, functions that return one, and functions or enumerations for constants.
 - Include other headers of this folder with ``#include "name.h"`` alone on a line.
@@ -72,11 +73,11 @@ def constant_macros(text: str) -> dict[str, str]:
     }
 
 
-def snippet(header: str, call: str, device: Literal["cpu", "cuda"], otherwise: str = "", folder: Path = FOLDER) -> str:
+def snippet(header: str, call: str, device: Literal["cpu", "cuda"], folder: Path = FOLDER) -> str:
     """Return the body of a native function that runs ``call``, a call of a function of ``header``.
 
     Args:
-        device: device that the header is compiled for; on the other one the body is ``otherwise``.
+        device: device that the header is compiled for; on the other one the body is empty.
     """
     text = header_text(header, folder)
     macros = constant_macros(text)
@@ -86,28 +87,24 @@ def snippet(header: str, call: str, device: Literal["cpu", "cuda"], otherwise: s
         f"struct native {{\n{text}}};",
         call,
         *(f"#undef {name}" for name in macros),
-        *(["#else", otherwise] if otherwise else []),
         "#endif",
     ]
     return "\n" + "\n".join(lines) + "\n"
 
 
 def native_function(
-    header: str, *, device: Literal["cpu", "cuda"] = "cpu", otherwise: str = "", folder: str | Path = FOLDER
+    header: str, *, device: Literal["cpu", "cuda"] = "cpu", folder: str | Path = FOLDER
 ) -> Callable[[Callable[..., Any]], wp.Function]:
     """Make a Warp function whose body is the function of the same name in ``header``.
 
     Args:
         header: file name in ``folder``.
         device: device that the function runs on; on the other one it compiles, but does nothing.
-        otherwise: statement for the other device, needed where a value is returned.
     """
 
     def decorate(function: Callable[..., Any]) -> wp.Function:
-        signature = inspect.signature(function)
-        call = f"native::{function.__name__.lstrip('_')}({', '.join(signature.parameters)});"
-        if signature.return_annotation is not inspect.Signature.empty:
-            call = f"return {call}"
-        return wp.func_native(snippet(header, call, device, otherwise, Path(folder)))(function)
+        name, arguments = function.__name__.lstrip("_"), ", ".join(inspect.signature(function).parameters)
+        call = f"native::{name}({arguments});"
+        return wp.func_native(snippet(header, call, device, Path(folder)))(function)
 
     return decorate

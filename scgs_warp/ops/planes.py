@@ -53,11 +53,11 @@ def plane_features(positions: Tensor, time: float | Tensor, planes: list[Tensor]
         raise ValueError("positions and planes must be float32 on one device")
     inside = positions.nan_to_num(nan=-1.0)
     if isinstance(time, Tensor):
-        time = time.detach().nan_to_num(nan=0.0).clamp(0.0, 1.0)
+        t = 2.0 * time.detach().nan_to_num(nan=0.0).clamp(0.0, 1.0) - 1.0
+        axes = [*inside.unbind(1), t.expand(len(inside))]
     else:
-        time = time if 0.0 <= time <= 1.0 else float(time > 1.0)
-    t = 2.0 * time - 1.0
-    axes = [*inside.unbind(1), t.expand(len(inside)) if isinstance(t, Tensor) else inside.new_full((len(inside),), t)]
+        t = 2.0 * (time if 0.0 <= time <= 1.0 else float(time > 1.0)) - 1.0
+        axes = [*inside.unbind(1), inside.new_full((len(inside),), t)]
     levels = []
     for level in range(0, len(planes), len(PAIRS)):
         product = None
