@@ -1,4 +1,4 @@
-"""As-rigid-as-possible: the rotation that best explains how a node's neighbourhood moved, and what it leaves over."""
+"""As-rigid-as-possible energy: the best-fitting rotation of each node's neighbourhood, and the residual."""
 
 import warp as wp
 
@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def largest_entry(S: wp.mat33d):
-    """The largest absolute value; 0 where an entry is not finite, as no rotation can be had of such a matrix either."""
+    """Return the largest absolute value, or 0 where an entry is non-finite: such a matrix has no rotation either."""
     largest = wp.float64(0.0)
     for a in range(3):
         for b in range(3):
@@ -25,14 +25,14 @@ def local_rotations(
     # In:
     rest_in: wp.array[wp.vec3],  # [M]
     posed_in: wp.array[wp.vec3],  # [M]
-    neighbors_in: wp.array2d[wp.int32],  # [M, J], < 0: none
+    neighbors_in: wp.array2d[wp.int32],  # [M, J], < 0 where missing
     weights_in: wp.array2d[float],  # [M, J]
     # Out:
     rotations_out: wp.array[wp.mat33],  # [M]
 ):
-    """R = argmin sum w |e' - R e|^2 = U diag(1, 1, det(U V^T)) V^T with U S V^T = sum w e' e^T.
+    """Compute R = argmin sum w |e' - R e|^2 = U diag(1, 1, det(U V^T)) V^T with U S V^T = sum w e' e^T. Grid: M.
 
-    In float64: a node has a few edges only, and nearly collinear ones are the rule in thin limbs.
+    In float64, because a node has only a few edges, and in thin limbs they are nearly collinear.
     """
     i = first + wp.tid()
     S = wp.mat33d(wp.float64(0.0))
@@ -46,7 +46,7 @@ def local_rotations(
     R = wp.identity(n=3, dtype=wp.float64)
     if largest > wp.float64(1.0e-60):
         U, _sigma, V = wp.svd3(S / largest)
-        # singular values come in descending order: a reflection is undone along the least of them
+        # Singular values come in descending order: a reflection is undone along the smallest one.
         if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):
             for a in range(3):
                 U[a, 2] = -U[a, 2]
@@ -71,6 +71,7 @@ def arap_energy(
     # Out:
     energies_out: wp.array[float],  # [M]
 ):
+    """Add up a node's weighted squared residuals. Grid: M."""
     i = first + wp.tid()
     energy = float(0.0)
     for j in range(neighbors_in.shape[1]):
@@ -90,15 +91,17 @@ def arap_energy_adjoint(
     neighbors_in: wp.array2d[wp.int32],  # [M, J]
     weights_in: wp.array2d[float],  # [M, J]
     rotations_in: wp.array[wp.mat33],  # [M], held constant
-    order_in: wp.array[wp.int32],  # edges i * J + j sorted by the node they lead to; those that lead nowhere come first
+    order_in: wp.array[wp.int32],  # edges i * J + j sorted by the node they lead to, missing ones first
     begin_in: wp.array[wp.int32],  # [M + 1]
     v_energies_in: wp.array[float],  # [M]
     # Out:
     v_rest_out: wp.array[wp.vec3],  # [M]
     v_posed_out: wp.array[wp.vec3],  # [M]
 ):
-    """Gradients of one node: over the edges that leave it, then over those that lead to it. Edges whose gradient would
-    overflow, or is none as an end is not finite, are left out."""
+    """Compute a node's gradients over the edges that leave it, then over those that lead to it. Grid: M.
+
+    Edges whose gradient overflows or is non-finite are left out.
+    """
     m = first + wp.tid()
     J = neighbors_in.shape[1]
     v_rest = wp.vec3(0.0)

@@ -1,7 +1,7 @@
-"""As-rigid-as-possible editing of the control points: the two steps that a sparse solve alternates with.
+"""As-rigid-as-possible editing of the control points: the two steps that alternate with a sparse solve.
 
-In float64 throughout: a few hundred points, bent by hand, whose result is compared bit by bit. Edges lie in rows
-(``begin``), both directions listed.
+All in float64: there are a few hundred points only, and results are compared bit by bit. Edges lie in rows (``begin``)
+and are listed in both directions.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 def turn_nodes(
     first: int,
     # In:
-    nodes_in: wp.array[wp.int32],  # [F] whose rotation is unknown
+    nodes_in: wp.array[wp.int32],  # [F] nodes with an unknown rotation
     rest_in: wp.array[wp.vec3d],  # [M]
     posed_in: wp.array[wp.vec3d],  # [M]
     begin_in: wp.array[wp.int32],  # [M + 1]
@@ -23,13 +23,16 @@ def turn_nodes(
     weights_in: wp.array[wp.float64],  # [E]
     smoothness: wp.float64,  # weight of a neighbour's rotation, squared units of the positions
     rotations_in: wp.array[wp.mat33d],  # [M] of the step before
-    leaning_in: wp.array[wp.float64],  # [M] weight of a rotation that is asked for, squared units of the positions
-    asked_in: wp.array[wp.mat33d],  # [M] read where that is not 0
+    leaning_in: wp.array[wp.float64],  # [M] weight of a requested rotation, squared units of the positions
+    asked_in: wp.array[wp.mat33d],  # [M] requested rotations, read where that weight is not 0
     # Out:
     rotations_out: wp.array[wp.mat33d],  # [M], rows of nodes_in only
 ):
-    """R = argmin sum w (|e' - R e|^2 + smoothness |R - R_j|^2) + leaning |R - asked|^2, determinant +1 always (SR-ARAP,
-    Levi & Gotsman). What edges along one line leave open is not turned: of all that explain those, the least."""
+    """Compute R = argmin sum w (|e' - R e|^2 + smoothness |R - R_j|^2) + leaning |R - asked|^2, with determinant +1
+    (SR-ARAP, Levi & Gotsman). Grid: F.
+
+    Where all edges lie along one line, take the smallest of the rotations that fit them.
+    """
     i = nodes_in[first + wp.tid()]
     S = wp.mat33d(wp.float64(0.0))
     for at in range(begin_in[i], begin_in[i + 1]):
@@ -43,7 +46,7 @@ def turn_nodes(
     R = rotations_in[i]
     if largest > wp.float64(1.0e-60):
         U, sigma, V = wp.svd3(S / largest)
-        # singular values come in descending order: a reflection is undone along the least of them
+        # Singular values come in descending order: a reflection is undone along the smallest one.
         if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):
             for a in range(3):
                 U[a, 2] = -U[a, 2]
@@ -64,7 +67,7 @@ def turn_nodes(
 def edge_sums(
     first: int,
     # In:
-    nodes_in: wp.array[wp.int32],  # [F] whose position is unknown
+    nodes_in: wp.array[wp.int32],  # [F] nodes with an unknown position
     fixed_in: wp.array[wp.int32],  # [M] 1: position known
     rest_in: wp.array[wp.vec3d],  # [M]
     posed_in: wp.array[wp.vec3d],  # [M]
@@ -78,8 +81,7 @@ def edge_sums(
     # Out:
     sums_out: wp.array[wp.vec3d],  # [F]
 ):
-    """The right-hand side of the linear system: where each edge wants to point, what known neighbours add, soft
-    targets."""
+    """Compute the right-hand side of the linear system: rotated edges, known neighbours and soft targets. Grid: F."""
     at_row = first + wp.tid()
     i = nodes_in[at_row]
     total = pulls_in[i] * targets_in[i]
@@ -88,10 +90,10 @@ def edge_sums(
         edge = rest_in[i] - rest_in[j]
         wanted = wp.float64(0.5) * ((rotations_in[i] + rotations_in[j]) * edge)
         posed = posed_in[i] - posed_in[j]
-        kept = wanted  # what an edge of its old length would be
+        kept = wanted  # the edge at its old length
         size = wp.length(posed)
         if size > wp.float64(0.0):
-            # Only as far as it points where it should: a reversed edge would be kept reversed, and a joint folded.
+            # Weighted by how well its direction fits: else a reversed edge would stay reversed, and a joint folded.
             cosine = wp.dot(posed, wanted) / wp.max(size * wp.length(wanted), wp.float64(1e-300))
             along = wp.max(cosine, wp.float64(0.0))
             kept = (along * wp.length(edge) / size) * posed + (wp.float64(1.0) - along) * wanted

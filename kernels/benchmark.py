@@ -1,4 +1,4 @@
-"""What benchmarks ask of a machine and a scene: arithmetic without memory, and how many splats make a pixel."""
+"""Measurements for benchmarks: arithmetic without memory access, and the number of splats blended per pixel."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ def arithmetic(
     # Out:
     values_out: wp.array[float],  # [C] written, so that no compiler drops the loop
 ):
+    """Iterate the logistic map. Grid: C."""
     i = first + wp.tid()
     x = float(0.3)
-    # The logistic map is chaotic: no closed form, no vector lanes, one value in a register.
+    # The map is chaotic: it has no closed form, and its one value stays in a register.
     for _round in range(rounds):
         x = 3.9 * x * (1.0 - x)
     values_out[i] = x
@@ -41,6 +42,7 @@ def count_contributors(
     # Out:
     counts_out: wp.array[int],  # [H * W] splats blended before the pixel ended
 ):
+    """Count the splats that contribute to a pixel. Grid: H x W."""
     pixel = first + wp.tid()
     y = pixel // width
     x = pixel - y * width

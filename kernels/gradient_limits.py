@@ -1,8 +1,8 @@
-"""What becomes of gradients that are beyond use: functions for the ends of adjoint kernels.
+"""Limits for gradients, applied at the ends of adjoint kernels.
 
-Extreme values, though finite, have gradients that overflow. Where that happens a Gaussian (or a control point) passes
-none, and what it shares sums with stays finite. A NaN that comes in from a loss is not hidden: it goes out with the
-gradients of colours, which are handed on as they are, and of Gaussians whose incoming gradient is not finite.
+Extreme but finite values have gradients that overflow. A Gaussian or control point with such a gradient passes 0, so
+that the sums it takes part in stay finite. A NaN from a loss is not hidden: it reaches the gradients of colours, which
+pass unchanged, and those of Gaussians whose incoming gradient is non-finite.
 """
 
 import warp as wp
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def passed(gradient: float) -> float:
-    """The gradient, or 0 where it is not finite or beyond use."""
+    """Return the gradient, or 0 where it is NaN or beyond GRADIENT_MAX."""
     return wp.where(wp.abs(gradient) <= GRADIENT_MAX, gradient, 0.0)
 
 
@@ -35,7 +35,7 @@ def passed(gradient: wp.vec4) -> wp.vec4:  # noqa: F811
 
 @wp.func
 def beyond(gradient: float) -> int:
-    """1 for NaN and what is beyond use, else 0: sums of it tell how many are."""
+    """Return the number of components that are NaN or beyond GRADIENT_MAX."""
     return wp.where(wp.abs(gradient) <= GRADIENT_MAX, 0, 1)
 
 
@@ -51,7 +51,7 @@ def beyond(gradient: wp.vec4) -> int:  # noqa: F811
 
 @wp.func
 def near(position: wp.vec3) -> bool:
-    """Whether a position is one that gradients can be computed for; false for NaN."""
+    """Return whether a position is within POSITION_MAX, where gradients can be computed; false for NaN."""
     return (
         wp.abs(position[0]) <= POSITION_MAX
         and wp.abs(position[1]) <= POSITION_MAX

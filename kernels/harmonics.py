@@ -1,4 +1,4 @@
-"""Spherical harmonics colour, degree 0 to 3 (real basis with the signs of 3D-GS: Plenoxels, supplement A.2)."""
+"""Colour from spherical harmonics of degree 0 to 3 (real basis with the signs of 3D-GS: Plenoxels, supplement A.2)."""
 
 import warp as wp
 
@@ -16,11 +16,13 @@ C32 = wp.constant(2.890611442640554)
 C31 = wp.constant(0.4570457994644658)
 C30 = wp.constant(0.3731763325901154)
 C3Z = wp.constant(1.445305721320277)
+FACTORS = ("C0", "C1", "C2", "C20", "C22", "C33", "C32", "C31", "C30", "C3Z")
+"""Names of the basis functions' factors."""
 
 
 @wp.func
 def view_ray(mean: wp.vec3, camera: wp.vec3):
-    """(unit direction, 1 / distance); zero both where the distance is zero or not finite."""
+    """Return the unit direction and 1 / distance; both are 0 where the distance is 0 or non-finite."""
     offset = mean - camera
     squared = wp.dot(offset, offset)
     inverse = float(0.0)
@@ -33,13 +35,13 @@ def view_ray(mean: wp.vec3, camera: wp.vec3):
 
 @wp.func
 def not_negative(color: float) -> float:
-    """A negative colour is 0; what is not finite stays so, as a mark: compositing leaves such a splat out."""
+    """Clamp a colour at 0. A non-finite one stays non-finite, so that compositing leaves the splat out."""
     return wp.where(color > 0.0, color, color - color)
 
 
 @wp.func
 def passed(color: float, v: float) -> float:
-    """The gradient that a colour lets through: none where it was clamped or is not finite."""
+    """Return the colour's gradient, or 0 where the colour was clamped or is non-finite."""
     return wp.where(color > 0.0 and wp.isfinite(color), v, 0.0)
 
 
@@ -54,7 +56,7 @@ def spherical_harmonics(
     camera_in: wp.array[wp.vec3],  # [1] centre of projection
     degree: int,
     # Out:
-    colors_out: wp.array[wp.vec3],  # [N] >= 0, or not finite where a coefficient is not
+    colors_out: wp.array[wp.vec3],  # [N] >= 0, or non-finite where a coefficient is
 ):
     i = first + wp.tid()
     k = i * rest
@@ -116,7 +118,7 @@ def spherical_harmonics_adjoint(
     if has_means != 0:
         v_means_out[i] = wp.vec3(0.0)
     if v[0] == 0.0 and v[1] == 0.0 and v[2] == 0.0:
-        # Culled or clamped: its coefficients need not be read, and a NaN among them stays there.
+        # The Gaussian is culled or clamped: its coefficients need not be read, and a NaN among them must not spread.
         if has_rest != 0:
             for j in range(k, k + rest):
                 v_sh_rest_out[j] = wp.vec3(0.0)
@@ -180,4 +182,4 @@ def spherical_harmonics_adjoint(
     # The direction is normalised: only what is perpendicular to it moves it.
     v_mean = inverse * (g - wp.dot(g, d) * d)
     if beyond(v_mean) == 0:
-        v_means_out[i] = v_mean  # else it overflows: none
+        v_means_out[i] = v_mean  # else it overflows and is left out

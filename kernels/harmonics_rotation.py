@@ -1,7 +1,7 @@
 """Rotation of real spherical harmonics, degrees 1 to 3: f'(d) = f(R^T d).
 
-A band of degree l has 2 l + 1 functions, so its values in 2 l + 1 directions say everything: the turned function is
-evaluated there, and a constant matrix leads back to coefficients.
+A band of degree l has 2 l + 1 functions, so its values in 2 l + 1 directions determine it. The rotated function is
+evaluated in those directions, and a constant matrix turns the values back into coefficients.
 """
 
 import warp as wp
@@ -20,7 +20,10 @@ mat73 = wp.types.matrix(shape=(7, 3), dtype=float)
 @wp.func
 def turn_first(k: int, back: wp.vec4, directions: wp.array[wp.vec3], inverses: wp.array[float],
                sh_in: wp.array[wp.vec3], sh_out: wp.array[wp.vec3]):  # fmt: skip
-    """One band; ``k``: row of its first coefficient. Loops over constants are unrolled, so values stay in registers."""
+    """Rotate the band of degree 1, whose first coefficient is in row ``k``.
+
+    Warp unrolls loops over constants, so the values stay in registers.
+    """
     values = mat33()
     for v in range(3):
         d = quat_rotate(back, directions[v])
@@ -35,6 +38,7 @@ def turn_first(k: int, back: wp.vec4, directions: wp.array[wp.vec3], inverses: w
 @wp.func
 def turn_second(k: int, back: wp.vec4, directions: wp.array[wp.vec3], inverses: wp.array[float],
                 sh_in: wp.array[wp.vec3], sh_out: wp.array[wp.vec3]):  # fmt: skip
+    """Rotate the band of degree 2, whose first coefficient is in row ``k``."""
     values = mat53()
     for v in range(5):
         d = quat_rotate(back, directions[3 + v])
@@ -58,6 +62,7 @@ def turn_second(k: int, back: wp.vec4, directions: wp.array[wp.vec3], inverses: 
 @wp.func
 def turn_third(k: int, back: wp.vec4, directions: wp.array[wp.vec3], inverses: wp.array[float],
                sh_in: wp.array[wp.vec3], sh_out: wp.array[wp.vec3]):  # fmt: skip
+    """Rotate the band of degree 3, whose first coefficient is in row ``k``."""
     values = mat73()
     for v in range(7):
         d = quat_rotate(back, directions[8 + v])
@@ -95,7 +100,7 @@ def rotate_harmonics(
     # Out:
     sh_rest_out: wp.array[wp.vec3],  # [N * R]
 ):
-    """The identity, to the bit, changes nothing."""
+    """Rotate all bands of a Gaussian; the exact identity keeps their bits. Grid: N."""
     i = first + wp.tid()
     q = quats_in[i]
     k = i * rest

@@ -1,6 +1,6 @@
-"""Quaternions as functions for other kernels: ``wxyz`` in a ``wp.vec4`` (``wp.quat`` is xyzw), adjoints beside them.
+"""Quaternion functions for other kernels, ``wxyz`` in a ``wp.vec4`` (``wp.quat`` is xyzw), and their adjoints.
 
-An adjoint takes the inputs of its function and the gradient of the result, and returns the gradients of the inputs.
+An adjoint takes the inputs of its function and the gradient of its result, and returns the gradients of the inputs.
 ``quat_matrix`` and ``quat_rotate`` are polynomials that are rotations for unit quaternions only; their adjoints are
 those of the polynomials, so the chain through ``quat_normalise_adjoint`` is exact.
 """
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def quat_inverse_norm(q: wp.vec4) -> float:
-    """1 / |q|, and 0 where |q|^2 is zero or not a number."""
+    """Return 1 / |q|, or 0 where |q|^2 is 0 or NaN."""
     squared = wp.dot(q, q)
     inverse = float(0.0)
     if squared > 0.0:
@@ -22,7 +22,7 @@ def quat_inverse_norm(q: wp.vec4) -> float:
 
 @wp.func
 def quat_normalise(q: wp.vec4) -> wp.vec4:
-    """q / |q|; the identity for a quaternion of norm zero."""
+    """Return q / |q|, or the identity for a quaternion of norm 0."""
     inverse = quat_inverse_norm(q)
     unit = wp.vec4(1.0, 0.0, 0.0, 0.0)
     if inverse > 0.0:
@@ -32,7 +32,7 @@ def quat_normalise(q: wp.vec4) -> wp.vec4:
 
 @wp.func
 def quat_normalise_adjoint(q: wp.vec4, v_unit: wp.vec4) -> wp.vec4:
-    """Zero for a quaternion of norm zero, whose normalised value is constant."""
+    """Return the gradient of q; it is 0 for a quaternion of norm 0, whose normalised value is constant."""
     inverse = quat_inverse_norm(q)
     unit = inverse * q
     return inverse * (v_unit - wp.dot(unit, v_unit) * unit)
@@ -40,7 +40,7 @@ def quat_normalise_adjoint(q: wp.vec4, v_unit: wp.vec4) -> wp.vec4:
 
 @wp.func
 def quat_multiply(a: wp.vec4, b: wp.vec4) -> wp.vec4:
-    """Hamilton product: turns by b, then by a."""
+    """Return the Hamilton product, which rotates by b, then by a."""
     return wp.vec4(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -56,13 +56,13 @@ def quat_conjugate(q: wp.vec4) -> wp.vec4:
 
 @wp.func
 def quat_multiply_adjoint(a: wp.vec4, b: wp.vec4, v_product: wp.vec4):
-    """(v_a, v_b): the product is linear in each factor, its transpose is the product with the conjugate."""
+    """Return v_a and v_b. The product is linear in each factor; its transpose is the product with the conjugate."""
     return quat_multiply(v_product, quat_conjugate(b)), quat_multiply(quat_conjugate(a), v_product)
 
 
 @wp.func
 def quat_matrix(q: wp.vec4) -> wp.mat33:
-    """Rotation matrix of a unit quaternion."""
+    """Return the rotation matrix of a unit quaternion."""
     w = q[0]
     x = q[1]
     y = q[2]
@@ -96,11 +96,11 @@ def quat_matrix_adjoint(q: wp.vec4, v: wp.mat33) -> wp.vec4:
 
 @wp.func
 def quat_rotate(q: wp.vec4, x: wp.vec3) -> wp.vec3:
-    """R(q) x for a unit quaternion."""
+    """Return R(q) x for a unit quaternion."""
     return quat_matrix(q) * x
 
 
 @wp.func
 def quat_rotate_adjoint(q: wp.vec4, x: wp.vec3, v_rotated: wp.vec3):
-    """(v_q, v_x)"""
+    """Return v_q and v_x."""
     return quat_matrix_adjoint(q, wp.outer(v_rotated, x)), wp.transpose(quat_matrix(q)) * v_rotated

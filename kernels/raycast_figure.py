@@ -1,8 +1,8 @@
 """Ray casting of a small textured triangle mesh, for the built-in synthetic scene. Forward only.
 
 The textures are solid: functions of the position in the part's own rest frame, so they travel with the surface.
-``visible`` and ``light_vertices`` serve every mesh; ``albedo`` knows the patterns of the
-figure in ``scgs_warp/data/synthetic/figure.py``.
+``visible`` and ``light_vertices`` serve every mesh; ``albedo`` draws the patterns of the figure in
+``scgs_warp/data/synthetic/figure.py``.
 """
 
 import warp as wp
@@ -27,14 +27,14 @@ GOLDEN = wp.constant(2.399963229728653)
 
 @wp.func
 def fractal_noise(p: wp.vec3, seed: int):
-    """Two octaves of gradient noise, about [-1, 1]."""
+    """Return two octaves of gradient noise, about [-1, 1]."""
     state = wp.rand_init(seed)
     return wp.noise(state, p) + 0.5 * wp.noise(state, p * 2.17)
 
 
 @wp.func
 def wobble(p: wp.vec3, seed: int):
-    """What keeps stripes from being ruled with a straight edge."""
+    """Return the noise that makes stripes uneven."""
     return 0.15 * wp.noise(wp.rand_init(seed), p * 6.0)
 
 
@@ -45,7 +45,7 @@ def fraction(x: float):
 
 @wp.func
 def turn(p: wp.vec3):
-    """Angle about z in turns, [0, 1)."""
+    """Return the angle about z in turns, [0, 1)."""
     return fraction(wp.atan2(p[1], p[0]) / TWO_PI + 1.0)
 
 
@@ -56,14 +56,14 @@ def mix(a: wp.vec3, b: wp.vec3, share: float):
 
 @wp.func
 def in_heart(x: float, z: float):
-    """Inside the sextic (x^2 + z^2 - 1)^3 = x^2 z^3, about 1.2 in radius."""
+    """Return whether a point is inside the sextic (x^2 + z^2 - 1)^3 = x^2 z^3, about 1.2 in radius."""
     q = x * x + z * z - 1.0
     return q * q * q - x * x * z * z * z < 0.0
 
 
 @wp.func
 def face(p: wp.vec3, shell: wp.vec3, visor: wp.vec3, glow: wp.vec3):
-    """A visor with eyes, a smile and cheeks on the side y < 0; rivets and a seam elsewhere."""
+    """Draw a visor with eyes, a smile and cheeks on the side y < 0, rivets and a seam elsewhere."""
     color = shell
     if wp.abs(p[2] + 0.17) < 0.018 or (p[1] > 0.0 and wp.abs(p[0]) < 0.018):
         color = shell * 0.55
@@ -104,7 +104,7 @@ SOFTNESS = wp.constant(0.3)
 
 @wp.func
 def albedo(p: wp.vec3, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, frequency: wp.vec3, part: int):
-    """Colour of a surface point from its rest position in the part's frame."""
+    """Return the colour of a surface point from its rest position in the part's frame."""
     color = a
     if kind == STRIPES:
         phase = fraction(p[2] * frequency[2] + wobble(p, part))
@@ -164,7 +164,7 @@ def albedo(p: wp.vec3, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, frequency:
 
 @wp.func
 def sphere_direction(index: int, count: int, rotation: float):
-    """Direction ``index`` of a spherical Fibonacci lattice."""
+    """Return direction ``index`` of a spherical Fibonacci lattice."""
     z = 1.0 - (2.0 * float(index) + 1.0) / float(count)
     radius = wp.sqrt(wp.max(1.0 - z * z, 0.0))
     angle = GOLDEN * float(index) + rotation
@@ -173,7 +173,7 @@ def sphere_direction(index: int, count: int, rotation: float):
 
 @wp.func
 def blocked(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, reach: float):
-    """Whether the ray meets the front of a triangle first; from inside another part (a joint) it does not."""
+    """Return whether the ray meets the front of a triangle first; a ray from inside another part (a joint) does not."""
     query = wp.mesh_query_ray(mesh, origin, direction, reach)
     return query.result and query.sign > 0.0
 
@@ -193,7 +193,10 @@ def light_vertices(
     # Out:
     light_out: wp.array[wp.vec3],  # [P] irradiance that multiplies the albedo
 ):
-    """Sky light with ambient occlusion and a broad key light with a soft shadow. Per vertex, hence without noise."""
+    """Compute sky light with ambient occlusion and a broad key light with a soft shadow. Grid: P.
+
+    Light is computed per vertex, so it has no sampling noise between pixels.
+    """
     i = first + wp.tid()
     normal = normals_in[i]
     key = light_in[0]
@@ -241,7 +244,7 @@ def raycast(
     # Out:
     image_out: wp.array3d[float],  # [H, W, 4] premultiplied colour and coverage
 ):
-    """One pixel of the window: the mean of samples x samples rays (a box filter)."""
+    """Render one pixel of the window as the mean of samples x samples rays (a box filter)."""
     i = first + wp.tid()
     y = top + i // columns
     x = left + i % columns
@@ -297,7 +300,7 @@ def visible(
     # Out:
     visible_out: wp.array[wp.int32],  # [P] 1 where inside the image and not hidden
 ):
-    """Whether a camera sees a surface point: inside the frustum, and the first thing on the ray from the camera."""
+    """Mark surface points that a camera sees: inside the frustum, and first on the ray from the camera."""
     i = first + wp.tid()
     point = points_in[i]
     seen = int(0)

@@ -1,8 +1,8 @@
 """Ray casting of a textured triangle mesh, for scenes made from glTF files. Forward only.
 
-A ray goes through what does not stop it: the back of a single-sided triangle, a texel under the alpha cutoff, and, with
-its share, a translucent surface. Colour is looked up and lit in linear light and encoded as sRGB; samples are averaged
-in stored values, as splats are composited.
+A ray passes through the back of a single-sided triangle, through a texel under the alpha cutoff, and partly through a
+translucent surface. Colour is looked up and lit in linear light and encoded as sRGB; samples are averaged in stored
+values, as splats are composited.
 """
 
 import warp as wp
@@ -19,14 +19,14 @@ MASK = wp.constant(1)
 BLEND = wp.constant(2)
 
 LAYERS = wp.constant(32)
-"""Surfaces that one ray looks at, at most."""
+"""Maximum number of surfaces along one ray."""
 CLEAR = wp.constant(1.0e-3)
-"""A ray that passes this little light on ends."""
+"""Share of light below which a ray ends."""
 
 
 @wp.func
 def wrapped(i: int, size: int, mode: int):
-    """Index of a texel, whatever the coordinate."""
+    """Map any texel coordinate to the index of a texel by the wrap mode."""
     if mode == CLAMP:
         return wp.clamp(i, 0, size - 1)
     period = size
@@ -44,7 +44,7 @@ def wrapped(i: int, size: int, mode: int):
 
 @wp.func
 def texel(texels_in: wp.array2d[wp.uint8], decode_in: wp.array[float], i: int):
-    """Linear colour and alpha of one texel."""
+    """Return the linear colour and alpha of one texel."""
     r = decode_in[int(texels_in[i, 0])]
     g = decode_in[int(texels_in[i, 1])]
     b = decode_in[int(texels_in[i, 2])]
@@ -55,7 +55,7 @@ def texel(texels_in: wp.array2d[wp.uint8], decode_in: wp.array[float], i: int):
 def sampled(
     texels_in: wp.array2d[wp.uint8], decode_in: wp.array[float], textures_in: wp.array2d[wp.int32], t: int, uv: wp.vec2
 ):
-    """Texture ``t`` at ``uv``, v down: bilinear between texel centres, or the nearest texel."""
+    """Sample texture ``t`` at ``uv`` (v down), bilinearly between texel centres or at the nearest texel."""
     offset = textures_in[t, 0]
     width = textures_in[t, 1]
     height = textures_in[t, 2]
@@ -84,7 +84,7 @@ def sampled(
 
 @wp.func
 def encoded(x: float):
-    """sRGB of a linear value, clamped to [0, 1] (IEC 61966-2-1)."""
+    """Encode a linear value, clamped to [0, 1], as sRGB (IEC 61966-2-1)."""
     x = wp.clamp(x, 0.0, 1.0)
     if x <= 0.0031308:
         return 12.92 * x
@@ -106,7 +106,7 @@ def surface(
     textures_in: wp.array2d[wp.int32],
     decode_in: wp.array[float],
 ):
-    """Linear base colour and alpha at a hit."""
+    """Return the linear base colour and alpha at a hit."""
     a = faces_in[3 * face]
     b = faces_in[3 * face + 1]
     c = faces_in[3 * face + 2]
@@ -121,7 +121,7 @@ def surface(
 
 @wp.func
 def opacity(alpha: float, sign: float, mode: int, double_sided: int, cutoff: float):
-    """How much of a ray a surface stops."""
+    """Return the share of a ray that a surface stops."""
     if sign < 0.0 and double_sided == 0:
         return float(0.0)
     if mode == OPAQUE:
@@ -133,7 +133,7 @@ def opacity(alpha: float, sign: float, mode: int, double_sided: int, cutoff: flo
 
 @wp.func
 def light_on(normal: wp.vec3, toward: wp.vec3, ambient: float, diffuse: float):
-    """Sky light, a little stronger from above, and Lambert's cosine of the light's direction."""
+    """Return sky light, a little stronger from above, plus the key light times Lambert's cosine."""
     sky = ambient * (0.75 + 0.25 * normal[2])
     return sky + diffuse * wp.max(wp.dot(normal, toward), 0.0)
 
@@ -163,12 +163,12 @@ def raycast_mesh(
     top: int,
     columns: int,  # of the window that holds the mesh
     samples: int,  # per pixel and axis
-    nudge: float,  # a ray goes on this far behind what did not stop it
+    nudge: float,  # distance behind a surface at which a ray goes on
     far: float,
     # Out:
     image_out: wp.array3d[float],  # [H, W, 4] premultiplied colour and coverage
 ):
-    """One pixel of the window: the mean of samples x samples rays (a box filter)."""
+    """Render one pixel of the window as the mean of samples x samples rays (a box filter)."""
     i = first + wp.tid()
     y = top + i // columns
     x = left + i % columns
@@ -241,7 +241,7 @@ def visible_on_mesh(
     # Out:
     visible_out: wp.array[wp.int32],  # [P] 1 where inside the image, drawn, and at most half hidden
 ):
-    """Whether a camera sees a surface point: inside the frustum, and something stops the ray there, not before."""
+    """Mark surface points that a camera sees: inside the frustum, on a surface that stops the ray, not hidden."""
     i = first + wp.tid()
     point = points_in[i]
     visible_out[i] = 0

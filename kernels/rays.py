@@ -1,4 +1,4 @@
-"""Rays of a pinhole camera, and what it sees of a point: shared by the kernels that look at triangle meshes."""
+"""Rays and frustum of a pinhole camera, shared by the kernels that cast rays at triangle meshes."""
 
 import warp as wp
 
@@ -7,13 +7,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def eye_of(camera_in: wp.array2d[float]):
-    """Where a camera [3, 4] (camera-to-world, OpenCV) stands."""
+    """Return the position of a camera [3, 4] (camera-to-world, OpenCV)."""
     return wp.vec3(camera_in[0, 3], camera_in[1, 3], camera_in[2, 3])
 
 
 @wp.func
 def ray_through(camera_in: wp.array2d[float], K_in: wp.array2d[float], x: float, y: float):
-    """Unit direction through an image point, pixels; pixel centres lie at halves."""
+    """Return the unit direction through an image point in pixels; pixel centres lie at +0.5."""
     right = wp.vec3(camera_in[0, 0], camera_in[1, 0], camera_in[2, 0])
     down = wp.vec3(camera_in[0, 1], camera_in[1, 1], camera_in[2, 1])
     forward = wp.vec3(camera_in[0, 2], camera_in[1, 2], camera_in[2, 2])
@@ -24,7 +24,7 @@ def ray_through(camera_in: wp.array2d[float], K_in: wp.array2d[float], x: float,
 
 @wp.func
 def rotation_of(viewmat_in: wp.array2d[float]):
-    """Of a world-to-camera matrix [4, 4]."""
+    """Return the rotation of a world-to-camera matrix [4, 4]."""
     return wp.matrix_from_rows(
         wp.vec3(viewmat_in[0, 0], viewmat_in[0, 1], viewmat_in[0, 2]),
         wp.vec3(viewmat_in[1, 0], viewmat_in[1, 1], viewmat_in[1, 2]),
@@ -34,7 +34,7 @@ def rotation_of(viewmat_in: wp.array2d[float]):
 
 @wp.func
 def in_view(viewmat_in: wp.array2d[float], K_in: wp.array2d[float], width: int, height: int, point: wp.vec3):
-    """Whether a point is in front of the camera and inside its image."""
+    """Return whether a point is in front of the camera and inside its image."""
     translation = wp.vec3(viewmat_in[0, 3], viewmat_in[1, 3], viewmat_in[2, 3])
     q = rotation_of(viewmat_in) * point + translation
     if q[2] <= 0.0:
@@ -46,6 +46,6 @@ def in_view(viewmat_in: wp.array2d[float], K_in: wp.array2d[float], width: int, 
 
 @wp.func
 def eye_of_view(viewmat_in: wp.array2d[float]):
-    """Where the camera of a world-to-camera matrix stands."""
+    """Return the camera position of a world-to-camera matrix [4, 4]."""
     translation = wp.vec3(viewmat_in[0, 3], viewmat_in[1, 3], viewmat_in[2, 3])
     return -(wp.transpose(rotation_of(viewmat_in)) * translation)

@@ -1,4 +1,4 @@
-"""Sums whose order is fixed by the data's shape alone."""
+"""Sums in an order that depends on the data's shape alone."""
 
 import warp as wp
 
@@ -15,7 +15,7 @@ def sum_rows(
     # Out:
     sums_out: wp.array2d[float],  # [ceil(N / ROWS), C]
 ):
-    """Grid: one index for each group of ``ROWS`` rows and column."""
+    """Add up groups of ``ROWS`` rows, column by column. Grid: ceil(N / ROWS) x C."""
     i = first + wp.tid()
     columns = values_in.shape[1]
     group = i // columns

@@ -1,4 +1,4 @@
-"""Farthest-point sampling: a well-spread subset of a cloud, the same one on every run."""
+"""Farthest-point sampling: a well-spread subset of a point cloud, the same on every run."""
 
 import warp as wp
 
@@ -6,7 +6,7 @@ wp.set_module_options({"enable_backward": False})
 
 CHOSEN = wp.constant(-1.0)
 NOT_FINITE = wp.constant(-0.5)
-"""Distances that mark a point: one already chosen, and one to be chosen only when nothing else is left."""
+"""Distances that mark points: already chosen, and to be chosen only when no finite point is left."""
 
 
 @wp.kernel
@@ -17,6 +17,7 @@ def start_distances(
     # Out:
     distances_out: wp.array[float],  # [N]
 ):
+    """Set infinite distances; mark points with non-finite coordinates. Grid: N."""
     i = first + wp.tid()
     distance = float(wp.inf)
     for d in range(points_in.shape[1]):
@@ -30,17 +31,20 @@ def farthest_step(
     first: int,
     # In:
     step: int,
-    size: int,  # points a chunk
+    size: int,  # points per chunk
     points_in: wp.array2d[float],  # [N, D]
-    best_in: wp.array[float],  # [chunks] of the step before: greatest distance of each chunk
-    best_index_in: wp.array[wp.int32],  # [chunks] and its point
+    best_in: wp.array[float],  # [chunks] greatest distance in each chunk, from the step before
+    best_index_in: wp.array[wp.int32],  # [chunks] point with that distance
     # Out:
     distances_out: wp.array[float],  # [N] squared, to the points chosen so far; updated
     best_out: wp.array[float],  # [chunks]
     best_index_out: wp.array[wp.int32],  # [chunks]
     chosen_out: wp.array[wp.int64],  # [count]
 ):
-    """Choose the farthest point (every chunk for itself, from the same figures), then update one chunk's distances."""
+    """Choose the farthest point, then update a chunk's distances to it. Grid: chunks.
+
+    Every chunk chooses for itself, from the same numbers, so that one launch does both.
+    """
     chunk = first + wp.tid()
     chosen = int(best_index_in[0])
     farthest = float(best_in[0])

@@ -1,8 +1,8 @@
-"""Brightness that follows the turn of a surface: a function of its rotation, of each Gaussian's own.
+"""Shading: each Gaussian's brightness as a function of its own rotation.
 
 To first order the light that a diffuse surface reflects is linear in its normal (an environment's irradiance up to
-degree 1), so while a surface turns by R it changes by ``x = <G, R - I>`` in proportion, where G holds light and normal.
-A lamp's light, which is cut off at grazing angles, bends away from that: hence a quadratic term of x.
+degree 1). While a surface turns by R, its brightness therefore changes by the share ``x = <G, R - I>``, where G
+combines light and normal. A lamp's light is cut off at grazing angles, which a quadratic term of x approximates.
 """
 
 import warp as wp
@@ -11,24 +11,24 @@ from .quaternion import quat_conjugate, quat_matrix, quat_multiply, quat_normali
 
 wp.set_module_options({"enable_backward": False})
 
-MOST = wp.constant(4.0)
-"""No Gaussian becomes brighter than so many times its colour at rest."""
+GAIN_MAX = wp.constant(4.0)
+"""Upper limit of a Gaussian's brightness, relative to its brightness at rest."""
 BEND = wp.constant(5.0)
-"""Of the quadratic term's coefficient, so that it learns about as fast as G."""
+"""Scale of the quadratic term's coefficient, chosen so that it learns about as fast as G."""
 GREY = wp.constant(1.7724538509055159)
-"""0.5 / C0: the coefficient of degree 0 is the colour less one half, over C0."""
+"""0.5 / C0, as the coefficient of degree 0 is (colour - 0.5) / C0."""
 
 
 @wp.func
 def turned(quat: wp.vec4, quat_t: wp.vec4) -> wp.mat33:
-    """R - I of the rotation that leads from ``quat`` to ``quat_t``."""
+    """Return R - I for the rotation R from ``quat`` to ``quat_t``."""
     rotation = quat_matrix(quat_multiply(quat_normalise(quat_t), quat_conjugate(quat_normalise(quat))))
     return rotation - wp.identity(n=3, dtype=float)
 
 
 @wp.func
 def response(i: int, shading: wp.array2d[float], turn: wp.mat33) -> float:
-    """x = <G, R - I>."""
+    """Return x = <G, R - I>."""
     total = float(0.0)
     for r in range(3):
         for c in range(3):
@@ -38,16 +38,16 @@ def response(i: int, shading: wp.array2d[float], turn: wp.mat33) -> float:
 
 @wp.func
 def gain(x: float, bend: float) -> float:
-    """1 + x + 5 b x^2, not limited, finite or not."""
+    """Return 1 + x + 5 b x^2, neither limited nor checked."""
     return 1.0 + x + BEND * bend * x * x
 
 
 @wp.func
 def limited(free: float) -> float:
-    """The gain within its limits; 1 where it is not finite."""
+    """Clamp the gain to its limits; return 1 where it is non-finite."""
     if not wp.isfinite(free):
         return 1.0
-    return wp.clamp(free, 0.0, MOST)
+    return wp.clamp(free, 0.0, GAIN_MAX)
 
 
 @wp.kernel
@@ -61,6 +61,7 @@ def shade(
     # Out:
     sh_dc_out: wp.array[wp.vec3],  # [N]
 ):
+    """Scale the colour of degree 0 by the gain. Grid: N."""
     i = first + wp.tid()
     x = response(i, shading_in, turned(quats_in[i], quats_t_in[i]))
     factor = limited(gain(x, shading_in[i, 9]))
@@ -81,7 +82,7 @@ def shade_adjoint(
     v_sh_dc_out: wp.array[wp.vec3],  # [N]
     v_shading_out: wp.array2d[float],  # [N, 10]
 ):
-    """A gain that is limited, or replaced as it is not finite, passes nothing to G and b."""
+    """Compute the gradients of colour, G and b; a limited or replaced gain passes none to G and b. Grid: N."""
     i = first + wp.tid()
     turn = turned(quats_in[i], quats_t_in[i])
     x = response(i, shading_in, turn)

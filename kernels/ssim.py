@@ -1,15 +1,14 @@
 """Photometric loss: L1 and SSIM of two planar images, forward and adjoint.
 
-SSIM (Wang et al. 2004, equation 13) with an 11 x 11 Gaussian of sigma 1.5 and zero padding. Of a window's statistics
-four blurred maps suffice, because the two variances occur only as their sum: ``x``, ``y``, ``x^2 + y^2`` and ``x y``.
+SSIM (Wang et al. 2004, equation 13) with an 11 x 11 Gaussian of sigma 1.5 and zero padding. Four blurred maps give a
+window's statistics, because the two variances occur only as their sum: ``x``, ``y``, ``x^2 + y^2`` and ``x y``.
 The forward pass leaves the three partial derivatives of each SSIM value (with respect to blurred ``x``, ``x^2 + y^2``
 and ``x y``); a blur is its own adjoint, so the gradient is three more blurs::
 
     d/dx = G * d_mean + 2 x (G * d_squares) + y (G * d_product)
 
-Here in plain Warp, one grid index a pixel or a row, for any device; ``ssim_cpu`` is the same in SIMD.
-
-Where ``mask`` is false the image counts as equal to the truth and the pixel's own L1 and SSIM are left out.
+This form takes one pixel or one row per grid index and runs on any device; ``cpu/ssim.py`` is the SIMD form. Where
+``mask`` is false the image counts as equal to the truth, and the pixel's own L1 and SSIM are left out.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ wp.set_module_options({"enable_backward": False})
 
 RADIUS = 5
 SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
 
 _taps = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(RADIUS + 1)]
 TAPS = [tap / (_taps[0] + 2.0 * sum(_taps[1:])) for tap in _taps]
-"""One half of the window, centre first; the whole sums to one."""
+"""One half of the window, centre first; the whole window sums to 1."""
 
 Taps = wp.types.vector(length=RADIUS + 1, dtype=wp.float32)
 _WINDOW = wp.constant(Taps(*TAPS))
-_C1 = wp.constant(wp.float32(C1))
-_C2 = wp.constant(wp.float32(C2))
+_C1 = wp.constant(wp.float32(SSIM_C1))
+_C2 = wp.constant(wp.float32(SSIM_C2))
 
 
 @wp.kernel
@@ -46,7 +45,7 @@ def blur_rows(
     # Out:
     blurred_out: wp.array4d[float],  # [4, C, H, W] x, y, x^2 + y^2, x y, blurred along rows
 ):
-    """The four maps of a pixel, blurred horizontally. Grid: C x H x W."""
+    """Blur the four maps horizontally at a pixel. Grid: C x H x W."""
     i = first + wp.tid()
     height = image_in.shape[1]
     width = image_in.shape[2]
@@ -81,7 +80,7 @@ def photometric(
     values_out: wp.array4d[float],  # [2, C, H, W] |x - y| and SSIM, 0 where masked
     partials_out: wp.array4d[float],  # [3, C, H, W] of SSIM to blurred x, x^2 + y^2, x y
 ):
-    """L1 and SSIM of a pixel and the partial derivatives of its SSIM. Grid: C x H x W."""
+    """Compute a pixel's L1, its SSIM and the partial derivatives of its SSIM. Grid: C x H x W."""
     i = first + wp.tid()
     height = image_in.shape[1]
     width = image_in.shape[2]
@@ -131,7 +130,7 @@ def sum_rows(
     # Out:
     sums_out: wp.array[float],  # [R]
 ):
-    """Sums along rows, left to right. Grid: R."""
+    """Add along rows, left to right. Grid: R."""
     i = first + wp.tid()
     total = float(0.0)
     for column in range(values_in.shape[1]):
@@ -147,7 +146,7 @@ def blur_rows_adjoint(
     # Out:
     blurred_out: wp.array4d[float],  # [3, C, H, W] blurred along rows
 ):
-    """The three partial derivatives, blurred horizontally. Grid: C x H x W."""
+    """Blur the three partial derivatives horizontally at a pixel. Grid: C x H x W."""
     i = first + wp.tid()
     height = partials_in.shape[2]
     width = partials_in.shape[3]
@@ -178,7 +177,7 @@ def photometric_adjoint(
     # Out:
     v_image_out: wp.array3d[float],  # [C, H, W]
 ):
-    """Gradient of a pixel of the image. Grid: C x H x W."""
+    """Compute the gradient of a pixel of the image. Grid: C x H x W."""
     i = first + wp.tid()
     height = image_in.shape[1]
     width = image_in.shape[2]

@@ -1,15 +1,16 @@
-"""C++ bodies of kernels: the headers of this folder, spliced into Warp's functions.
+"""C++ bodies of kernels: headers in this folder that become Warp functions.
 
-A header holds ``static inline`` functions, structures and enumerations. Warp compiles a native function from a piece of
-text that becomes the function's body, so :func:`native_function` puts a header, with what it includes, into a local
-structure there and calls the function of the same name. Two rules follow for headers:
+A header holds ``static inline`` functions, structures and enumerations. Warp compiles a native function from a text
+that becomes the function's body, so :func:`native_function` puts a header and its includes into a local structure there
+and calls the function of the same name. This sets three rules:
 
-- no templates and no static data members, which local structures may not have: use generic lambdas inside a function,
-  and functions or enumerations for constants;
-- include other headers of this folder with ``#include "name.h"`` alone on a line.
+- Write results to arrays: Warp sees a return type under its own decorator alone.
+- Use no templates and no static data members, which local structures may not have. Use generic lambdas inside
+  functions, functions that return one, and functions or enumerations for constants.
+- Include other headers of this folder with ``#include "name.h"`` alone on a line.
 
-Warp hashes the text it is given: an edited header is compiled again. Constants that Python and C++ share stand in
-``CONSTANTS`` and reach a header as macros. ``tests/kernels/test_native.py`` compiles every header by itself.
+Warp hashes the text, so it compiles an edited header again. ``CONSTANTS`` holds the constants that Python and C++
+share; they reach a header as macros. ``tests/kernels/test_native.py`` compiles every header by itself.
 """
 
 from __future__ import annotations
@@ -22,23 +23,35 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import types
+from .. import harmonics, ssim, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
+    "ADAM_CHUNK": types.ADAM_CHUNK,
+    "ADAM_GRADIENT_MAX": types.ADAM_GRADIENT_MAX,
     "ALPHA_MAX": types.ALPHA_MAX,
     "CHANNEL_GROUP": types.CHANNEL_GROUP,
+    "GRADIENT_MAX": types.GRADIENT_MAX,
+    "NETWORK_PANEL": types.NETWORK_PANEL,
     "PACKED_GEOMETRY": types.PACKED_GEOMETRY,
+    "ROOFLINE_BLOCK": types.ROOFLINE_BLOCK,
+    "ROOFLINE_CHAINS": types.ROOFLINE_CHAINS,
+    **{f"SH_{name}": getattr(harmonics, name) for name in harmonics.FACTORS},
+    "SSIM_BAND": types.SSIM_BAND,
+    "SSIM_BLOCK": types.SSIM_BLOCK,
+    "SSIM_C1": ssim.SSIM_C1,
+    "SSIM_C2": ssim.SSIM_C2,
+    **{f"SSIM_TAP_{distance}": tap for distance, tap in enumerate(ssim.TAPS)},
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
 }
-"""Macros by name; a header sees those that its text names."""
+"""Values of macros by name; a header gets those that its text names."""
 
 _INCLUDE = re.compile(r'^#include "([\w./]+)"\n', re.MULTILINE)
 _GUARDS = {"cpu": "#if !defined(__CUDA_ARCH__)", "cuda": "#if defined(__CUDA_ARCH__)"}
 
 
 def header_text(name: str, folder: Path = FOLDER) -> str:
-    """Return a header of ``folder`` with every header it includes in place of its first ``#include``."""
+    """Return a header of ``folder``, with each included header in place of its first ``#include``."""
     seen: set[str] = set()
 
     def read(file: str) -> str:
@@ -60,11 +73,11 @@ def constant_macros(text: str) -> dict[str, str]:
     }
 
 
-def snippet(header: str, call: str, device: Literal["cpu", "cuda"], otherwise: str = "", folder: Path = FOLDER) -> str:
+def snippet(header: str, call: str, device: Literal["cpu", "cuda"], folder: Path = FOLDER) -> str:
     """Return the body of a native function that runs ``call``, a call of a function of ``header``.
 
     Args:
-        device: where the header compiles; for the other device the body is ``otherwise``.
+        device: device that the header is compiled for; on the other one the body is empty.
     """
     text = header_text(header, folder)
     macros = constant_macros(text)
@@ -74,28 +87,24 @@ def snippet(header: str, call: str, device: Literal["cpu", "cuda"], otherwise: s
         f"struct native {{\n{text}}};",
         call,
         *(f"#undef {name}" for name in macros),
-        *(["#else", otherwise] if otherwise else []),
         "#endif",
     ]
     return "\n" + "\n".join(lines) + "\n"
 
 
 def native_function(
-    header: str, *, device: Literal["cpu", "cuda"] = "cpu", otherwise: str = "", folder: str | Path = FOLDER
+    header: str, *, device: Literal["cpu", "cuda"] = "cpu", folder: str | Path = FOLDER
 ) -> Callable[[Callable[..., Any]], wp.Function]:
     """Make a Warp function whose body is the function of the same name in ``header``.
 
     Args:
         header: file name in ``folder``.
-        device: where the function runs; a kernel that calls it compiles for the other device, but does nothing there.
-        otherwise: statement for the other device, needed where a value is returned.
+        device: device that the function runs on; on the other one it compiles, but does nothing.
     """
 
     def decorate(function: Callable[..., Any]) -> wp.Function:
-        signature = inspect.signature(function)
-        call = f"native::{function.__name__.lstrip('_')}({', '.join(signature.parameters)});"
-        if signature.return_annotation is not inspect.Signature.empty:
-            call = f"return {call}"
-        return wp.func_native(snippet(header, call, device, otherwise, Path(folder)))(function)
+        name, arguments = function.__name__.lstrip("_"), ", ".join(inspect.signature(function).parameters)
+        call = f"native::{name}({arguments});"
+        return wp.func_native(snippet(header, call, device, Path(folder)))(function)
 
     return decorate

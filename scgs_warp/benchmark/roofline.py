@@ -15,6 +15,7 @@ import torch
 from torch import nn
 
 from ..kernels.cpu import roofline as kernels
+from ..kernels.types import LANES, ROOFLINE_BLOCK, ROOFLINE_CHAINS
 from ..motion import ControlPoints
 from ..runtime import environment
 from ..runtime.launch import launch
@@ -84,13 +85,13 @@ def measure_limits(threads: int, blocks: int | None = None) -> Limits:
     moving = _copying(blocks)
     hand_back()  # no row shall count these buffers
     environment.configure(before)
-    flops = 2.0 * CHUNKS * ROUNDS * kernels.CHAINS * kernels.LANES
-    return Limits(threads, 2 * FLOAT * blocks * kernels.BLOCK / moving / 1e9, flops / computing / 1e9)
+    flops = 2.0 * CHUNKS * ROUNDS * ROOFLINE_CHAINS * LANES
+    return Limits(threads, 2 * FLOAT * blocks * ROOFLINE_BLOCK / moving / 1e9, flops / computing / 1e9)
 
 
 def _copying(blocks: int) -> float:
     """Seconds for copying that many blocks."""
-    source, target = torch.ones(blocks * kernels.BLOCK), torch.zeros(blocks * kernels.BLOCK)
+    source, target = torch.ones(blocks * ROOFLINE_BLOCK), torch.zeros(blocks * ROOFLINE_BLOCK)
     return _best(lambda: launch(kernels.copy, blocks, source, target, grain=1))
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.network import Layers, PackedLayers, evaluate, network
-from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_features_and_variation
+from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_variation
 from ..optim import log_linear
 from ..seeding import generator
 from ..types import Gaussians
@@ -45,7 +45,7 @@ class HexPlane(Motion):
                 shape = (CHANNELS, rows, SPATIAL * multiple)
                 # Space planes vary at first, time planes are 1: the scene starts at rest.
                 plane = torch.ones(shape) if second == 3 else 0.1 + 0.4 * torch.rand(shape, generator=random)
-                # Channels last: a texel is two cache lines.
+                # Channels last: the samples of a texel lie side by side.
                 self.planes.append(nn.Parameter(plane.permute(1, 2, 0).contiguous()))
         self.trunk = nn.Linear(CHANNELS * len(MULTIPLES), WIDTH)
         self.heads = nn.ModuleDict(
@@ -76,11 +76,8 @@ class HexPlane(Motion):
         if step < config.coarse:  # a static scene first (4D-GS)
             return TrainingPose(gaussians.activate(), None)
         weights = Smoothness(config.loss.hexplane_tv, config.loss.hexplane_smooth, config.loss.hexplane_rest)
-        if not any(weights):
-            return TrainingPose(self.gaussians_at(gaussians, time), None)
-        where = gaussians.means / BOUND
-        found, variation = plane_features_and_variation(where, time, list(self.planes), weights)
-        return TrainingPose(self._moved(gaussians, found), variation)
+        variation = plane_variation(list(self.planes), weights) if any(weights) else None
+        return TrainingPose(self.gaussians_at(gaussians, time), variation)
 
     def train(self, mode: bool = True) -> HexPlane:
         self._packed.forget()  # the optimiser writes where torch need not count

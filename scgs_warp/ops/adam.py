@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 from ..kernels import adam as kernels
+from ..kernels.cpu import adam as cpu_kernels
+from ..kernels.types import ADAM_CHUNK
 from ..runtime.launch import launch
 
 Form = Literal["auto", "plain", "cpu"]
@@ -62,9 +64,9 @@ def adam_step(
     tables = _table(addresses, np.int64, device), _table(factors, np.float32, device), sizes, chunks
     numbers = 1.0 - betas[0], betas[1], 1.0 - betas[1], eps
     if simd:
-        launch(kernels.adam_chunks, len(chunks), *tables, *numbers, grain=4)
+        launch(cpu_kernels.adam_step, len(chunks), *tables, *numbers, grain=4)
     else:
-        launch(kernels.adam, len(chunks) * kernels.CHUNK, *tables, *numbers)
+        launch(kernels.adam_step, len(chunks) * ADAM_CHUNK, *tables, *numbers)
     # As torch's own in-place operations do: what was computed from the old values can tell that they are gone.
     torch.autograd.graph.increment_version([tensor for update in updates for tensor in (update.value, *update[2:4])])
 
@@ -86,7 +88,7 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
     sizes, chunks = _layout(tuple([tensor.numel() for tensor in tensors]), tensors[0].device)
     bad = torch.empty(len(chunks), dtype=torch.int32)
     addresses = _table([tensor.data_ptr() for tensor in tensors], np.int64, tensors[0].device)
-    launch(kernels.find_bad_chunks, len(chunks), addresses, sizes, chunks, bad, grain=4)
+    launch(cpu_kernels.find_non_finite, len(chunks), addresses, sizes, chunks, bad, grain=4)
     found = bad.numpy().nonzero()[0]
     return int(chunks[found[0], 0]) if len(found) else None
 
@@ -146,6 +148,6 @@ def _refuse(update: Update, device: torch.device) -> None:
 @lru_cache(maxsize=16)
 def _layout(sizes: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
     """Sizes [T] and chunks [C, 2] (tensor, first element) of tensors with ``sizes`` elements."""
-    chunks = [(i, begin) for i, size in enumerate(sizes) for begin in range(0, size, kernels.CHUNK)]
+    chunks = [(i, begin) for i, size in enumerate(sizes) for begin in range(0, size, ADAM_CHUNK)]
     table = torch.tensor(chunks, dtype=torch.int64).view(-1, 2)
     return torch.tensor(sizes, dtype=torch.int64).to(device), table.to(device)

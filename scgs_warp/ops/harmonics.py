@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..kernels import harmonics as kernels
 from ..kernels.cpu import harmonics as cpu_kernels
+from ..kernels.types import LANES
 from ..runtime.launch import launch
 from .reduction import sum_rows
 
@@ -24,8 +25,8 @@ class _SphericalHarmonics(torch.autograd.Function):
         flat = sh_rest.view(count * rest, 3)
         arguments = sh_dc, flat, rest, means, camera[None], degree, colors
         if form == "cpu":
-            blocks = -(-count // cpu_kernels.LANES)
-            launch(cpu_kernels.spherical_harmonics_lanes, blocks, *arguments, grain=32)
+            blocks = -(-count // LANES)
+            launch(cpu_kernels.spherical_harmonics, blocks, *arguments, grain=32)
         else:
             launch(kernels.spherical_harmonics, count, *arguments)
         ctx.save_for_backward(sh_rest, means, camera, colors)
@@ -48,8 +49,8 @@ class _SphericalHarmonics(torch.autograd.Function):
         flags = int(wants_rest), int(wants_means)
         arguments = *inputs, *flags, v_dc, v_flat, v_means
         if ctx.form == "cpu":
-            blocks = -(-count // cpu_kernels.LANES)
-            launch(cpu_kernels.spherical_harmonics_lanes_adjoint, blocks, *arguments, grain=32)
+            blocks = -(-count // LANES)
+            launch(cpu_kernels.spherical_harmonics_adjoint, blocks, *arguments, grain=32)
         else:
             launch(kernels.spherical_harmonics_adjoint, count, *arguments)
         # Only mean minus camera enters, so the camera's gradient is minus the sum of the means'.

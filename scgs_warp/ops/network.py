@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..kernels.cpu import network as kernels
 from ..kernels.cpu import network_adjoint as kernels_adjoint
-from ..kernels.cpu.network_panels import BLOCK, PANEL
+from ..kernels.types import NETWORK_BLOCK, NETWORK_PANEL
 from ..runtime.launch import launch
 
 ROWS = 8
@@ -38,38 +38,38 @@ class Layers:
     def __init__(self, weights: list[Tensor], biases: list[Tensor], inputs: int, inputs_adjoint: bool = False) -> None:
         self.weights, self.biases = [w.detach() for w in weights], [b.detach() for b in biases]
         self.inputs = inputs
-        self.panels = max(-(-w.shape[0] // PANEL) for w in weights)
+        self.panels = max(-(-w.shape[0] // NETWORK_PANEL) for w in weights)
         self.outputs = weights[-1].shape[0]
         self.gradient_begin: list[int] = []
         rows, at, behind, before = [], 0, 0, 0
         for layer, weight in enumerate(self.weights):
             out, columns = weight.shape
             own = columns - before
-            panels = -(-out // PANEL)
-            adjoint = at + panels * PANEL * columns
+            panels = -(-out // NETWORK_PANEL)
+            adjoint = at + panels * NETWORK_PANEL * columns
             to_inputs = adjoint + before * out
             own_row = [weight.data_ptr(), self.biases[layer].data_ptr(), own, before, out, at]
             wanted = inputs_adjoint and own > 0
             rows.append([*own_row, adjoint if before else -1, to_inputs if wanted else -1, 0])
-            at = to_inputs + (-(-own // PANEL) * PANEL * out if wanted else 0)
+            at = to_inputs + (-(-own // NETWORK_PANEL) * NETWORK_PANEL * out if wanted else 0)
             self.gradient_begin.append(behind)
             behind += out * columns + out
             before = out
         self.gradient_size = behind
         self.table = torch.tensor(rows, dtype=torch.int64)
         self.packed = torch.empty(at)
-        widest = max(self.panels, -(-inputs // PANEL)) if inputs_adjoint else self.panels
+        widest = max(self.panels, -(-inputs // NETWORK_PANEL)) if inputs_adjoint else self.panels
         launch(kernels.pack_weights, len(rows) * widest, widest, self.table, self.packed, grain=1)
 
     def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Inputs and hidden values in panels, and the outputs [T M, out]."""
         count = where.shape[0] * when.shape[0]
         rows = -(-count // ROWS) * ROWS
-        inputs = torch.empty(-(-self.inputs // PANEL), rows, PANEL)
+        inputs = torch.empty(-(-self.inputs // NETWORK_PANEL), rows, NETWORK_PANEL)
         launch(kernels.pack_inputs, rows, where, when, inputs)
-        hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * PANEL)
+        hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * NETWORK_PANEL)
         out = torch.empty(count, self.outputs)
-        blocks, size = -(-rows // BLOCK), BLOCK
+        blocks, size = -(-rows // NETWORK_BLOCK), NETWORK_BLOCK
         launch(kernels.network_values, blocks, size, int(keep), self.table, self.packed, inputs, hidden, out, grain=1)
         return inputs, hidden, out
 
@@ -87,7 +87,7 @@ class Layers:
         parts = 2
         for begin in range(0, rows, LARGEST_ADJOINT):
             own = min(LARGEST_ADJOINT, rows - begin)
-            grid, where = -(-own // BLOCK), (BLOCK, begin, table, self.packed)
+            grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, self.packed)
             launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
             if v_inputs is not None:
                 launch(kernels_adjoint.network_inputs_adjoint, grid, *where, v_hidden, v_inputs, grain=1)
@@ -157,7 +157,7 @@ def supported(weights: list[Tensor], biases: list[Tensor]) -> bool:
     """Whether :func:`network` takes them: float32 on a CPU, hidden widths multiples of 32."""
     return all(
         p.device.type == "cpu" and p.dtype == torch.float32 and p.is_contiguous() for p in (*weights, *biases)
-    ) and all(w.shape[0] % PANEL == 0 for w in weights[:-1])
+    ) and all(w.shape[0] % NETWORK_PANEL == 0 for w in weights[:-1])
 
 
 def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:

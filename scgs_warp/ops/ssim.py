@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels import ssim as kernels
 from ..kernels.cpu import ssim as cpu_kernels
+from ..kernels.types import SSIM_BAND
 from ..runtime import launch
 
 Form = Literal["auto", "pixel", "cpu"]
@@ -71,8 +72,8 @@ def photometric_loss(
 def _forward_bands(image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor | None) -> Tensor:
     channels, height, _ = image.shape
     sums = image.new_empty(2, channels, height)
-    bands = channels * -(-height // cpu_kernels.BAND)
-    launch.launch(cpu_kernels.photometric_bands, bands, image, truth, mask, sums, partials, grain=1)
+    bands = channels * -(-height // SSIM_BAND)
+    launch.launch(cpu_kernels.photometric, bands, image, truth, mask, sums, partials, grain=1)
     return sums
 
 
@@ -142,9 +143,9 @@ class _Photometric(torch.autograd.Function):
             v_means = torch.stack([v_l1 + (1.0 - ctx.weight) * v_loss, v_ssim - ctx.weight * v_loss])
             v_sums = (v_means / ctx.count).float()
             if ctx.simd:
-                bands = image.shape[0] * -(-image.shape[1] // cpu_kernels.BAND)
+                bands = image.shape[0] * -(-image.shape[1] // SSIM_BAND)
                 launch.launch(
-                    cpu_kernels.photometric_bands_adjoint, bands, image, truth, mask, partials, v_sums, v_image, grain=1
+                    cpu_kernels.photometric_adjoint, bands, image, truth, mask, partials, v_sums, v_image, grain=1
                 )
             else:
                 _adjoint_pixels(image, truth, mask, partials, v_sums, v_image)

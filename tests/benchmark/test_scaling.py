@@ -12,6 +12,7 @@ from scgs_warp.apps import bench as app
 from scgs_warp.benchmark import plan, plot, roofline, scaling, scenes
 from scgs_warp.errors import UserError
 from scgs_warp.kernels.cpu import roofline as kernels
+from scgs_warp.kernels.types import LANES, ROOFLINE_BLOCK, ROOFLINE_CHAINS
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.launch import launch
 
@@ -124,15 +125,15 @@ def test_the_loops_do_what_their_time_is_taken_for(threads):
     rounds, values = 7, torch.zeros(5)
     launch(kernels.multiply_add, 5, rounds, values, grain=1)
     total = 0.0
-    for k in range(kernels.CHAINS):
+    for k in range(ROOFLINE_CHAINS):
         x = 0.1 * (k + 1)
         for _ in range(rounds):
             x = x * 0.999 + 0.001
-        total += kernels.LANES * x
+        total += LANES * x
     assert values.tolist() == pytest.approx([total] * 5, rel=1e-5)
-    source, target = torch.rand(3 * kernels.BLOCK), torch.zeros(4 * kernels.BLOCK)
+    source, target = torch.rand(3 * ROOFLINE_BLOCK), torch.zeros(4 * ROOFLINE_BLOCK)
     launch(kernels.copy, 3, source, target, grain=1)
-    assert torch.equal(target[: 3 * kernels.BLOCK], source) and not bool(target[3 * kernels.BLOCK :].any())
+    assert torch.equal(target[: 3 * ROOFLINE_BLOCK], source) and not bool(target[3 * ROOFLINE_BLOCK :].any())
 
 
 def test_limits_are_those_of_a_computer():

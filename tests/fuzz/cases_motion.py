@@ -11,7 +11,7 @@ from fuzz.poison import Draw, finite_rows
 from scgs_warp.ops.arap import arap_energy, local_rotations, trajectory_graph
 from scgs_warp.ops.neighbors import NeighborSearch, nearest, node_lists, rbf_weights
 from scgs_warp.ops.network import network
-from scgs_warp.ops.planes import PAIRS, _features_in_torch, plane_features, plane_features_and_variation
+from scgs_warp.ops.planes import PAIRS, plane_features, plane_variation
 from scgs_warp.ops.sampling import farthest_points
 from scgs_warp.ops.skinning import skin, skin_rbf
 from scgs_warp.types import Pose
@@ -219,16 +219,9 @@ def case_planes(d: Draw, device: str) -> None:
     grads = torch.autograd.grad(features, [positions, *planes], d.normal(*features.shape).to(device))
     laws.finite("gradients of positions, planes", *grads)
     laws.zero("gradients of broken coordinates", grads[0][~positions.isfinite()])
-    in_torch = _features_in_torch(positions, time, planes)
-    laws.finite("features in torch", in_torch)
-    grads = torch.autograd.grad(in_torch, [positions, *planes], d.normal(*features.shape).to(device))
-    laws.finite("gradients of positions, planes in torch", *grads)
-    assert torch.allclose(in_torch, features, rtol=1e-3, atol=1e-2), "forms differ"
-    both = plane_features_and_variation(positions, time, planes)
-    laws.equal("features", both[0], features)
-    laws.finite("variation", both[1])
-    grads = torch.autograd.grad(both, planes, [d.normal(*features.shape).to(device), torch.ones_like(both[1])])
-    laws.finite("gradients of planes", *grads)
+    variation = plane_variation(planes)
+    laws.finite("variation", variation)
+    laws.finite("gradients of the variation", *torch.autograd.grad(variation, planes))
 
 
 def case_network(d: Draw, device: str) -> None:

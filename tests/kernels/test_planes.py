@@ -5,16 +5,7 @@ import torch
 from torch import Tensor
 
 from reference import planes as twin
-from scgs_warp.ops.planes import (
-    EVEN,
-    PAIRS,
-    Smoothness,
-    _features_in_torch,
-    _variation_in_torch,
-    plane_features,
-    plane_features_and_variation,
-    plane_variation,
-)
+from scgs_warp.ops.planes import EVEN, PAIRS, Smoothness, plane_features, plane_variation
 from scgs_warp.runtime import environment
 
 EXTENTS = [[(5, 7, 4, 3)], [(8, 8, 8, 5), (16, 16, 16, 5)], [(2, 3, 2, 2), (3, 2, 4, 7)]]
@@ -38,7 +29,7 @@ WEIGHTS = [EVEN, Smoothness(0.7, 0.0, 2.0), Smoothness(0.0, 3.0, 0.5)]
 
 def compare(positions: Tensor, time: float, planes: list[Tensor], seed: int, weights: Smoothness = EVEN) -> None:
     """Features, variation and all gradients against the twin."""
-    found, smooth = plane_features_and_variation(positions, time, planes, weights)
+    found, smooth = plane_features(positions, time, planes), plane_variation(planes, weights)
     own = positions.detach().cpu().double().requires_grad_()
     own_planes = [plane.detach().cpu().double().requires_grad_() for plane in planes]
     expected, expected_smooth = twin.features(own, time, own_planes), twin.variation(own_planes, *weights)
@@ -86,32 +77,10 @@ def test_exact_texels(time, device):
     torch.testing.assert_close(plane_features(where, time, planes)[0], product, rtol=1e-6, atol=0.0)
 
 
-def test_agrees_with_grid_sample():
-    """The form for CUDA, torch's sampling of channels-first planes, here on the CPU."""
-    planes, positions = planes_of(EXTENTS[1], 4), positions_of(200, 4)
-    forms = plane_features(positions, 0.3, planes), _features_in_torch(positions, 0.3, planes)
-    torch.testing.assert_close(*forms, rtol=1e-5, atol=1e-5)
-    weights = Smoothness(0.5, 2.0, 0.3)
-    smooth = plane_variation(planes, weights), _variation_in_torch(planes, weights)
-    torch.testing.assert_close(*smooth)
-    v = torch.randn(forms[0].shape, generator=torch.Generator().manual_seed(4)), torch.tensor(2.0)
-    inputs = (positions, *planes)
-    for got, want in zip(*(torch.autograd.grad(both, inputs, v) for both in zip(forms, smooth))):
-        torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4)
-    where = torch.tensor([[float("nan"), float("inf"), -3e38]], requires_grad=True)
-    forms = plane_features(where, 0.3, planes), _features_in_torch(where, 0.3, planes)
-    torch.testing.assert_close(*forms, rtol=1e-5, atol=1e-5)
-    for found in forms:
-        assert not bool(torch.autograd.grad(found.sum(), where)[0].any())
-
-
 def test_the_time_may_be_a_tensor(device):
     planes, positions = planes_of(EXTENTS[0], 12, device), positions_of(7, 12, device)
     found = plane_features(positions, torch.tensor([0.25], device=device), planes)
     assert torch.equal(found, plane_features(positions, 0.25, planes))
-    where = positions.detach().cpu(), [plane.detach().cpu() for plane in planes]
-    in_torch = _features_in_torch(where[0], torch.tensor([0.25]), where[1])
-    torch.testing.assert_close(found.cpu(), in_torch, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 3e38, -3e38])
@@ -146,10 +115,8 @@ def test_nobody_there(device):
     assert all(not bool(g.any()) for g in gradients[1:])
 
 
-def test_variation_alone(device):
+def test_variation_of_plain_planes(device):
     planes = planes_of(EXTENTS[2], 8, device)
-    alone, both = plane_variation(planes), plane_features_and_variation(positions_of(9, 8, device), 0.1, planes)[1]
-    assert torch.equal(alone, both)
     flat = [torch.full_like(plane, 0.7) for plane in planes]
     assert float(plane_variation(flat)) == 0.0
     even = [torch.arange(p.shape[0], device=device).float()[:, None, None].expand_as(p).contiguous() for p in planes]
@@ -166,7 +133,7 @@ def test_same_bits_on_any_number_of_threads():
     try:
         for threads in (1, 2, 3, 2):
             environment.configure(threads)
-            found, smooth = plane_features_and_variation(positions, 0.77, planes)
+            found, smooth = plane_features(positions, 0.77, planes), plane_variation(planes)
             v = torch.linspace(-1.0, 2.0, found.numel()).view_as(found)
             gradients = torch.autograd.grad((found, smooth), (positions, *planes), (v, torch.tensor(1e3)))
             results.append([found, smooth, *gradients])

@@ -8,11 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reference.ssim import photometric_loss as reference_loss
-from scgs_warp.kernels.cpu.ssim import BAND, BLOCK
+from scgs_warp.kernels.types import SSIM_BAND, SSIM_BLOCK
 from scgs_warp.ops.ssim import photometric_loss, ssim
 from scgs_warp.runtime import environment
 
-SHAPES = [(3, 37, 53), (1, 1, 1), (2, 5, 16), (3, 11, 17), (1, BAND + 1, 7), (3, BAND, 2 * BLOCK + 3), (4, 90, 31)]
+SHAPES = [
+    (3, 37, 53),
+    (1, 1, 1),
+    (2, 5, 16),
+    (3, 11, 17),
+    (1, SSIM_BAND + 1, 7),
+    (3, SSIM_BAND, 2 * SSIM_BLOCK + 3),
+    (4, 90, 31),
+]
 
 
 def _pair(shape: tuple[int, ...], seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -116,7 +124,7 @@ def test_the_mask_of_all_pixels_is_no_mask(device):
 
 
 def test_same_bits_for_any_thread_count(all_threads):
-    image, truth = _pair((3, 3 * BAND + 7, 2 * BLOCK + 5), 7)
+    image, truth = _pair((3, 3 * SSIM_BAND + 7, 2 * SSIM_BLOCK + 5), 7)
     for form in _forms("cpu"):
         results = []
         for threads in (1, 2):

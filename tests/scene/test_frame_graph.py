@@ -14,7 +14,6 @@ from scgs_warp.config.presets import MOTIONS
 from scgs_warp.kernels.cpu import skinning
 from scgs_warp.motion import network
 from scgs_warp.motion.base import Motion
-from scgs_warp.ops import planes
 from scgs_warp.rendering.render import render
 from scgs_warp.runtime import memory
 from scgs_warp.scene import frame_graph
@@ -166,7 +165,6 @@ class NoHost(TorchDispatchMode):
 def test_nothing_in_a_frame_asks_the_host(model: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(network, "supported", lambda *_: False)  # network and skinning as on CUDA
     monkeypatch.setattr(skinning, "MAX_NEIGHBORS", 0)
-    monkeypatch.setattr(planes, "_run", lambda *args: (planes._features_in_torch(*args[:3]).contiguous(), None))
     scene = scene_of(model, "cpu")
     frames = scene.frame_graph()
     frames.render(scenes.scene_camera(scene, (64, 48)), 0.5, torch.zeros(3))

@@ -1,0 +1,125 @@
+// A small multilayer perceptron: packing of its weights and inputs, and its values.
+#pragma once
+#include "network_panels.h"
+
+// Pack one panel of a layer's weights, as each of its products reads them.
+static inline void pack_panel(int layer, int panel, const wp::array_t<wp::int64>& table, wp::array_t<float>& packed) {
+    const long long* own = (const long long*)table.data + (long long)layer * TABLE_COLUMNS;
+    const float* weights = (const float*)own[WEIGHTS];
+    const int in = (int)(own[INPUTS] + own[HIDDEN]), out = (int)own[OUTPUTS];
+    if (panel < panels(out)) {  // row k, column j of a panel: weights[j, k]
+        float* to = packed.data + own[PACKED] + (long long)panel * in * PANEL;
+        const int n = out - panel * PANEL < PANEL ? out - panel * PANEL : PANEL;
+        const float* from = weights + (long long)panel * PANEL * in;
+        for (int k = 0; k < in; ++k)
+            for (int j = 0; j < PANEL; ++j) to[k * PANEL + j] = j < n ? from[(long long)j * in + k] : 0.0f;
+    }
+    if (own[PACKED_INPUTS] >= 0 && panel < panels(own[INPUTS])) {  // row j, column k: weights[j, k]
+        float* to = packed.data + own[PACKED_INPUTS] + (long long)panel * out * PANEL;
+        const int n = own[INPUTS] - panel * PANEL < PANEL ? own[INPUTS] - panel * PANEL : PANEL;
+        const float* from = weights + (long long)panel * PANEL;
+        for (int j = 0; j < out; ++j)
+            for (int k = 0; k < PANEL; ++k) to[j * PANEL + k] = k < n ? from[(long long)j * in + k] : 0.0f;
+    }
+    if (own[PACKED_ADJOINT] >= 0 && panel < panels(own[HIDDEN])) {  // row j, column k: weights[j, inputs + k]
+        float* to = packed.data + own[PACKED_ADJOINT] + (long long)panel * out * PANEL;
+        const float* from = weights + own[INPUTS] + (long long)panel * PANEL;
+        for (int j = 0; j < out; ++j) __builtin_memcpy(to + j * PANEL, from + (long long)j * in, PANEL * sizeof(float));
+    }
+}
+
+// Write one row of the inputs: a position's columns, then a time's.
+static inline void pack_row(
+    int row, const wp::array_t<float>& where, const wp::array_t<float>& when, wp::array_t<float>& inputs
+) {
+    const int positions = where.shape.dims[0], wide = where.shape.dims[1], narrow = when.shape.dims[1];
+    const int t = row / positions, rows = inputs.shape.dims[1];
+    const bool there = t < when.shape.dims[0];  // else it only fills up the last block
+    const float* a = where.data + (long long)(row - t * positions) * wide;
+    const float* b = when.data + (long long)t * narrow;
+    for (int p = 0; p < inputs.shape.dims[0]; ++p) {
+        float* to = inputs.data + ((long long)p * rows + row) * PANEL;
+        if (there && (p + 1) * PANEL <= wide)
+            __builtin_memcpy(to, a + p * PANEL, PANEL * sizeof(float));
+        else
+            for (int j = 0; j < PANEL; ++j) {
+                const int c = p * PANEL + j;
+                to[j] = there && c < wide + narrow ? (c < wide ? a[c] : b[c - wide]) : 0.0f;
+            }
+    }
+}
+
+// Take a block of rows through all layers.
+static inline void network_block(
+    int block, int size, int keep, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
+    const wp::array_t<float>& inputs, wp::array_t<float>& hidden, wp::array_t<float>& out
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    const auto accumulate = accumulation();
+    const int layers = table.shape.dims[0], rows = hidden.shape.dims[1];
+    const int begin = block * size, end = begin + size < rows ? begin + size : rows, count = out.shape.dims[0];
+    const int width = hidden.shape.dims[2];
+    const long long plane = (long long)rows * width;
+    struct Full {
+        enum { value = VECTORS };
+    };
+    struct Half {
+        enum { value = 1 };
+    };
+    // A strip of one or two vectors of a layer's outputs, for the rows of the block.
+    auto tile = [&](auto vectors, int l, int p, int c) {
+        constexpr int V = decltype(vectors)::value;
+        const long long* own = (const long long*)table.data + (long long)l * TABLE_COLUMNS;
+        const float* bias = (const float*)own[BIAS];
+        const int from_inputs = (int)own[INPUTS], from_hidden = (int)own[HIDDEN], outputs = (int)own[OUTPUTS];
+        const float* before = hidden.data + plane * (keep ? l - 1 : (l - 1) & 1);
+        float* after = hidden.data + plane * (keep ? l : l & 1);
+        const float* right = packed.data + own[PACKED] + (long long)p * (from_inputs + from_hidden) * PANEL + c;
+        vn start[V];
+        for (int v = 0; v < V; ++v)
+            for (int j = 0; j < LANES; ++j) {
+                const int column = p * PANEL + c + v * LANES + j;
+                start[v][j] = column < outputs ? bias[column] : 0.0f;
+            }
+        for (int i = begin; i < end; i += ROWS) {
+            vn acc[ROWS][V];
+            for (int r = 0; r < ROWS; ++r)
+                for (int v = 0; v < V; ++v) acc[r][v] = start[v];
+            const float* b = right;
+            for (int k = 0; k < from_inputs; k += PANEL) {
+                const int n = from_inputs - k < PANEL ? from_inputs - k : PANEL;
+                accumulate(acc, inputs.data + (long long)k * rows + (long long)i * PANEL, Panel(), One(), b, n);
+                b += n * PANEL;
+            }
+            for (int k = 0; k < from_hidden; k += PANEL) {
+                accumulate(acc, before + (long long)k * rows + (long long)i * PANEL, Panel(), One(), b, PANEL);
+                b += PANEL * PANEL;
+            }
+            if (l + 1 < layers) {
+                float* to = after + (long long)p * PANEL * rows + (long long)i * PANEL + c;
+                for (int r = 0; r < ROWS; ++r)
+                    for (int v = 0; v < V; ++v)  // a NaN stays
+                        *(vnu*)(to + r * PANEL + v * LANES) = acc[r][v] < 0.0f ? vn{} : acc[r][v];
+                continue;
+            }
+            for (int r = 0; r < ROWS && i + r < count; ++r)
+                for (int v = 0; v < V; ++v)
+                    for (int j = 0; j < LANES; ++j) {
+                        const int column = p * PANEL + c + v * LANES + j;
+                        if (column < outputs) out.data[(long long)(i + r) * outputs + column] = acc[r][v][j];
+                    }
+        }
+    };
+    for (int l = 0; l < layers; ++l) {
+        const int outputs = (int)table.data[(long long)l * TABLE_COLUMNS + OUTPUTS];
+        for (int p = 0; p < panels(outputs); ++p)
+            for (int c = 0; c < PANEL; c += STRIP) {
+                if (p * PANEL + c >= outputs) break;
+                // Half a tile is enough for the end of a narrow last layer.
+                if (p * PANEL + c + LANES < outputs)
+                    tile(Full(), l, p, c);
+                else
+                    tile(Half(), l, p, c);
+            }
+    }
+}

@@ -1,0 +1,78 @@
+// Matrices in panels of 32 columns, and the loop that multiplies them.
+//
+// Element (i, j) of a matrix with R rows is at ((j / 32) R + i) 32 + j % 32. All products (values, adjoint of values,
+// adjoint of weights) then stream through memory in one direction, and all are the same loop: a tile of rows x columns
+// of the result stays in registers while one column of the left factor at a time meets one row of the right factor.
+// Each sum is taken in the order of its index, by one thread: the bits depend neither on the number of threads nor on
+// how the rows are cut into blocks.
+#pragma once
+#include "simd.h"
+
+// Columns of the table of layers:
+enum {
+    WEIGHTS,          // address of the weights [out, in]
+    BIAS,             // address of the bias [out]
+    INPUTS,           // columns read from the inputs
+    HIDDEN,           // columns read from the layer before
+    OUTPUTS,          // columns written
+    PACKED,           // where the layer's packed weights begin: for values,
+    PACKED_ADJOINT,   // for the adjoint of the layer before (-1: not wanted),
+    PACKED_INPUTS,    // for the adjoint of the inputs (-1: not wanted)
+    WEIGHTS_ADJOINT,  // address of the gradient of the weights; that of the bias follows it
+    TABLE_COLUMNS,
+};
+
+enum { PANEL = NETWORK_PANEL };  // columns of a panel
+
+// The tile of a result that fits into the registers: 16 accumulators hide the latency of a fused multiply-add.
+#if defined(__AVX512F__)
+enum { LANES = 16, ROWS = 8, VECTORS = 2 };
+#elif defined(__AVX__)
+enum { LANES = 8, ROWS = 4, VECTORS = 2 };
+#else
+enum { LANES = 4, ROWS = 8, VECTORS = 2 };
+#endif
+enum { STRIP = LANES * VECTORS };  // columns of a tile
+
+// One register of the CPU, and the same at any address.
+typedef float vn __attribute__((vector_size(LANES * 4)));
+typedef float vnu __attribute__((vector_size(LANES * 4), aligned(4)));
+
+// Distances between elements of a left factor, as types.
+struct One {
+    enum { value = 1 };
+};
+struct Panel {
+    enum { value = PANEL };
+};
+
+static inline int panels(long long columns) { return (int)((columns + PANEL - 1) / PANEL); }
+
+// Return a function: sums[r][v] += sum over k < n of left(r, k) right(k, v), where left(r, k) is at
+// left[r * row + k * step]. The copy of the sums stays in registers, whatever the caller does with its own.
+static inline auto accumulation() {
+    FUSE_WITHIN_EXPRESSIONS
+    return [](auto& sums, const float* left, auto row, auto step, const float* right, int n) {
+        constexpr int V = sizeof(sums[0]) / sizeof(vn);
+        vn acc[ROWS][V];
+#pragma clang loop unroll(full)
+        for (int r = 0; r < ROWS; ++r)
+#pragma clang loop unroll(full)
+            for (int v = 0; v < V; ++v) acc[r][v] = sums[r][v];
+        for (const float* end = right + n * PANEL; right < end; right += PANEL, left += step.value) {
+            vn b[V];
+#pragma clang loop unroll(full)
+            for (int v = 0; v < V; ++v) b[v] = *(const vnu*)(right + v * LANES);
+#pragma clang loop unroll(full)
+            for (int r = 0; r < ROWS; ++r) {
+                const float a = left[r * row.value];
+#pragma clang loop unroll(full)
+                for (int v = 0; v < V; ++v) acc[r][v] += a * b[v];
+            }
+        }
+#pragma clang loop unroll(full)
+        for (int r = 0; r < ROWS; ++r)
+#pragma clang loop unroll(full)
+            for (int v = 0; v < V; ++v) sums[r][v] = acc[r][v];
+    };
+}
