@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
+from ..formats.gaussian_files import gaussian_points
 from ..gaussians import SH_C0
 from ..storage.files import check_ply_counts
 from ..storage.safe_paths import is_regular
@@ -48,8 +49,6 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         UserError: as :func:`read_ply` and ``gaussian_files.read_gaussians``.
     """
     if path.suffix.lower() in (".splat", ".spz"):
-        from ..formats.gaussian_files import gaussian_points
-
         return gaussian_points(path)
     return read_ply(path)
 

@@ -91,7 +91,7 @@ class Scene:
         if metadata.get("stage") != "main":
             raise UserError(f"{folder}: training stopped in stage 1; continue it with apps/train.py --resume")
         scene.freeze_binding()
-        check_motion(scene, str(folder / checkpoint.FILE))
+        check_motion(scene.gaussians_at, str(folder / checkpoint.FILE))
         return scene
 
     def freeze_binding(self) -> None:

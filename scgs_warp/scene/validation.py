@@ -6,16 +6,14 @@ given an index beyond its arrays would read, and write, what is not its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..errors import UserError
-
-if TYPE_CHECKING:
-    from .scene import Scene
+from ..types import Gaussians
 
 REMEDY = "use the previous checkpoint, or train again"
 SH_COUNTS = (0, 3, 8, 15)
@@ -117,15 +115,18 @@ def _vector(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 3 and all(_number(x, -LARGEST, LARGEST) for x in value)
 
 
-def check_motion(scene: Scene, source: str) -> None:
-    """At the beginning, the middle and the end of the motion every Gaussian is somewhere: finite numbers may lead to
-    others that are not.
+def check_motion(gaussians_at: Callable[[float], Gaussians], source: str) -> None:
+    """Check that the Gaussians are finite at the beginning, the middle and the end of the motion: finite parameters
+    may lead to non-finite poses.
+
+    Args:
+        gaussians_at: time in [0, 1] -> posed Gaussians.
 
     Raises:
-        UserError: it does not.
+        UserError: naming the time and the attribute.
     """
     for time in MOMENTS:
-        posed = scene.gaussians_at(time)
+        posed = gaussians_at(time)
         for name in ("means", "quats", "scales", "sh_dc"):
             if not bool(torch.isfinite(getattr(posed, name)).all()):
                 raise _wrong(source, f"at time {time:g} the Gaussians' {name} are not finite")
