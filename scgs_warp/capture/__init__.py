@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from .pipeline import Captured, Request, capture
+from .pipeline import CaptureRequest, CaptureResult, capture
 
-__all__ = ["Captured", "Request", "capture"]
+__all__ = ["CaptureRequest", "CaptureResult", "capture"]

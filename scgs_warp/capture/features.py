@@ -24,25 +24,25 @@ Tensor = torch.Tensor
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Matching = Literal["auto", "sequential", "exhaustive"]
-RATIO = 0.8
+MAX_ANGLE_RATIO = 0.8
 """Largest ratio of the angles to the best and the second best descriptor (Lowe 2004)."""
-ANGLE = 0.7
+MAX_ANGLE = 0.7
 """Largest angle between descriptors that match, radians."""
-UNIT = 512.0
+DESCRIPTOR_LENGTH = 512.0
 """Length of a descriptor of bytes."""
 EXHAUSTIVE_VIDEO = 40
 """Up to so many frames of a video are compared each with each ..."""
 EXHAUSTIVE_FOLDER = 120
 """... and up to so many images of a folder, which need not be in order."""
-FOLLOWING = 8
+NEXT_FRAMES = 8
 """Frames that a frame is compared with; then those 16, 32, 64 ... later ..."""
-LOOP = 10
+LOOP_STRIDE = 10
 """... and every tenth with every tenth: the camera may come back."""
 INITIAL_FOCAL = 1.2
 """Focal length over the longer side, where nobody knows: 45 degrees."""
 
 
-class Shots(NamedTuple):
+class FrameFiles(NamedTuple):
     """What features are taken from."""
 
     folder: Path
@@ -72,7 +72,7 @@ def quiet() -> Iterator[Any]:
         pycolmap.logging.minloglevel = before
 
 
-def begin(database: Path, shots: Shots, model: CameraModel, focal: float | None) -> None:
+def begin(database: Path, frame_files: FrameFiles, model: CameraModel, focal: float | None) -> None:
     """A database of the frames, with one camera for all, unless it is there.
 
     Args:
@@ -84,15 +84,15 @@ def begin(database: Path, shots: Shots, model: CameraModel, focal: float | None)
                 return
         options = pycolmap.ImageReaderOptions(camera_model=model, default_focal_length_factor=INITIAL_FOCAL)
         if focal is not None:
-            height, width = read_rgb(shots.folder / shots.names[0]).shape[:2]
+            height, width = read_rgb(frame_files.folder / frame_files.names[0]).shape[:2]
             camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
             options.camera_params = ",".join(repr(float(value)) for value in camera.params)
         pycolmap.import_images(
-            database, shots.folder, pycolmap.CameraMode.SINGLE, image_names=shots.names, options=options
+            database, frame_files.folder, pycolmap.CameraMode.SINGLE, image_names=frame_files.names, options=options
         )
 
 
-def extract(database: Path, shots: Shots, most: int, done: Callable[[], object]) -> None:
+def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[], object]) -> None:
     """Features of every frame that has none yet, outside of its mask.
 
     Args:
@@ -103,14 +103,14 @@ def extract(database: Path, shots: Shots, most: int, done: Callable[[], object])
         options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
         options.sift.max_num_features = most
         extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-        for name in shots.names:
+        for name in frame_files.names:
             image = there.read_image_with_name(name).image_id
             if not there.exists_keypoints(image):
-                gray = cv2.cvtColor(read_rgb(shots.folder / name), cv2.COLOR_RGB2GRAY)
+                gray = cv2.cvtColor(read_rgb(frame_files.folder / name), cv2.COLOR_RGB2GRAY)
                 keypoints, descriptors = extractor.extract_from_uint8_array(gray)
                 rows = pycolmap.keypoints_to_matrix(keypoints)
-                if shots.masks is not None and len(rows):
-                    kept = ~_masked(shots.masks / name, rows[:, :2])
+                if frame_files.masks is not None and len(rows):
+                    kept = ~_masked(frame_files.masks / name, rows[:, :2])
                     rows, descriptors.data = rows[kept], descriptors.data[kept]
                 there.write_descriptors(image, descriptors)
                 there.write_keypoints(image, rows)
@@ -130,16 +130,21 @@ def pairs(count: int, matching: Matching, video: bool) -> list[tuple[int, int]]:
         matching = "exhaustive" if count <= (EXHAUSTIVE_VIDEO if video else EXHAUSTIVE_FOLDER) else "sequential"
     if matching == "exhaustive":
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
-    steps = [*range(1, FOLLOWING + 1)]
+    steps = [*range(1, NEXT_FRAMES + 1)]
     while 2 * steps[-1] < count:
         steps.append(2 * steps[-1])
     found = {(i, i + step) for i in range(count) for step in steps if i + step < count}
-    found |= {(i, j) for i in range(0, count, LOOP) for j in range(i + LOOP, count, LOOP)}
+    found |= {(i, j) for i in range(0, count, LOOP_STRIDE) for j in range(i + LOOP_STRIDE, count, LOOP_STRIDE)}
     return sorted(found)
 
 
 def match(
-    database: Path, shots: Shots, chosen: Sequence[tuple[int, int]], seed: int, device: str, done: Callable[..., object]
+    database: Path,
+    frame_files: FrameFiles,
+    chosen: Sequence[tuple[int, int]],
+    seed: int,
+    device: str,
+    done: Callable[..., object],
 ) -> None:
     """Matches of every pair of frames that has none yet, and the geometry that they agree with.
 
@@ -152,7 +157,7 @@ def match(
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = seed
-        images = [there.read_image_with_name(name) for name in shots.names]
+        images = [there.read_image_with_name(name) for name in frame_files.names]
         points = [there.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
         camera = there.read_camera(images[0].camera_id)
         for a, b in chosen:
@@ -181,7 +186,7 @@ def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
     """[M, 2] uint32: descriptors [N, 128] uint8 of two frames that are each other's nearest, clearly so."""
     if len(one) < 2 or len(two) < 2:
         return np.zeros((0, 2), np.uint32)
-    cosines = (one.float() @ two.float().T) / UNIT**2
+    cosines = (one.float() @ two.float().T) / DESCRIPTOR_LENGTH**2
     forth, there = _distinct(cosines)
     back, here = _distinct(cosines.T)
     mutual = forth & back[there] & (here[there] == torch.arange(len(one), device=one.device))
@@ -193,7 +198,7 @@ def _distinct(cosines: Tensor) -> tuple[Tensor, Tensor]:
     """Of each row, whether its best is good and much better than the second best; and which it is."""
     best, where = cosines.topk(2, dim=1)
     angles = best.clamp(-1.0, 1.0).acos()
-    return (angles[:, 0] <= ANGLE) & (angles[:, 0] <= RATIO * angles[:, 1]), where[:, 0]
+    return (angles[:, 0] <= MAX_ANGLE) & (angles[:, 0] <= MAX_ANGLE_RATIO * angles[:, 1]), where[:, 0]
 
 
 class Links(NamedTuple):
@@ -209,10 +214,10 @@ class Links(NamedTuple):
     """Share of all agreeing pairs for which one homography does: the camera turned without moving, or saw a plane."""
 
 
-def links(database: Path, shots: Shots) -> Links:
+def links(database: Path, frame_files: FrameFiles) -> Links:
     """Count what is in the database."""
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
-        images = [there.read_image_with_name(name).image_id for name in shots.names]
+        images = [there.read_image_with_name(name).image_id for name in frame_files.names]
         features = [there.num_keypoints_for_image(image) for image in images]
         found = [
             there.read_two_view_geometry(a, b) if there.exists_two_view_geometry(a, b) else None

@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .features import Shots, quiet
+from .features import FrameFiles, quiet
 
-FEWEST_VIEWS = 3
+MIN_VIEWS = 3
 """Frames that a point must be seen in ..."""
-LARGEST_ERROR = 2.0
+MAX_ERROR = 2.0
 """... and pixels by which its projections may miss on average."""
 
 
-class Solved(NamedTuple):
+class CameraSolution(NamedTuple):
     """A model of the scene at rest, in COLMAP's frame and scale, which mean nothing."""
 
     model: str
@@ -39,7 +39,7 @@ class Solved(NamedTuple):
     """Degrees: how far apart rays to a point are, at the median of all points."""
 
 
-def solve(database: Path, shots: Shots, folder: Path, seed: int, done: Callable[[], object]) -> int:
+def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done: Callable[[], object]) -> int:
     """Run the mapper, on one thread: sums over threads would differ from run to run. Its largest model goes to
     ``folder``, unless there is none.
 
@@ -59,7 +59,7 @@ def solve(database: Path, shots: Shots, folder: Path, seed: int, done: Callable[
         options.triangulation.random_seed = seed
         pycolmap.set_random_seed(seed)
         found = pycolmap.incremental_mapping(
-            database, shots.folder, attempts, options, next_image_callback=lambda: _ignore(done())
+            database, frame_files.folder, attempts, options, next_image_callback=lambda: _ignore(done())
         )
         best = max(found.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
         if best is not None and best.num_reg_images():
@@ -74,13 +74,13 @@ def _ignore(_: object) -> None:
     """The mapper's callback must return nothing."""
 
 
-def read_solution(folder: Path, shots: Shots) -> Solved | None:
+def read_solution(folder: Path, frame_files: FrameFiles) -> CameraSolution | None:
     """The model that :func:`solve` left; None without one."""
     if not (folder / "images.bin").is_file():
         return None
     with quiet() as pycolmap:
         model = pycolmap.Reconstruction(folder)
-        place = {name: number for number, name in enumerate(shots.names)}
+        place = {name: number for number, name in enumerate(frame_files.names)}
         images = {place[image.name]: image for image in model.images.values() if image.has_pose}
         places = sorted(images)
         viewmats = np.tile(np.eye(4), (len(places), 1, 1))
@@ -88,8 +88,8 @@ def read_solution(folder: Path, shots: Shots) -> Solved | None:
             viewmats[row, :3] = images[number].cam_from_world().matrix()
         camera = next(iter(model.cameras.values()))
         points = [model.points3D[key] for key in sorted(model.points3D)]
-        kept = [p for p in points if p.track.length() >= FEWEST_VIEWS and p.error <= LARGEST_ERROR] or points
-        return Solved(
+        kept = [p for p in points if p.track.length() >= MIN_VIEWS and p.error <= MAX_ERROR] or points
+        return CameraSolution(
             camera.model_name,
             tuple(float(value) for value in camera.params),
             camera.width,

@@ -17,33 +17,33 @@ from ..errors import UserError
 from ..storage.files import size_text
 from .source import Folder, Source, open_source, read_rgb, shrunk
 
-SIDE = 480
+FLOW_SIDE = 480
 """Longer side of the images in which flow is computed, pixels."""
 STEPS = (-2, -1, 1, 2)
 """Frames that each frame is compared with."""
 GRID = 12
 """Every so many pixels a flow vector takes part in the search for the camera's motion."""
-FEWEST = 60
+MIN_VECTORS = 60
 """Flow vectors without which no motion is sought."""
-OFF_LINE = 1.5
-"""Pixels of ``SIDE`` from the epipolar line that flow is never that wrong by ..."""
-OFF_TYPICAL = 6.0
+MIN_LINE_DISTANCE = 1.5
+"""Pixels of ``FLOW_SIDE`` from the epipolar line that flow is never that wrong by ..."""
+TYPICAL_FACTOR = 6.0
 """... unless it usually is: times the median distance."""
-RETURN = 1.5
+MAX_ROUND_TRIP = 1.5
 """Pixels that flow forth and back may end from where it began; more, and the pixel is hidden in one of the frames."""
-TEXTURE = 4.0
+MIN_CONTRAST = 4.0
 """Grey levels of local contrast without which flow is a guess."""
-AGREE = 0.5
+MIN_AGREEMENT = 0.5
 """Share of the comparisons in which a pixel must move by itself."""
-LARGEST = 0.5
+MAX_MASK_SHARE = 0.5
 """A mask of more than this share of the frame says that the search has failed."""
-GROW = 0.015
-"""Masks are widened by this share of ``SIDE``: flow is blurred at outlines."""
-SPECK = 0.001
+DILATION = 0.015
+"""Masks are widened by this share of ``FLOW_SIDE``: flow is blurred at outlines."""
+MIN_AREA = 0.001
 """Smaller areas, as shares of the frame, are errors of the flow."""
 
 
-def consensus(load: Callable[[int], np.ndarray], count: int, done: Callable[[], object]) -> list[np.ndarray]:
+def find_moving(load: Callable[[int], np.ndarray], count: int, done: Callable[[], object]) -> list[np.ndarray]:
     """Masks of ``count`` frames.
 
     Args:
@@ -72,12 +72,12 @@ def consensus(load: Callable[[int], np.ndarray], count: int, done: Callable[[], 
                 kept[k], size = _gray(image), (image.shape[1], image.shape[0])
         votes, asked = np.zeros(kept[index].shape, np.float32), np.zeros(kept[index].shape, np.float32)
         for other in around:
-            answer = off_line(kept[index], flow(index, other), flow(other, index))
+            answer = leaves_epipolar_line(kept[index], flow(index, other), flow(other, index))
             if answer is not None:
                 moves, sure = answer
                 votes += moves & sure
                 asked += sure
-        mask = (votes >= 1) & (votes >= AGREE * asked)
+        mask = (votes >= 1) & (votes >= MIN_AGREEMENT * asked)
         masks.append(_tidy(mask, size))
         gone = index + min(STEPS)
         kept.pop(gone, None)
@@ -87,10 +87,10 @@ def consensus(load: Callable[[int], np.ndarray], count: int, done: Callable[[], 
 
 
 def _gray(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(shrunk(image, SIDE), cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(shrunk(image, FLOW_SIDE), cv2.COLOR_RGB2GRAY)
 
 
-def off_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def leaves_epipolar_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Which pixels of an image leave their epipolar lines on the way to another, and of which that can be said.
 
     Args:
@@ -105,25 +105,25 @@ def off_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -> tuple[np.n
     there = np.stack([x, y], 2) + forth
     returned = cv2.remap(back, there[..., 0], there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (there >= 0).all(2) & (there[..., 0] < width) & (there[..., 1] < height)
-    sure = inside & (np.square(forth + returned).sum(2) < RETURN**2) & _textured(one)
+    sure = inside & (np.square(forth + returned).sum(2) < MAX_ROUND_TRIP**2) & _textured(one)
     chosen = np.zeros_like(sure)
     chosen[GRID // 2 :: GRID, GRID // 2 :: GRID] = True
     chosen &= sure
-    if chosen.sum() < FEWEST:
+    if chosen.sum() < MIN_VECTORS:
         return None
     here = np.stack([x, y], 2)
     matrix, _ = cv2.findFundamentalMat(here[chosen], there[chosen], cv2.USAC_MAGSAC, 0.5, 0.999, 2000)
     if matrix is None or matrix.shape != (3, 3):
         return None
     distance = sampson(matrix, here, there)
-    limit = max(OFF_LINE, OFF_TYPICAL * float(np.median(distance[sure])))
+    limit = max(MIN_LINE_DISTANCE, TYPICAL_FACTOR * float(np.median(distance[sure])))
     return distance > limit, sure
 
 
 def _textured(gray: np.ndarray) -> np.ndarray:
     values = gray.astype(np.float32)
     mean = cv2.blur(values, (9, 9))
-    return cv2.blur(values * values, (9, 9)) - mean * mean > TEXTURE**2
+    return cv2.blur(values * values, (9, 9)) - mean * mean > MIN_CONTRAST**2
 
 
 def sampson(matrix: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -137,19 +137,19 @@ def sampson(matrix: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarr
 
 def _tidy(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Without specks and holes, widened, at ``size`` (width, height); nothing where too much is left."""
-    reach = max(1, round(GROW * max(mask.shape)))
+    reach = max(1, round(DILATION * max(mask.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     pixels = cv2.medianBlur(mask.astype(np.uint8), 5)
     pixels = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, disc)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(pixels)
-    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= SPECK * mask.size]
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= MIN_AREA * mask.size]
     pixels = cv2.dilate(np.isin(labels, large).astype(np.uint8), disc)
-    if pixels.mean() > LARGEST:
+    if pixels.mean() > MAX_MASK_SHARE:
         pixels[:] = 0
     return cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def given(path: Path, source: Source, indices: Sequence[int], names: Sequence[str], size: tuple[int, int]) -> list:
+def read_masks(path: Path, source: Source, indices: Sequence[int], names: Sequence[str], size: tuple[int, int]) -> list:
     """Masks that the user made: black where something moves, as COLMAP and nerfstudio have it.
 
     A video of masks, or a folder with one for each frame of the source: of the same name for a folder of images, in the

@@ -8,19 +8,19 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from .source import Still, shrunk
+from .source import SourceFrame, shrunk
 
-LOOK_SIDE = 640
+SHARPNESS_SIDE = 640
 """Longer side of the images in which sharpness is measured, pixels."""
 FLOW_SIDE = 320
 """Of those in which motion is measured."""
-FASTEST = 0.05
+FASTEST_SHARE = 0.05
 """Motion is that of the fastest pixels, this share of all: a small thing that moves counts in a film at rest."""
-STILL_PIXELS = 0.15
+NOISE_PIXELS = 0.15
 """Motion below this between two frames, in pixels of ``FLOW_SIDE``, is noise."""
-ALIKE = 1.0
+MIN_MOTION = 1.0
 """Frames that have moved by less pixels of ``FLOW_SIDE`` since the one picked before show the same again."""
-BLURRED = 0.5
+MIN_SHARPNESS = 0.5
 """Sharpness below this share of what neighbours have is blur."""
 NEIGHBOURS = 12
 """On each side; they show about the same things, so that their sharpness can be compared."""
@@ -28,7 +28,7 @@ NEIGHBOURS_QUANTILE = 0.75
 """The sharpness that neighbours have: high enough that a burst of blurred frames is seen to be one."""
 
 
-class Measures(NamedTuple):
+class FrameMeasures(NamedTuple):
     """What was measured of each of F frames."""
 
     index: np.ndarray
@@ -41,33 +41,33 @@ class Measures(NamedTuple):
     """[F] since the frame before, pixels of ``FLOW_SIDE``; the first has none"""
 
 
-class Picked(NamedTuple):
+class Selection(NamedTuple):
     places: list[int]
-    """Of the picked frames in ``Measures``, ascending."""
+    """Of the picked frames in ``FrameMeasures``, ascending."""
     blurred: int
     """Frames that were too blurred."""
     alike: int
     """Frames that show what the one picked before shows."""
 
 
-def measure(stills: Iterable[Still], done: Callable[[], object] = lambda: None) -> Measures:
+def measure(stills: Iterable[SourceFrame], done: Callable[[], object] = lambda: None) -> FrameMeasures:
     """Look at every frame once.
 
     Args:
-        stills: in order; images need be no larger than ``LOOK_SIDE``.
+        stills: in order; images need be no larger than ``SHARPNESS_SIDE``.
         done: called after each.
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     rows, before = [], None
     for still in stills:
-        gray = cv2.cvtColor(shrunk(still.image, LOOK_SIDE), cv2.COLOR_RGB2GRAY)
+        gray = cv2.cvtColor(shrunk(still.image, SHARPNESS_SIDE), cv2.COLOR_RGB2GRAY)
         small = shrunk(gray, FLOW_SIDE)
         motion = 0.0 if before is None else fastest(flow.calc(before, small, None))  # type: ignore[call-overload]
         rows.append((still.index, still.seconds, sharpness(gray), motion))
         before = small
         done()
     table = np.array(rows, np.float64).reshape(-1, 4)
-    return Measures(table[:, 0].astype(int), *table[:, 1:].T)
+    return FrameMeasures(table[:, 0].astype(int), *table[:, 1:].T)
 
 
 def sharpness(gray: np.ndarray) -> float:
@@ -76,9 +76,9 @@ def sharpness(gray: np.ndarray) -> float:
 
 
 def fastest(flow: np.ndarray) -> float:
-    """Mean length of the longest vectors of [H, W, 2], ``FASTEST`` of all."""
+    """Mean length of the longest vectors of [H, W, 2], ``FASTEST_SHARE`` of all."""
     lengths = np.hypot(flow[..., 0], flow[..., 1]).ravel()
-    count = max(1, round(FASTEST * len(lengths)))
+    count = max(1, round(FASTEST_SHARE * len(lengths)))
     return float(np.partition(lengths, len(lengths) - count)[-count:].mean())
 
 
@@ -90,7 +90,7 @@ def relative_sharpness(sharp: np.ndarray) -> np.ndarray:
     return np.where(usual > 0, sharp / np.maximum(usual, 1e-12), 1.0)
 
 
-def pick(found: Measures, count: int) -> Picked:
+def pick(found: FrameMeasures, count: int) -> Selection:
     """Choose at most ``count`` frames.
 
     The film is cut into ``count`` stretches that hold equal shares of its time and its motion, half of each; the
@@ -99,8 +99,8 @@ def pick(found: Measures, count: int) -> Picked:
     """
     frames = len(found.index)
     relative = relative_sharpness(found.sharpness)
-    blurred = relative < BLURRED
-    moved = np.cumsum(np.maximum(found.motion - STILL_PIXELS, 0.0))
+    blurred = relative < MIN_SHARPNESS
+    moved = np.cumsum(np.maximum(found.motion - NOISE_PIXELS, 0.0))
     if count >= frames:
         stretch = np.arange(frames)
     else:
@@ -112,8 +112,8 @@ def pick(found: Measures, count: int) -> Picked:
     for number in np.unique(stretch):
         members = np.flatnonzero(stretch == number)
         members = members[~blurred[members]]
-        distinct = members if not places else members[moved[members] - moved[places[-1]] >= ALIKE]
+        distinct = members if not places else members[moved[members] - moved[places[-1]] >= MIN_MOTION]
         alike += len(members) - len(distinct) if count >= frames or not len(distinct) else 0
         if len(distinct):
             places.append(int(distinct[relative[distinct].argmax()]))
-    return Picked(places, int(blurred.sum()), alike)
+    return Selection(places, int(blurred.sum()), alike)

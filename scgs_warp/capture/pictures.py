@@ -9,10 +9,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ..data.dataset import spread
 from ..visualization.video import write_png
-from .writing import Scene
+from .writing import CapturedScene
 
-MOST = 48
+MAX_PICTURES = 48
 """Pictures on the sheet."""
 COLUMNS = 8
 CELL = 200
@@ -21,9 +22,9 @@ CAPTION = 18
 GAP = 4
 MOVING = (255, 60, 40)
 """What masks hide is tinted in this colour."""
-LOST = (200, 30, 30)
-MOST_POINTS = 6000
-MOST_FRUSTA = 60
+STRUCK_OUT = (200, 30, 30)
+MAX_POINTS = 6000
+MAX_FRUSTA = 60
 
 
 def sheet(
@@ -41,7 +42,7 @@ def sheet(
         registered: numbers of the frames with a camera.
     """
     count = len(seconds)
-    shown = sorted({round(k * (count - 1) / max(min(count, MOST) - 1, 1)) for k in range(min(count, MOST))})
+    shown = spread(count, MAX_PICTURES)
     cells = [_cell(*load(k), _caption(k, seconds[k], k in registered, video), k in registered) for k in shown]
     height, width = cells[0].shape[:2]
     columns = min(COLUMNS, len(cells))
@@ -65,15 +66,15 @@ def _cell(image: np.ndarray, mask: np.ndarray | None, text: str, found: bool) ->
         hidden = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         picture[hidden] = (picture[hidden] // 2 + np.array(MOVING) // 2).astype(np.uint8)
     if not found:
-        cv2.line(picture, (0, 0), (size[0] - 1, size[1] - 1), LOST, 2, cv2.LINE_AA)
+        cv2.line(picture, (0, 0), (size[0] - 1, size[1] - 1), STRUCK_OUT, 2, cv2.LINE_AA)
     cell = np.full((size[1] + CAPTION, CELL, 3), 255, np.uint8)
     cell[: size[1]] = picture
-    color = (40, 40, 40) if found else LOST
+    color = (40, 40, 40) if found else STRUCK_OUT
     cv2.putText(cell, text, (3, size[1] + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
     return cell
 
 
-def cameras(path: Path, scene: Scene) -> None:
+def cameras(path: Path, scene: CapturedScene) -> None:
     """The scene from above and from the side: points in their colours, cameras in the colours of their time."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
@@ -82,14 +83,14 @@ def cameras(path: Path, scene: Scene) -> None:
     figure = Figure(figsize=(13, 6.2), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     frusta = _frusta(scene)
-    some = slice(None, None, max(1, len(scene.points) // MOST_POINTS))
+    some = slice(None, None, max(1, len(scene.points) // MAX_POINTS))
     points, colors = scene.points[some], scene.colors[some] / 255.0
     places = frusta[:, 0, 0]
     low, high = _window(points, places)
     lines: Any = None
     for axes, (a, b), title in zip(figure.subplots(1, 2), ((0, 1), (1, 2)), ("from above", "from the side")):
         axes.scatter(points[:, a], points[:, b], s=2, c=colors, linewidths=0)
-        every = max(1, len(frusta) // MOST_FRUSTA)
+        every = max(1, len(frusta) // MAX_FRUSTA)
         chosen = frusta[::every]
         edges = chosen[..., [a, b]].reshape(-1, *chosen.shape[2:3], 2)
         lines = LineCollection(list(edges), cmap="plasma", linewidths=0.9)
@@ -103,7 +104,7 @@ def cameras(path: Path, scene: Scene) -> None:
     figure.savefig(path, metadata={"Software": None})
 
 
-def _frusta(scene: Scene) -> np.ndarray:
+def _frusta(scene: CapturedScene) -> np.ndarray:
     """[V, 5, 4, 3] polylines of each camera: four sides, each from the centre and back (one point repeated), and the
     image plane (closed by its first corner)."""
     p = scene.pinhole

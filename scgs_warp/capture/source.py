@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import cv2
 import numpy as np
 
-from ..data.images import bomb, whole
+from ..data.images import is_complete, oversized_claim
 from ..errors import UserError
 from ..storage.files import natural, size_text
 
@@ -19,7 +19,7 @@ DIGEST_BYTES = 1 << 20
 """Of the beginning and the end of a file, which tell it from others; videos are large."""
 
 
-class Still(NamedTuple):
+class SourceFrame(NamedTuple):
     """One frame."""
 
     index: int
@@ -41,7 +41,7 @@ class Source(Protocol):
     count: int
     """Frames, as the file says before it is decoded; may be wrong."""
 
-    def frames(self, longest: int) -> Iterator[Still]:
+    def frames(self, longest: int) -> Iterator[SourceFrame]:
         """All frames in order. ``longest``: images are made smaller until their longer side is this, or kept.
 
         Raises:
@@ -101,7 +101,7 @@ class Video:
             raise UserError(f"{self.path}: holds no pictures; give a video, or a folder of images")
         return container
 
-    def frames(self, longest: int) -> Iterator[Still]:
+    def frames(self, longest: int) -> Iterator[SourceFrame]:
         from av.error import FFmpegError
 
         with self._opened() as container:
@@ -117,7 +117,7 @@ class Video:
                 for frame in decoded:
                     seconds = float(frame.time) if frame.time is not None else index / self.rate
                     first = seconds if first is None else first
-                    yield Still(index, seconds - first, _picture(frame, longest, shape), "")
+                    yield SourceFrame(index, seconds - first, _picture(frame, longest, shape), "")
                     index += 1
         if index == 0:
             raise UserError(f"{self.path}: no frame can be decoded; save it as .mp4, or give a folder of images")
@@ -160,7 +160,7 @@ class Folder:
         if not files:
             raise UserError(f"{path}: holds no images ({', '.join(SUFFIXES)}); give the folder that does, or a video")
 
-    def frames(self, longest: int) -> Iterator[Still]:
+    def frames(self, longest: int) -> Iterator[SourceFrame]:
         size = None
         for index, file in enumerate(self.files):
             image = read_rgb(file)
@@ -170,7 +170,7 @@ class Folder:
                     f"{file}: is {size_text(image.shape[1::-1])}, but {self.files[0].name} is {size_text(size)}; "
                     "give images of one camera and one size"
                 )
-            yield Still(index, float(index), shrunk(image, longest), file.name)
+            yield SourceFrame(index, float(index), shrunk(image, longest), file.name)
 
     def digest(self) -> str:
         return _digest(self.files)
@@ -180,10 +180,10 @@ def read_rgb(file: Path) -> np.ndarray:
     """[H, W, 3] uint8 RGB, turned as its EXIF tags say; UserError where it is no image."""
     try:
         data = np.fromfile(file, np.uint8)
-        claim = bomb(data.data)
+        claim = oversized_claim(data.data)
         if claim is not None:
             raise UserError(f"{file}: says it is {claim} in {data.size} bytes; save it again, smaller")
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if whole(data) else None
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if is_complete(data) else None
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
     except cv2.error:

@@ -14,8 +14,8 @@ import numpy as np
 from ..data.readers.transforms import OPENGL_TO_OPENCV
 from ..storage.files import held_out
 from ..visualization.video import write_png
-from .features import Shots, quiet
-from .mapping import Solved
+from .features import FrameFiles, quiet
+from .mapping import CameraSolution
 from .similarity import upright
 from .source import read_rgb
 
@@ -34,7 +34,7 @@ class Pinhole(NamedTuple):
     height: int
 
 
-class Scene(NamedTuple):
+class CapturedScene(NamedTuple):
     """What is written; world: z up."""
 
     pinhole: Pinhole
@@ -52,7 +52,7 @@ class Scene(NamedTuple):
     """[P, 3] uint8"""
 
 
-def pinhole_of(solved: Solved) -> tuple[Pinhole, np.ndarray, np.ndarray]:
+def pinhole_of(solved: CameraSolution) -> tuple[Pinhole, np.ndarray, np.ndarray]:
     """The largest pinhole image without empty pixels inside a distorted one, and where its pixels lie there:
     x [H, W], y [H, W] float32, as OpenCV counts."""
     with quiet() as pycolmap:
@@ -66,7 +66,7 @@ def pinhole_of(solved: Solved) -> tuple[Pinhole, np.ndarray, np.ndarray]:
     return Pinhole(fx, fy, cx, cy, flat.width, flat.height), pixels[..., 0].copy(), pixels[..., 1].copy()
 
 
-def undistort(shots: Shots, solved: Solved, folder: Path, done: Callable[[], object]) -> Pinhole:
+def undistort(frame_files: FrameFiles, solved: CameraSolution, folder: Path, done: Callable[[], object]) -> Pinhole:
     """Write ``images/`` and, where there are any, ``masks/`` of the registered frames.
 
     Args:
@@ -74,14 +74,14 @@ def undistort(shots: Shots, solved: Solved, folder: Path, done: Callable[[], obj
     """
     pinhole, x, y = pinhole_of(solved)
     (folder / "images").mkdir(exist_ok=True)
-    if shots.masks is not None:
+    if frame_files.masks is not None:
         (folder / "masks").mkdir(exist_ok=True)
     for place in solved.places:
-        name = shots.names[place]
-        image = cv2.remap(read_rgb(shots.folder / name), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        name = frame_files.names[place]
+        image = cv2.remap(read_rgb(frame_files.folder / name), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         write_png(folder / "images" / name, image)
-        if shots.masks is not None:
-            mask = read_rgb(shots.masks / name)
+        if frame_files.masks is not None:
+            mask = read_rgb(frame_files.masks / name)
             moved = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
             write_png(folder / "masks" / name, moved)
         done()
@@ -89,24 +89,28 @@ def undistort(shots: Shots, solved: Solved, folder: Path, done: Callable[[], obj
 
 
 def scene_of(
-    shots: Shots, solved: Solved, pinhole: Pinhole, seconds: Sequence[float], span: tuple[float, float]
-) -> Scene:
+    frame_files: FrameFiles,
+    solved: CameraSolution,
+    pinhole: Pinhole,
+    seconds: Sequence[float],
+    span: tuple[float, float],
+) -> CapturedScene:
     """Cameras and points upright, times from 0 to 1 over ``span`` (seconds of the video)."""
     moved = upright(solved.viewmats, solved.points)
     length = max(span[1] - span[0], 1e-9)
     chosen = [seconds[place] for place in solved.places]
-    return Scene(
+    return CapturedScene(
         pinhole,
         moved.viewmats(solved.viewmats),
         [min(max((second - span[0]) / length, 0.0), 1.0) for second in chosen],
         chosen,
-        [shots.names[place] for place in solved.places],
+        [frame_files.names[place] for place in solved.places],
         moved.points(solved.points),
         solved.colors,
     )
 
 
-def write_scene(folder: Path, scene: Scene) -> None:
+def write_scene(folder: Path, scene: CapturedScene) -> None:
     """``points.ply`` and, last, ``transforms.json``: where it is, the folder is complete."""
     write_points(folder / POINTS, scene.points, scene.colors)
     inside = [f"images/{name}" for name in scene.names]

@@ -9,13 +9,13 @@ from ..config.fields import CACHE_MIB
 from ..errors import UserError
 from .cache import ImageCache
 from .dataset import Dataset
-from .images import Look, check_options
+from .images import ReadOptions, check_options
 from .readers import colmap, dnerf, nerfies, nerfstudio, panoptic, poses_bounds
 
 __all__ = ["Dataset", "ImageCache", "load"]
 
 READERS = (dnerf, nerfstudio, nerfies, panoptic, poses_bounds, colmap)
-"""Asked in this order: ``recognises(folder)``, then ``read(folder, split, look)``."""
+"""Asked in this order: ``recognises(folder)``, then ``read(folder, split, options)``."""
 
 
 def load(
@@ -54,10 +54,12 @@ def load(
     folder = Path(folder)
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; give that of a data set, as docs/data.md describes them")
-    look = Look(downscale, resample, background, progress, cache if cache is not None else ImageCache(cache_mib))
+    options = ReadOptions(
+        downscale, resample, background, progress, cache if cache is not None else ImageCache(cache_mib)
+    )
     for reader in READERS:
         if reader.recognises(folder):
-            return reader.read(folder, split, look)
+            return reader.read(folder, split, options)
     raise UserError(
         f"{folder}: nothing known lies here: no transforms_{split}.json (D-NeRF, Blender), transforms.json "
         "(nerfstudio), dataset.json (HyperNeRF, NeRF-DS), train_meta.json (Panoptic), poses_bounds.npy "

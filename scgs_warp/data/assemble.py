@@ -18,20 +18,20 @@ from ..storage.files import size_text
 from ..types import Camera
 from .borders import border_mask, reduce_mask
 from .cache import ImageCache, Pixels
-from .dataset import Dataset, View, spread
-from .images import Decoded, Look, decode, is_transparent, parallel_map, read_image
+from .dataset import Dataset, StoredFrame, spread
+from .images import Decoded, ReadOptions, decode, is_transparent, parallel_map, read_image
 from .lens import Lens
-from .points import finite
+from .points import finite_points
 
 BORDER_FRAMES = 24
 """At most so many frames, spread over the video, are looked at for a border: all of them are in memory at once."""
 
-LARGEST = 1e30
+MAX_CAMERA_VALUE = 1e30
 """Of a camera's numbers: float32 holds them, and what is made of them."""
 
 
 @dataclass(frozen=True)
-class Shot:
+class FrameRecord:
     """A frame as its reader describes it."""
 
     file: Path
@@ -60,8 +60,8 @@ class _Facts:
 
 
 def assemble(
-    shots: Sequence[Shot],
-    look: Look,
+    records: Sequence[FrameRecord],
+    options: ReadOptions,
     *,
     folder: Path,
     split: str,
@@ -81,23 +81,23 @@ def assemble(
     Raises:
         UserError: one line naming the file, the field and the remedy.
     """
-    cache = look.cache if look.cache is not None else ImageCache()
-    keys = [object() for _ in shots]
+    cache = options.cache if options.cache is not None else ImageCache()
+    keys = [object() for _ in records]
 
-    def examine(index: int) -> _Facts:
-        decoded = _decode(shots[index], look)
+    def inspect(index: int) -> _Facts:
+        decoded = _decode(records[index], options)
         cache.offer(keys[index], decoded.pixels)
-        return _facts(shots[index], decoded, border)
+        return _facts(records[index], decoded, border)
 
-    facts = parallel_map(examine, range(len(shots)), look.progress)
+    facts = parallel_map(inspect, range(len(records)), options.progress)
     cut_out = any(fact.transparent for fact in facts)
     borders: dict[tuple[int, int], Tensor | None] = {}
     views = []
-    for shot, fact, key in zip(shots, facts, keys):
+    for record, fact, key in zip(records, facts, keys):
         if one_size and fact.source != facts[0].source:
             raise UserError(
-                f"{shot.file}: is {size_text(fact.source)}, but {shots[0].file.name} is {size_text(facts[0].source)}; "
-                "give all images of a split one size"
+                f"{record.file}: is {size_text(fact.source)}, but {records[0].file.name} is "
+                f"{size_text(facts[0].source)}; give all images of a split one size"
             )
         has_alpha = fact.has_alpha and cut_out
         if fact.has_alpha and not has_alpha:
@@ -110,12 +110,14 @@ def assemble(
         if not (fact.valid if common is None else fact.valid_within_border):
             # Neither a step nor a score could say anything of such a frame.
             raise UserError(
-                f"{shot.file}: no pixel is left by its mask, the video's border and the reduction to "
+                f"{record.file}: no pixel is left by its mask, the video's border and the reduction to "
                 f"{size_text((fact.camera.width, fact.camera.height))}; "
                 "correct mask_path or the lens, give a smaller downscale or drop the frame"
             )
-        views.append(View(fact.camera, shot.time, shot.name, _reader(shot, look), has_alpha, common, key))
-    return Dataset(views, folder=folder, split=split, background=look.background, cache=cache)
+        views.append(
+            StoredFrame(fact.camera, record.time, record.name, _reader(record, options), has_alpha, common, key)
+        )
+    return Dataset(views, folder=folder, split=split, background=options.background, cache=cache)
 
 
 def with_points(data: Dataset, points: np.ndarray | None, colors: np.ndarray | None) -> Dataset:
@@ -123,32 +125,33 @@ def with_points(data: Dataset, points: np.ndarray | None, colors: np.ndarray | N
     in float32 are left out."""
     if points is None:
         return data
-    kept = finite(points)
+    kept = finite_points(points)
     data.points = torch.from_numpy(points[kept]).float()
     data.colors = None if colors is None else torch.from_numpy(colors[kept]).float()
     return data
 
 
-def _decode(shot: Shot, look: Look) -> Decoded:
-    return read_image(shot.file, look, shot.lens, shot.mask)
+def _decode(record: FrameRecord, options: ReadOptions) -> Decoded:
+    return read_image(record.file, options, record.lens, record.mask)
 
 
-def _reader(shot: Shot, look: Look) -> Callable[[], Pixels]:
-    return lambda: _decode(shot, look).pixels
+def _reader(record: FrameRecord, options: ReadOptions) -> Callable[[], Pixels]:
+    return lambda: _decode(record, options).pixels
 
 
-def _facts(shot: Shot, decoded: Decoded, border: np.ndarray | None) -> _Facts:
+def _facts(record: FrameRecord, decoded: Decoded, border: np.ndarray | None) -> _Facts:
     image, alpha, mask = decoded.pixels
     height, width = image.shape[:2]
     lens, source = decoded.lens, decoded.source_size
     sx, sy = width / source[0], height / source[1]
-    numbers = np.abs([lens.fx, lens.fy, lens.cx, lens.cy, *shot.viewmat.ravel()])
-    if not (numbers < LARGEST).all() or min(lens.fx * sx, lens.fy * sy) * LARGEST < 1.0:
+    numbers = np.abs([lens.fx, lens.fy, lens.cx, lens.cy, *record.viewmat.ravel()])
+    if not (numbers < MAX_CAMERA_VALUE).all() or min(lens.fx * sx, lens.fy * sy) * MAX_CAMERA_VALUE < 1.0:
         raise UserError(
-            f"{shot.file}: its camera has numbers beyond {LARGEST:g}, or none; correct its pose and intrinsics"
+            f"{record.file}: its camera has numbers beyond {MAX_CAMERA_VALUE:g}, or none; "
+            "correct its pose and intrinsics"
         )
     K = np.array([[lens.fx * sx, 0.0, lens.cx * sx], [0.0, lens.fy * sy, lens.cy * sy], [0.0, 0.0, 1.0]])
-    camera = Camera(torch.from_numpy(shot.viewmat).float(), torch.from_numpy(K).float(), width, height)
+    camera = Camera(torch.from_numpy(record.viewmat).float(), torch.from_numpy(K).float(), width, height)
     valid = mask is None or bool(mask.any())
     within = valid
     if border is not None and border.shape == (source[1], source[0]):
@@ -166,8 +169,8 @@ def _fitting(border: np.ndarray | None, fact: _Facts) -> Tensor | None:
 def video_border(files: Sequence[Path], times: Sequence[float]) -> np.ndarray | None:
     """[H, W] bool, False on the black border of the video, if it has one; the same whichever split is read."""
     order = sorted(range(len(files)), key=lambda index: times[index])
-    looked_at = [files[order[place]] for place in spread(len(order), BORDER_FRAMES)]
-    images = parallel_map(decode, [file for file in looked_at if file.is_file()])
+    sampled = [files[order[place]] for place in spread(len(order), BORDER_FRAMES)]
+    images = parallel_map(decode, [file for file in sampled if file.is_file()])
     if any(is_transparent(image) for image in images):
         return None  # alpha says it better
     return border_mask([image[..., :3] for image in images])

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-BLACK = 4 / 255
+BLACK_LEVEL = 4 / 255
 """Largest channel of a pixel that counts as black: a JPEG of a black border is not quite black."""
-SHARE = 0.9
+MIN_FRAME_SHARE = 0.9
 """Of the frames in which a border is black; something dark that comes and goes is not cut."""
-FEWEST = 4
+MIN_FRAMES = 4
 """Frames that it takes to tell a border from something dark."""
-WIDEST = 0.2
+MAX_AREA = 0.2
 """A border that covers more of the image, or reaches its middle, is none, but a scene on a black ground."""
 
 
@@ -27,18 +27,18 @@ def border_mask(images: Sequence[np.ndarray]) -> np.ndarray | None:
         [H, W] bool, False on the border and on the one pixel beside it that interpolation darkened. None where there
         is no border, or nothing to tell it by.
     """
-    if len(images) < FEWEST or len({image.shape for image in images}) != 1:
+    if len(images) < MIN_FRAMES or len({image.shape for image in images}) != 1:
         return None
     black = np.zeros(images[0].shape[:2], np.float32)
     for image in images:
-        black += image[..., :3].max(axis=2) <= BLACK * np.iinfo(image.dtype).max
-    dark = (black >= SHARE * len(images)).astype(np.uint8)
+        black += image[..., :3].max(axis=2) <= BLACK_LEVEL * np.iinfo(image.dtype).max
+    dark = (black >= MIN_FRAME_SHARE * len(images)).astype(np.uint8)
     _, labels = cv2.connectedComponents(dark, connectivity=8)
     edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     border = np.isin(labels, edge[edge > 0])
     height, width = border.shape
     middle = border[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    if not border.any() or border.mean() > WIDEST or middle.any():
+    if not border.any() or border.mean() > MAX_AREA or middle.any():
         return None
     return cv2.dilate(border.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
 

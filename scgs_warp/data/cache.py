@@ -16,9 +16,9 @@ from torch import Tensor
 from ..config.fields import CACHE_MIB
 from ..runtime import memory
 
-SHARE = 0.5
+MEMORY_SHARE = 0.5
 """Part of the memory that is free at the start which images may take."""
-AHEAD = 2
+READ_AHEAD = 2
 """Images that are decoded before they are asked for."""
 
 
@@ -41,7 +41,7 @@ class ImageCache:
     """Shared by the splits of a run, used by several threads."""
 
     def __init__(self, mib: float = CACHE_MIB) -> None:
-        self.budget = min(int(mib * 2**20), int(SHARE * memory.room("cpu")))
+        self.budget = min(int(mib * 2**20), int(MEMORY_SHARE * memory.room("cpu")))
         self.used = 0
         self._kept: dict[Hashable, Pixels] = {}
         self._coming: dict[Hashable, Future[Pixels]] = {}
@@ -73,6 +73,11 @@ class ImageCache:
                 self._kept[key] = pixels
                 self.used += size
 
+    @property
+    def read_ahead(self) -> int:
+        """Number of images that were begun in the background and not asked for yet."""
+        return len(self._coming)
+
     def expect(self, key: Hashable, read: Callable[[], Pixels]) -> None:
         """Begin to read in the background what will be asked for soon."""
         with self._lock:
@@ -80,7 +85,7 @@ class ImageCache:
                 return
             if self._pool is None:
                 self._pool = ThreadPoolExecutor(1, "images")
-            while len(self._coming) >= AHEAD:  # foretold wrongly: the order has changed
+            while len(self._coming) >= READ_AHEAD:  # foretold wrongly: the order has changed
                 self._coming.pop(next(iter(self._coming))).cancel()
             self._coming[key] = self._pool.submit(read)
 

@@ -27,7 +27,7 @@ def spread(count: int, most: int) -> list[int]:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class StoredFrame:
     """A frame whose pixels are on disk."""
 
     camera: Camera
@@ -72,7 +72,7 @@ class Dataset(Sequence[Frame]):
 
     def __init__(
         self,
-        frames: Sequence[Frame | View],
+        frames: Sequence[Frame | StoredFrame],
         *,
         folder: Path,
         split: str,
@@ -93,7 +93,7 @@ class Dataset(Sequence[Frame]):
         """[P, 3] their colours in [0, 1], where the data has those, too."""
         self.cache = cache if cache is not None else ImageCache()
 
-    def _with(self, entries: Sequence[Frame | View]) -> Dataset:
+    def _with(self, entries: Sequence[Frame | StoredFrame]) -> Dataset:
         return Dataset(
             entries,
             folder=self.folder,
@@ -121,7 +121,7 @@ class Dataset(Sequence[Frame]):
             return tuple(self._frame(entry) for entry in self.entries[index])
         return self._frame(self.entries[index])
 
-    def _frame(self, entry: Frame | View) -> Frame:
+    def _frame(self, entry: Frame | StoredFrame) -> Frame:
         return entry if isinstance(entry, Frame) else entry.frame(self.cache)
 
     def __len__(self) -> int:
@@ -133,7 +133,7 @@ class Dataset(Sequence[Frame]):
     def expect(self, index: int) -> None:
         """Begin to read a frame that will be asked for soon."""
         entry = self.entries[index]
-        if isinstance(entry, View):
+        if isinstance(entry, StoredFrame):
             self.cache.expect(entry.key, entry.read)
 
     @property
@@ -142,7 +142,7 @@ class Dataset(Sequence[Frame]):
         return [
             index
             for index, entry in enumerate(self.entries)
-            if (entry.has_alpha if isinstance(entry, View) else entry.alpha is not None)
+            if (entry.has_alpha if isinstance(entry, StoredFrame) else entry.alpha is not None)
         ]
 
     @property

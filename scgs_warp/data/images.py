@@ -22,13 +22,13 @@ from ..storage.files import size_text
 from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
-from .lens import Lens, seen, undistort
+from .lens import Lens, undistort, valid_pixels
 
 RESAMPLES = ("area", "bicubic")
 SMALLEST_SIDE = 8
 """Pixels; a smaller image is smaller than SSIM's window and surely a mistake."""
 
-ALWAYS_FINE, THINNEST = 2**25, 64
+TRUSTED_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 64
 """Images of more pixels have at least a byte for so many of them: a megabyte of zeros unpacks to a gigabyte."""
 
 # What a camera wrote beside the picture is of no interest, and a warning about it goes to everybody's terminal.
@@ -49,7 +49,7 @@ class Decoded(NamedTuple):
     """Of the file."""
 
 
-class Look(NamedTuple):
+class ReadOptions(NamedTuple):
     """How a data set is to be read."""
 
     downscale: float = 1
@@ -103,7 +103,7 @@ def reduced_size(width: int, height: int, downscale: float, path: Path) -> tuple
 
 
 def read_image(
-    path: Path, look: Look, lens_of: Callable[[tuple[int, int]], Lens], mask_path: Path | None = None
+    path: Path, options: ReadOptions, lens_of: Callable[[tuple[int, int]], Lens], mask_path: Path | None = None
 ) -> Decoded:
     """Decode one file, undistort it, reduce it, and composite it on the background once.
 
@@ -121,13 +121,13 @@ def read_image(
     pixels = decode(path)
     height, width = pixels.shape[:2]
     lens = lens_of((width, height))
-    size = reduced_size(width, height, look.downscale, path)
+    size = reduced_size(width, height, options.downscale, path)
     mask = None if mask_path is None else read_mask(mask_path, path, (width, height))
     if lens.distorted:
-        moved = seen(lens, width, height)
+        moved = valid_pixels(lens, width, height)
         mask = moved if mask is None else moved & (undistort(mask.astype(np.float32), lens) > 1.0 - 1e-4)
-    color = np.asarray(BACKGROUND_COLORS[look.background], np.float32)
-    if look.resample == "bicubic" and size != (width, height):
+    color = np.asarray(BACKGROUND_COLORS[options.background], np.float32)
+    if options.resample == "bicubic" and size != (width, height):
         rgb, alpha = _bicubic(undistort(pixels, lens) if lens.distorted else pixels, size, color)
     else:
         rgb, alpha = _area(pixels, size, color, lens if lens.distorted else None)
@@ -170,11 +170,11 @@ def decode(path: Path) -> np.ndarray:
         raise UserError(f"{path}: no such image, though a frame names it; restore the file or drop the frame") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
-    claim = bomb(data.data)
+    claim = oversized_claim(data.data)
     if claim is not None:
         raise UserError(f"{path}: says it is {claim} in {data.size} bytes; save it again, smaller")
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if whole(data) else None
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if is_complete(data) else None
     except cv2.error:
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
@@ -186,7 +186,7 @@ def decode(path: Path) -> np.ndarray:
     return cv2.cvtColor(pixels, code)
 
 
-def bomb(data: bytes | memoryview) -> str | None:
+def oversized_claim(data: bytes | memoryview) -> str | None:
     """The size that an image file claims, where so few bytes can be no such picture; None for all others."""
     from PIL import Image
 
@@ -198,10 +198,10 @@ def bomb(data: bytes | memoryview) -> str | None:
     except (OSError, ValueError, SyntaxError, TypeError, struct.error):
         return None  # whoever decodes it says what is wrong
     count = size[0] * size[1]
-    return size_text(size) if count > ALWAYS_FINE and count > THINNEST * len(data) else None
+    return size_text(size) if count > TRUSTED_PIXELS and count > MAX_PIXELS_PER_BYTE * len(data) else None
 
 
-def whole(data: np.ndarray) -> bool:
+def is_complete(data: np.ndarray) -> bool:
     """Whether a JPEG or PNG ends where it should, given as bytes. Older versions of OpenCV fill up what is missing of a
     JPEG with grey; all make room for as many bytes as a PNG says will follow."""
     content = data.tobytes()

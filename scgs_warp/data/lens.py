@@ -18,7 +18,7 @@ ROWS = 64
 DIRECTIONS = 16
 RADII = 512
 """Rays towards the corners, on which a model is followed outwards to where it folds back."""
-SLACK = 0.01
+EDGE_TOLERANCE = 0.01
 """Pixels beyond the outermost centres that rounding may lead to."""
 SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_FISHEYE", "SIMPLE_DIVISION")
 SINGLE_FOCAL += ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -93,7 +93,7 @@ def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
     return pixels
 
 
-def reach(lens: Lens, width: int, height: int) -> float:
+def valid_radius(lens: Lens, width: int, height: int) -> float:
     """The tangent of the angle to the optical axis up to which the model carries rays outwards; polynomials of
     distortion turn back beyond what they were fitted to. Infinite where it does so all over the image."""
     corners = [abs(x) for x in (lens.cx, width - lens.cx)], [abs(y) for y in (lens.cy, height - lens.cy)]
@@ -110,19 +110,21 @@ def reach(lens: Lens, width: int, height: int) -> float:
 
 
 @functools.lru_cache(maxsize=4)
-def maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def undistortion_maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where the pinhole's pixels lie in the file, as OpenCV counts: x [H, W], y [H, W] float32; and which of them the
     file has, [H, W] bool."""
     x = (np.arange(width) + 0.5 - lens.cx) / lens.fx
     y = (np.arange(height) + 0.5 - lens.cy) / lens.fy
-    limit = reach(lens, width, height)
+    limit = valid_radius(lens, width, height)
     columns, rows = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     valid = np.empty((height, width), bool)
     for first in range(0, height, ROWS):
         band = slice(first, min(first + ROWS, height))
         grid = np.stack(np.broadcast_arrays(x[None, :], y[band, None], 1.0), axis=2)
         pixels = project(lens, grid.reshape(-1, 3)).reshape(*grid.shape[:2], 2) - 0.5
-        inside = (pixels >= -SLACK) & (pixels <= (width - 1 + SLACK, height - 1 + SLACK))  # NaN: no
+        inside = (pixels >= -EDGE_TOLERANCE) & (
+            pixels <= (width - 1 + EDGE_TOLERANCE, height - 1 + EDGE_TOLERANCE)
+        )  # NaN: no
         valid[band] = inside.all(axis=2) & (np.hypot(grid[..., 0], grid[..., 1]) < limit)
         pixels = np.where(valid[band, :, None], pixels, -9.0)
         columns[band], rows[band] = pixels[..., 0], pixels[..., 1]
@@ -131,12 +133,12 @@ def maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, n
 
 def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
     """The image [H, W, ...] as the lens's pinhole would have taken it, bilinear; 0 where the file has nothing."""
-    columns, rows, valid = maps(lens, image.shape[1], image.shape[0])
+    columns, rows, valid = undistortion_maps(lens, image.shape[1], image.shape[0])
     moved = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     moved[~valid] = 0
     return moved
 
 
-def seen(lens: Lens, width: int, height: int) -> np.ndarray:
+def valid_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
     """[H, W] bool: which pixels of the undistorted image the file has."""
-    return maps(lens, width, height)[2]
+    return undistortion_maps(lens, width, height)[2]

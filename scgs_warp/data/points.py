@@ -13,7 +13,7 @@ from ..storage.files import check_ply_counts
 from ..storage.safe_paths import is_regular
 
 
-def finite(points: np.ndarray) -> np.ndarray:
+def finite_points(points: np.ndarray) -> np.ndarray:
     """[P] bool: which points [P, 3] float64 are finite in float32, as training takes them."""
     with np.errstate(over="ignore"):
         return np.all(np.isfinite(points.astype(np.float32)), axis=1)
@@ -80,5 +80,5 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         raise UserError(f"{path}: no PLY file of vertices with x, y, z; export the points again") from None
     except (MemoryError, OverflowError):
         raise UserError(f"{path}: says it has more points than fit into memory; export the points again") from None
-    kept = finite(points)
+    kept = finite_points(points)
     return points[kept], None if colors is None else colors[kept]

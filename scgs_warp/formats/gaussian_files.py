@@ -27,12 +27,12 @@ def read_gaussians(path: str | Path) -> GaussianParameters:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise UserError(f"{path}: Gaussians are read from {', '.join(READERS)}; give one of these or convert it")
-    with fitting(path):
+    with shortage_as_user_error(path):
         return reader(path)
 
 
 @contextmanager
-def fitting(path: Path) -> Iterator[None]:
+def shortage_as_user_error(path: Path) -> Iterator[None]:
     """Around what needs memory for all Gaussians of a file.
 
     Raises:

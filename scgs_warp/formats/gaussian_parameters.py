@@ -10,7 +10,7 @@ import torch
 from ..errors import UserError
 from ..gaussians import GaussianParameters
 
-LARGEST = {"means": 1e15, "log_scales": 80.0, "quats": 1e15}
+MAX_VALUES = {"means": 1e15, "log_scales": 80.0, "quats": 1e15}
 """Of parameters: their squares, and what they activate to, are float32. The others are colours."""
 
 
@@ -28,7 +28,7 @@ def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParamete
     good = (values["quats"] != 0).any(axis=1)
     for name, value in values.items():
         with np.errstate(invalid="ignore"):
-            good &= (np.abs(value.reshape(total, -1)) <= LARGEST.get(name, 1e6)).all(axis=1)  # NaN: no
+            good &= (np.abs(value.reshape(total, -1)) <= MAX_VALUES.get(name, 1e6)).all(axis=1)  # NaN: no
     if not good.any():
         raise UserError(f"{path}: none of its {total} Gaussians is finite; export it again")
     made = GaussianParameters.empty(int(good.sum()), rest, 0, False, "cpu")

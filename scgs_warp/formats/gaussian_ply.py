@@ -14,7 +14,7 @@ from ..storage.files import check_ply_counts
 from ..types import Gaussians
 from .gaussian_parameters import to_parameters
 
-REST_COUNTS = (0, 9, 24, 45)
+REST_COLUMNS = (0, 9, 24, 45)
 """``f_rest_*`` columns of degrees 0 to 3."""
 OPAQUE_LOGIT = 80.0
 """Opaque beyond rounding: some programs write infinity."""
@@ -41,7 +41,7 @@ def read_gaussian_ply(path: str | Path) -> GaussianParameters:
     if missing:
         raise UserError(f"{path}: vertices lack {', '.join(missing[:4])}; give a .ply of 3D Gaussian splatting")
     rest = len([name for name in names if name.startswith("f_rest_")])
-    if rest not in REST_COUNTS or any(f"f_rest_{i}" not in names for i in range(rest)):
+    if rest not in REST_COLUMNS or any(f"f_rest_{i}" not in names for i in range(rest)):
         raise UserError(f"{path}: {rest} f_rest columns; harmonics of degree 0 to 3 have 0, 9, 24 or 45")
 
     def columns(*wanted: str) -> np.ndarray:

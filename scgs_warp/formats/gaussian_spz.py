@@ -28,21 +28,21 @@ MAGIC = 0x5053474E
 VERSION = 3
 """What is written: the last one that a plain gzip reader opens, the first with four bytes a rotation."""
 ANTIALIASED = 1
-COLOR = 0.15
-"""A byte of colour says ``127.5 + 255 * COLOR * sh_dc``."""
-SCALE_STEPS, SCALE_LEAST = 16.0, 10.0
-"""A byte of scale says ``SCALE_STEPS * (log(scale) + SCALE_LEAST)``: steps of 6 %, from 4.5e-5 to 377."""
-FINE = 16
+COLOR_SCALE = 0.15
+"""A byte of colour says ``127.5 + 255 * COLOR_SCALE * sh_dc``."""
+SCALE_STEPS, SCALE_OFFSET = 16.0, 10.0
+"""A byte of scale says ``SCALE_STEPS * (log(scale) + SCALE_OFFSET)``: steps of 6 %, from 4.5e-5 to 377."""
+POSITION_BITS = 16
 """Positions are rounded to the size of the scene over 2 to this."""
-LARGEST_SHIFT = 24
-MOST = 10_000_000
+MAX_FRACTION_BITS = 24
+MAX_GAUSSIANS = 10_000_000
 """Gaussians in a file, as the format's own reader has it."""
-COUNTS = (0, 3, 8, 15)
+SH_COUNTS = (0, 3, 8, 15)
 """Coefficients above degree 0, for degrees 0 to 3."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """What a half turn about x does to each harmonic of degrees 1 to 3."""
-HALF = math.sqrt(0.5)
-DENSEST = 1040
+SQRT_HALF = math.sqrt(0.5)
+MAX_GZIP_RATIO = 1040
 """Bytes that one byte of a gzip stream can stand for, and a little more."""
 REMEDY = "export the .spz again"
 
@@ -55,12 +55,12 @@ def fraction_bits(means: np.ndarray) -> int:
     """
     middle = np.median(means, axis=0)
     extent = float(np.quantile(np.abs(means - middle).max(axis=1), 0.95)) or 1.0
-    wanted = FINE - math.floor(math.log2(extent))
+    wanted = POSITION_BITS - math.floor(math.log2(extent))
     reach = float(np.abs(means).max()) or 1.0
     room = math.floor(math.log2((2**23 - 1) / reach))
     if room < 0:
         raise UserError(f"a Gaussian lies {reach:.3g} from the origin; .spz holds up to 8.3e6: make the scene smaller")
-    return max(0, min(wanted, room, LARGEST_SHIFT))
+    return max(0, min(wanted, room, MAX_FRACTION_BITS))
 
 
 def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
@@ -84,13 +84,13 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     quats = torch.nn.functional.normalize(gaussians.quats.detach().cpu().double(), dim=1).numpy()
     rest = gaussians.sh_rest.detach().cpu().double().numpy()
-    degree = COUNTS.index(rest.shape[1])
+    degree = SH_COUNTS.index(rest.shape[1])
     scales = np.log(np.maximum(gaussians.scales.detach().cpu().double().numpy(), 1e-30))
     head = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), degree, bits, ANTIALIASED * antialiased, 0)
     bytes_ = (
         255.0 * gaussians.opacities.detach().cpu().double().numpy(),
-        127.5 + 255.0 * COLOR * gaussians.sh_dc.detach().cpu().double().numpy(),
-        SCALE_STEPS * (scales + SCALE_LEAST),
+        127.5 + 255.0 * COLOR_SCALE * gaussians.sh_dc.detach().cpu().double().numpy(),
+        SCALE_STEPS * (scales + SCALE_OFFSET),
         128.0 + 128.0 * rest * FLIPS[: rest.shape[1], None],
     )
     opacity, color, scale, harmonics = (_byte(values) for values in bytes_)
@@ -119,7 +119,7 @@ def pack_quats(quats: np.ndarray) -> np.ndarray:
     turned = turned * np.where(np.take_along_axis(turned, largest[:, None], 1) < 0, -1.0, 1.0)
     packed = largest.astype(np.uint32)
     for k in range(4):
-        size = np.minimum(np.floor(511.0 * np.abs(turned[:, k]) / HALF + 0.5), 511).astype(np.uint32)
+        size = np.minimum(np.floor(511.0 * np.abs(turned[:, k]) / SQRT_HALF + 0.5), 511).astype(np.uint32)
         code = (turned[:, k] < 0).astype(np.uint32) << np.uint32(9) | size
         packed = np.where(largest == k, packed, packed << np.uint32(10) | code)
     return packed.astype("<u4")
@@ -131,7 +131,7 @@ def unpack_quats(packed: np.ndarray) -> np.ndarray:
     largest = left >> np.uint32(30)
     found = np.zeros((len(left), 4))
     for k in (3, 2, 1, 0):
-        size = (left & np.uint32(511)).astype(np.float64) * (HALF / 511.0)
+        size = (left & np.uint32(511)).astype(np.float64) * (SQRT_HALF / 511.0)
         value = np.where(left >> np.uint32(9) & np.uint32(1), -size, size)
         found[:, k] = np.where(largest == k, 0.0, value)
         left = np.where(largest == k, left, left >> np.uint32(10))
@@ -165,16 +165,16 @@ def read_spz(path: str | Path) -> GaussianParameters:
     means *= np.array([1, -1, -1], np.float32) * np.float32(2.0**-bits)
     opacity = np.linspace(0.0, 1.0, 256).clip(1e-6, 1.0 - 1e-6)  # of every byte
     quats = _three_bytes(parts[4].reshape(count, 3)) if version == 2 else unpack_quats(parts[4].view("<u4"))
-    rest = parts[5].reshape(count, COUNTS[degree], 3).astype(np.float32)
+    rest = parts[5].reshape(count, SH_COUNTS[degree], 3).astype(np.float32)
     rest -= 128.0
-    rest *= FLIPS[: COUNTS[degree], None] / 128.0
+    rest *= FLIPS[: SH_COUNTS[degree], None] / 128.0
     steps = np.arange(256)
     values = {
         "means": means,
-        "sh_dc": ((steps / 255.0 - 0.5) / COLOR).astype(np.float32)[parts[2].reshape(count, 3)],
+        "sh_dc": ((steps / 255.0 - 0.5) / COLOR_SCALE).astype(np.float32)[parts[2].reshape(count, 3)],
         "sh_rest": rest,
         "opacity_logits": np.log(opacity / (1.0 - opacity)).astype(np.float32)[parts[1]],
-        "log_scales": (steps / SCALE_STEPS - SCALE_LEAST).astype(np.float32)[parts[3].reshape(count, 3)],
+        "log_scales": (steps / SCALE_STEPS - SCALE_OFFSET).astype(np.float32)[parts[3].reshape(count, 3)],
         "quats": quats.astype(np.float32),
     }
     return to_parameters(path, values)
@@ -199,11 +199,13 @@ def _sizes(path: Path, version: int, count: int, degree: int) -> list[int]:
     """Bytes of each array."""
     if not 2 <= version <= 4:
         raise UserError(f"{path}: version {version} of .spz; 2 to 4 are read: convert it, for example to .ply")
-    if count == 0 or degree >= len(COUNTS):
+    if count == 0 or degree >= len(SH_COUNTS):
         raise UserError(f"{path}: {count} Gaussians with harmonics of degree {degree}; at least 1 of degree 0 to 3")
-    if count > MOST:
-        raise UserError(f"{path}: says it holds {count:,} Gaussians; up to {MOST:,} are read: {REMEDY} in parts")
-    return [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * COUNTS[degree] * count]
+    if count > MAX_GAUSSIANS:
+        raise UserError(
+            f"{path}: says it holds {count:,} Gaussians; up to {MAX_GAUSSIANS:,} are read: {REMEDY} in parts"
+        )
+    return [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * SH_COUNTS[degree] * count]
 
 
 def _read_gzip(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
@@ -216,7 +218,7 @@ def _read_gzip(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.
     if magic != MAGIC:
         raise UserError(f"{path}: a gzip stream of something else than Gaussians; give a .spz")
     sizes = _sizes(path, version, count, degree)
-    if sum(sizes) > DENSEST * len(content):
+    if sum(sizes) > MAX_GZIP_RATIO * len(content):
         raise UserError(f"{path}: cut short: {len(content):,} bytes cannot hold {count:,} Gaussians; {REMEDY}")
     try:
         rows = stream.decompress(stream.unconsumed_tail, sum(sizes))  # never more than the header promises

@@ -26,9 +26,9 @@ from ..runtime import debug, memory
 from ..runtime.cuda_graph import CudaGraph
 from ..types import Camera, Image, Splats, Tiles
 
-SPARE = 1.25
+CAPACITY_FACTOR = 1.25
 """Room for this times the pairs of the frame that asked for more."""
-GRANULE = 1 << 16
+CAPACITY_STEP = 1 << 16
 """Room is a multiple of this, so that it seldom changes."""
 RECORD_AFTER = 2
 """Frames drawn step by step before one is recorded: for a single picture a recording does not pay."""
@@ -80,11 +80,11 @@ class FrameGraph:
         self.gaussians, self.motion = gaussians, motion
         self.capacity, self.recordings, self.failure = 0, 0, None
         self._antialiased, self._depth_of = antialiased, depth_of
-        self._inputs = torch.zeros(29, device=gaussians.means.device)
+        self.inputs = torch.zeros(29, device=gaussians.means.device)
         self._size = (0, 0)
         self._state: list[Any] = []
         self._frames_of_state = 0
-        self._recorded: CudaGraph | _Steps | None = None
+        self._recorded: CudaGraph | Steps | None = None
         self._kept: list[Any] = []
         self._lock = threading.Lock()
 
@@ -117,19 +117,19 @@ class FrameGraph:
             if pairs <= pending.capacity:
                 return pending.image
             with self._lock:
-                if pairs > self.capacity and not self._make_room(pairs, pending.size):
-                    return self._drawn(pending.inputs.to(self._inputs.device), pending.size)
+                if pairs > self.capacity and not self.make_room(pairs, pending.size):
+                    return self._drawn(pending.inputs.to(self.inputs.device), pending.size)
             pending = self._start(pending.inputs, pending.size)
 
     @torch.no_grad()
     def _start(self, inputs: Tensor, size: tuple[int, int]) -> Pending:
         with self._lock:
-            device = self._inputs.device
+            device = self.inputs.device
             if device.type == "cuda" and inputs.device.type == "cpu" and not inputs.is_pinned():
                 inputs = inputs.pin_memory()
-            self._inputs.copy_(inputs, non_blocking=True)
+            self.inputs.copy_(inputs, non_blocking=True)
             self._follow(size)
-            recorded = self._recorded or _Steps(self._body)
+            recorded = self._recorded or Steps(self.draw_steps)
             image, total = recorded.replay()
             if recorded.overwrites:
                 planes = image.rgb.permute(2, 0, 1).clone()
@@ -147,11 +147,11 @@ class FrameGraph:
         """Notice another size or a changed scene, learn how much room is needed, and record when it pays."""
         state = self._scene_state()
         if size != self._size or state != self._state:
-            require_image(image_demand(*size, 4), size, len(self.gaussians), self._inputs.device)
+            require_image(image_demand(*size, 4), size, len(self.gaussians), self.inputs.device)
             self._size, self._state, self._recorded, self._frames_of_state = size, state, None, 0
         if self.capacity == 0:
             self.capacity = 1
-            self._make_room(int(self._body()[1]), size)
+            self.make_room(int(self.draw_steps()[1]), size)
         self._frames_of_state += 1
         if debug.enabled():  # its checks ask the device
             return
@@ -159,11 +159,11 @@ class FrameGraph:
             self._record()
 
     def _record(self) -> None:
-        if self._inputs.device.type != "cuda":
-            self._recorded = _Steps(self._body)
+        if self.inputs.device.type != "cuda":
+            self._recorded = Steps(self.draw_steps)
         else:
             try:
-                self._recorded = CudaGraph(self._body, self._inputs.device)
+                self._recorded = CudaGraph(self.draw_steps, self.inputs.device)
             except RuntimeError as error:  # frames are drawn step by step then; whoever measures looks at ``failure``
                 self.failure = str(error)
                 return
@@ -176,17 +176,17 @@ class FrameGraph:
         tensors = (*self.gaussians.parameters(), *self.motion.parameters())
         return [(x.data_ptr(), x.shape, 0 if x.is_inference() else x._version) for x in tensors]
 
-    def _make_room(self, pairs: int, size: tuple[int, int]) -> bool:
+    def make_room(self, pairs: int, size: tuple[int, int]) -> bool:
         """Room for so many pairs and some to spare, unless that is more than lists can index or memory can hold."""
-        capacity = min(-(-int(SPARE * max(pairs, 1)) // GRANULE) * GRANULE, MAX_ROOM)
+        capacity = min(-(-int(CAPACITY_FACTOR * max(pairs, 1)) // CAPACITY_STEP) * CAPACITY_STEP, MAX_ROOM)
         tiles = -(-size[0] // TILE_SIZE) * -(-size[1] // TILE_SIZE)
         need = bytes_within(capacity, len(self.gaussians), tiles)
-        if pairs > capacity or not memory.fits(need, self._inputs.device):
+        if pairs > capacity or not memory.fits(need, self.inputs.device):
             return False
         self.capacity, self._recorded = capacity, None
         return True
 
-    def _body(self) -> tuple[Image, Tensor]:
+    def draw_steps(self) -> tuple[Image, Tensor]:
         """The whole frame, from the inputs' memory; also the number of pairs, [1]."""
         found: list[Tensor] = []
 
@@ -195,7 +195,7 @@ class FrameGraph:
             found.append(total)
             return tiles
 
-        return self._drawn(self._inputs, self._size, binned), found[0]
+        return self._drawn(self.inputs, self._size, binned), found[0]
 
     @torch.no_grad()
     def _drawn(self, inputs: Tensor, size: tuple[int, int], binned: Callable[[Splats], Tiles] | None = None) -> Image:
@@ -208,7 +208,7 @@ class FrameGraph:
         return Image(image[:3].permute(1, 2, 0), alpha, depth)
 
 
-class _Steps:
+class Steps:
     """The same as a ``CudaGraph`` of ``body``, one launch after the other."""
 
     overwrites = False

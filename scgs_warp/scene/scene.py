@@ -27,7 +27,7 @@ from .frame_graph import FrameGraph
 from .validation import check_metadata, check_motion, check_settings, check_tensors, reason
 
 
-def moment(time: float) -> float:
+def clamped_time(time: float) -> float:
     """``time`` clamped to [0, 1].
 
     Raises:
@@ -139,7 +139,7 @@ class Scene:
         Raises:
             UserError: the time is not finite.
         """
-        posed = self.motion.gaussians_at(self.gaussians, moment(time))
+        posed = self.motion.gaussians_at(self.gaussians, clamped_time(time))
         undo = self.normalisation
         return Gaussians(
             undo.undo(posed.means),
@@ -168,7 +168,7 @@ class Scene:
         Raises:
             UserError: the time is not finite.
         """
-        time = moment(time)
+        time = clamped_time(time)
         color = torch.as_tensor(self.background_color if background is None else background, dtype=torch.float32)
         view = self.normalisation.apply_camera(camera)
         if self.device.type == "cuda" and self.motion.takes_time_tensor:
@@ -197,7 +197,7 @@ class Scene:
         Raises:
             UserError: the time is not finite.
         """
-        return self.normalisation.undo(self.motion.control_points_at(moment(time)))
+        return self.normalisation.undo(self.motion.control_points_at(clamped_time(time)))
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that makes the scene, by name, for a checkpoint."""

@@ -18,18 +18,18 @@ from ..types import Gaussians
 REMEDY = "use the previous checkpoint, or train again"
 SH_COUNTS = (0, 3, 8, 15)
 """Coefficients above degree 0, of degrees 0 to 3."""
-LARGEST = 1e12
+MAX_MAGNITUDE = 1e12
 """Of centre and scale, of the overview and of steps: beyond it float32 leaves no scene."""
-PLANE = "planes.3"
-MOST_TIMES = 4096
-TINY = 1e-30
-WHOLE = ("extra.graph.neighbors",)
+TIME_PLANE = "planes.3"
+MAX_PLANE_TIMES = 4096
+MIN_MOMENT = 1e-30
+INTEGER_TENSORS = ("extra.graph.neighbors",)
 """Tensors of whole numbers."""
-MOMENTS = (0.0, 0.5, 1.0)
+CHECKED_TIMES = (0.0, 0.5, 1.0)
 """When a scene is looked at once it is loaded."""
 
 
-def _wrong(source: str, what: str) -> UserError:
+def _unusable(source: str, what: str) -> UserError:
     return UserError(f"{source}: {what}; {REMEDY}")
 
 
@@ -41,27 +41,27 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
     """
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            raise _wrong(source, f"{name} holds numbers that are not finite")
-        wanted = torch.int32 if name in WHOLE else torch.float32
+            raise _unusable(source, f"{name} holds numbers that are not finite")
+        wanted = torch.int32 if name in INTEGER_TENSORS else torch.float32
         if value.dtype != wanted:
-            raise _wrong(source, f"{name} is of {value.dtype}, not of {wanted}")
+            raise _unusable(source, f"{name} is of {value.dtype}, not of {wanted}")
     rows = {name: tuple(tensors[name].shape) for name in tensors if name.startswith("gaussians.")}
     means, rest, hyper = (rows.get(f"gaussians.{name}", ()) for name in ("means", "sh_rest", "hyper"))
     if len(means) != 2 or means[0] < 1 or means[1] != 3:
-        raise _wrong(source, f"gaussians.means is {list(means)}, not [N, 3]")
+        raise _unusable(source, f"gaussians.means is {list(means)}, not [N, 3]")
     if len(rest) != 3 or rest[1] not in SH_COUNTS or rest[2] != 3:
-        raise _wrong(source, f"gaussians.sh_rest is {list(rest)}, not [N, 0 or 3 or 8 or 15, 3]")
+        raise _unusable(source, f"gaussians.sh_rest is {list(rest)}, not [N, 0 or 3 or 8 or 15, 3]")
     if len(hyper) != 2 or len(rows.get("gaussians.shading", (0, 0))) != 2:
-        raise _wrong(source, "gaussians.hyper or gaussians.shading is not [N, ...]")
+        raise _unusable(source, "gaussians.hyper or gaussians.shading is not [N, ...]")
     for name, shape in rows.items():
         if not shape or shape[0] != means[0]:
-            raise _wrong(source, f"{name} is {list(shape)}, but there are {means[0]} Gaussians")
+            raise _unusable(source, f"{name} is {list(shape)}, but there are {means[0]} Gaussians")
     nodes = tensors.get("motion.positions")
     if nodes is not None and (nodes.ndim != 2 or nodes.shape[0] < 1 or nodes.shape[1] != 3):
-        raise _wrong(source, f"motion.positions is {list(nodes.shape)}, not [M, 3]")
-    plane = tensors.get(f"motion.{PLANE}")
-    if plane is not None and (plane.ndim != 3 or not 1 <= plane.shape[0] <= MOST_TIMES or plane.numel() == 0):
-        raise _wrong(source, f"motion.{PLANE} is {list(plane.shape)}, not [T, X, channels]")
+        raise _unusable(source, f"motion.positions is {list(nodes.shape)}, not [M, 3]")
+    plane = tensors.get(f"motion.{TIME_PLANE}")
+    if plane is not None and (plane.ndim != 3 or not 1 <= plane.shape[0] <= MAX_PLANE_TIMES or plane.numel() == 0):
+        raise _unusable(source, f"motion.{TIME_PLANE} is {list(plane.shape)}, not [T, X, channels]")
 
 
 def check_metadata(metadata: Mapping[str, Any], source: str) -> None:
@@ -72,25 +72,25 @@ def check_metadata(metadata: Mapping[str, Any], source: str) -> None:
     """
     for name in ("config", "normalisation", "overview"):
         if not isinstance(metadata.get(name), dict):
-            raise _wrong(source, f"metadata.{name} is missing or no object")
+            raise _unusable(source, f"metadata.{name} is missing or no object")
     unit, overview = metadata["normalisation"], metadata["overview"]
     for name, value in (("normalisation.centre", unit.get("centre")), ("overview.centre", overview.get("centre"))):
         if not _vector(value):
-            raise _wrong(source, f"metadata.{name} is not three numbers")
+            raise _unusable(source, f"metadata.{name} is not three numbers")
     if not _vector(overview.get("up")) or not any(abs(x) > 1e-6 for x in overview["up"]):
-        raise _wrong(source, "metadata.overview.up is no direction")
-    ranges = {"radius": (0, LARGEST), "fov_x": (1e-3, 179.0), "aspect": (1e-3, 1e3)}
+        raise _unusable(source, "metadata.overview.up is no direction")
+    ranges = {"radius": (0, MAX_MAGNITUDE), "fov_x": (1e-3, 179.0), "aspect": (1e-3, 1e3)}
     for name, value in overview.items():
-        low, high = ranges.get(name, (-LARGEST, LARGEST))
+        low, high = ranges.get(name, (-MAX_MAGNITUDE, MAX_MAGNITUDE))
         if name not in ("centre", "up") and not _number(value, low, high):
-            raise _wrong(source, f"metadata.overview.{name} is no number from {low:g} to {high:g}")
-    if not _number(unit.get("scale"), 1 / LARGEST, LARGEST):
-        raise _wrong(source, "metadata.normalisation.scale is no positive number")
+            raise _unusable(source, f"metadata.overview.{name} is no number from {low:g} to {high:g}")
+    if not _number(unit.get("scale"), 1 / MAX_MAGNITUDE, MAX_MAGNITUDE):
+        raise _unusable(source, "metadata.normalisation.scale is no positive number")
     step = metadata.get("step")
-    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < LARGEST:
-        raise _wrong(source, "metadata.step is no whole number")
+    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < MAX_MAGNITUDE:
+        raise _unusable(source, "metadata.step is no whole number")
     if not isinstance(metadata.get("motion"), str):
-        raise _wrong(source, "metadata.motion names no motion model")
+        raise _unusable(source, "metadata.motion names no motion model")
 
 
 def check_settings(settings: Any, source: str) -> None:
@@ -112,7 +112,7 @@ def _number(value: Any, low: float, high: float) -> bool:
 
 
 def _vector(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(_number(x, -LARGEST, LARGEST) for x in value)
+    return isinstance(value, list) and len(value) == 3 and all(_number(x, -MAX_MAGNITUDE, MAX_MAGNITUDE) for x in value)
 
 
 def check_motion(gaussians_at: Callable[[float], Gaussians], source: str) -> None:
@@ -125,11 +125,11 @@ def check_motion(gaussians_at: Callable[[float], Gaussians], source: str) -> Non
     Raises:
         UserError: naming the time and the attribute.
     """
-    for time in MOMENTS:
+    for time in CHECKED_TIMES:
         posed = gaussians_at(time)
         for name in ("means", "quats", "scales", "sh_dc"):
             if not bool(torch.isfinite(getattr(posed, name)).all()):
-                raise _wrong(source, f"at time {time:g} the Gaussians' {name} are not finite")
+                raise _unusable(source, f"at time {time:g} the Gaussians' {name} are not finite")
 
 
 def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], source: str) -> None:
@@ -142,30 +142,33 @@ def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], so
     for name in ("grad_norm", "count", "max_radii"):
         found = tensors.get(f"stats.{name}")
         if found is None or found.shape != (count,):
-            raise _wrong(source, f"stats.{name} is missing or not [{count}]")
+            raise _unusable(source, f"stats.{name} is missing or not [{count}]")
     for name in ("points", "colors"):
         if name in tensors and (tensors[name].ndim != 2 or tensors[name].shape[1] != 3):
-            raise _wrong(source, f"{name} is {list(tensors[name].shape)}, not [P, 3]")
+            raise _unusable(source, f"{name} is {list(tensors[name].shape)}, not [P, 3]")
     if len(tensors.get("points", ())) != len(tensors.get("colors", ())):
-        raise _wrong(source, "points and colors are not as many")
+        raise _unusable(source, "points and colors are not as many")
     for name, value in tensors.items():
         if name.endswith(".exp_avg_sq") and value.numel():
             if float(value.min()) < 0:
-                raise _wrong(source, f"{name} holds negative numbers")
+                raise _unusable(source, f"{name} holds negative numbers")
             mean = tensors.get(name.removesuffix("_sq"))
             if mean is None or mean.shape != value.shape or _beyond(mean, value):
-                raise _wrong(source, f"{name} and its exp_avg are not of the same gradients")
-        if name.endswith(".step") and (value.ndim != 0 or not 0 <= float(value) < LARGEST):
-            raise _wrong(source, f"{name} is no number of steps")
-    if not _number(metadata.get("extent"), 1 / LARGEST, LARGEST) or metadata.get("stage") not in ("pretrain", "main"):
-        raise _wrong(source, "metadata.extent or metadata.stage is missing or none")
+                raise _unusable(source, f"{name} and its exp_avg are not of the same gradients")
+        if name.endswith(".step") and (value.ndim != 0 or not 0 <= float(value) < MAX_MAGNITUDE):
+            raise _unusable(source, f"{name} is no number of steps")
+    if not _number(metadata.get("extent"), 1 / MAX_MAGNITUDE, MAX_MAGNITUDE) or metadata.get("stage") not in (
+        "pretrain",
+        "main",
+    ):
+        raise _unusable(source, "metadata.extent or metadata.stage is missing or none")
     _check_graph(tensors, source)
 
 
 def _beyond(mean: Tensor, square: Tensor) -> bool:
     """Whether moments would lead to a step that no gradients do: with Adam's rates the mean is at most 7.3 times the
-    root of the mean square. What is smaller than ``TINY`` may have been rounded to 0."""
-    return bool((mean.double().square() > 1000.0 * square.double() + TINY).any())
+    root of the mean square. What is smaller than ``MIN_MOMENT`` may have been rounded to 0."""
+    return bool((mean.double().square() > 1000.0 * square.double() + MIN_MOMENT).any())
 
 
 def _check_graph(tensors: Mapping[str, Tensor], source: str) -> None:
@@ -175,9 +178,9 @@ def _check_graph(tensors: Mapping[str, Tensor], source: str) -> None:
     nodes = len(tensors.get("motion.positions", tensors["gaussians.means"]))  # in stage 1 spheres are both
     fits = neighbors is not None and weights is not None and neighbors.shape == weights.shape and neighbors.ndim == 2
     if not fits or neighbors is None or neighbors.dtype != torch.int32 or len(neighbors) != nodes:
-        raise _wrong(source, f"extra.graph.neighbors and weights are not both [{nodes}, J]")
+        raise _unusable(source, f"extra.graph.neighbors and weights are not both [{nodes}, J]")
     if neighbors.numel() and not -1 <= int(neighbors.min()) <= int(neighbors.max()) < nodes:
-        raise _wrong(source, f"extra.graph.neighbors names control points that are none of the {nodes}")
+        raise _unusable(source, f"extra.graph.neighbors names control points that are none of the {nodes}")
 
 
 def reason(error: Exception) -> str:

@@ -16,7 +16,7 @@ from ..errors import UserError
 from ..storage.checkpoint import write_atomically
 from ..storage.files import as_number, parse_json
 
-NUMBERS, LARGEST = ("step", "seconds"), 1e9
+AXIS_FIELDS, MAX_AXIS_VALUE = ("step", "seconds"), 1e9
 """Fields of a log line without which it cannot be placed, and the largest value that they can have."""
 ERROR_RANGE = 0.2
 """The mean absolute error over the channels that gets the brightest colour of an error map."""
@@ -56,7 +56,7 @@ def psnr_of(truth: Picture, render: Picture) -> float:
     return -10.0 * math.log10(error) if error > 0 else math.inf
 
 
-def _write(canvas: np.ndarray, text: str, x: int, y: int, width: int) -> None:
+def _put_text(canvas: np.ndarray, text: str, x: int, y: int, width: int) -> None:
     """Text in a box ``width`` pixels wide and ``CAPTION`` high, smaller where it would not fit."""
     import cv2
 
@@ -111,7 +111,7 @@ def contact_sheet(
     sheet = np.full((CAPTION + len(rows) * (height + CAPTION + GAP), 3 * width + 4 * GAP, 3), PAPER, np.uint8)
     columns = [GAP + column * (width + GAP) for column in range(3)]
     for x, text in zip(columns, ("truth", "render", f"error (0 .. {ERROR_RANGE:g})")):
-        _write(sheet, text, x, 0, width)
+        _put_text(sheet, text, x, 0, width)
     for index, (truth, render) in enumerate(rows):
         y = CAPTION + index * (height + CAPTION + GAP)
         pictures = (to_bytes(_floats(truth)), to_bytes(_floats(render)), error_map(truth, render))
@@ -120,7 +120,7 @@ def contact_sheet(
         score = scores[index] if index < len(scores) else psnr_of(truth, render)
         captions = (titles[index] if index < len(titles) else "", "", f"PSNR {score:.2f} dB")
         for x, text in zip(columns, captions):
-            _write(sheet, text, x, y + height, width)
+            _put_text(sheet, text, x, y + height, width)
     return sheet
 
 
@@ -140,17 +140,17 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
             value = parse_json(line)
         except ValueError:
             continue
-        if isinstance(value, dict) and all(_sound(value.get(key)) for key in NUMBERS):
+        if isinstance(value, dict) and all(_is_axis_value(value.get(key)) for key in AXIS_FIELDS):
             lines.append(value)
     return lines
 
 
-def _sound(value: Any) -> bool:
+def _is_axis_value(value: Any) -> bool:
     """A number that a log has, or nothing."""
-    return value is None or (as_number(value) is not None and 0 <= value <= LARGEST)
+    return value is None or (as_number(value) is not None and 0 <= value <= MAX_AXIS_VALUE)
 
 
-def _placed(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], list[tuple[str, float]]]:
+def axis_positions(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], list[tuple[str, float]]]:
     """Where each (stage, step) lies on one axis, stage behind stage, and where each stage begins."""
     steps: dict[str, list[int]] = {}
     for line in lines:
@@ -166,7 +166,7 @@ def _placed(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], 
     return positions, starts
 
 
-def _series(lines: list[dict[str, Any]], key: str, positions: dict[tuple[str, int], float]) -> dict[float, float]:
+def series_of(lines: list[dict[str, Any]], key: str, positions: dict[tuple[str, int], float]) -> dict[float, float]:
     """Position to value, in order; of lines for the same step (a resumed run) the last one counts."""
     found = {}
     for line in lines:
@@ -194,7 +194,7 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
     stage = ""
     for line in lines:  # a line without a stage (an evaluation) belongs to that of the lines before it
         stage = line["stage"] = str(line.get("stage", stage))
-    positions, starts = _placed(lines)
+    positions, starts = axis_positions(lines)
     panels = (
         ("PSNR [dB]", (("psnr", "train", "-"), ("test_psnr", "test", "o-"))),
         ("loss", (("loss", "loss", "-"), ("l1", "L1", "-"))),
@@ -207,7 +207,7 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
         axes.set_xlabel("step")
         axes.grid(alpha=0.3)
         for key, label, style in series:
-            points = _series(lines, key, positions)
+            points = series_of(lines, key, positions)
             if points:
                 axes.plot(list(points), list(points.values()), style, label=label, markersize=3, linewidth=1.2)
         drawn = len(axes.lines)

@@ -31,9 +31,9 @@ HIDDEN_OPACITY = 0.25
 """What lies behind the surface is drawn this faintly."""
 SURFACE_THICKNESS = 0.02
 """Control points sit inside the body they move: up to this share of their depth behind the surface counts as seen."""
-OPAQUE = 0.5
+SURFACE_ALPHA = 0.5
 """Depth means something where alpha is larger."""
-SHIFT = 4
+FRACTION_BITS = 4
 """Fractional bits of the coordinates given to OpenCV: dots that move by less than a pixel should not jump."""
 
 
@@ -44,7 +44,7 @@ def depth_range(images: Iterable[Image]) -> tuple[float, float]:
     """
     found = []
     for image in images:
-        depth = image.depth[image.alpha > OPAQUE].detach().cpu().numpy()
+        depth = image.depth[image.alpha > SURFACE_ALPHA].detach().cpu().numpy()
         found.append(depth[:: max(1, len(depth) // 50_000)])
     depths = np.concatenate(found) if found else np.zeros(0)
     if len(depths) == 0:
@@ -110,12 +110,12 @@ def _hidden(pixels: np.ndarray, depths: np.ndarray, image: Image | None) -> np.n
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row = column.clip(0, width - 1), row.clip(0, height - 1)
     behind = depths * (1.0 - SURFACE_THICKNESS) > surface[row, column]
-    return inside & behind & (alpha[row, column] > OPAQUE)
+    return inside & behind & (alpha[row, column] > SURFACE_ALPHA)
 
 
-def _fixed(pixels: np.ndarray) -> np.ndarray:
+def _fixed_point(pixels: np.ndarray) -> np.ndarray:
     """OpenCV's coordinates, whose pixel centres are whole numbers, in fixed point."""
-    return np.rint((pixels - 0.5) * (1 << SHIFT)).astype(np.int32)
+    return np.rint((pixels - 0.5) * (1 << FRACTION_BITS)).astype(np.int32)
 
 
 def _blend(below: np.ndarray, above: np.ndarray) -> np.ndarray:
@@ -146,9 +146,9 @@ def draw_points(
     for faint in (True, False):
         layer = canvas.copy() if faint else canvas
         for index in order[(keep & (hidden == faint))[order]]:
-            x, y = _fixed(pixels[index]).tolist()
+            x, y = _fixed_point(pixels[index]).tolist()
             for size, color in ((radius + 1.0, (20, 20, 20)), (radius, colors[index].tolist())):
-                cv2.circle(layer, (x, y), round(size * (1 << SHIFT)), color, -1, cv2.LINE_AA, SHIFT)
+                cv2.circle(layer, (x, y), round(size * (1 << FRACTION_BITS)), color, -1, cv2.LINE_AA, FRACTION_BITS)
         canvas = _blend(canvas, layer) if faint else layer
     return canvas
 
@@ -174,7 +174,7 @@ def draw_trails(rgb: np.ndarray, tracks: np.ndarray, camera: Camera, image: Imag
     hidden = _hidden(pixels, depths, image)
     ramp = cv2.applyColorMap(np.linspace(40, 235, steps).astype(np.uint8)[None], cv2.COLORMAP_PLASMA)[0, :, ::-1]
     thickness = max(1, round(0.002 * max(camera.width, camera.height)))
-    places = _fixed(np.where(keep[..., None], pixels, 0.0))
+    places = _fixed_point(np.where(keep[..., None], pixels, 0.0))
     ends = np.stack([places[:-1], places[1:]], axis=2)
     for faint in (True, False):
         layer = canvas.copy() if faint else canvas
@@ -182,7 +182,7 @@ def draw_trails(rgb: np.ndarray, tracks: np.ndarray, camera: Camera, image: Imag
             chosen = keep[step] & keep[step + 1] & (hidden[step + 1] == faint)
             if chosen.any():
                 lines = list(ends[step][chosen])
-                cv2.polylines(layer, lines, False, ramp[step].tolist(), thickness, cv2.LINE_AA, SHIFT)
+                cv2.polylines(layer, lines, False, ramp[step].tolist(), thickness, cv2.LINE_AA, FRACTION_BITS)
         canvas = _blend(canvas, layer) if faint else layer
     return canvas
 
@@ -247,6 +247,6 @@ def tracks(scene: Scene, samples: int = 100) -> np.ndarray:
     times = np.linspace(0.0, 1.0, samples).tolist()
     if len(scene.control_points_at(0.0)):
         return np.stack([_array(scene.control_points_at(time)) for time in times])
-    opaque = (scene.gaussians_at(0.0).opacities > OPAQUE).nonzero()[:, 0]
+    opaque = (scene.gaussians_at(0.0).opacities > SURFACE_ALPHA).nonzero()[:, 0]
     chosen = opaque[:: max(1, len(opaque) // TRACKED_GAUSSIANS)]
     return np.stack([_array(scene.gaussians_at(time).means[chosen]) for time in times])

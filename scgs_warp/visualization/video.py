@@ -27,7 +27,7 @@ PIXEL_BYTES = 64
 GIF_PIXEL_BYTES = 4
 """Of every frame of a GIF: its bytes, and its places in the palette."""
 FRAME_NAME = "frame_{:05d}.png"
-FRAMES = r"frame_\d{5,}\.png"
+FRAME_PATTERN = r"frame_\d{5,}\.png"
 
 
 def check_path(path: str | Path) -> Path:
@@ -45,7 +45,7 @@ def check_path(path: str | Path) -> Path:
     if not suffix and path.exists():
         if not path.is_dir():
             raise UserError(f"{path}: is a file; end the name in .mp4 or .gif, or name a folder")
-        if not holds_only(path, FRAMES):
+        if not holds_only(path, FRAME_PATTERN):
             raise UserError(f"{path}: holds other files than a film's frames; name a new folder")
     make_parent(path)
     return path
@@ -73,7 +73,7 @@ def require_memory(path: str | Path, width: int, height: int, frames: int, devic
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _disk_errors_as_user_errors(path: Path) -> Iterator[None]:
     """What goes wrong with the disk becomes one line. PyAV's errors of that kind are OSErrors, too."""
     try:
         yield
@@ -106,7 +106,7 @@ class FilmWriter:
             raise ValueError(f"frame must be [H, W, 3] uint8, got {list(frame.shape)} {frame.dtype}")
         if self._shape is not None and frame.shape != self._shape:
             raise ValueError(f"frame must be {list(self._shape)} like the first one, got {list(frame.shape)}")
-        with _told(self.path):
+        with _disk_errors_as_user_errors(self.path):
             if self._shape is None:
                 self._shape = frame.shape
                 self._open(frame)
@@ -222,7 +222,7 @@ class _Folder(FilmWriter):
         write_png(self.temporary / FRAME_NAME.format(self.frames), frame)
 
     def publish(self) -> None:
-        if self.path.is_dir() and not holds_only(self.path, FRAMES):
+        if self.path.is_dir() and not holds_only(self.path, FRAME_PATTERN):
             raise UserError(f"{self.path}: holds other files than a film's frames; name a new folder")
         replace_folder(self.path, self.temporary)
 
@@ -264,7 +264,7 @@ def film(path: str | Path, fps: float = 30, *, quality: int = QUALITY) -> Iterat
         yield writer
         if writer.frames == 0:
             raise UserError(f"{path}: a film needs at least one frame")
-        with _told(path):
+        with _disk_errors_as_user_errors(path):
             writer.close()
             writer.publish()
     finally:

@@ -12,12 +12,12 @@ import torch
 
 from helpers.layouts import HEIGHT, POINTS, WIDTH, dots, share_found, viewmat
 from scgs_warp.capture import features, moving, picking, writing
-from scgs_warp.capture.diagnosis import Outcome, notes, reason, too_few
-from scgs_warp.capture.features import Links, Shots
+from scgs_warp.capture.diagnosis import Outcome, likely_reason, notes, too_few
+from scgs_warp.capture.features import FrameFiles, Links
 from scgs_warp.capture.journal import Journal
-from scgs_warp.capture.mapping import Solved
+from scgs_warp.capture.mapping import CameraSolution
 from scgs_warp.capture.similarity import Similarity, align, centres, upright
-from scgs_warp.capture.source import Folder, Still, Video, open_source
+from scgs_warp.capture.source import Folder, SourceFrame, Video, open_source
 from scgs_warp.capture.source import upright as turned
 from scgs_warp.data import load
 from scgs_warp.errors import UserError
@@ -40,8 +40,8 @@ def pan(shifts, height: int = 120, width: int = 160) -> list[np.ndarray]:
     return [background[:, shift : shift + width].copy() for shift in shifts]
 
 
-def measured(frames: list[np.ndarray]) -> picking.Measures:
-    return picking.measure(Still(index, index / 30, frame, "") for index, frame in enumerate(frames))
+def measured(frames: list[np.ndarray]) -> picking.FrameMeasures:
+    return picking.measure(SourceFrame(index, index / 30, frame, "") for index, frame in enumerate(frames))
 
 
 def blur(frame: np.ndarray) -> np.ndarray:
@@ -111,7 +111,7 @@ def planes(index: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_what_leaves_its_epipolar_line_moves():
     scenes = [planes(index) for index in range(6)]
-    masks = moving.consensus(lambda k: scenes[k][0], 6, lambda: None)
+    masks = moving.find_moving(lambda k: scenes[k][0], 6, lambda: None)
     for mask, (_, truth) in zip(masks, scenes):
         assert (mask & truth).sum() > 0.8 * truth.sum()
         assert (mask & ~truth).sum() < 0.04 * truth.size
@@ -119,9 +119,9 @@ def test_what_leaves_its_epipolar_line_moves():
 
 def test_nothing_moves_in_a_scene_at_rest_or_without_texture():
     rest = pan(range(0, 24, 4), 240, 320)
-    assert max(mask.mean() for mask in moving.consensus(lambda k: rest[k], 6, lambda: None)) < 0.01
+    assert max(mask.mean() for mask in moving.find_moving(lambda k: rest[k], 6, lambda: None)) < 0.01
     grey = np.full((240, 320, 3), 90, np.uint8)
-    assert not any(mask.any() for mask in moving.consensus(lambda k: grey, 3, lambda: None))
+    assert not any(mask.any() for mask in moving.find_moving(lambda k: grey, 3, lambda: None))
 
 
 def images(folder, count: int, size=(160, 120), name="{:03d}.png"):
@@ -138,17 +138,17 @@ def test_masks_that_are_given(tmp_path):
     frames = images(tmp_path / "frames", 12, (320, 240))
     masks = images(tmp_path / "masks", 12)
     names = [f"{index:03d}.png" for index in (2, 7)]
-    by_name = moving.given(masks, Folder(frames), [2, 7], names, (320, 240))
+    by_name = moving.read_masks(masks, Folder(frames), [2, 7], names, (320, 240))
     assert by_name[0][20:60, 20:60].all() and by_name[1][20:60, 70:110].all()
     assert [mask.sum() for mask in by_name] == [1600, 1600]
     with film(tmp_path / "frames.mp4") as out:
         for file in sorted(frames.iterdir()):
             out.write(cv2.imread(str(file)))
     video = Video(tmp_path / "frames.mp4")
-    by_order = moving.given(masks, video, [2, 7], ["", ""], (320, 240))
-    by_film = moving.given(tmp_path / "frames.mp4", video, [2, 7], ["", ""], (320, 240))
+    by_order = moving.read_masks(masks, video, [2, 7], ["", ""], (320, 240))
+    by_film = moving.read_masks(tmp_path / "frames.mp4", video, [2, 7], ["", ""], (320, 240))
     few = images(tmp_path / "few", 8, name="frame_{:05d}.png")
-    by_number = moving.given(few, video, [2, 7], ["", ""], (320, 240))
+    by_number = moving.read_masks(few, video, [2, 7], ["", ""], (320, 240))
     for found in (by_order, by_number):
         assert all(np.array_equal(a, b) for a, b in zip(by_name, found))
     for index, mask in zip((2, 7), by_film):
@@ -158,14 +158,14 @@ def test_masks_that_are_given(tmp_path):
 def test_masks_that_do_not_fit(tmp_path):
     frames, masks = Folder(images(tmp_path / "frames", 12)), images(tmp_path / "masks", 6)
     with pytest.raises(UserError, match=r"masks: no mask for 007 \(1 of 2"):
-        moving.given(masks, frames, [2, 7], ["002.png", "007.png"], (160, 120))
+        moving.read_masks(masks, frames, [2, 7], ["002.png", "007.png"], (160, 120))
     with pytest.raises(UserError, match="proportions"):
-        moving.given(masks, frames, [2], ["002.png"], (160, 160))
+        moving.read_masks(masks, frames, [2], ["002.png"], (160, 160))
     with film(tmp_path / "short.mp4") as out:
         for _ in range(4):
             out.write(np.zeros((120, 160, 3), np.uint8))
     with pytest.raises(UserError, match="ends before frame 7"):
-        moving.given(tmp_path / "short.mp4", frames, [2, 7], ["", ""], (160, 120))
+        moving.read_masks(tmp_path / "short.mp4", frames, [2, 7], ["", ""], (160, 120))
 
 
 # What is read
@@ -292,11 +292,11 @@ def test_scenes_are_put_upright():
 # What is written
 
 
-def solved(params: tuple[float, ...], count: int = 10) -> Solved:
+def solved(params: tuple[float, ...], count: int = 10) -> CameraSolution:
     views = np.stack([viewmat(index) for index in range(count)])
     colors = np.full((len(POINTS), 3), 200, np.uint8)
     places = [index for index in range(count) if index != 3]
-    return Solved("SIMPLE_RADIAL", params, WIDTH, HEIGHT, places, views[places], POINTS, colors, 0.2, 9.0)
+    return CameraSolution("SIMPLE_RADIAL", params, WIDTH, HEIGHT, places, views[places], POINTS, colors, 0.2, 9.0)
 
 
 @pytest.mark.parametrize("bend", [0.0, -0.08, 0.05])
@@ -313,7 +313,7 @@ def test_the_written_folder_is_read_back_with_identical_cameras(tmp_path, bend):
     (tmp_path / "out").mkdir()
     for index, name in enumerate(names):
         cv2.imwrite(str(tmp_path / "frames" / name), dots(viewmat(index), lens=lens))
-    shots = Shots(tmp_path / "frames", names, tmp_path / "frames")
+    shots = FrameFiles(tmp_path / "frames", names, tmp_path / "frames")
     pinhole = writing.undistort(shots, found, tmp_path / "out", lambda: None)
     seconds = [2.0 + 0.5 * index for index in range(10)]
     scene = writing.scene_of(shots, found, pinhole, seconds, (2.0, 7.0))
@@ -343,12 +343,12 @@ LINKS = Links(2000, 300, 1.0, 0.3)
 
 
 def test_the_likeliest_reason_is_given():
-    assert "texture" in reason(Outcome(50, 0, 0, Links(30, 0, 0.0, 0.0), 0.1))
-    assert "--frames 100" in reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.1))
-    assert "--masks none" in reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.4))
-    assert "walking" in reason(Outcome(50, 0, 0, Links(2000, 300, 1.0, 1.0), 0.1))
-    assert "walking" in reason(Outcome(50, 50, 0.4, LINKS, 0.1))
-    assert "--matching" in reason(Outcome(50, 20, 9, LINKS, 0.1))
+    assert "texture" in likely_reason(Outcome(50, 0, 0, Links(30, 0, 0.0, 0.0), 0.1))
+    assert "--frames 100" in likely_reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.1))
+    assert "--masks none" in likely_reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.4))
+    assert "walking" in likely_reason(Outcome(50, 0, 0, Links(2000, 300, 1.0, 1.0), 0.1))
+    assert "walking" in likely_reason(Outcome(50, 50, 0.4, LINKS, 0.1))
+    assert "--matching" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1))
     line = too_few("out", Outcome(50, 20, 9, LINKS, 0.1))
     assert line.startswith("out: 20 of 50 frames registered") and "--least 0.4 " in line
     assert "--least" not in too_few("out", Outcome(50, 0, 0, LINKS, 0.1))

@@ -16,7 +16,7 @@ from helpers.nerfstudio_files import write
 from helpers.tiny import tiny_config
 from scgs_warp.config.presets import DataConfig
 from scgs_warp.data import ImageCache, images, load
-from scgs_warp.data.cache import AHEAD, Pixels
+from scgs_warp.data.cache import READ_AHEAD, Pixels
 from scgs_warp.errors import UserError
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
@@ -63,7 +63,7 @@ def test_reading_ahead():
     assert threads[0] is not threading.main_thread()
     for key in range(10):  # foretold wrongly
         cache.expect(key, read)
-    assert len(cache._coming) == AHEAD
+    assert cache.read_ahead == READ_AHEAD
 
     def fail() -> Pixels:
         raise UserError("gone")
@@ -145,13 +145,13 @@ def test_truncated_images_are_told(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(data)
     assert images.decode(path).shape == (40, 60, 3)
-    assert images.whole(np.frombuffer(data + b"appended", np.uint8))
+    assert images.is_complete(np.frombuffer(data + b"appended", np.uint8))
     for share in (0.0, 0.1, 0.5, 0.99):
         path.write_bytes(data[: int(share * len(data))])
         with pytest.raises(UserError, match=rf"a\{suffix}: not an image"):
             images.decode(path)
         if suffix == ".jpg":
-            assert not images.whole(np.fromfile(path, np.uint8))
+            assert not images.is_complete(np.fromfile(path, np.uint8))
 
 
 def test_long_reading_shows_how_far_it_is(tmp_path, monkeypatch, capsys):

@@ -19,7 +19,7 @@ from scgs_warp.edit.edit_file import parse, read
 from scgs_warp.edit.rotations import from_axis
 from scgs_warp.errors import UserError
 from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 from scgs_warp.visualization.figures import to_bytes
 
 SCRIPT = {
@@ -191,7 +191,7 @@ def test_names_that_nobody_knows_are_cut_and_on_one_line(session):
 def test_another_count_of_control_points_says_how_to_ask_for_it(session, ply):
     script = {"format": "scgs-warp edit", "version": 1, "scene": {"control_points": 33}}
     with pytest.raises(UserError, match="--nodes 33"):
-        parse(script, "edit.json", EditSession(open_ply(ply, nodes=20)))
+        parse(script, "edit.json", EditSession(open_gaussians(ply, nodes=20)))
     with pytest.raises(UserError) as caught:
         parse(script, "edit.json", session)
     assert "--nodes" not in str(caught.value)
@@ -302,7 +302,7 @@ def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
     arguments = ["--ply", str(ply), "--script", str(tmp_path / "edit.json"), "--output", str(tmp_path / "film.mp4")]
     assert app.cli(arguments) == 2
     assert "film.fps" in capsys.readouterr().err and not (tmp_path / "film.mp4").exists()
-    assert open_ply(ply).gaussian_count == 300
+    assert open_gaussians(ply).gaussian_count == 300
 
 
 def test_without_viser_the_editor_says_what_to_install(tmp_path, monkeypatch, capsys):

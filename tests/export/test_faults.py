@@ -27,7 +27,7 @@ from scgs_warp.formats import gaussian_files
 from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.motion.control_points import ControlPoints
 from scgs_warp.motion.static_nodes import StaticNodes
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Gaussians, Pose
 
@@ -73,7 +73,7 @@ def test_what_does_not_fit_after_reading_is_one_line_too(tmp_path, monkeypatch, 
     with monkeypatch.context() as patch:
         patch.setattr(StaticNodes, "sample", refuse)
         with pytest.raises(UserError, match=r"a\.spz: .*fit into memory; export"):
-            open_ply(path)
+            open_gaussians(path)
     monkeypatch.setattr(GaussianParameters, "activate", refuse)
     with pytest.raises(UserError, match=r"a\.spz: .*fit into memory; export"):
         job.export(Request(tmp_path / "b.ply", ply=path))

@@ -26,7 +26,7 @@ from scgs_warp.formats.gaussian_files import gaussian_points, read_gaussians
 from scgs_warp.formats.gaussian_spz import FLIPS, fraction_bits, pack_quats, read_antialiased, unpack_quats
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.ops.harmonics_rotation import rotate_harmonics
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 from scgs_warp.types import Gaussians
 
 UPS = [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8)]
@@ -154,7 +154,7 @@ def test_spz_keeps_the_mark_of_antialiasing(tmp_path, antialiased):
     write_still(tmp_path / "a.spz", cloud(), antialiased=antialiased)
     export(Request(tmp_path / "b.spz", ply=tmp_path / "a.spz"))
     assert gzip.decompress((tmp_path / "b.spz").read_bytes())[14] == antialiased
-    assert open_ply(tmp_path / "b.spz", nodes=5).config.antialiased == antialiased
+    assert open_gaussians(tmp_path / "b.spz", nodes=5).config.antialiased == antialiased
     (tmp_path / "c.spz").write_bytes(b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, antialiased, 5, 32))
     assert read_antialiased(tmp_path / "c.spz") == antialiased
     for content in (b"", b"no Gaussians"):
@@ -271,7 +271,7 @@ def test_files_open_as_scenes_and_as_points(tmp_path, suffix):
     truth = ordered(cloud())
     path = tmp_path / f"a{suffix}"
     write_still(path, truth)
-    scene = open_ply(path, nodes=20)
+    scene = open_gaussians(path, nodes=20)
     torch.testing.assert_close(ordered(scene.gaussians_at(0.0)).means, truth.means, atol=2e-5, rtol=0)
     assert scene.control_point_count == 20
     for points, colors in (gaussian_points(path), read_points(path)):

@@ -22,10 +22,10 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import parse_json, read_bytes
 from ...storage.safe_paths import inside, is_regular
-from ..images import bomb, whole
-from .schema import problem
+from ..images import is_complete, oversized_claim
+from .schema import find_problem
 
-UNDERSTOOD = {
+SUPPORTED_EXTENSIONS = {
     "KHR_mesh_quantization",
     "KHR_texture_transform",
     "KHR_materials_unlit",
@@ -33,7 +33,7 @@ UNDERSTOOD = {
     "EXT_texture_webp",
 }
 """Extensions whose data are read; others matter only where a file requires them."""
-HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights")
+IGNORABLE_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights")
 """They change how light is reflected, not what moves where: left out even where required."""
 REMEDIES = {
     "KHR_draco_mesh_compression": "export it again without Draco compression",
@@ -62,7 +62,7 @@ class GltfFile:
         if not version.startswith("2."):
             raise self.error("asset.version", f"is {version or 'missing'}; export it again as glTF 2.0")
         for name in self.document.extensionsRequired or []:
-            if name not in UNDERSTOOD and not name.startswith(HARMLESS):
+            if name not in SUPPORTED_EXTENSIONS and not name.startswith(IGNORABLE_EXTENSIONS):
                 remedy = REMEDIES.get(name, "export it again without this extension")
                 raise self.error("extensionsRequired", f"names {name}, which is not supported; {remedy}")
 
@@ -190,12 +190,12 @@ class GltfFile:
         image = self.item("images", index, field)
         where = f"images[{index}]"
         data = self.resource(image.uri, f"{where}.uri") if image.uri else self.view(image.bufferView, where)[0]
-        claim = bomb(data)
+        claim = oversized_claim(data)
         if claim is not None:
             raise self.error(where, f"says it is {claim} in {len(data)} bytes; export the file with smaller textures")
         try:
             raw = np.frombuffer(data, np.uint8)
-            pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if whole(raw) else None
+            pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if is_complete(raw) else None
         except cv2.error:
             pixels = None
         if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
@@ -226,7 +226,7 @@ def _checked(path: Path) -> dict[str, Any]:
         content = parse_json(data.decode("utf-8-sig"))
     except (ValueError, struct.error) as error:
         raise UserError(f"{path}: is no glTF that can be read ({str(error)[:80]}); export it again") from None
-    found = problem(content)
+    found = find_problem(content)
     if found is not None:
         raise UserError(f"{path}: {found[0]} {found[1]}; export the file again")
     return content

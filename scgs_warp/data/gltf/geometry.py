@@ -1,7 +1,7 @@
 """The triangles of a glTF scene, and what carries each vertex: one set of arrays for all meshes and primitives.
 
 A vertex of a skin is carried by joints, any other by its node; both are rows of one palette of matrices, so that posing
-a file is one formula (``gltf_scene.GltfScene``).
+a file is one formula (``scene.GltfScene``).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Morph(NamedTuple):
     """[targets] at rest."""
 
 
-class Part(NamedTuple):
+class MeshPart(NamedTuple):
     """One primitive at one node."""
 
     positions: np.ndarray
@@ -64,7 +64,7 @@ class Part(NamedTuple):
 class Geometry(NamedTuple):
     """Everything a file draws."""
 
-    parts: list[Part]
+    parts: list[MeshPart]
     palette: list[Bone]
     morphs: list[Morph]
     skipped: int
@@ -77,7 +77,7 @@ def read_geometry(file: GltfFile, nodes: Nodes, materials: list[Material]) -> Ge
     Raises:
         UserError: there is none, or an attribute cannot be used; the message names it.
     """
-    parts: list[Part] = []
+    parts: list[MeshPart] = []
     palette: list[Bone] = []
     morphs: list[Morph] = []
     skins: dict[int, int] = {}
@@ -139,7 +139,7 @@ def _skin(file: GltfFile, index: int, field: str) -> list[Bone]:
 
 def _part(
     file: GltfFile, primitive: Any, mode: int, materials: list[Material], first: int, joints: int, where: str
-) -> Part:
+) -> MeshPart:
     attributes = primitive.attributes
     accessor = _attribute(attributes, "POSITION")
     if accessor is None:
@@ -172,7 +172,7 @@ def _part(
     faces = _faces(file, primitive, mode, count, where)
     targets = _targets(file, primitive, count, where)
     used, faces = np.unique(faces, return_inverse=True)  # primitives often share one long list of vertices
-    return Part(
+    return MeshPart(
         positions=positions[used],
         normals=normals[used],
         uv=transformed(uv, material)[used],

@@ -10,7 +10,7 @@ import numpy as np
 
 from .animation import Clip, choose_clip, interpolate, read_clips
 from .file import GltfFile
-from .geometry import Bone, Morph, Part, read_geometry
+from .geometry import Bone, MeshPart, Morph, read_geometry
 from .materials import Material, Texture, read_materials
 from .nodes import Nodes
 
@@ -49,7 +49,7 @@ class GltfScene:
     clip: Clip | None
     """None: the file has no animation and nothing moves."""
     nodes: Nodes
-    parts: list[Part]
+    parts: list[MeshPart]
     palette: list[Bone]
     morphs: list[Morph]
     materials: list[Material]
@@ -84,7 +84,7 @@ class GltfScene:
             start = rows.stop
         linear = blended[:, :3, :3]
         positions = np.einsum("pij,pj->pi", linear, rest) + blended[:, :3, 3]
-        return Vertices(positions, _turned(normals, linear))
+        return Vertices(positions, _transformed_normals(normals, linear))
 
     def _morphed(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """Rest positions and normals [P, 3] with the morph targets of the instant added."""
@@ -103,7 +103,7 @@ class GltfScene:
         return rest, normals
 
 
-def _turned(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
+def _transformed_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
     """[P, 3] unit normals after the linear maps [P, 3, 3]: by cofactors, which exist where an inverse does not."""
     a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
@@ -150,7 +150,7 @@ def read_scene(path: str | Path, clip: str | None = None) -> GltfScene:
     return scene
 
 
-def _triangles(parts: list[Part]) -> Triangles:
+def _triangles(parts: list[MeshPart]) -> Triangles:
     faces, material, count = [], [], 0
     for part in parts:
         faces.append(part.faces + count)

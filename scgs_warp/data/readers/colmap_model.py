@@ -18,7 +18,7 @@ import numpy as np
 
 from ...errors import UserError
 
-LONGEST_NAME = 4096
+MAX_NAME_BYTES = 4096
 
 
 class ModelCamera(NamedTuple):
@@ -35,7 +35,7 @@ class ModelImage(NamedTuple):
     """[4, 4] world-to-camera, OpenCV."""
 
 
-class Model(NamedTuple):
+class SparseModel(NamedTuple):
     cameras: dict[int, ModelCamera]
     images: list[ModelImage]
     points: np.ndarray
@@ -48,7 +48,7 @@ class _Damaged(Exception):
     """What is wrong with a file, in a few words."""
 
 
-def find(folder: Path) -> Path | None:
+def find_model(folder: Path) -> Path | None:
     """The folder of the model: the one with most about images, if COLMAP left several; None where there is none."""
     places = [folder, *(folder / name for name in ("sparse", "colmap/sparse", "colmap_sparse", "colmap"))]
     candidates = []
@@ -65,7 +65,7 @@ def _files(place: Path, name: str) -> list[Path]:
     return [place / f"{name}{suffix}" for suffix in (".bin", ".txt") if (place / f"{name}{suffix}").is_file()]
 
 
-def read_model(place: Path) -> Model:
+def read_model(place: Path) -> SparseModel:
     """Cameras, images and points of the model in ``place``; binary if it is there, else text.
 
     Raises:
@@ -85,7 +85,7 @@ def read_model(place: Path) -> Model:
                 f"{place / f'images{suffix}'}: {image.name} is of camera {image.camera}, which cameras{suffix} does "
                 "not have; export the model again"
             )
-    return Model(cameras, images, points, colors)
+    return SparseModel(cameras, images, points, colors)
 
 
 def _read(file: Path, reader: Callable[[bytes], Any]) -> Any:
@@ -134,7 +134,7 @@ def _parameter_count(model: str) -> int:
 def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
     names, cameras = _model_names(), {}
     (count,), place = struct.unpack_from("<Q", data), 8
-    for _ in range(_believed(count, len(data) - place, 24)):
+    for _ in range(_plausible_count(count, len(data) - place, 24)):
         identity, model, width, height = struct.unpack_from("<iiQQ", data, place)
         if model not in names:
             raise _Damaged(f"camera {identity} is of model {model}, which is not known")
@@ -147,30 +147,30 @@ def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
 def _binary_images(data: bytes) -> list[ModelImage]:
     images = []
     (count,), place = struct.unpack_from("<Q", data), 8
-    for _ in range(_believed(count, len(data) - place, 73)):
+    for _ in range(_plausible_count(count, len(data) - place, 73)):
         values = struct.unpack_from("<i7di", data, place)
         place += 64
-        end = data.index(b"\0", place, place + LONGEST_NAME)
+        end = data.index(b"\0", place, place + MAX_NAME_BYTES)
         name = data[place:end].decode("utf-8")
         (observations,) = struct.unpack_from("<Q", data, end + 1)
-        place = end + 9 + 24 * _believed(observations, len(data) - end - 9, 24)
+        place = end + 9 + 24 * _plausible_count(observations, len(data) - end - 9, 24)
         images.append(ModelImage(name, values[8], _pose(np.array(values[1:5]), np.array(values[5:8]), name)))
     return images
 
 
 def _binary_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     (count,), place = struct.unpack_from("<Q", data), 8
-    count = _believed(count, len(data) - place, 51)
+    count = _plausible_count(count, len(data) - place, 51)
     points, colors = np.empty((count, 3)), np.empty((count, 3))
     unpack = struct.Struct("<Q3d3BdQ").unpack_from
     for index in range(count):
         values = unpack(data, place)
         points[index], colors[index] = values[1:4], values[4:7]
-        place += 51 + 8 * _believed(values[8], len(data) - place - 51, 8)
+        place += 51 + 8 * _plausible_count(values[8], len(data) - place - 51, 8)
     return points, colors / 255.0
 
 
-def _believed(count: int, left: int, least: int) -> int:
+def _plausible_count(count: int, left: int, least: int) -> int:
     """``count``, where the bytes that are left can hold so many of at least ``least`` bytes."""
     if count * least > left:
         raise _Damaged(f"truncated or damaged: lists {count} entries, more than the file holds")

@@ -20,9 +20,9 @@ import numpy as np
 
 from ...errors import UserError
 from ...storage.files import as_array, as_number, held_out, is_rotation, read_json, read_npy, size_text
-from ..assemble import Shot, assemble, with_points
+from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from ..lens import Lens, make_lens
 
 FILE = "dataset.json"
@@ -41,7 +41,7 @@ def recognises(folder: Path) -> bool:
     return (folder / FILE).is_file() and (folder / "camera").is_dir()
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the ids that ``dataset.json`` lists for it, with their own cameras and images.
 
     ``test`` and ``val`` are ``val_ids``, never trained on. Where none are listed, every eighth of ``ids`` is held out.
@@ -53,14 +53,14 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
     listed, chosen = _ids(folder / FILE, split)
     times = _times(folder / "metadata.json", listed)
     world = _world(folder / "scene.json")
-    images, ratio = _images(folder / "rgb", look.downscale)
-    shots = []
+    images, ratio = _images(folder / "rgb", options.downscale)
+    records = []
     for name in chosen:
         path = folder / "camera" / f"{name}.json"
         content = read_json(path, "each listed id needs its camera; restore it or drop the id from dataset.json")
         file = next((images / f"{name}{s}" for s in SUFFIXES if (images / f"{name}{s}").is_file()), None)
-        shots.append(
-            Shot(
+        records.append(
+            FrameRecord(
                 file if file is not None else images / f"{name}.png",
                 _viewmat(path, content, world),
                 times[name],
@@ -68,7 +68,9 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
                 name,
             )
         )
-    data = assemble(shots, look._replace(downscale=max(1.0, look.downscale / ratio)), folder=folder, split=split)
+    data = assemble(
+        records, options._replace(downscale=max(1.0, options.downscale / ratio)), folder=folder, split=split
+    )
     return with_points(data, _points(folder / "points.npy", world), None)
 
 

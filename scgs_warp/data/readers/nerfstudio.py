@@ -19,9 +19,9 @@ from ...errors import UserError
 from ...storage.files import by_name, held_out
 from ...storage.safe_paths import inside
 from ...types import Camera
-from ..assemble import Shot, assemble, video_border, with_points
+from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from ..points import read_points
 from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
 
@@ -33,7 +33,7 @@ def recognises(folder: Path) -> bool:
     return (folder / FILE).is_file()
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
     Frames without a time are taken to be evenly spaced in the order of their names (9 before 10). Without lists of
@@ -52,19 +52,19 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
     for entry in entries:
         read_distortion(path, {**content, **entry})
     chosen = _chosen(path, content, files, split)
-    shots = [_shot(path, folder, content, index, files[index], times[index]) for index in chosen]
+    records = [_record(path, folder, content, index, files[index], times[index]) for index in chosen]
     border = video_border(files, times)
-    data = assemble(shots, look, folder=folder, split=split, one_size=True, border=border)
+    data = assemble(records, options, folder=folder, split=split, one_size=True, border=border)
     return with_points(data, *_points(path, folder, content, data.cameras))
 
 
-def _shot(path: Path, folder: Path, content: dict[str, Any], index: int, file: Path, time: float) -> Shot:
+def _record(path: Path, folder: Path, content: dict[str, Any], index: int, file: Path, time: float) -> FrameRecord:
     entry = content["frames"][index]
     fields = {**content, **entry}
     mask = entry.get("mask_path")
     if mask is not None and not (isinstance(mask, str) and mask):
         raise UserError(f"{path}: frames[{index}].mask_path is no text; name the mask's file or leave it out")
-    return Shot(
+    return FrameRecord(
         file,
         read_pose(path, index, entry),
         time,

@@ -17,9 +17,9 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import as_array, as_number, is_rotation, read_json, read_npy, size_text
 from ...storage.safe_paths import inside
-from ..assemble import Shot, assemble, with_points
+from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from ..lens import Lens
 
 TRAIN, TEST = "train_meta.json", "test_meta.json"
@@ -31,7 +31,7 @@ def recognises(folder: Path) -> bool:
     return (folder / TRAIN).is_file() or (folder / TEST).is_file()
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the cameras of ``train_meta.json``, or of ``test_meta.json`` for ``test`` and ``val``.
 
     All cameras of an instant share its time, the place of the instant in the list.
@@ -43,7 +43,7 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
     content = read_json(path, "this split needs it, or choose another split")
     rows = {key: _rows(path, content, key) for key in ("fn", "k", "w2c")}
     files, last = rows["fn"], max(len(rows["fn"]) - 1, 1)
-    shots = []
+    records = []
     for instant, names in enumerate(files):
         for key in ("k", "w2c"):
             if len(rows[key]) != len(files) or len(rows[key][instant]) != len(names):
@@ -61,10 +61,10 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
             file = inside(folder / "ims", name, f"{path}: fn{where}", "image")
             pose = np.vstack([viewmat[:3], (0.0, 0.0, 0.0, 1.0)])
             label = Path(name).with_suffix("").as_posix().replace("/", "_").strip("._")
-            shots.append(Shot(file, pose, instant / last, partial(_lens, path, content, K), label))
-    if not shots:
+            records.append(FrameRecord(file, pose, instant / last, partial(_lens, path, content, K), label))
+    if not records:
         raise UserError(f"{path}: fn lists no frame; list at least one")
-    data = assemble(shots, look, folder=folder, split=split)
+    data = assemble(records, options, folder=folder, split=split)
     return with_points(data, *_points(folder / POINTS))
 
 

@@ -15,19 +15,19 @@ import numpy as np
 
 from ...errors import UserError
 from ...storage.files import is_rotation, natural, read_npy, size_text
-from ..assemble import Shot, assemble, with_points
+from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from ..lens import Lens
 from ..points import read_points
 from .transforms import SUFFIXES
 
 FILE = "poses_bounds.npy"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
-HELD_OUT = 0
+HELD_OUT_CAMERA = 0
 """The camera that is held out: the central one of Neural 3D Video, and what others report."""
 POINTS = ("points3D.ply", "points3D_downsample2.ply", "points3d.ply")
-TALLER = 0.01
+MAX_ASPECT_ERROR = 0.01
 """Largest relative difference between the reductions of width and height that rounding explains."""
 
 
@@ -36,7 +36,7 @@ def recognises(folder: Path) -> bool:
     return (folder / FILE).is_file()
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the first camera is ``test`` and ``val``, the others are trained on.
 
     All cameras share the times, the place of each image in the order of names.
@@ -56,21 +56,23 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
             f"{path}: has {len(rows)} rows, but {folder} holds {len(cameras)} folders of images "
             f"({cameras[0].name} to {cameras[-1].name}); give each camera a row and a folder"
         )
-    chosen = [index for index in range(len(cameras)) if (index == HELD_OUT) != (split == "train")]
+    chosen = [index for index in range(len(cameras)) if (index == HELD_OUT_CAMERA) != (split == "train")]
     files = [_files(camera) for camera in cameras]
-    shots = []
+    records = []
     for index in chosen:
-        if len(files[index]) != len(files[HELD_OUT]):
+        if len(files[index]) != len(files[HELD_OUT_CAMERA]):
             raise UserError(
-                f"{cameras[index]}: holds {len(files[index])} images, but {cameras[HELD_OUT].name} "
-                f"{len(files[HELD_OUT])}; all cameras need the same instants"
+                f"{cameras[index]}: holds {len(files[index])} images, but {cameras[HELD_OUT_CAMERA].name} "
+                f"{len(files[HELD_OUT_CAMERA])}; all cameras need the same instants"
             )
         viewmat = _viewmat(path, index, rows[index, :15].reshape(3, 5))
         lens = partial(_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4])
         last = max(len(files[index]) - 1, 1)
         for place, file in enumerate(files[index]):
-            shots.append(Shot(file, viewmat, place / last, lens, f"{_label(folder, cameras[index])}_{file.stem}"))
-    data = assemble(shots, look, folder=folder, split=split)
+            records.append(
+                FrameRecord(file, viewmat, place / last, lens, f"{_label(folder, cameras[index])}_{file.stem}")
+            )
+    data = assemble(records, options, folder=folder, split=split)
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     return data if points is None else with_points(data, *read_points(points))
 
@@ -123,7 +125,7 @@ def _lens(path: Path, index: int, column: np.ndarray, source: tuple[int, int]) -
     if min(height, width, focal) < 1:
         raise UserError(f"{path}: row {index} has no positive height, width and focal length; restore the file")
     sx, sy = source[0] / width, source[1] / height
-    if abs(sx / sy - 1.0) > TALLER:
+    if abs(sx / sy - 1.0) > MAX_ASPECT_ERROR:
         raise UserError(
             f"{path}: row {index} is of {width:g} x {height:g} pixels, but the images are {size_text(source)}; "
             "reduce width and height alike"

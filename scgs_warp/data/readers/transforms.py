@@ -19,7 +19,7 @@ from ..lens import Lens, make_lens
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
+LISTED_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """What ``distortion_params`` lists, in nerfstudio's order."""
 PERSPECTIVES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models (COLMAP's and nerfstudio's names) that are a pinhole where all distortion is 0: r, tangential, and with
@@ -111,11 +111,14 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
     values = {key: _parameter(path, key, fields.get(key, 0.0)) for key in DISTORTION}
     listed = fields.get("distortion_params")
     if listed is not None:
-        if not isinstance(listed, list) or len(listed) > len(LISTED):
+        if not isinstance(listed, list) or len(listed) > len(LISTED_DISTORTION):
             raise UserError(
-                f"{path}: distortion_params is {repr(listed)[:60]}; give up to six numbers, {', '.join(LISTED)}"
+                f"{path}: distortion_params is {repr(listed)[:60]}; give up to six numbers, "
+                f"{', '.join(LISTED_DISTORTION)}"
             )
-        values |= {key: _parameter(path, f"distortion_params ({key})", value) for key, value in zip(LISTED, listed)}
+        values |= {
+            key: _parameter(path, f"distortion_params ({key})", value) for key, value in zip(LISTED_DISTORTION, listed)
+        }
     k1, k2, k3, k4, k5, k6, p1, p2 = values.values()
     if not any(values.values()) and (name is None or name.upper() in PERSPECTIVES) and not fields.get("is_fisheye"):
         return "PINHOLE", ()

@@ -16,11 +16,10 @@ import numpy as np
 
 from ...errors import UserError
 from ...storage.files import parse_json
-from ...types import Camera
 from .figure import Figure, build_figure
-from .orbit_cameras import Shot, camera_of, instants, on_sphere
+from .orbit_cameras import PlannedPicture, instants, random_on_sphere
 from .raycast import Raycaster
-from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_pictures, write_whole
+from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_folder_atomically, write_pictures
 
 VERSION = 4
 """Raised whenever the scene's pictures or its ground truth change; folders of another version are made anew."""
@@ -44,7 +43,7 @@ def make_synthetic(
 ) -> Path:
     """Make the scene in ``folder``, unless it is there already with these arguments.
 
-    An interrupted run leaves nothing half made (``write_whole``).
+    An interrupted run leaves nothing half made (``write_folder_atomically``).
 
     Args:
         size: width and height in pixels.
@@ -67,7 +66,7 @@ def make_synthetic(
     if _recipe_of(folder) == recipe:
         return folder
     _check_replaceable(folder)
-    write_whole(folder, lambda work: _write_scene(work, recipe, progress, device))
+    write_folder_atomically(folder, lambda work: _write_scene(work, recipe, progress, device))
     return folder
 
 
@@ -112,8 +111,9 @@ def _write_scene(work: Path, recipe: dict[str, Any], progress: Callable[[int, in
     subject = FigureSubject(device)
     rng = np.random.default_rng(recipe["seed"])
     points = subject.sample(SURFACE_POINTS, rng)
-    shots = {
-        split: [Shot(time, random_camera(rng), 0) for time in instants(recipe[split])] for split in ("train", "test")
+    pictures = {
+        split: [PlannedPicture(time, random_camera(rng), 0) for time in instants(recipe[split])]
+        for split in ("train", "test")
     }
     total = recipe["train"] + recipe["test"]
     counter = itertools.count(1)
@@ -123,17 +123,13 @@ def _write_scene(work: Path, recipe: dict[str, Any], progress: Callable[[int, in
             progress(next(counter), total)
 
     optics = Optics(FIELD_OF_VIEW, recipe["size"], recipe["size"], SAMPLES)
-    write_pictures(work, subject, points, shots, optics, done)
+    write_pictures(work, subject, points, pictures, optics, done)
     (work / MARKER).write_text(json.dumps(recipe) + "\n")
 
 
 def random_camera(rng: np.random.Generator) -> np.ndarray:
     """[4, 4] camera-to-world, OpenGL: on the upper hemisphere, evenly over its area, looking at the origin."""
-    return on_sphere(rng, SINE_OF_ELEVATION, RADIUS)
-
-
-def _camera(camera_to_world: np.ndarray, size: int) -> Camera:
-    return camera_of(camera_to_world, FIELD_OF_VIEW, size, size)
+    return random_on_sphere(rng, SINE_OF_ELEVATION, RADIUS)
 
 
 def sample_surface(figure: Figure, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 
 from ...types import Camera
-from .orbit_cameras import Shot
-from .renderer import over
+from ..dataset import spread
+from .orbit_cameras import PlannedPicture
+from .renderer import over_gray
 
 COLUMNS = 6
 CELL = 240
@@ -20,7 +21,7 @@ GROUND = 0.85
 DOT = 1
 
 
-class Sheet:
+class ContactSheet:
     """Collects some of the pictures while they are made: a ``Watcher``."""
 
     def __init__(self, counts: dict[str, int]) -> None:
@@ -28,17 +29,19 @@ class Sheet:
         Args:
             counts: pictures of each split.
         """
-        self._wanted = {split: spread(count, COLUMNS) for split, count in counts.items() if split != "val"}
+        self._wanted = {split: set(spread(count, COLUMNS)) for split, count in counts.items() if split != "val"}
         self._rows: dict[str, list[np.ndarray]] = {"train": [], "tracks": [], "test": []}
         self._colors: np.ndarray | None = None
 
-    def __call__(self, split: str, index: int, shot: Shot, camera: Camera, image: np.ndarray, seen: Any) -> None:
+    def __call__(
+        self, split: str, index: int, planned: PlannedPicture, camera: Camera, image: np.ndarray, seen: Any
+    ) -> None:
         if seen is not None and self._colors is None:
-            self._colors = hues(seen[0])
+            self._colors = position_hues(seen[0])
         if index not in self._wanted.get(split, ()):
             return
-        picture = np.rint(over(image, GROUND).clip(0.0, 1.0) * 255.0).astype(np.uint8)
-        caption = f"{split} {index}  t {shot.time:.2f}"
+        picture = np.rint(over_gray(image, GROUND).clip(0.0, 1.0) * 255.0).astype(np.uint8)
+        caption = f"{split} {index}  t {planned.time:.2f}"
         self._rows[split].append(_captioned(_reduced(picture), caption))
         if seen is not None and self._colors is not None:
             points, visible = seen
@@ -67,13 +70,6 @@ class Sheet:
         return sheet
 
 
-def spread(count: int, wanted: int) -> set[int]:
-    """At most ``wanted`` of ``count`` indices, at equal distances, the first and the last among them."""
-    if count <= wanted:
-        return set(range(count))
-    return {round(k * (count - 1) / (wanted - 1)) for k in range(wanted)}
-
-
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     """[P, 2] pixels of world points [P, 3]."""
     viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
@@ -81,7 +77,7 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     return seen[:, :2] / seen[:, 2:]
 
 
-def hues(points: np.ndarray) -> np.ndarray:
+def position_hues(points: np.ndarray) -> np.ndarray:
     """[P, 3] RGB bytes: each point's place at the first time as a colour."""
     low, high = points.min(0), points.max(0)
     return np.rint(255.0 * (points - low) / np.maximum(high - low, 1e-9)).astype(np.uint8)

@@ -14,29 +14,29 @@ import numpy as np
 Vector = tuple[float, float, float]
 
 
-class Bone(NamedTuple):
+class Joint(NamedTuple):
     """A joint: its place in the parent's frame (None: the world's)."""
 
     parent: str | None
     place: Vector
 
 
-BONES: dict[str, Bone] = {
-    "hips": Bone(None, (0.0, 0.0, -0.40)),
-    "torso": Bone("hips", (0.0, 0.0, 0.04)),
-    "neck": Bone("torso", (0.0, 0.0, 0.60)),
-    "head": Bone("neck", (0.0, 0.0, 0.03)),
-    "antenna": Bone("head", (0.0, 0.0, 0.56)),
-    "scarf": Bone("neck", (0.15, -0.20, -0.02)),
-    "scarf_tip": Bone("scarf", (0.0, 0.0, -0.24)),
-    "shoulder_left": Bone("torso", (0.365, 0.0, 0.45)),
-    "elbow_left": Bone("shoulder_left", (0.0, 0.0, -0.28)),
-    "shoulder_right": Bone("torso", (-0.365, 0.0, 0.45)),
-    "elbow_right": Bone("shoulder_right", (0.0, 0.0, -0.28)),
-    "hip_left": Bone("hips", (0.145, 0.0, -0.06)),
-    "knee_left": Bone("hip_left", (0.0, 0.0, -0.26)),
-    "hip_right": Bone("hips", (-0.145, 0.0, -0.06)),
-    "knee_right": Bone("hip_right", (0.0, 0.0, -0.26)),
+BONES: dict[str, Joint] = {
+    "hips": Joint(None, (0.0, 0.0, -0.40)),
+    "torso": Joint("hips", (0.0, 0.0, 0.04)),
+    "neck": Joint("torso", (0.0, 0.0, 0.60)),
+    "head": Joint("neck", (0.0, 0.0, 0.03)),
+    "antenna": Joint("head", (0.0, 0.0, 0.56)),
+    "scarf": Joint("neck", (0.15, -0.20, -0.02)),
+    "scarf_tip": Joint("scarf", (0.0, 0.0, -0.24)),
+    "shoulder_left": Joint("torso", (0.365, 0.0, 0.45)),
+    "elbow_left": Joint("shoulder_left", (0.0, 0.0, -0.28)),
+    "shoulder_right": Joint("torso", (-0.365, 0.0, 0.45)),
+    "elbow_right": Joint("shoulder_right", (0.0, 0.0, -0.28)),
+    "hip_left": Joint("hips", (0.145, 0.0, -0.06)),
+    "knee_left": Joint("hip_left", (0.0, 0.0, -0.26)),
+    "hip_right": Joint("hips", (-0.145, 0.0, -0.06)),
+    "knee_right": Joint("hip_right", (0.0, 0.0, -0.26)),
 }
 
 

@@ -16,13 +16,13 @@ import torch
 from ...types import Camera
 
 Arrangement = Literal["sphere", "path"]
-REACH = 1.365
+FRAMED_RADIUS = 1.365
 """Cameras stand where a ball of this radius around the origin just fits into their pictures."""
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True)
-class Filming:
+class FilmingSettings:
     """How a scene is filmed."""
 
     width: int = 400
@@ -42,7 +42,7 @@ class Filming:
     """How often a path goes round."""
 
 
-class Shot(NamedTuple):
+class PlannedPicture(NamedTuple):
     """One picture to be made."""
 
     time: float
@@ -52,14 +52,14 @@ class Shot(NamedTuple):
     """Camera of a rig; 0 for one camera."""
 
 
-def distance(filming: Filming) -> float:
+def camera_distance(filming: FilmingSettings) -> float:
     """Of the cameras from the origin."""
     half_x = math.tan(math.radians(filming.fov) / 2)
     narrower = math.atan(half_x * min(1.0, filming.height / filming.width))
-    return REACH / math.sin(narrower)
+    return FRAMED_RADIUS / math.sin(narrower)
 
 
-def stand(azimuth: float, sine: float, radius: float) -> np.ndarray:
+def camera_at(azimuth: float, sine: float, radius: float) -> np.ndarray:
     """[4, 4] camera-to-world at an azimuth (radians) and a sine of the elevation, looking at the origin, z up."""
     flat = math.sqrt(1.0 - sine * sine)
     backward = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), sine])
@@ -70,40 +70,42 @@ def stand(azimuth: float, sine: float, radius: float) -> np.ndarray:
     return matrix
 
 
-def on_sphere(rng: np.random.Generator, sines: tuple[float, float], radius: float) -> np.ndarray:
+def random_on_sphere(rng: np.random.Generator, sines: tuple[float, float], radius: float) -> np.ndarray:
     """A camera at random, evenly over the area of the sphere between two sines of elevation."""
     azimuth = rng.uniform(0.0, 2.0 * math.pi)
-    return stand(azimuth, rng.uniform(*sines), radius)
+    return camera_at(azimuth, rng.uniform(*sines), radius)
 
 
-def _sines(filming: Filming) -> tuple[float, float]:
+def _sines(filming: FilmingSettings) -> tuple[float, float]:
     low, high = filming.elevation
     return math.sin(math.radians(low)), math.sin(math.radians(high))
 
 
-def rig(filming: Filming, start: float) -> list[np.ndarray]:
+def rig(filming: FilmingSettings, start: float) -> list[np.ndarray]:
     """Cameras that stand still, spread evenly over the sphere between the elevations (a golden-angle spiral)."""
     low, high = _sines(filming)
     return [
-        stand(start + GOLDEN_ANGLE * view, low + (high - low) * (view + 0.5) / filming.views, distance(filming))
+        camera_at(
+            start + GOLDEN_ANGLE * view, low + (high - low) * (view + 0.5) / filming.views, camera_distance(filming)
+        )
         for view in range(filming.views)
     ]
 
 
-def along_path(filming: Filming, time: float, start: float, view: int) -> np.ndarray:
+def along_path(filming: FilmingSettings, time: float, start: float, view: int) -> np.ndarray:
     """Where a moving camera stands: ``turns`` round the subject, up and down once for every turn; those of a rig
     follow each other at equal angles."""
     low, high = filming.elevation
     angle = 2.0 * math.pi * (filming.turns * time + view / filming.views)
     height = math.radians((low + high) / 2 + (high - low) / 2 * math.sin(angle))
-    return stand(start + angle, math.sin(height), distance(filming))
+    return camera_at(start + angle, math.sin(height), camera_distance(filming))
 
 
 def instants(count: int) -> list[float]:
     return [index / max(count - 1, 1) for index in range(count)]
 
 
-def shots(filming: Filming, rng: np.random.Generator) -> dict[str, list[Shot]]:
+def plan_pictures(filming: FilmingSettings, rng: np.random.Generator) -> dict[str, list[PlannedPicture]]:
     """All pictures of each split that has any. Held-out views are spread over time, each from a random place."""
     start = float(rng.uniform(0.0, 2.0 * math.pi))
     standing = rig(filming, start) if filming.cameras == "sphere" and filming.views > 1 else []
@@ -115,13 +117,13 @@ def shots(filming: Filming, rng: np.random.Generator) -> dict[str, list[Shot]]:
             elif filming.cameras == "path":
                 matrix = along_path(filming, time, start, view)
             else:
-                matrix = on_sphere(rng, _sines(filming), distance(filming))
-            train.append(Shot(time, matrix, view))
+                matrix = random_on_sphere(rng, _sines(filming), camera_distance(filming))
+            train.append(PlannedPicture(time, matrix, view))
     found = {"train": train}
     for split, count in (("test", filming.test), ("val", filming.val)):
         if count:
-            places = [on_sphere(rng, _sines(filming), distance(filming)) for _ in range(count)]
-            found[split] = [Shot(time, place, 0) for time, place in zip(instants(count), places)]
+            places = [random_on_sphere(rng, _sines(filming), camera_distance(filming)) for _ in range(count)]
+            found[split] = [PlannedPicture(time, place, 0) for time, place in zip(instants(count), places)]
     return found
 
 

@@ -25,7 +25,7 @@ TOLERANCE = 2e-3
 """World units by which a visible point may lie behind the first hit."""
 
 
-class Posed(NamedTuple):
+class PosedFigure(NamedTuple):
     """The figure at one time, ready for queries."""
 
     mesh: wp.Mesh
@@ -58,7 +58,7 @@ class Raycaster:
         transforms = bone_transforms(time)
         return np.stack([transforms[bone] for bone in self.bones])
 
-    def pose(self, time: float) -> Posed:
+    def pose(self, time: float) -> PosedFigure:
         """The figure at ``time`` in [0, 1], lit."""
         transforms = self.part_transforms(time)[self.figure.vertex_part]
         vertices = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.local) + transforms[:, :3, 3]
@@ -70,12 +70,12 @@ class Raycaster:
             kernels.light_vertices, len(points), mesh.id, points, directions, self.light_direction, LIGHT_SPREAD,
             SKY_RAYS, KEY_RAYS, OCCLUSION_REACH, light, grain=64,
         )  # fmt: skip
-        return Posed(mesh, points, light)
+        return PosedFigure(mesh, points, light)
 
-    def render(self, posed: Posed, camera: Camera, samples: int = 4) -> Tensor:
+    def render(self, posed: PosedFigure, camera: Camera, samples: int = 4) -> Tensor:
         """[H, W, 4] premultiplied colour and coverage, ``samples`` x ``samples`` rays a pixel."""
         image = torch.zeros(camera.height, camera.width, 4, device=self.device)
-        left, top, columns, rows = window(posed.vertices, camera)
+        left, top, columns, rows = pixel_window(posed.vertices, camera)
         camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
         launch(
             kernels.raycast, columns * rows, posed.mesh.id, self.faces, self.rest, posed.light, self.face_part,
@@ -84,7 +84,7 @@ class Raycaster:
         )  # fmt: skip
         return image
 
-    def visible(self, posed: Posed, camera: Camera, points: Tensor) -> Tensor:
+    def visible(self, posed: PosedFigure, camera: Camera, points: Tensor) -> Tensor:
         """[P] bool: which surface points [P, 3] the camera sees."""
         seen = torch.empty(len(points), dtype=torch.int32, device=self.device)
         launch(
@@ -102,7 +102,7 @@ def mesh_over(vertices: Tensor, faces: Tensor) -> wp.Mesh:
         return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
 
 
-def window(vertices: Tensor, camera: Camera) -> tuple[int, int, int, int]:
+def pixel_window(vertices: Tensor, camera: Camera) -> tuple[int, int, int, int]:
     """(left, top, columns, rows) of the pixels that a mesh of vertices [P, 3] may touch."""
     view = camera.to(vertices.device)
     points = vertices @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]

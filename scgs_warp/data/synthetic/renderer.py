@@ -22,18 +22,18 @@ from torch import Tensor
 
 from ...errors import UserError
 from ...types import Camera
-from .orbit_cameras import Shot, camera_of
+from .orbit_cameras import PlannedPicture, camera_of
 
-ROOM = 1.3
+ROOM_RADIUS = 1.3
 """World radius of the ball around the origin that a subject never leaves: what D-NeRF's scenes take."""
 SURFACE_POINTS = 2000
-TRUTH_TIMES = 51
+GROUND_TRUTH_TIMES = 51
 
 Background = Literal["transparent", "black", "white"]
 
 
 class Subject(Protocol):
-    """Something that moves while time goes from 0 to 1, inside the ball of radius ``ROOM`` (world, z up)."""
+    """Something that moves while time goes from 0 to 1, inside the ball of radius ``ROOM_RADIUS`` (world, z up)."""
 
     device: str
 
@@ -116,7 +116,7 @@ def write_rgba(path: Path, image: np.ndarray) -> None:
     write_png(path, cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_RGBA2BGRA))
 
 
-def over(image: np.ndarray, gray: float) -> np.ndarray:
+def over_gray(image: np.ndarray, gray: float) -> np.ndarray:
     """[H, W, 3] a premultiplied picture [H, W, 4] on a grey ground."""
     return image[..., :3] + (1.0 - image[..., 3:]) * gray
 
@@ -134,21 +134,23 @@ def write_picture(path: Path, image: np.ndarray, background: Background) -> None
     if background == "transparent":
         write_rgba(path, image)
         return
-    pixels = over(image, 1.0 if background == "white" else 0.0).clip(0.0, 1.0) * 255.0
+    pixels = over_gray(image, 1.0 if background == "white" else 0.0).clip(0.0, 1.0) * 255.0
     write_png(path, cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_RGB2BGR))
 
 
 class Watcher(Protocol):
     """Looks at pictures as they are made."""
 
-    def __call__(self, split: str, index: int, shot: Shot, camera: Camera, image: np.ndarray, seen: Any) -> None: ...
+    def __call__(
+        self, split: str, index: int, planned: PlannedPicture, camera: Camera, image: np.ndarray, seen: Any
+    ) -> None: ...
 
 
 def write_pictures(
     folder: Path,
     subject: Subject,
     points: Any,
-    shots: Mapping[str, Sequence[Shot]],
+    pictures: Mapping[str, Sequence[PlannedPicture]],
     optics: Optics,
     done: Callable[[], None],
     watch: Watcher | None = None,
@@ -164,13 +166,13 @@ def write_pictures(
         OSError: something cannot be written.
     """
     visible = []
-    for split, planned in shots.items():
+    for split, split_pictures in pictures.items():
         (folder / split).mkdir()
         entries, time, posed = [], float("nan"), None
-        for index, shot in enumerate(planned):
-            if shot.time != time:
-                time, posed = shot.time, subject.pose(shot.time)
-            camera = camera_of(shot.camera_to_world, optics.fov, optics.width, optics.height)
+        for index, planned in enumerate(split_pictures):
+            if planned.time != time:
+                time, posed = planned.time, subject.pose(planned.time)
+            camera = camera_of(planned.camera_to_world, optics.fov, optics.width, optics.height)
             image = subject.render(posed, camera, optics.samples).cpu().numpy()
             name = f"{split}/r_{index:03d}"
             write_picture(folder / f"{name}.png", image, optics.background)
@@ -180,30 +182,32 @@ def write_pictures(
                 tensor = torch.from_numpy(places.astype(np.float32)).to(subject.device)
                 seen = places, subject.visible(posed, camera, tensor).cpu().numpy()
                 visible.append(seen[1])
-            entries.append({"file_path": f"./{name}", "time": time, "transform_matrix": shot.camera_to_world.tolist()})
+            entries.append(
+                {"file_path": f"./{name}", "time": time, "transform_matrix": planned.camera_to_world.tolist()}
+            )
             if watch is not None:
-                watch(split, index, shot, camera, image, seen)
+                watch(split, index, planned, camera, image, seen)
             done()
         content = {"camera_angle_x": optics.fov, "frames": entries}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1) + "\n")
-    times = np.linspace(0.0, 1.0, TRUTH_TIMES)
+    times = np.linspace(0.0, 1.0, GROUND_TRUTH_TIMES)
     np.savez(
         folder / "ground_truth.npz",
         points=subject.track(points, times.tolist()).astype(np.float32),
         times=times.astype(np.float32),
         visible=np.stack(visible),
-        height=np.float32(height_of(subject)),
+        height=np.float32(subject_height(subject)),
     )
 
 
-def height_of(subject: Subject) -> float:
+def subject_height(subject: Subject) -> float:
     """Extent along z at time 0; of something that lies flat, the largest extent."""
     vertices = subject.pose(0.0).vertices.cpu().numpy()
     extent = vertices.max(0) - vertices.min(0)
     return extent[2] if extent[2] > 0.05 * extent.max() else extent.max()
 
 
-def write_whole(folder: Path, write: Callable[[Path], None]) -> None:
+def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None:
     """Have ``write`` fill a temporary folder beside ``folder`` and rename it: nothing is ever left half made.
 
     Raises:

@@ -225,7 +225,7 @@ def test_colmap_takes_the_largest_model(tmp_path):
     ],
 )
 def test_times_in_names(names, expected):
-    assert colmap._times(names) == pytest.approx(expected)
+    assert colmap.times_from_names(names) == pytest.approx(expected)
 
 
 def test_any_names(tmp_path):
