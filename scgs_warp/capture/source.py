@@ -135,10 +135,10 @@ def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
     size = max(1, round(width * scale)), max(1, round(height * scale))
     if size != (frame.width, frame.height):
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return upright(image, getattr(frame, "rotation", 0) or 0)
+    return rotate_image(image, getattr(frame, "rotation", 0) or 0)
 
 
-def upright(image: np.ndarray, degrees: float) -> np.ndarray:
+def rotate_image(image: np.ndarray, degrees: float) -> np.ndarray:
     """The image turned counter-clockwise by ``degrees``, to the nearest quarter."""
     return np.ascontiguousarray(np.rot90(image, round(degrees / 90) % 4))
 
