@@ -1,4 +1,4 @@
-"""Which pixels of a video hold nothing: the black borders that undistortion leaves."""
+"""Detection of the black borders that undistortion leaves in a video."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import cv2
 import numpy as np
 
 BLACK_LEVEL = 4 / 255
-"""Largest channel of a pixel that counts as black: a JPEG of a black border is not quite black."""
+"""Largest channel value of a black pixel, of 1: JPEG compression lifts black borders slightly."""
 MIN_FRAME_SHARE = 0.9
-"""Of the frames in which a border is black; something dark that comes and goes is not cut."""
+"""Share of the frames in which a border pixel must be black, so that passing dark objects are not masked."""
 MIN_FRAMES = 4
-"""Frames that it takes to tell a border from something dark."""
+"""Smallest number of frames from which a border is detected."""
 MAX_AREA = 0.2
-"""A border that covers more of the image, or reaches its middle, is none, but a scene on a black ground."""
+"""Largest share of the image that a border covers; beyond it, or in the middle, black is the scene's background."""
 
 
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray | None:
-    """Where the images are not border: black in nearly all of them, and connected through such pixels to the edge.
+    """Find the border: pixels that are black in nearly all images and connected to the image's edge.
 
     Args:
         images: [H, W, 3], all of one size, uint8 or uint16, from all over the video.
 
     Returns:
-        [H, W] bool, False on the border and on the one pixel beside it that interpolation darkened. None where there
-        is no border, or nothing to tell it by.
+        [H, W] bool, False on the border and on the one pixel beside it that interpolation darkened. None without a
+        border, with too few images, or with images of different sizes.
     """
     if len(images) < MIN_FRAMES or len({image.shape for image in images}) != 1:
         return None
@@ -44,7 +44,7 @@ def border_mask(images: Sequence[np.ndarray]) -> np.ndarray | None:
 
 
 def reduce_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """[h, w] bool: True where every pixel of ``mask`` [H, W] underneath is. ``size`` is (w, h)."""
+    """Reduce ``mask`` [H, W] bool to ``size`` (w, h): True where every covered pixel is True."""
     if size == (mask.shape[1], mask.shape[0]):
         return mask
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1.0 - 1e-4

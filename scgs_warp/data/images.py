@@ -1,4 +1,4 @@
-"""Image files to planar float tensors: decode, reduce, composite; in a small pool of threads."""
+"""Image files to planar float tensors: decoding, undistortion, reduction and compositing, in a pool of threads."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ from .lens import Lens, undistort, valid_pixels
 
 RESAMPLES = ("area", "bicubic")
 SMALLEST_SIDE = 8
-"""Pixels; a smaller image is smaller than SSIM's window and surely a mistake."""
+"""Smallest side after a reduction, pixels: SSIM's window would not fit into a smaller image."""
 
 TRUSTED_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 64
-"""Images of more pixels have at least a byte for so many of them: a megabyte of zeros unpacks to a gigabyte."""
+"""Pixel count below which a header is trusted, and pixels per byte of the file beyond it: a megabyte of zeros may
+unpack to a gigabyte."""
 
-# What a camera wrote beside the picture is of no interest, and a warning about it goes to everybody's terminal.
+# Pixels do not depend on EXIF data, so the warning would only clutter the terminal.
 warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
 
 T = TypeVar("T")
@@ -40,17 +41,17 @@ R = TypeVar("R")
 
 class Decoded(NamedTuple):
     pixels: Pixels
-    """On the background; ``alpha`` None for a file without alpha, ``mask`` None where every pixel is valid."""
+    """Composited pixels; ``alpha`` is None for a file without alpha, ``mask`` is None if every pixel is valid."""
     source_size: tuple[int, int]
-    """(width, height) of the file, before the reduction."""
+    """(width, height) of the file before the reduction."""
     transparent: bool
     """Whether any pixel of the file is less than opaque."""
     lens: Lens
-    """Of the file."""
+    """Lens of the file."""
 
 
 class ReadOptions(NamedTuple):
-    """How a data set is to be read."""
+    """Options of reading a data set."""
 
     downscale: float = 1
     resample: str = "area"
@@ -58,11 +59,11 @@ class ReadOptions(NamedTuple):
     progress: Callable[[int, int], None] | None = None
     """Called with (done, total) after each image."""
     cache: ImageCache | None = None
-    """Where decoded images go; None: one of its own."""
+    """Cache of decoded images; None: a new one."""
 
 
 def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[[int, int], None] | None = None):
-    """``work`` of every item, in order, in as many threads as the process may use; the first exception is raised.
+    """Apply ``work`` to every item, in order, in as many threads as the process may use; raise the first exception.
 
     Args:
         progress: called with (done, total) after each item.
@@ -81,7 +82,7 @@ def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[
 
 
 def check_options(downscale: float, resample: str, background: str) -> None:
-    """Raise UserError for an option that no reader takes."""
+    """Raise UserError for an invalid option."""
     if not (isinstance(downscale, (int, float)) and math.isfinite(downscale) and downscale >= 1):
         raise UserError(f"downscale is {downscale!r}; give a number >= 1 (2 halves width and height)")
     if resample not in RESAMPLES:
@@ -91,7 +92,7 @@ def check_options(downscale: float, resample: str, background: str) -> None:
 
 
 def reduced_size(width: int, height: int, downscale: float, path: Path) -> tuple[int, int]:
-    """(width, height) after ``downscale``, rounded; UserError where nothing useful is left."""
+    """Return (width, height) after ``downscale``, rounded; raise UserError if a side becomes too small."""
     size = (max(1, round(width / downscale)), max(1, round(height / downscale)))
     if downscale != 1 and min(size) < SMALLEST_SIDE:
         largest = max(1, min(width, height) // SMALLEST_SIDE)
@@ -107,13 +108,13 @@ def read_image(
 ) -> Decoded:
     """Decode one file, undistort it, reduce it, and composite it on the background once.
 
-    ``area`` averages colour premultiplied by alpha over each target pixel, in float. ``bicubic`` repeats what the
-    official SC-GS does: composite, truncate to 8 bits, then Pillow's bicubic filter on colour and alpha apart.
-    With ``random`` the image is on black (= premultiplied).
+    ``area`` averages colour premultiplied by alpha over each target pixel, in float. ``bicubic`` follows the official
+    SC-GS: composite, truncate to 8 bits, then apply Pillow's bicubic filter to colour and alpha separately.
+    With ``random`` the image stays premultiplied, on black.
 
     Args:
         lens_of: called with (width, height) of the file; raises UserError if they do not fit.
-        mask_path: an image, black where the frame is not valid; not all of it.
+        mask_path: an image that is black where the frame is not valid, and not black everywhere.
 
     Raises:
         UserError: a file is missing or does not decode, or the mask has another size than the image.
@@ -139,14 +140,14 @@ def read_image(
 
 
 def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
-    """[H, W] bool, True where the mask is not black. ``size``: (width, height) of the image it belongs to.
+    """Read a mask: [H, W] bool, True where it is not black. ``size``: (width, height) of its image.
 
     Raises:
         UserError: the file is missing or does not decode, is all black, or has another size.
     """
     mask = decode(path)[..., :3].max(axis=2) > 0
     if not mask.any():
-        raise UserError(f"{path}: a mask that is all black leaves nothing to look at; drop the frame")
+        raise UserError(f"{path}: the mask is all black, so no pixel is valid; drop the frame")
     if mask.shape[::-1] != size:
         raise UserError(
             f"{image}: is {size_text(size)}, but its mask is {size_text(mask.shape[::-1])}; "
@@ -187,7 +188,7 @@ def decode(path: Path) -> np.ndarray:
 
 
 def oversized_claim(data: bytes | memoryview) -> str | None:
-    """The size that an image file claims, where so few bytes can be no such picture; None for all others."""
+    """Return the size that an image file claims if its bytes are too few for it, else None."""
     from PIL import Image
 
     try:
@@ -196,17 +197,20 @@ def oversized_claim(data: bytes | memoryview) -> str | None:
     except Image.DecompressionBombError:
         return "hundreds of megapixels"
     except (OSError, ValueError, SyntaxError, TypeError, struct.error):
-        return None  # whoever decodes it says what is wrong
+        return None  # The decoder reports the damage.
     count = size[0] * size[1]
     return size_text(size) if count > TRUSTED_PIXELS and count > MAX_PIXELS_PER_BYTE * len(data) else None
 
 
 def is_complete(data: np.ndarray) -> bool:
-    """Whether a JPEG or PNG ends where it should, given as bytes. Older versions of OpenCV fill up what is missing of a
-    JPEG with grey; all make room for as many bytes as a PNG says will follow."""
+    """Return whether a JPEG or PNG, given as bytes, is not truncated.
+
+    Older versions of OpenCV fill the missing part of a JPEG with grey; all versions allocate as many bytes as a PNG
+    announces.
+    """
     content = data.tobytes()
     if content.startswith(b"\xff\xd8"):
-        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # the end of the image, after its last scan
+        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # The end marker follows the last scan.
     if content.startswith(b"\x89PNG\r\n\x1a\n"):
         at = 8
         while at + 8 <= len(content):
@@ -218,7 +222,7 @@ def is_complete(data: np.ndarray) -> bool:
 
 
 def header_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) as the file's first bytes say; None where they say nothing, or there is no such file."""
+    """Return (width, height) from the file's header; None if the file is missing or its header is unreadable."""
     from PIL import Image
 
     try:

@@ -1,7 +1,6 @@
-"""What a glTF document must look like before anything of it is used: every field that is read has the type that the
-specification gives it. The parser takes whatever JSON holds; beyond this file nobody has to ask again.
+"""Types of all glTF fields that are read, checked once before use because the parser accepts any JSON.
 
-Names and types: glTF 2.0 specification, chapter 5, and the extensions that ``file.py`` lists.
+Names and types: glTF 2.0 specification, chapter 5, and the extensions listed in ``file.py``.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from typing import Any
 INT, NUMBER, TEXT, FLAG = "a whole number from 0 on", "a finite number", "text", "true or false"
 MAX_INT = 2**40
 MAX_NUMBER = 1e12
-"""Of numbers of a scene: beyond it, products of a few matrices leave float64."""
+"""Largest number in a scene: products of a few matrices of such numbers stay in the range of float64."""
 
 _TEXTURE = {
     "index": INT,
@@ -25,7 +24,7 @@ _GLOSSY = {"diffuseFactor": [NUMBER], "diffuseTexture": {**_TEXTURE, "": ("index
 _PLACED = {"bufferView": INT, "byteOffset": INT, "componentType": INT}
 
 ANY_INT: dict[str, Any] = {"*": INT}
-"""An object of whatever keys."""
+"""An object with any keys."""
 FIELDS: dict[str, Any] = {
     "asset": {"version": TEXT, "": ("version",)},
     "scene": INT,
@@ -66,11 +65,11 @@ FIELDS: dict[str, Any] = {
     ],
     "": ("asset",),
 }  # fmt: skip
-"""A type, a list of a type, or an object; what is there under "" must not be missing. Other fields are not read."""
+"""A type, a list of a type, or an object; "" lists the required fields of an object. Other fields are ignored."""
 
 
 def find_problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, str] | None:
-    """The first field that is not what it should be, and what is wrong with it; None where all is well."""
+    """Return the first invalid field and its fault; None if the document is valid."""
     kind = FIELDS if kind is None else kind
     if isinstance(kind, list):
         if not isinstance(value, list):

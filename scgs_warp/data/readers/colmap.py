@@ -25,12 +25,12 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: every eighth image, in the order of names, is held out for ``test`` and ``val`` alike.
 
-    A model says nothing of time. Where every name has a number, those of the last folder or file name are the times
-    (so that images that COLMAP did not register leave a gap, and cameras whose files are numbered alike share theirs);
-    else the images follow each other evenly in the order of their names.
+    A model has no times. If every file name contains a number, the last number of each name is its time: images that
+    COLMAP did not register leave a gap, and cameras with equally numbered files share times. Otherwise the images are
+    evenly spaced in the order of their names.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     place = find_model(folder)
     assert place is not None, "recognises(folder)"
@@ -66,7 +66,7 @@ def _file(base: Path, image: ModelImage, place: Path) -> Path:
 
 
 def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Lens]]) -> None:
-    """All files, whichever split is read, and before any is decoded: a model of other images is refused at once."""
+    """Check the files of all splits before any is decoded, so that a model of other images is refused at once."""
     for file, lens in zip(files, lenses):
         size = header_size(file)
         if size is not None:
@@ -75,12 +75,12 @@ def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Len
     if missing:
         raise UserError(
             f"{missing[0]}: no such image, though the model has it ({len(missing)} of {len(files)} are missing); give "
-            "the images that the model was made from, under their names"
+            "the images that the model was made from, with their names"
         )
 
 
 def times_from_names(names: list[str]) -> list[float]:
-    """[0, 1], from the numbers in the names where all have one and they differ; else by order."""
+    """Return times in [0, 1]: from the last number in each name if all have one and they differ, else by order."""
     found = [re.findall(r"[0-9]{1,15}", PurePosixPath(name).stem) for name in names]
     if all(found):
         numbers = [int(digits[-1]) for digits in found]

@@ -1,8 +1,7 @@
-"""COLMAP's sparse models, binary and text: cameras, poses of images, points. Of the observations nothing is kept.
+"""COLMAP's sparse models, binary and text: cameras, poses of images and points, without observations.
 
-pycolmap gives the camera models their meaning, but does not read the files: it keeps every observation in memory, wants
-rigs and frames to agree with the images, and does not come back from some truncated files. Here nothing is believed
-before the file is known to be long enough.
+The files are parsed here rather than by pycolmap, which keeps every observation in memory, requires rigs and frames
+that agree with the images, and hangs on some truncated files. Every count is checked against the file's length first.
 Format: https://colmap.github.io/format.html
 """
 
@@ -45,11 +44,11 @@ class SparseModel(NamedTuple):
 
 
 class _Damaged(Exception):
-    """What is wrong with a file, in a few words."""
+    """A file is damaged; the message says how in a few words."""
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder of the model: the one with most about images, if COLMAP left several; None where there is none."""
+    """Find the folder of the model: of several, the one with the largest file of images; None without a model."""
     places = [folder, *(folder / name for name in ("sparse", "colmap/sparse", "colmap_sparse", "colmap"))]
     candidates = []
     for place in places:
@@ -66,10 +65,10 @@ def _files(place: Path, name: str) -> list[Path]:
 
 
 def read_model(place: Path) -> SparseModel:
-    """Cameras, images and points of the model in ``place``; binary if it is there, else text.
+    """Read cameras, images and points of the model in ``place``, binary if present, else text.
 
     Raises:
-        UserError: a file is missing, or damaged.
+        UserError: a file is missing or damaged.
     """
     suffix = ".bin" if _files(place, "cameras")[0].suffix == ".bin" and (place / "images.bin").is_file() else ".txt"
     readers = _BINARY if suffix == ".bin" else _TEXT
@@ -102,11 +101,11 @@ def _read(file: Path, reader: Callable[[bytes], Any]) -> Any:
 
 
 def _pose(quaternion: np.ndarray, translation: np.ndarray, name: str) -> np.ndarray:
-    """[4, 4] from wxyz and the translation of world-to-camera."""
-    with np.errstate(over="ignore"):  # infinite, and refused
+    """Return world-to-camera [4, 4] of a wxyz quaternion and a translation."""
+    with np.errstate(over="ignore"):  # An infinite length is refused below.
         length = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(translation).all() and 0.99 < length < 1.01):  # NaN: no
-        raise _Damaged(f"the pose of {name[:60]!r} is no unit quaternion and translation of finite numbers")
+    if not (np.isfinite(translation).all() and 0.99 < length < 1.01):  # False for NaN
+        raise _Damaged(f"the pose of {name[:60]!r} is not a unit quaternion and a finite translation")
     w, x, y, z = quaternion / length
     viewmat = np.eye(4)
     viewmat[:3, :3] = [
@@ -171,7 +170,7 @@ def _binary_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _plausible_count(count: int, left: int, least: int) -> int:
-    """``count``, where the bytes that are left can hold so many of at least ``least`` bytes."""
+    """Return ``count`` if ``left`` bytes can hold so many entries of at least ``least`` bytes; raise otherwise."""
     if count * least > left:
         raise _Damaged(f"truncated or damaged: lists {count} entries, more than the file holds")
     return count
@@ -201,7 +200,7 @@ def _text_images(data: bytes) -> list[ModelImage]:
         words = line.split(maxsplit=9)
         values = np.array([float(word) for word in words[1:8]])
         images.append(ModelImage(words[9].strip(), int(words[8]), _pose(values[:4], values[4:], words[9])))
-        if next(lines, None) is None:  # the image's observations, an empty line if there are none
+        if next(lines, None) is None:  # The line of observations is present even if it is empty.
             raise _Damaged(f"truncated after {words[9][:60]!r}: its line of observations is missing")
     return images
 

@@ -29,7 +29,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = transforms_path(folder, split)
     content = read_transforms(path)

@@ -1,4 +1,4 @@
-"""Reader of the Nerfies layout, which HyperNeRF and NeRF-DS share: one JSON file for each camera, images at scales.
+"""Reader of the Nerfies layout, shared by HyperNeRF and NeRF-DS: one JSON file per camera, images at several scales.
 
 ``dataset.json``: ``ids``, ``train_ids``, ``val_ids``; ``metadata.json``: for each id ``time_id``, or ``warp_id`` in
 older data; ``camera/ID.json``: ``orientation`` (world-to-camera, OpenCV), ``position``, ``focal_length``,
@@ -6,7 +6,7 @@ older data; ``camera/ID.json``: ``orientation`` (world-to-camera, OpenCV), ``pos
 ``image_size``; ``scene.json``: ``center`` and ``scale`` of the world; ``points.npy``; ``rgb/1x/ID.png``, ``rgb/2x`` ...
 Layout: Park et al., Nerfies, ICCV 2021; HyperNeRF, SIGGRAPH Asia 2021; Yan et al., NeRF-DS, CVPR 2023.
 
-The masks of NeRF-DS are black where something moves. They do not say where pixels are valid, and are left alone.
+The masks of NeRF-DS mark moving pixels, not invalid ones, and are ignored.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class World(NamedTuple):
-    """``scene.json``: scaled = (file - centre) * scale, as all programs that read this layout have it."""
+    """World transform of ``scene.json``: scaled = (file - centre) * scale."""
 
     centre: np.ndarray
     scale: float
@@ -42,13 +42,13 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
-    """Read one split: the ids that ``dataset.json`` lists for it, with their own cameras and images.
+    """Read one split: the ids listed in ``dataset.json``, each with its camera and image.
 
-    ``test`` and ``val`` are ``val_ids``, never trained on. Where none are listed, every eighth of ``ids`` is held out.
-    Times are ``time_id``, from the first to the last of all listed frames.
+    ``test`` and ``val`` are ``val_ids``, which are never trained on; if that list is empty, every eighth id is held
+    out. Times are ``time_id``, scaled to [0, 1] over all listed frames.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     listed, chosen = _ids(folder / FILE, split)
     times = _times(folder / "metadata.json", listed)
@@ -75,7 +75,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
 
 
 def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
-    """All ids that are listed anywhere, and those of this split."""
+    """Return all listed ids, and those of this split."""
     content = read_json(path)
     lists: dict[str, list[str]] = {}
     for key in ("ids", "train_ids", "val_ids"):
@@ -102,7 +102,7 @@ def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
 
 
 def _times(path: Path, names: list[str]) -> dict[str, float]:
-    """[0, 1], from the first to the last time of all frames; in the order of the list where there is no metadata."""
+    """Return times in [0, 1] from the metadata of all frames; evenly spaced in the listed order without metadata."""
     if not path.is_file():
         return {name: index / max(len(names) - 1, 1) for index, name in enumerate(names)}
     content = read_json(path)
@@ -131,15 +131,15 @@ def _world(path: Path) -> World:
 
 
 def _images(folder: Path, downscale: float) -> tuple[Path, int]:
-    """The folder of images to read, and how much smaller than the cameras' size they are: the smallest images that are
-    large enough, or the largest there are."""
+    """Choose the folder of the smallest images that are large enough, or else of the largest; return it with the ratio
+    of the cameras' image size to its own."""
     found = {}
     for place in folder.iterdir() if folder.is_dir() else ():
         match = re.fullmatch(r"([1-9][0-9]{0,2})x", place.name)
         if match and place.is_dir():
             found[int(match[1])] = place
     if not found:
-        raise UserError(f"{folder}: no folder of images, 1x, 2x, 4x ...; put the images of full size into {folder}/1x")
+        raise UserError(f"{folder}: no folder of images, 1x, 2x, 4x ...; put the full-size images into {folder}/1x")
     ratio = max([ratio for ratio in found if ratio <= downscale], default=min(found))
     return found[ratio], ratio
 
@@ -157,7 +157,7 @@ def _viewmat(path: Path, content: dict[str, Any], world: World) -> np.ndarray:
 
 
 def _lens(path: Path, content: dict[str, Any], ratio: int, source: tuple[int, int]) -> Lens:
-    """The lens at the size of the images that are read, ``ratio`` times smaller than the camera's."""
+    """Return the lens at the size of the images, which are ``ratio`` times smaller than the camera's."""
     size = as_array(content.get("image_size"), (2,))
     if size is None or (size < 1).any():
         raise UserError(f"{path}: image_size is not two positive numbers; give width and height in pixels")

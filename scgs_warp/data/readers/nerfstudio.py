@@ -1,4 +1,4 @@
-"""Reader of the nerfstudio layout: one ``transforms.json`` for all frames, with intrinsics, poses, and maybe points.
+"""Reader of the nerfstudio layout: one ``transforms.json`` for all frames, with intrinsics, poses and optional points.
 
 ``fl_x, fl_y, cx, cy, w, h`` (pixels; for all frames or in each), per frame ``file_path``, ``transform_matrix``
 (camera-to-world, OpenGL), ``time`` in [0, 1] and ``mask_path``; ``ply_file_path``, sparse points in the frame of the
@@ -36,13 +36,12 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
-    Frames without a time are taken to be evenly spaced in the order of their names (9 before 10). Without lists of
-    files every eighth frame is held out, for ``test`` and ``val`` alike; with lists that leave out one of these two, or
-    leave it empty, it is the other. A frame's mask is False where ``mask_path`` is black, and on borders that
-    undistortion left.
+    Frames without times are evenly spaced in the order of their names (9 before 10). Without lists of files, every
+    eighth frame is held out for ``test`` and ``val`` alike. If only one of these two lists is present and not empty,
+    it serves for both. A frame's mask is False where ``mask_path`` is black and on the borders of undistorted images.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = folder / FILE
     content = read_transforms(path)
@@ -88,7 +87,7 @@ def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list
 def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) -> list[int]:
     """Indices of the frames of this split, in the order of the file."""
     lists = {name: content[f"{name}_filenames"] for name in ("train", "val", "test") if f"{name}_filenames" in content}
-    for name in ("val", "test"):  # exporters write all three lists, whether or not they hold frames out twice
+    for name in ("val", "test"):  # Exporters write all three lists, of which one may be empty.
         if lists.get(name) == []:
             del lists[name]
     if not lists:
@@ -112,7 +111,7 @@ def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) 
 def _points(
     path: Path, folder: Path, content: dict[str, Any], cameras: list[Camera]
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Points [P, 3] in the frame of the poses and their colours [P, 3], where the file names any."""
+    """Read points [P, 3] in the frame of the poses and their colours [P, 3]; None if the file names no points."""
     name = content.get("ply_file_path")
     if name is None:
         return None, None
@@ -120,14 +119,14 @@ def _points(
         raise UserError(f"{path}: ply_file_path is no text; name the file of points or leave it out")
     points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
     moved = _applied(path, content, points)
-    # Writers disagree whether the transform that was applied to the poses was applied to the points, too.
+    # Some writers apply the poses' transform to the points and some do not: keep what more cameras see.
     if moved is not None and _seen(moved, cameras) > _seen(points, cameras):
         points = moved
     return points, colors
 
 
 def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndarray | None:
-    """The points after ``applied_transform`` and ``applied_scale``; None where the file has neither."""
+    """Apply ``applied_transform`` and ``applied_scale`` to the points; return None if the file has neither."""
     if "applied_transform" not in content and "applied_scale" not in content:
         return None
     try:
@@ -144,7 +143,7 @@ def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndar
 
 
 def _seen(points: np.ndarray, cameras: list[Camera]) -> int:
-    """In how many (point, camera) pairs the point falls into the image."""
+    """Count the (point, camera) pairs in which the point falls into the image."""
     total = 0
     for camera in cameras:
         viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()

@@ -1,9 +1,8 @@
-"""Reader of the layout of Dynamic 3D Gaussians, in which the CMU Panoptic sequences are passed on: many cameras, shared
-instants.
+"""Reader of the layout of Dynamic 3D Gaussians, used for the CMU Panoptic sequences: many cameras with shared times.
 
 ``train_meta.json`` and ``test_meta.json``: ``w, h``; ``fn [T][C]``, images in ``ims/``; ``k [T][C][3][3]``, pixels;
 ``w2c [T][C][4][4]``, world-to-camera, OpenCV; ``cam_id [T][C]``. ``init_pt_cld.npz``: ``data [P, 7]``, positions,
-colours in [0, 1], foreground. ``seg/`` tells people from the dome; both are learnt. Layout: Luiten et al., 3DV 2024.
+colours in [0, 1], foreground. ``seg/`` separates people from the dome and is ignored. Layout: Luiten et al., 3DV 2024.
 """
 
 from __future__ import annotations
@@ -34,10 +33,10 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the cameras of ``train_meta.json``, or of ``test_meta.json`` for ``test`` and ``val``.
 
-    All cameras of an instant share its time, the place of the instant in the list.
+    All cameras of an instant share its time; instants are evenly spaced in the order of the list.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = folder / (TRAIN if split == "train" else TEST)
     content = read_json(path, "this split needs it, or choose another split")
@@ -69,7 +68,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
 
 
 def _rows(path: Path, content: dict[str, Any], key: str) -> list[list[Any]]:
-    """One list of cameras for each instant."""
+    """Return the field's list of cameras for each instant."""
     rows = content.get(key)
     if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
         raise UserError(f"{path}: {key} is missing or no list of lists; give one list of cameras for each instant")

@@ -1,4 +1,4 @@
-"""Reader of the layout of Neural 3D Video: ``poses_bounds.npy`` of LLFF for a rig of cameras, and each camera's images.
+"""Reader of the Neural 3D Video layout: LLFF's ``poses_bounds.npy`` for a rig of cameras, and a folder of images each.
 
 ``poses_bounds.npy [C, 17]``: rows of 3 x 5, the camera-to-world rotation in columns (down, right, backwards),
 position, and (height, width, focal length) in pixels; nearest and farthest depth. Row c belongs to the c-th camera in
@@ -25,10 +25,10 @@ from .transforms import SUFFIXES
 FILE = "poses_bounds.npy"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
 HELD_OUT_CAMERA = 0
-"""The camera that is held out: the central one of Neural 3D Video, and what others report."""
+"""Index of the held-out camera: the central one of Neural 3D Video, as in published results."""
 POINTS = ("points3D.ply", "points3D_downsample2.ply", "points3d.ply")
 MAX_ASPECT_ERROR = 0.01
-"""Largest relative difference between the reductions of width and height that rounding explains."""
+"""Largest relative difference between the reductions of width and height that is attributed to rounding."""
 
 
 def recognises(folder: Path) -> bool:
@@ -37,12 +37,12 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
-    """Read one split: the first camera is ``test`` and ``val``, the others are trained on.
+    """Read one split: the first camera is ``test`` and ``val``, the others are ``train``.
 
-    All cameras share the times, the place of each image in the order of names.
+    All cameras share their times, which are evenly spaced in the order of the images' names.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = folder / FILE
     rows = read_npy(path)
@@ -78,13 +78,13 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
 
 
 def _label(folder: Path, camera: Path) -> str:
-    """The camera's name, where the folder of its images is called ``images``."""
+    """Return the name of a camera's folder, or of its parent if the folder is called ``images``."""
     parts = camera.relative_to(folder).parts
     return parts[-2] if parts[-1] == "images" else parts[-1]
 
 
 def _cameras(folder: Path) -> list[Path]:
-    """The cameras' folders of images, in the order of their names."""
+    """Return the cameras' folders of images, in the order of their names."""
     base = folder / "frames" if (folder / "frames").is_dir() else folder
     found = []
     for place in sorted((p for p in base.iterdir() if p.is_dir()), key=lambda p: natural(p.name)):
@@ -109,7 +109,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
-    """[4, 4] world-to-camera, OpenCV."""
+    """Return world-to-camera [4, 4], OpenCV, of a row's pose."""
     down, right, backwards, position = pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3]
     rotation = np.stack([right, down, -backwards])
     if not np.isfinite(pose).all() or not is_rotation(rotation):
@@ -120,7 +120,7 @@ def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
 
 
 def _lens(path: Path, index: int, column: np.ndarray, source: tuple[int, int]) -> Lens:
-    """The lens of images that may be smaller than those the rig was calibrated with."""
+    """Return the lens of images that may be smaller than those of the calibration."""
     height, width, focal = column
     if min(height, width, focal) < 1:
         raise UserError(f"{path}: row {index} has no positive height, width and focal length; restore the file")
