@@ -1,4 +1,4 @@
-"""From a glTF file, or the built-in figure, to a folder that trains: ``plan`` looks, ``film`` makes."""
+"""Data sets of a glTF file or the built-in figure: ``plan_synthesis`` checks a request, ``synthesize`` writes it."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from .renderer import SURFACE_POINTS, Background, Optics, Subject, write_folder_
 MARKER = "synthesis.json"
 SHEET = "contact_sheet.png"
 VERSION = 1
-"""Raised whenever the same request gives other pictures or another ground truth."""
+"""Version of the pictures and the ground truth of a request."""
 MAX_SIDE = 8192
 
 
 @dataclass(frozen=True)
 class SynthesisRequest:
-    """What to make; everything that its bytes depend on, the file's contents apart."""
+    """Settings of a data set: everything that its bytes depend on but the contents of the mesh file."""
 
     mesh: Path | None = None
-    """None: the built-in figure."""
+    """A glTF file; None: the built-in figure."""
     clip: str | None = None
-    """None: the file's first."""
+    """Name of the clip; None: the file's first."""
     start: float | None = None
     """Seconds of the clip that become time 0; None: its first keyframe."""
     end: float | None = None
@@ -48,7 +48,7 @@ class SynthesisRequest:
 
 
 class SynthesisPlan(NamedTuple):
-    """A request that was looked at and can be carried out: see ``film``."""
+    """A checked request, ready for ``synthesize``."""
 
     folder: Path
     request: SynthesisRequest
@@ -57,20 +57,20 @@ class SynthesisPlan(NamedTuple):
     """Surface points whose tracks become the ground truth."""
     pictures: dict[str, list[PlannedPicture]]
     recipe: dict[str, Any]
-    """Goes into the marker: the request, and what was found in the file."""
+    """Content of the marker file: the request and the identity of the mesh file."""
     lines: list[str]
-    """What was found, for the user."""
+    """Description of the subject, for the user."""
     made: bool
-    """The folder holds just this already."""
+    """Whether the folder already holds this data set."""
 
     @property
     def counts(self) -> dict[str, int]:
-        """Pictures of each split."""
+        """Number of pictures of each split."""
         return {split: len(found) for split, found in self.pictures.items()}
 
 
 def check(request: SynthesisRequest) -> None:
-    """Refuse what cannot work.
+    """Check the values of a request.
 
     Raises:
         UserError: naming the option, its value and the remedy.
@@ -103,7 +103,7 @@ def check(request: SynthesisRequest) -> None:
 
 
 def span_of(scene: GltfScene, start: float | None, end: float | None) -> tuple[float, float]:
-    """The seconds of the clip that become times 0 and 1.
+    """Return the seconds of the clip that become times 0 and 1.
 
     Raises:
         UserError: they lie outside the clip, or in the wrong order.
@@ -126,10 +126,10 @@ def span_of(scene: GltfScene, start: float | None, end: float | None) -> tuple[f
 
 
 def load_subject(request: SynthesisRequest, device: str) -> tuple[Subject, dict[str, Any], list[str]]:
-    """The subject, what of it goes into the marker, and lines that say what was found.
+    """Load the subject; return it with its part of the recipe and its description.
 
     Raises:
-        UserError: the mesh, the clip or the time range cannot be used.
+        UserError: the mesh, the clip or the time range is invalid.
     """
     if request.mesh is None:
         return FigureSubject(device), {"subject": "built-in figure"}, ["the built-in figure"]
@@ -148,7 +148,7 @@ def load_subject(request: SynthesisRequest, device: str) -> tuple[Subject, dict[
 
 
 def describe(scene: GltfScene, span: tuple[float, float]) -> list[str]:
-    """What a user wants to know about a file before it is filmed."""
+    """Describe a file for the user: sizes, clips and omitted primitives."""
     triangles = scene.triangles
     lines = [
         f"{scene.path.name}: {len(triangles.faces):,} triangles, {len(scene.materials) - 1} materials, "
@@ -166,11 +166,11 @@ def describe(scene: GltfScene, span: tuple[float, float]) -> list[str]:
 
 
 def plan_synthesis(folder: str | Path, request: SynthesisRequest, device: str = "cpu") -> SynthesisPlan:
-    """Read what there is to read and refuse what cannot be made; nothing is written yet.
+    """Load the subject and check the request; write nothing.
 
     Args:
         folder: must not exist, or be empty, or hold the result of the same request.
-        device: where rays are cast, ``cpu`` or ``cuda``.
+        device: device of the ray casting, ``cpu`` or ``cuda``.
 
     Raises:
         UserError: one line naming the option or the file, the field and the remedy.
@@ -188,7 +188,7 @@ def plan_synthesis(folder: str | Path, request: SynthesisRequest, device: str = 
 
 
 def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | None = None) -> Path:
-    """Make the data set, unless it is there already. The same request gives the same bytes.
+    """Make the data set, unless it exists. The same request gives the same bytes.
 
     Args:
         progress: called with (done, total) after each picture.
@@ -197,7 +197,7 @@ def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | No
         The folder.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the folder cannot be written.
     """
     if planned.made:
         return planned.folder
@@ -221,7 +221,7 @@ def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | No
 
 
 def _recipe(request: SynthesisRequest, found: dict[str, Any]) -> dict[str, Any]:
-    """What JSON gives back as it was: no path, no date, no host."""
+    """Make the content of the marker, which holds no path, date or host."""
     options = {
         "filming": asdict(request.filming),
         "look": asdict(request.shading),

@@ -1,4 +1,4 @@
-"""A glTF scene fitted into a room and made ready for rays: one of the subjects that ``synthesis`` writes."""
+"""A glTF scene as a ``Subject`` of the renderer: fitted into the room and uploaded for ray casting."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from .raycast import TOLERANCE, mesh_over, pixel_window
 from .renderer import ROOM_RADIUS, SurfacePoints, points_on_triangles
 
 FIT_TIMES = 101
-"""Instants of the clip that are looked at to find out how much room it takes."""
+"""Number of instants of the clip at which its extent is measured."""
 RAY_OFFSET = 1e-5
-"""Times the room's radius: how far behind a surface that did not stop it a ray goes on."""
+"""Distance, in room radii, behind a transparent surface at which a ray continues."""
 MAX_RAY_LENGTH = 1000.0
 
 
 @dataclass(frozen=True)
 class Shading:
-    """The one light, and how surfaces answer it."""
+    """Light and diffuse shading."""
 
     light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
     """Direction to the light, world (z up, the subject faces -y)."""
@@ -49,13 +49,13 @@ class PosedMesh(NamedTuple):
 
 
 def srgb_to_linear() -> np.ndarray:
-    """[256] float32 linear value of an sRGB byte (IEC 61966-2-1)."""
+    """Return the linear value of each sRGB byte, [256] float32 (IEC 61966-2-1)."""
     x = np.arange(256) / 255.0
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 class MeshSubject:
-    """Poses, pictures and tracks of a glTF scene; ``time`` from 0 to 1 goes through ``span`` seconds of its clip."""
+    """Poses, pictures and tracks of a glTF scene; ``time`` from 0 to 1 covers ``span``, seconds of its clip."""
 
     def __init__(self, scene: GltfScene, span: tuple[float, float], shading: Shading, device: str = "cpu") -> None:
         """
@@ -83,11 +83,11 @@ class MeshSubject:
         return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(self.device)
 
     def seconds(self, time: float) -> float:
-        """Of the clip."""
+        """Convert ``time`` in [0, 1] to seconds of the clip."""
         return self.span[0] + time * (self.span[1] - self.span[0])
 
     def _fit(self) -> None:
-        """Move and scale the scene so that it stays in a ball of radius ``ROOM_RADIUS`` around the origin."""
+        """Translate and scale the scene into a ball of radius ``ROOM_RADIUS`` around the origin at all times."""
         times = np.linspace(0.0, 1.0, FIT_TIMES if self.scene.clip else 1)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for time in times:
@@ -117,24 +117,24 @@ class MeshSubject:
             rows.append((offset, width, height, *texture.wrap, int(texture.nearest)))
             texels.append(texture.pixels.reshape(-1, 4))
             offset += width * height
-        if not textures:  # an array with no element has no address
+        if not textures:  # Kernels need the address of at least one element.
             rows, texels = [(0, 1, 1, 0, 0, 0)], [np.zeros((1, 4), np.uint8)]
         self.textures = torch.tensor(rows, dtype=torch.int32, device=self.device)
         self.texels = torch.from_numpy(np.concatenate(texels)).to(self.device)
 
     def _surface(self) -> tuple[Tensor, ...]:
-        """What both kernels take to know the surface."""
+        """Return the kernel arguments that describe the surface."""
         return (self.uv, self.colors, self.material, self.factors, self.kinds, self.cutoffs, self.texels,
                 self.textures, self.decode)  # fmt: skip
 
     def pose(self, time: float) -> PosedMesh:
-        """The scene at ``time`` in [0, 1]."""
+        """Pose the scene at ``time`` in [0, 1]."""
         vertices = self.scene.posed(self.seconds(time))
         points, normals = self._tensor(vertices.positions), self._tensor(vertices.normals)
         return PosedMesh(mesh_over(points, self.faces), points, normals)
 
     def render(self, posed: PosedMesh, camera: Camera, samples: int) -> Tensor:
-        """[H, W, 4] premultiplied colour and coverage, ``samples`` x ``samples`` rays a pixel."""
+        """Render [H, W, 4] premultiplied colour and coverage with ``samples`` x ``samples`` rays per pixel."""
         image = torch.zeros(camera.height, camera.width, 4, device=self.device)
         left, top, columns, rows = pixel_window(posed.vertices, camera)
         camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
@@ -146,7 +146,7 @@ class MeshSubject:
         return image
 
     def visible(self, posed: PosedMesh, camera: Camera, points: Tensor) -> Tensor:
-        """[P] bool: which surface points [P, 3] the camera sees."""
+        """Return [P] bool: which surface points [P, 3] the camera sees."""
         seen = torch.empty(len(points), dtype=torch.int32, device=self.device)
         launch(
             kernels.visible_on_mesh, len(points), posed.mesh.id, points, self.faces, *self._surface(),
@@ -156,10 +156,10 @@ class MeshSubject:
         return seen.bool()
 
     def sample(self, count: int, rng: np.random.Generator) -> SurfacePoints:
-        """Points spread evenly by area over the surface at time 0.
+        """Sample points evenly by area over the surface at time 0.
 
         Raises:
-            UserError: it has no area then.
+            UserError: the surface has no area at time 0.
         """
         positions = self.scene.posed(self.seconds(0.0)).positions
         a, b, c = positions[self.scene.triangles.faces].transpose(1, 0, 2)
@@ -169,7 +169,7 @@ class MeshSubject:
         return points_on_triangles(positions, self.scene.triangles.faces, count, rng)
 
     def track(self, points: SurfacePoints, times) -> np.ndarray:
-        """[T, P, 3] float64 world positions of surface points."""
+        """Return world positions [T, P, 3] float64 of surface points."""
         corners = self.scene.triangles.faces[points.face]
         tracks = []
         for time in times:
