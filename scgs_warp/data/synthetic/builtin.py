@@ -54,7 +54,8 @@ def make_synthetic(
         device: device of the ray casting, ``cpu`` or ``cuda``.
 
     Returns:
-        The folder, with ``transforms_{train,test}.json``, ``train/``, ``test/``, ``ground_truth.npz``, ``synthetic.json``.
+        The folder, with ``transforms_{train,test}.json``, ``train/``, ``test/``, ``ground_truth.npz`` and
+        ``synthetic.json``.
 
     Raises:
         UserError: the folder holds something else, or cannot be written.
