@@ -1,4 +1,4 @@
-"""From a video to a data set: frames, what moves in them, where the camera was (pycolmap), a folder that trains."""
+"""Capture of a data set from a video: frame selection, motion masks, camera poses (pycolmap) and undistortion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What to tell a user whose film gave too few cameras: the likeliest reason, and what helps."""
+"""Diagnosis of a capture in which too few frames got a camera: the likeliest reason and its remedy."""
 
 from __future__ import annotations
 
@@ -7,30 +7,33 @@ from typing import NamedTuple
 from .features import Links
 
 MIN_FEATURES = 150
-"""Of a frame; below, there is nothing to recognise."""
+"""Smallest useful number of features per frame."""
 MIN_INLIERS = 40
-"""Between neighbours; below, they hardly show the same."""
+"""Smallest useful number of inlier matches between consecutive frames."""
 MIN_LINKED = 0.8
+"""Smallest useful share of consecutive frames that match at all."""
 MAX_PLANAR = 0.97
-"""Share of pairs of frames that one homography explains."""
+"""Share of frame pairs explained by one homography beyond which the camera is taken to rotate only."""
 MIN_ARC = 2.0
-"""Degrees between rays to a point; below, depth is a guess."""
+"""Smallest useful angle between the rays to a point, degrees; below it, depth is unreliable."""
 GOOD_SHARE = 0.9
-"""Share of registered frames that needs no word."""
+"""Share of registered frames above which no note is given."""
 
 
 class Outcome(NamedTuple):
+    """Result of a capture in numbers."""
+
     picked: int
     registered: int
     arc: float
-    """Degrees; 0 without a model."""
+    """Median angle between the rays to a point, degrees; 0 without a model."""
     links: Links
     masked: float
-    """Share of the pixels that masks hide."""
+    """Share of the pixels that are masked."""
 
 
 def likely_reason(outcome: Outcome) -> str:
-    """Why, and what helps, in one clause each."""
+    """Return the likeliest reason for missing cameras, and its remedy."""
     links = outcome.links
     if links.features < MIN_FEATURES:
         return (
@@ -54,17 +57,17 @@ def likely_reason(outcome: Outcome) -> str:
 
 
 def too_few(folder: str, outcome: Outcome) -> str:
-    """The line for a capture that failed."""
+    """Return the message for a failed capture."""
     accepted = outcome.registered / max(outcome.picked, 1)
     accept = f"; --least {int(100 * accepted) / 100:g} takes it as it is" if outcome.registered >= 3 else ""
     return (
         f"{folder}: {outcome.registered} of {outcome.picked} frames registered; {likely_reason(outcome)}{accept} "
-        "(what was made is kept, the same command goes on from it)"
+        "(finished work is kept; the same command continues from it)"
     )
 
 
 def notes(outcome: Outcome) -> list[str]:
-    """What a user should know of a capture that did not fail."""
+    """Return notes on a capture that succeeded."""
     lines = []
     if outcome.registered < GOOD_SHARE * outcome.picked:
         lines.append(f"note: {outcome.picked - outcome.registered} frames have no camera; {likely_reason(outcome)}")

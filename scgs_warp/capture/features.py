@@ -1,8 +1,8 @@
-"""Features of the picked frames and what of them agrees between frames, in COLMAP's database. Interrupted work goes on.
+"""Features of the picked frames and their matches, in COLMAP's database. Interrupted work is resumed.
 
-pycolmap finds the features (SIFT) and the geometry of two views. Descriptors are compared here, all with all: they are
-bytes, whose products are exact in float32, so that no bit depends on the device or on the number of threads, as it does
-with the search trees of COLMAP's own matcher on CPUs.
+pycolmap extracts the features (SIFT) and estimates two-view geometry. Descriptors are matched here, exhaustively: they
+are bytes, whose products are exact in float32, so that matches depend neither on the device nor on the number of
+threads, unlike those of COLMAP's own CPU matcher, which uses search trees.
 """
 
 from __future__ import annotations
@@ -25,40 +25,40 @@ Tensor = torch.Tensor
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Matching = Literal["auto", "sequential", "exhaustive"]
 MAX_ANGLE_RATIO = 0.8
-"""Largest ratio of the angles to the best and the second best descriptor (Lowe 2004)."""
+"""Largest ratio of the angles to the best and the second-best descriptor (Lowe 2004)."""
 MAX_ANGLE = 0.7
-"""Largest angle between descriptors that match, radians."""
+"""Largest angle between matching descriptors, radians."""
 DESCRIPTOR_LENGTH = 512.0
-"""Length of a descriptor of bytes."""
+"""Euclidean length of a descriptor of bytes."""
 EXHAUSTIVE_VIDEO = 40
-"""Up to so many frames of a video are compared each with each ..."""
+"""Largest number of video frames that are all compared with each other."""
 EXHAUSTIVE_FOLDER = 120
-"""... and up to so many images of a folder, which need not be in order."""
+"""The same for images of a folder, which need not be in order."""
 NEXT_FRAMES = 8
-"""Frames that a frame is compared with; then those 16, 32, 64 ... later ..."""
+"""Number of following frames that a frame is compared with, besides those 16, 32, 64 ... later."""
 LOOP_STRIDE = 10
-"""... and every tenth with every tenth: the camera may come back."""
+"""Stride of the frames that are all compared with each other, because the camera may return."""
 INITIAL_FOCAL = 1.2
-"""Focal length over the longer side, where nobody knows: 45 degrees."""
+"""Initial focal length over the longer side if the field of view is unknown: 45 degrees."""
 
 
 class FrameFiles(NamedTuple):
-    """What features are taken from."""
+    """Files of the picked frames and their masks."""
 
     folder: Path
-    """Of the frames."""
+    """Folder of the frames."""
     names: list[str]
-    """Files in the folder, in order of time; all of one size and one camera."""
+    """Names in the folder, in order of time; all frames have one size and one camera."""
     masks: Path | None
-    """Folder of masks of the same names, black where something moves."""
+    """Folder of masks with the same names, black on moving pixels; None without masks."""
 
 
 @contextmanager
 def quiet() -> Iterator[Any]:
-    """pycolmap without its log.
+    """Provide pycolmap with its log silenced.
 
     Raises:
-        UserError: it is too old.
+        UserError: pycolmap is too old.
     """
     import pycolmap
 
@@ -73,10 +73,10 @@ def quiet() -> Iterator[Any]:
 
 
 def begin(database: Path, frame_files: FrameFiles, model: CameraModel, focal: float | None) -> None:
-    """A database of the frames, with one camera for all, unless it is there.
+    """Make the database of the frames, with one camera for all, unless it exists.
 
     Args:
-        focal: in pixels, where it is known.
+        focal: focal length in pixels; None if unknown.
     """
     with quiet() as pycolmap:
         with pycolmap.Database.open(database) as there:
@@ -93,10 +93,10 @@ def begin(database: Path, frame_files: FrameFiles, model: CameraModel, focal: fl
 
 
 def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[], object]) -> None:
-    """Features of every frame that has none yet, outside of its mask.
+    """Extract features of every frame that has none yet, outside of its mask.
 
     Args:
-        most: features a frame.
+        most: largest number of features per frame.
         done: called after each frame.
     """
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
@@ -118,14 +118,14 @@ def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[
 
 
 def _masked(file: Path, pixels: np.ndarray) -> np.ndarray:
-    """[N] bool: which of the pixels [N, 2] the mask hides."""
+    """Return [N] bool: which of the pixels [N, 2] are masked."""
     mask = read_rgb(file)[..., 0] < 128
     columns, rows = np.floor(pixels).astype(int).T
     return mask[rows.clip(0, mask.shape[0] - 1), columns.clip(0, mask.shape[1] - 1)]
 
 
 def pairs(count: int, matching: Matching, video: bool) -> list[tuple[int, int]]:
-    """Which of ``count`` frames are compared, ascending."""
+    """Return the pairs of ``count`` frames to compare, in ascending order."""
     if matching == "auto":
         matching = "exhaustive" if count <= (EXHAUSTIVE_VIDEO if video else EXHAUSTIVE_FOLDER) else "sequential"
     if matching == "exhaustive":
@@ -146,11 +146,11 @@ def match(
     device: str,
     done: Callable[..., object],
 ) -> None:
-    """Matches of every pair of frames that has none yet, and the geometry that they agree with.
+    """Match every pair of frames that has no matches yet, and estimate its two-view geometry.
 
     Args:
-        chosen: numbers of frames.
-        device: where descriptors are compared.
+        chosen: pairs of frame numbers, ascending.
+        device: device of the comparison of descriptors.
         done: called after each pair.
     """
     kept: dict[int, Tensor] = {}
@@ -163,7 +163,7 @@ def match(
         for a, b in chosen:
             one, two = images[a].image_id, images[b].image_id
             if not there.exists_two_view_geometry(one, two):
-                kept = {k: v for k, v in kept.items() if k >= a}  # ascending pairs do not go back
+                kept = {k: v for k, v in kept.items() if k >= a}  # Ascending pairs never return to earlier frames.
                 for k in (a, b):
                     if k not in kept:
                         kept[k] = torch.from_numpy(there.read_descriptors(images[k].image_id).data.copy()).to(device)
@@ -176,14 +176,15 @@ def match(
 
 
 def forget(database: Path) -> None:
-    """Remove all matches; features stay."""
+    """Remove all matches but keep the features."""
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
         there.clear_matches()
         there.clear_two_view_geometries()
 
 
 def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
-    """[M, 2] uint32: descriptors [N, 128] uint8 of two frames that are each other's nearest, clearly so."""
+    """Return the pairs [M, 2] uint32 of descriptors [N, 128] uint8 that are mutual nearest neighbours and pass the
+    ratio test."""
     if len(one) < 2 or len(two) < 2:
         return np.zeros((0, 2), np.uint32)
     cosines = (one.float() @ two.float().T) / DESCRIPTOR_LENGTH**2
@@ -195,27 +196,27 @@ def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
 
 
 def _distinct(cosines: Tensor) -> tuple[Tensor, Tensor]:
-    """Of each row, whether its best is good and much better than the second best; and which it is."""
+    """Return for each row whether its best column passes the angle and ratio tests, and which column it is."""
     best, where = cosines.topk(2, dim=1)
     angles = best.clamp(-1.0, 1.0).acos()
     return (angles[:, 0] <= MAX_ANGLE) & (angles[:, 0] <= MAX_ANGLE_RATIO * angles[:, 1]), where[:, 0]
 
 
 class Links(NamedTuple):
-    """How much the frames have in common."""
+    """Statistics of the features and matches of a capture."""
 
     features: int
-    """Median of a frame."""
+    """Median number of features per frame."""
     inliers: int
-    """Median of the pairs of frames that follow each other: matches that agree with one geometry."""
+    """Median number of inlier matches between consecutive frames."""
     linked: float
-    """Share of these pairs that agree at all."""
+    """Share of consecutive frames with inlier matches."""
     planar: float
-    """Share of all agreeing pairs for which one homography does: the camera turned without moving, or saw a plane."""
+    """Share of matched pairs explained by one homography: the camera only rotated, or saw a plane."""
 
 
 def links(database: Path, frame_files: FrameFiles) -> Links:
-    """Count what is in the database."""
+    """Compute the statistics of the database."""
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
         images = [there.read_image_with_name(name).image_id for name in frame_files.names]
         features = [there.num_keypoints_for_image(image) for image in images]

@@ -1,4 +1,4 @@
-"""Where the camera was: COLMAP's incremental mapping of matched frames, the largest of its models."""
+"""Camera poses: COLMAP's incremental mapping of matched frames, of which the largest model is kept."""
 
 from __future__ import annotations
 
@@ -12,42 +12,43 @@ import numpy as np
 from .features import FrameFiles, quiet
 
 MIN_VIEWS = 3
-"""Frames that a point must be seen in ..."""
+"""Smallest number of frames in which a point is seen."""
 MAX_ERROR = 2.0
-"""... and pixels by which its projections may miss on average."""
+"""Largest mean reprojection error of a point, pixels."""
 
 
 class CameraSolution(NamedTuple):
-    """A model of the scene at rest, in COLMAP's frame and scale, which mean nothing."""
+    """Cameras and points of the static scene, in COLMAP's arbitrary frame and scale."""
 
     model: str
-    """The camera's, COLMAP's name."""
+    """COLMAP's name of the camera model."""
     params: tuple[float, ...]
     width: int
     height: int
     places: list[int]
-    """Of the registered frames, ascending."""
+    """Indices of the registered frames, ascending."""
     viewmats: np.ndarray
     """[V, 4, 4] world-to-camera, OpenCV."""
     points: np.ndarray
-    """[P, 3] that several frames agree on."""
+    """[P, 3] points seen in several frames."""
     colors: np.ndarray
     """[P, 3] uint8"""
     error: float
-    """Mean distance of projections from features, pixels."""
+    """Mean reprojection error, pixels."""
     arc: float
-    """Degrees: how far apart rays to a point are, at the median of all points."""
+    """Median angle between the rays to a point, degrees."""
 
 
 def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done: Callable[[], object]) -> int:
-    """Run the mapper, on one thread: sums over threads would differ from run to run. Its largest model goes to
-    ``folder``, unless there is none.
+    """Run the mapper and write its largest model to ``folder``.
+
+    It runs on one thread because sums over threads would differ from run to run.
 
     Args:
-        done: called after each frame that a model takes.
+        done: called after each registered frame.
 
     Returns:
-        Registered frames of that model; 0 without one.
+        Number of registered frames of that model; 0 without a model.
     """
     attempts = folder.with_name(f"{folder.name}-attempts")
     shutil.rmtree(attempts, ignore_errors=True)
@@ -71,11 +72,11 @@ def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done
 
 
 def _ignore(_: object) -> None:
-    """The mapper's callback must return nothing."""
+    """Discard a result: the mapper's callback must return None."""
 
 
 def read_solution(folder: Path, frame_files: FrameFiles) -> CameraSolution | None:
-    """The model that :func:`solve` left; None without one."""
+    """Read the model that :func:`solve` wrote; return None without one."""
     if not (folder / "images.bin").is_file():
         return None
     with quiet() as pycolmap:
@@ -104,7 +105,7 @@ def read_solution(folder: Path, frame_files: FrameFiles) -> CameraSolution | Non
 
 
 def _arc(model, points: list) -> float:
-    """Degrees between the first and the last camera that see a point, at the median."""
+    """Return the median angle, in degrees, between the rays to a point from the first and last camera that see it."""
     centres = {key: image.projection_center() for key, image in model.images.items() if image.has_pose}
     angles = []
     for point in points[:: max(1, len(points) // 2000)]:

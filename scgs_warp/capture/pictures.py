@@ -1,4 +1,4 @@
-"""What a user looks at before training: the picked frames on a sheet, and where the cameras were."""
+"""Pictures for checking a capture before training: a contact sheet of the picked frames, and a plot of the cameras."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ..visualization.video import write_png
 from .writing import CapturedScene
 
 MAX_PICTURES = 48
-"""Pictures on the sheet."""
+"""Largest number of pictures on the sheet."""
 COLUMNS = 8
 CELL = 200
 """Width of a picture on the sheet, pixels."""
 CAPTION = 18
 GAP = 4
 MOVING = (255, 60, 40)
-"""What masks hide is tinted in this colour."""
+"""Tint of masked pixels."""
 STRUCK_OUT = (200, 30, 30)
 MAX_POINTS = 6000
 MAX_FRUSTA = 60
@@ -34,11 +34,11 @@ def sheet(
     registered: set[int],
     video: bool,
 ) -> None:
-    """Frames in order of time, what is masked in them tinted; those that no camera was found for are struck out.
+    """Write the contact sheet: frames in order of time, masked pixels tinted, frames without a camera struck out.
 
     Args:
         load: number of a picked frame -> image [H, W, 3] uint8, mask [H, W] bool or None.
-        seconds: of each picked frame; of a folder, its place.
+        seconds: time of each picked frame; of a folder, its index.
         registered: numbers of the frames with a camera.
     """
     count = len(seconds)
@@ -75,7 +75,7 @@ def _cell(image: np.ndarray, mask: np.ndarray | None, text: str, found: bool) ->
 
 
 def cameras(path: Path, scene: CapturedScene) -> None:
-    """The scene from above and from the side: points in their colours, cameras in the colours of their time."""
+    """Plot the scene from above and from the side: points in their colours, cameras coloured by time."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -105,8 +105,8 @@ def cameras(path: Path, scene: CapturedScene) -> None:
 
 
 def _frusta(scene: CapturedScene) -> np.ndarray:
-    """[V, 5, 4, 3] polylines of each camera: four sides, each from the centre and back (one point repeated), and the
-    image plane (closed by its first corner)."""
+    """Return polylines [V, 5, 4, 3] of each camera: four sides that start and end at the centre, and the corners of the
+    image plane."""
     p = scene.pinhole
     reach = 0.25
     corners = np.array([[0, 0], [p.width, 0], [p.width, p.height], [0, p.height]], np.float64)
@@ -122,7 +122,7 @@ def _frusta(scene: CapturedScene) -> np.ndarray:
 
 
 def _window(points: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of what is shown: all cameras, and the points without the far ones."""
+    """Return the corners of the plotted range: all cameras, and the points without outliers."""
     if len(points):
         near, far = np.quantile(points, [0.02, 0.98], axis=0)
         points = points[((points >= near) & (points <= far)).all(1)]

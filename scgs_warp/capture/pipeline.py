@@ -1,4 +1,4 @@
-"""From a film to a folder that trains, stage by stage: frames, masks, features, matches, cameras, images."""
+"""Stages of a capture: frames, masks, features, matches, cameras, undistorted images."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from .journal import Journal
 from .source import Source, SourceFrame, open_source, read_rgb
 
 MAX_SECONDS = 1e9
-"""Seconds; no film is as long."""
+"""Largest plausible time in a film, seconds."""
 MIN_FRAMES = 6
-"""Frames from which nothing can be learnt of a motion."""
+"""Smallest number of frames of a capture."""
 SHEET, CAMERAS = "contact_sheet.png", "cameras.png"
 VIDEO_FRAMES = 150
 
@@ -35,44 +35,44 @@ ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
 
 @dataclass(frozen=True)
 class CaptureRequest:
-    """What to make of a film."""
+    """Settings of a capture."""
 
     source: Path
     """A video, or a folder of images."""
     frames: int | None = None
-    """At most; None: ``VIDEO_FRAMES`` of a video, all images of a folder."""
+    """Largest number of frames; None: ``VIDEO_FRAMES`` of a video, all images of a folder."""
     start: float | None = None
     end: float | None = None
-    """Seconds of the video that are used."""
+    """Range of the video to use, seconds."""
     size: int = 1280
-    """Longer side of the images, pixels; smaller ones stay."""
+    """Largest longer side of the images, pixels."""
     masks: str = "auto"
-    """``auto``: what moves against the rest; ``none``; else a path of masks."""
+    """``auto``: masks of independently moving pixels; ``none``; else a path of masks."""
     matching: Matching = "auto"
     camera_model: CameraModel = "SIMPLE_RADIAL"
     fov: float | None = None
-    """Horizontal field of view, degrees, where it is known."""
+    """Horizontal field of view, degrees; None if unknown."""
     features: int = 4096
-    """At most, of a frame."""
+    """Largest number of features per frame."""
     least: float = 0.5
-    """Share of the frames that must get a camera."""
+    """Smallest share of the frames that must get a camera."""
     seed: int = 0
 
 
 class PickedFrames(NamedTuple):
-    """The picked ones."""
+    """The picked frames of a source."""
 
     indices: list[int]
-    """Places in the video."""
+    """Indices in the source."""
     seconds: list[float]
     names: list[str]
-    """Of the images in a folder that was given; empty for a video."""
+    """File names of the images of a folder; empty strings for a video."""
     span: tuple[float, float]
     """Seconds of the video that become times 0 and 1."""
     size: tuple[int, int]
     """(width, height)"""
     seen: int
-    """Frames that were looked at."""
+    """Number of frames of the source."""
     blurred: int
     alike: int
 
@@ -82,14 +82,17 @@ class PickedFrames(NamedTuple):
 
 
 class CaptureResult(NamedTuple):
+    """Result of a capture."""
+
     outcome: Outcome
     lines: list[str]
-    """What was found, for the user."""
+    """Description of the result, for the user."""
     made_before: bool
+    """Whether the folder was complete before."""
 
 
 def check(request: CaptureRequest) -> None:
-    """Refuse what cannot work.
+    """Check the values of a request.
 
     Raises:
         UserError: naming the option, its value and the remedy.
@@ -114,14 +117,14 @@ def check(request: CaptureRequest) -> None:
 def capture(
     request: CaptureRequest, folder: Path, *, device: str = "cpu", show: ShowProgress = progress
 ) -> CaptureResult:
-    """Make the data set in ``folder``, or go on with what an interrupted attempt has left there.
+    """Make the data set in ``folder``, or resume an interrupted attempt.
 
     Args:
-        device: where descriptors are compared.
+        device: device of the comparison of descriptors.
         show: ``show(total, text)`` is a context that shows progress; its value has ``advance()``.
 
     Raises:
-        UserError: the source, the masks or an option cannot be used, or too few frames got a camera.
+        UserError: the source, the masks or an option is invalid, or too few frames got a camera.
     """
     check(request)
     source = open_source(request.source)
@@ -156,7 +159,7 @@ def _enough(request: CaptureRequest, frames: PickedFrames) -> None:
 
 
 def _frames(request: CaptureRequest, source: Source, journal: Journal, show: ShowProgress) -> PickedFrames:
-    """Pick frames and write them."""
+    """Pick the frames and write them."""
     place = journal.work / "frames"
 
     def make() -> dict[str, Any]:
@@ -182,7 +185,7 @@ def _frames(request: CaptureRequest, source: Source, journal: Journal, show: Sho
 
 
 def _frames_of(found: Any) -> PickedFrames | None:
-    """What a journal holds of them; None where it is none of what ``_frames`` writes there."""
+    """Parse the picked frames from a journal; return None if the entry is malformed."""
     try:
         frames = PickedFrames(**{**found, "span": tuple(found["span"]), "size": tuple(found["size"])})
         counts = (*frames.indices, *frames.size, frames.seen, frames.blurred, frames.alike)
@@ -201,7 +204,7 @@ def _until(stills: Iterator[SourceFrame], last: int) -> Iterator[SourceFrame]:
 
 
 def _choose(request: CaptureRequest, source: Source, show: ShowProgress) -> PickedFrames:
-    """Which frames to take; of a folder, all of them unless a number is given."""
+    """Choose the frames; of a folder, all of them unless a number is given."""
     start, end = request.start or 0.0, math.inf if request.end is None else request.end
     with show(source.count, "looking at frames") as bar:
         within = (
@@ -231,7 +234,7 @@ def _shown(source: Source, bar: Any) -> Iterator[SourceFrame]:
 def _masks(
     request: CaptureRequest, source: Source, frames: PickedFrames, journal: Journal, show: ShowProgress
 ) -> FrameFiles:
-    """Write masks, if there are to be any."""
+    """Write the masks, if any are requested."""
     folder, place = journal.work / "frames", journal.work / "masks"
     files = frames.files
     if request.masks == "none":
@@ -265,7 +268,7 @@ def _solve(
     device: str,
     show: ShowProgress,
 ) -> tuple[Outcome, mapping.CameraSolution | None]:
-    """Features, matches, cameras."""
+    """Run the stages of features, matches and cameras."""
     database, model = journal.work / "database.db", journal.work / "model"
     count = len(frame_files.names)
     focal = None if request.fov is None else 0.5 * frames.size[0] / math.tan(math.radians(request.fov) / 2)
@@ -295,7 +298,7 @@ def _solve(
 
 
 def _share(journal: Journal) -> float:
-    """Of the pixels that move, as the journal has it."""
+    """Return the share of masked pixels from the journal."""
     found = journal.result("masks")
     share = as_number(found.get("share")) if isinstance(found, dict) else None
     if share is None:

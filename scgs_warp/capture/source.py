@@ -1,4 +1,4 @@
-"""What was filmed, frame by frame: a video through PyAV, or a folder of images. Upright, with square pixels."""
+"""Sources of frames: a video decoded by PyAV, or a folder of images. Frames are upright with square pixels."""
 
 from __future__ import annotations
 
@@ -16,49 +16,49 @@ from ..storage.files import natural, size_text
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20
-"""Of the beginning and the end of a file, which tell it from others; videos are large."""
+"""Bytes at the beginning and the end of a file that enter its digest; videos are too large to hash whole."""
 
 
 class SourceFrame(NamedTuple):
-    """One frame."""
+    """One frame of a source."""
 
     index: int
-    """Its place in the video, or in the order of names; from 0."""
+    """Index in the video, or in the order of names; from 0."""
     seconds: float
-    """Since the first frame; of a folder: its place."""
+    """Time since the first frame; of a folder, the index."""
     image: np.ndarray
     """[H, W, 3] uint8 RGB"""
     name: str
-    """Of the image's file; of a video: empty."""
+    """Name of the image file; empty for a video."""
 
 
 class Source(Protocol):
-    """Something that was filmed."""
+    """A video or a folder of images."""
 
     path: Path
     video: bool
-    """Whether frames follow each other in time as they were filmed; else someone chose them."""
+    """Whether this is a video; images of a folder need not be consecutive."""
     count: int
-    """Frames, as the file says before it is decoded; may be wrong."""
+    """Number of frames according to the file's header, which may be wrong."""
 
     def frames(self, longest: int) -> Iterator[SourceFrame]:
-        """All frames in order. ``longest``: images are made smaller until their longer side is this, or kept.
+        """Yield all frames in order, reduced to a longer side of at most ``longest`` pixels.
 
         Raises:
-            UserError: one of them cannot be decoded.
+            UserError: a frame cannot be decoded.
         """
         ...
 
     def digest(self) -> str:
-        """Tells this source from others."""
+        """Return a hash that identifies this source."""
         ...
 
 
 def open_source(path: Path) -> Source:
-    """The video, or the folder of images, at ``path``.
+    """Open the video or the folder of images at ``path``.
 
     Raises:
-        UserError: there is none, or it cannot be read.
+        UserError: the path is missing or cannot be read.
     """
     if path.is_dir():
         return Folder(path)
@@ -68,14 +68,14 @@ def open_source(path: Path) -> Source:
 
 
 class Video:
-    """A file that ffmpeg's libraries decode."""
+    """A video file, decoded by ffmpeg's libraries."""
 
     video = True
 
     def __init__(self, path: Path) -> None:
         """
         Raises:
-            UserError: it is no video.
+            UserError: the file is not a video.
         """
         self.path = path
         with self._opened() as container:
@@ -91,7 +91,7 @@ class Video:
 
         try:
             container = av.open(str(self.path))
-        except (FFmpegError, OSError, ValueError) as error:  # ValueError: what it says of itself is no text
+        except (FFmpegError, OSError, ValueError) as error:  # ValueError: metadata that is not text
             reason = getattr(error, "strerror", None) or type(error).__name__
             raise UserError(
                 f"{self.path}: is no video that can be decoded ({reason}); save it as .mp4, or give a folder of images"
@@ -112,7 +112,7 @@ class Video:
             for packet in container.demux(stream):
                 try:
                     decoded = packet.decode()
-                except FFmpegError:  # a damaged packet; what follows may be whole
+                except FFmpegError:  # Later packets may be intact.
                     continue
                 for frame in decoded:
                     seconds = float(frame.time) if frame.time is not None else index / self.rate
@@ -127,8 +127,7 @@ class Video:
 
 
 def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
-    """A decoded frame as it is to be shown: pixels, ``shape`` times as wide as high, made square; turned as the phone
-    was held."""
+    """Return a decoded frame as displayed: upright, with pixels ``shape`` times as wide as high made square."""
     width, height = frame.width * shape, frame.height
     scale = min(1.0, longest / max(width, height))
     image = frame.to_ndarray(format="rgb24")
@@ -139,7 +138,7 @@ def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
 
 
 def rotate_image(image: np.ndarray, degrees: float) -> np.ndarray:
-    """The image turned counter-clockwise by ``degrees``, to the nearest quarter."""
+    """Rotate the image counter-clockwise by ``degrees``, rounded to a multiple of 90."""
     return np.ascontiguousarray(np.rot90(image, round(degrees / 90) % 4))
 
 
@@ -151,7 +150,7 @@ class Folder:
     def __init__(self, path: Path) -> None:
         """
         Raises:
-            UserError: it holds no images.
+            UserError: the folder holds no images.
         """
         self.path = path
         files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
@@ -177,7 +176,7 @@ class Folder:
 
 
 def read_rgb(file: Path) -> np.ndarray:
-    """[H, W, 3] uint8 RGB, turned as its EXIF tags say; UserError where it is no image."""
+    """Read [H, W, 3] uint8 RGB, rotated by its EXIF tags; raise UserError if the file is not an image."""
     try:
         data = np.fromfile(file, np.uint8)
         claim = oversized_claim(data.data)
@@ -194,7 +193,7 @@ def read_rgb(file: Path) -> np.ndarray:
 
 
 def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
-    """The image with its longer side at most ``longest``."""
+    """Reduce the image to a longer side of at most ``longest``."""
     scale = longest / max(image.shape[:2])
     if scale >= 1:
         return image
@@ -203,7 +202,7 @@ def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
 
 
 def _digest(files: list[Path]) -> str:
-    """Of sizes, and of both ends of each file; names and dates do not count."""
+    """Hash the sizes and both ends of the files, independently of names and dates."""
     found = hashlib.sha256()
     for file in files:
         size = file.stat().st_size

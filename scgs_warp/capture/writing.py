@@ -1,4 +1,4 @@
-"""The folder that training takes: undistorted images, cameras and times in nerfstudio's layout, points."""
+"""Output of a capture: undistorted images, cameras and times in nerfstudio's layout, and points."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ POINTS = "points.ply"
 
 
 class Pinhole(NamedTuple):
-    """Of the undistorted images."""
+    """Intrinsics of the undistorted images."""
 
     fx: float
     fy: float
@@ -35,7 +35,7 @@ class Pinhole(NamedTuple):
 
 
 class CapturedScene(NamedTuple):
-    """What is written; world: z up."""
+    """The captured scene as written to disk; world with z up."""
 
     pinhole: Pinhole
     viewmats: np.ndarray
@@ -43,9 +43,9 @@ class CapturedScene(NamedTuple):
     times: list[float]
     """[0, 1]"""
     seconds: list[float]
-    """In the video."""
+    """Times in the video."""
     names: list[str]
-    """Files in ``images``."""
+    """File names in ``images``."""
     points: np.ndarray
     """[P, 3]"""
     colors: np.ndarray
@@ -53,8 +53,8 @@ class CapturedScene(NamedTuple):
 
 
 def pinhole_of(solved: CameraSolution) -> tuple[Pinhole, np.ndarray, np.ndarray]:
-    """The largest pinhole image without empty pixels inside a distorted one, and where its pixels lie there:
-    x [H, W], y [H, W] float32, as OpenCV counts."""
+    """Return the largest pinhole image without empty pixels inside the distorted one, and the distorted coordinates of
+    its pixels, x [H, W] and y [H, W] float32 in OpenCV's convention."""
     with quiet() as pycolmap:
         camera = pycolmap.Camera(model=solved.model, width=solved.width, height=solved.height)
         camera.params = list(solved.params)
@@ -67,7 +67,7 @@ def pinhole_of(solved: CameraSolution) -> tuple[Pinhole, np.ndarray, np.ndarray]
 
 
 def undistort(frame_files: FrameFiles, solved: CameraSolution, folder: Path, done: Callable[[], object]) -> Pinhole:
-    """Write ``images/`` and, where there are any, ``masks/`` of the registered frames.
+    """Write ``images/``, and ``masks/`` if there are masks, of the registered frames.
 
     Args:
         done: called after each frame.
@@ -95,7 +95,7 @@ def scene_of(
     seconds: Sequence[float],
     span: tuple[float, float],
 ) -> CapturedScene:
-    """Cameras and points upright, times from 0 to 1 over ``span`` (seconds of the video)."""
+    """Turn cameras and points upright and scale times to [0, 1] over ``span`` (seconds of the video)."""
     moved = upright(solved.viewmats, solved.points)
     length = max(span[1] - span[0], 1e-9)
     chosen = [seconds[place] for place in solved.places]
@@ -111,7 +111,7 @@ def scene_of(
 
 
 def write_scene(folder: Path, scene: CapturedScene) -> None:
-    """``points.ply`` and, last, ``transforms.json``: where it is, the folder is complete."""
+    """Write ``points.ply`` and then ``transforms.json``, whose presence marks a complete folder."""
     write_points(folder / POINTS, scene.points, scene.colors)
     inside = [f"images/{name}" for name in scene.names]
     lists = {split: held_out(folder, range(len(inside)), split) for split in ("train", "test")}
@@ -136,14 +136,14 @@ def write_scene(folder: Path, scene: CapturedScene) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """All of it or nothing."""
+    """Write a text file atomically."""
     part = path.with_name(f".{path.name}.part")
     part.write_text(text, encoding="utf-8")
     os.replace(part, path)
 
 
 def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """A binary PLY file of points [P, 3] and colours [P, 3] uint8."""
+    """Write a binary PLY file of points [P, 3] and colours [P, 3] uint8."""
     from plyfile import PlyData, PlyElement
 
     fields = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
