@@ -51,7 +51,7 @@ def find_moving(load: Callable[[int], np.ndarray], count: int, done: Callable[[]
         done: called after each frame.
 
     Returns:
-        [H, W] bool at the frames' size, True where something moves by itself.
+        [H, W] bool of each frame at its size, True on moving pixels.
     """
     kept: dict[int, np.ndarray] = {}
     flows: dict[tuple[int, int], np.ndarray] = {}

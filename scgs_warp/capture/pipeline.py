@@ -88,7 +88,7 @@ class CaptureResult(NamedTuple):
     lines: list[str]
     """Description of the result, for the user."""
     made_before: bool
-    """Whether the folder was complete before."""
+    """True if the folder was complete before."""
 
 
 def check(request: CaptureRequest) -> None:

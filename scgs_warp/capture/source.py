@@ -37,7 +37,7 @@ class Source(Protocol):
 
     path: Path
     video: bool
-    """Whether this is a video; images of a folder need not be consecutive."""
+    """True for a video; images of a folder need not be consecutive."""
     count: int
     """Number of frames according to the file's header, which may be wrong."""
 

@@ -55,7 +55,7 @@ class _Facts:
     transparent: bool
     distorted: bool
     valid: bool
-    """Whether the frame's own mask leaves a pixel."""
+    """True if the frame's own mask leaves a pixel."""
     valid_within_border: bool
 
 

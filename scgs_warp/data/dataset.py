@@ -36,7 +36,7 @@ class StoredFrame:
     read: Callable[[], Pixels]
     """Decodes the file; returns the same pixels every time."""
     has_alpha: bool = False
-    """Whether the alpha of the file counts."""
+    """True if the alpha of the file counts."""
     common_mask: Tensor | None = None
     """[H, W] bool, combined with the frame's own mask."""
     key: object = field(default_factory=object)

@@ -45,7 +45,7 @@ class Decoded(NamedTuple):
     source_size: tuple[int, int]
     """(width, height) of the file before the reduction."""
     transparent: bool
-    """Whether any pixel of the file is less than opaque."""
+    """True if any pixel of the file is less than opaque."""
     lens: Lens
     """Lens of the file."""
 
@@ -157,7 +157,7 @@ def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def is_transparent(pixels: np.ndarray) -> bool:
-    """Whether any pixel of a file [H, W, 3 or 4] is less than opaque."""
+    """Return whether any pixel of a file [H, W, 3 or 4] is less than opaque."""
     return pixels.shape[2] == 4 and bool((pixels[..., 3] < np.iinfo(pixels.dtype).max).any())
 
 

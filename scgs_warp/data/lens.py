@@ -43,7 +43,7 @@ class Lens:
 
     @property
     def distorted(self) -> bool:
-        """Whether the image differs from that of the pinhole."""
+        """True if the image differs from that of the pinhole."""
         if self.skew != 0.0:
             return True
         if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):

@@ -1,9 +1,9 @@
-"""``.spz`` (Niantic): Gaussians in some 20 to 64 bytes before compression.
+"""``.spz`` files (Niantic): Gaussians of 20 to 64 bytes before compression.
 
-A header of 16 bytes, then one array after the other: positions (24-bit fixed point), opacities, colours of degree 0,
-logarithms of scales (a byte each), rotations, harmonics (coefficient by coefficient, channels innermost); all of it is
-one gzip stream (versions 1 to 3), or a plain header of 32 bytes, a table and one zstd stream an array (version 4).
-Positions are in a frame with x right, y up, z back, where a ``.ply`` has x right, y down, z forward.
+A header of 16 bytes is followed by arrays: positions (24-bit fixed point), opacities, colours of degree 0, logarithms
+of scales (a byte each), rotations, harmonics (coefficient by coefficient, channels innermost). Versions 1 to 3 are one
+gzip stream; version 4 is a plain header of 32 bytes, a table and one zstd stream per array.
+Positions are in a frame with x right, y up, z back; a ``.ply`` has x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from .gaussian_parameters import to_parameters
 
 MAGIC = 0x5053474E
 VERSION = 3
-"""What is written: the last one that a plain gzip reader opens, the first with four bytes a rotation."""
+"""Version to write: the last one that a plain gzip reader opens and the first with four bytes per rotation."""
 ANTIALIASED = 1
 COLOR_SCALE = 0.15
-"""A byte of colour says ``127.5 + 255 * COLOR_SCALE * sh_dc``."""
+"""A byte of colour is ``127.5 + 255 * COLOR_SCALE * sh_dc``."""
 SCALE_STEPS, SCALE_OFFSET = 16.0, 10.0
-"""A byte of scale says ``SCALE_STEPS * (log(scale) + SCALE_OFFSET)``: steps of 6 %, from 4.5e-5 to 377."""
+"""A byte of scale is ``SCALE_STEPS * (log(scale) + SCALE_OFFSET)``: steps of 6 %, from 4.5e-5 to 377."""
 POSITION_BITS = 16
-"""Positions are rounded to the size of the scene over 2 to this."""
+"""Positions are rounded to the size of the scene over ``2 ** POSITION_BITS``."""
 MAX_FRACTION_BITS = 24
 MAX_GAUSSIANS = 10_000_000
-"""Gaussians in a file, as the format's own reader has it."""
+"""Largest number of Gaussians in a file, as in the format's reference reader."""
 SH_COUNTS = (0, 3, 8, 15)
-"""Coefficients above degree 0, for degrees 0 to 3."""
+"""Numbers of coefficients above degree 0, for degrees 0 to 3."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""What a half turn about x does to each harmonic of degrees 1 to 3."""
+"""Signs that a half turn about x gives to the harmonics of degrees 1 to 3."""
 SQRT_HALF = math.sqrt(0.5)
 MAX_GZIP_RATIO = 1040
-"""Bytes that one byte of a gzip stream can stand for, and a little more."""
+"""Upper bound of the bytes that one byte of a gzip stream decompresses to."""
 REMEDY = "export the .spz again"
 
 
 def fraction_bits(means: np.ndarray) -> int:
-    """Binary places for positions [N, 3]: as fine as makes sense, as coarse as 24 bits demand.
+    """Choose the number of fractional bits for positions [N, 3], limited by the range of 24 bits.
 
     Raises:
         UserError: a position is beyond 2^23.
@@ -73,11 +73,11 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
         antialiased: whether they were trained with the antialiasing compensation.
 
     Returns:
-        How many values lay beyond what a byte can say, and are at its end now: scales outside [4.5e-5, 377], harmonics
-        of degrees 1 to 3 outside [-1, 1], those of degree 0 outside [-3.3, 3.3].
+        Number of values that were clipped to the range of a byte: scales outside [4.5e-5, 377], harmonics of degrees 1
+        to 3 outside [-1, 1], harmonics of degree 0 outside [-3.3, 3.3].
 
     Raises:
-        UserError: the place cannot be written, or the scene is too large for the format.
+        UserError: the file cannot be written, or the scene is too large for the format.
     """
     means = gaussians.means.detach().cpu().double().numpy() * (1, -1, -1)
     bits = fraction_bits(means)
@@ -112,8 +112,8 @@ def _byte(values: np.ndarray) -> np.ndarray:
 
 
 def pack_quats(quats: np.ndarray) -> np.ndarray:
-    """[N] uint32 of unit quaternions [N, 4] wxyz in a ``.ply``'s frame: two bits say which of xyzw is the largest, ten
-    bits (sign, nine of magnitude) hold each of the others over sqrt(1/2), in the order of xyzw."""
+    """Pack unit quaternions [N, 4] wxyz in a ``.ply``'s frame to [N] uint32: two bits name the largest of xyzw, ten
+    bits (sign and nine of magnitude) hold each of the others over sqrt(1/2), in the order of xyzw."""
     turned = quats[:, [1, 2, 3, 0]] * (1, -1, -1, 1)
     largest = np.abs(turned).argmax(axis=1)
     turned = turned * np.where(np.take_along_axis(turned, largest[:, None], 1) < 0, -1.0, 1.0)
@@ -126,7 +126,7 @@ def pack_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def unpack_quats(packed: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz float64, in a ``.ply``'s frame: the inverse of :func:`pack_quats`."""
+    """Unpack [N, 4] wxyz float64 in a ``.ply``'s frame: the inverse of :func:`pack_quats`."""
     left = packed.astype(np.uint32).copy()
     largest = left >> np.uint32(30)
     found = np.zeros((len(left), 4))
@@ -141,17 +141,17 @@ def unpack_quats(packed: np.ndarray) -> np.ndarray:
 
 
 def _three_bytes(packed: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz of version 2: x, y, z as bytes, w what is left."""
+    """Unpack the rotations of version 2 to [N, 4] wxyz: x, y, z are bytes, w completes the unit length."""
     axis = packed.astype(np.float64) / 127.5 - 1.0
     w = np.sqrt(np.maximum(1.0 - (axis**2).sum(axis=1), 0.0))
     return np.column_stack([w, axis * (1, -1, -1)])
 
 
 def read_spz(path: str | Path) -> GaussianParameters:
-    """Raw parameters, in a ``.ply``'s frame. Versions 2 to 4.
+    """Read raw parameters in a ``.ply``'s frame from versions 2 to 4.
 
     Raises:
-        UserError: it is missing, damaged, of another version, or version 4 without the package zstandard.
+        UserError: the file is missing, damaged or of another version, or version 4 without the package zstandard.
     """
     path = Path(path)
     content = read_bytes(path, "give a .spz")
@@ -161,9 +161,9 @@ def read_spz(path: str | Path) -> GaussianParameters:
         version, count, degree, bits, parts = _read_gzip(path, content)
     fixed = np.zeros((count, 3, 4), "u1")
     fixed[:, :, 1:] = parts[0].reshape(count, 3, 3)
-    means = (fixed.view("<i4")[:, :, 0] >> 8).astype(np.float32)  # shifted down again with the sign; 24 bits are exact
+    means = (fixed.view("<i4")[:, :, 0] >> 8).astype(np.float32)  # The shift extends the sign; 24 bits are exact.
     means *= np.array([1, -1, -1], np.float32) * np.float32(2.0**-bits)
-    opacity = np.linspace(0.0, 1.0, 256).clip(1e-6, 1.0 - 1e-6)  # of every byte
+    opacity = np.linspace(0.0, 1.0, 256).clip(1e-6, 1.0 - 1e-6)  # The opacity of every byte.
     quats = _three_bytes(parts[4].reshape(count, 3)) if version == 2 else unpack_quats(parts[4].view("<u4"))
     rest = parts[5].reshape(count, SH_COUNTS[degree], 3).astype(np.float32)
     rest -= 128.0
@@ -181,7 +181,7 @@ def read_spz(path: str | Path) -> GaussianParameters:
 
 
 def read_antialiased(path: str | Path) -> bool:
-    """Whether a file says that its Gaussians were trained with the antialiasing compensation; only a ``.spz`` can."""
+    """Return whether a ``.spz`` is marked as trained with the antialiasing compensation; False for other files."""
     path = Path(path)
     if path.suffix.lower() != ".spz":
         return False
@@ -192,11 +192,11 @@ def read_antialiased(path: str | Path) -> bool:
             start = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(start, 16)
         return bool(start[14] & ANTIALIASED)
     except (OSError, zlib.error, IndexError):
-        return False  # whoever reads the Gaussians says what is wrong
+        return False  # The reader of the Gaussians reports the damage.
 
 
 def _sizes(path: Path, version: int, count: int, degree: int) -> list[int]:
-    """Bytes of each array."""
+    """Return the number of bytes of each array."""
     if not 2 <= version <= 4:
         raise UserError(f"{path}: version {version} of .spz; 2 to 4 are read: convert it, for example to .ply")
     if count == 0 or degree >= len(SH_COUNTS):
@@ -221,7 +221,7 @@ def _read_gzip(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.
     if sum(sizes) > MAX_GZIP_RATIO * len(content):
         raise UserError(f"{path}: cut short: {len(content):,} bytes cannot hold {count:,} Gaussians; {REMEDY}")
     try:
-        rows = stream.decompress(stream.unconsumed_tail, sum(sizes))  # never more than the header promises
+        rows = stream.decompress(stream.unconsumed_tail, sum(sizes))  # Bounded by the header.
     except zlib.error:
         rows = b""
     if len(rows) != sum(sizes):
@@ -230,7 +230,7 @@ def _read_gzip(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.
 
 
 def _read_streams(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
-    """Version 4: a stream for each array that is not empty."""
+    """Read version 4: one stream for each non-empty array."""
     try:
         import zstandard
     except ImportError:
@@ -249,7 +249,7 @@ def _read_streams(path: Path, content: bytes) -> tuple[int, int, int, int, list[
             packed, plain = struct.unpack_from("<QQ", content, table + 16 * index)
             if plain != size or place + packed > len(content):
                 raise ValueError
-            # The frame's own claim is not trusted: no more than the header promises is decoded.
+            # The size claimed by the zstd frame is not trusted: decoding is bounded by the header.
             with decoder.stream_reader(content[place : place + packed]) as reader:
                 parts.append(np.frombuffer(reader.read(size), "u1"))
             if len(parts[-1]) != size:

@@ -1,4 +1,4 @@
-"""Static scenes with control points, from files of Gaussians."""
+"""Static scenes with control points, made from files of Gaussians or from static scenes."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from ..motion.static_nodes import COUNT, StaticNodes
 from .scene import Scene
 
 FOV_AND_ELEVATION = (40.0, 10.0)
-"""Field of view and elevation, in degrees, of films of a file that says nothing about cameras."""
+"""Field of view and elevation, degrees, of the overview, since files of Gaussians have no cameras."""
 BULK_QUANTILES = (0.02, 0.98)
-"""Quantiles of the opaque Gaussians' coordinates that count as the scene."""
+"""Quantiles of the opaque Gaussians' coordinates that bound the scene."""
 MIN_OPACITY = 0.1
 
 
 def open_gaussians(
     path: str | Path, device: str = "cpu", nodes: int = COUNT, up: tuple[float, float, float] | None = None
 ) -> Scene:
-    """A static scene with control points, from a file of Gaussians: ``.ply``, ``.splat`` or ``.spz``.
+    """Open a file of Gaussians (``.ply``, ``.splat`` or ``.spz``) as a static scene with control points.
 
     Args:
-        nodes: control points, sampled from the Gaussians.
-        up: for cameras of films; None: -y, as structure from motion has it.
+        nodes: number of control points, sampled from the Gaussians.
+        up: up direction of the overview; None: -y, the convention of structure from motion.
 
     Raises:
         UserError: as :func:`~scgs_warp.formats.gaussian_files.read_gaussians`.
@@ -66,7 +66,7 @@ def _static_scene(
 
 
 def with_control_points(scene: Scene, nodes: int = COUNT) -> Scene:
-    """A static scene given control points."""
+    """Return a static scene with control points in place of its motion."""
     motion = StaticNodes.sample(scene.gaussians, nodes)
     return Scene(
         scene.gaussians, motion, scene.normalisation, scene.config, scene.overview, step=scene.step,

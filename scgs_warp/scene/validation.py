@@ -1,7 +1,7 @@
-"""Whether what a checkpoint holds can be a scene. Checkpoints are passed on: nothing in one is believed.
+"""Validation of checkpoints, which may come from anyone and are therefore not trusted.
 
-Sizes are checked before anything is allocated by them, numbers before anything is computed from them: a kernel that is
-given an index beyond its arrays would read, and write, what is not its own.
+Sizes are checked before memory is allocated and numbers before they are used: an index out of range would make a
+kernel read or write foreign memory.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from ..types import Gaussians
 
 REMEDY = "use the previous checkpoint, or train again"
 SH_COUNTS = (0, 3, 8, 15)
-"""Coefficients above degree 0, of degrees 0 to 3."""
+"""Numbers of coefficients above degree 0, for degrees 0 to 3."""
 MAX_MAGNITUDE = 1e12
-"""Of centre and scale, of the overview and of steps: beyond it float32 leaves no scene."""
+"""Largest centre, scale, overview value and step."""
 TIME_PLANE = "planes.3"
 MAX_PLANE_TIMES = 4096
 MIN_MOMENT = 1e-30
 INTEGER_TENSORS = ("extra.graph.neighbors",)
-"""Tensors of whole numbers."""
+"""Names of the int32 tensors; all others are float32."""
 CHECKED_TIMES = (0.0, 0.5, 1.0)
-"""When a scene is looked at once it is loaded."""
+"""Times at which a loaded scene is checked."""
 
 
 def _unusable(source: str, what: str) -> UserError:
@@ -34,14 +34,14 @@ def _unusable(source: str, what: str) -> UserError:
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """All floats are finite; those that say how many there are of something have the shape that goes with it.
+    """Check that all tensors are finite and of consistent types and shapes.
 
     Raises:
         UserError: naming the tensor.
     """
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            raise _unusable(source, f"{name} holds numbers that are not finite")
+            raise _unusable(source, f"{name} holds non-finite numbers")
         wanted = torch.int32 if name in INTEGER_TENSORS else torch.float32
         if value.dtype != wanted:
             raise _unusable(source, f"{name} is of {value.dtype}, not of {wanted}")
@@ -65,7 +65,7 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
 
 
 def check_metadata(metadata: Mapping[str, Any], source: str) -> None:
-    """The parts that a scene is made of are there, of their types, and finite.
+    """Check that all metadata of a scene is present, of the right type and finite.
 
     Raises:
         UserError: naming the field.
@@ -94,7 +94,7 @@ def check_metadata(metadata: Mapping[str, Any], source: str) -> None:
 
 
 def check_settings(settings: Any, source: str) -> None:
-    """What of ``config.json`` is used beside the checkpoint: where the data lie, and how they are looked at.
+    """Check the fields of ``config.json`` that are used besides the checkpoint: the data folder and its options.
 
     Raises:
         UserError: naming the field.
@@ -108,7 +108,7 @@ def check_settings(settings: Any, source: str) -> None:
 
 
 def _number(value: Any, low: float, high: float) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high  # NaN: no
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high  # False for NaN
 
 
 def _vector(value: Any) -> bool:
@@ -133,10 +133,10 @@ def check_motion(gaussians_at: Callable[[float], Gaussians], source: str) -> Non
 
 
 def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], source: str) -> None:
-    """What training needs beside the scene: statistics, moments, the graph of control points.
+    """Check the state that resuming needs besides the scene: statistics, moments, the graph of control points.
 
     Raises:
-        UserError: naming what is wrong.
+        UserError: naming the tensor or the field.
     """
     count = len(tensors["gaussians.means"])
     for name in ("grad_norm", "count", "max_radii"):
@@ -147,7 +147,7 @@ def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], so
         if name in tensors and (tensors[name].ndim != 2 or tensors[name].shape[1] != 3):
             raise _unusable(source, f"{name} is {list(tensors[name].shape)}, not [P, 3]")
     if len(tensors.get("points", ())) != len(tensors.get("colors", ())):
-        raise _unusable(source, "points and colors are not as many")
+        raise _unusable(source, "points and colors differ in number")
     for name, value in tensors.items():
         if name.endswith(".exp_avg_sq") and value.numel():
             if float(value.min()) < 0:
@@ -166,8 +166,8 @@ def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], so
 
 
 def _beyond(mean: Tensor, square: Tensor) -> bool:
-    """Whether moments would lead to a step that no gradients do: with Adam's rates the mean is at most 7.3 times the
-    root of the mean square. What is smaller than ``MIN_MOMENT`` may have been rounded to 0."""
+    """Return whether moments are impossible: with Adam's rates the mean is at most 7.3 times the root of the mean
+    square. Squares below ``MIN_MOMENT`` may have been rounded to 0."""
     return bool((mean.double().square() > 1000.0 * square.double() + MIN_MOMENT).any())
 
 
@@ -175,15 +175,15 @@ def _check_graph(tensors: Mapping[str, Tensor], source: str) -> None:
     neighbors, weights = tensors.get("extra.graph.neighbors"), tensors.get("extra.graph.weights")
     if neighbors is None and weights is None:
         return
-    nodes = len(tensors.get("motion.positions", tensors["gaussians.means"]))  # in stage 1 spheres are both
+    nodes = len(tensors.get("motion.positions", tensors["gaussians.means"]))  # In stage 1 the spheres are both.
     fits = neighbors is not None and weights is not None and neighbors.shape == weights.shape and neighbors.ndim == 2
     if not fits or neighbors is None or neighbors.dtype != torch.int32 or len(neighbors) != nodes:
         raise _unusable(source, f"extra.graph.neighbors and weights are not both [{nodes}, J]")
     if neighbors.numel() and not -1 <= int(neighbors.min()) <= int(neighbors.max()) < nodes:
-        raise _unusable(source, f"extra.graph.neighbors names control points that are none of the {nodes}")
+        raise _unusable(source, f"extra.graph.neighbors names control points outside of the {nodes}")
 
 
 def reason(error: Exception) -> str:
-    """Why something did not load, in a few words: PyTorch lists every tensor."""
+    """Shorten the text of a loading error, in which PyTorch lists every tensor."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 200 else f"{text[:200]} ..."

@@ -18,7 +18,7 @@ from .colmap_model import ModelCamera, ModelImage, find_model, read_model
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return find_model(folder) is not None
 
 

@@ -21,7 +21,7 @@ def transforms_path(folder: Path, split: str) -> Path:
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return any(transforms_path(folder, split).is_file() for split in ("train", "test", "val"))
 
 

@@ -37,7 +37,7 @@ class World(NamedTuple):
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return (folder / FILE).is_file() and (folder / "camera").is_dir()
 
 

@@ -29,7 +29,7 @@ FILE = "transforms.json"
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return (folder / FILE).is_file()
 
 

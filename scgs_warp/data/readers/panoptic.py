@@ -26,7 +26,7 @@ POINTS = "init_pt_cld.npz"
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return (folder / TRAIN).is_file() or (folder / TEST).is_file()
 
 

@@ -32,7 +32,7 @@ MAX_ASPECT_ERROR = 0.01
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return (folder / FILE).is_file()
 
 

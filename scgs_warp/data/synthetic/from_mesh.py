@@ -61,7 +61,7 @@ class SynthesisPlan(NamedTuple):
     lines: list[str]
     """Description of the subject, for the user."""
     made: bool
-    """Whether the folder already holds this data set."""
+    """True if the folder already holds this data set."""
 
     @property
     def counts(self) -> dict[str, int]:
