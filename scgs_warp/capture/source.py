@@ -94,7 +94,7 @@ class Video:
         except (FFmpegError, OSError, ValueError) as error:  # ValueError: metadata that is not text
             reason = getattr(error, "strerror", None) or type(error).__name__
             raise UserError(
-                f"{self.path}: is no video that can be decoded ({reason}); save it as .mp4, or give a folder of images"
+                f"{self.path}: is not a video that decodes ({reason}); save it as .mp4, or give a folder of images"
             ) from None
         if not container.streams.video:
             container.close()
@@ -188,7 +188,7 @@ def read_rgb(file: Path) -> np.ndarray:
     except cv2.error:
         image = None
     if image is None:
-        raise UserError(f"{file}: is no image that decodes; save it again as PNG or JPEG, or take it out")
+        raise UserError(f"{file}: is not an image that decodes; save it again as PNG or JPEG, or take it out")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

@@ -162,10 +162,10 @@ def is_transparent(pixels: np.ndarray) -> bool:
 
 
 def decode(path: Path) -> np.ndarray:
-    """[H, W, 3 or 4] RGB(A), uint8 or uint16; UserError where the file is missing or no image."""
+    """[H, W, 3 or 4] RGB(A), uint8 or uint16; UserError if the file is missing or not an image."""
     try:
         if not is_regular(path):
-            raise UserError(f"{path}: is no file; give an image, or drop the frame")
+            raise UserError(f"{path}: is not a regular file; give an image, or drop the frame")
         data = np.fromfile(path, np.uint8)
     except FileNotFoundError:
         raise UserError(f"{path}: no such image, though a frame names it; restore the file or drop the frame") from None

@@ -65,7 +65,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
     try:
         if not is_regular(path):
-            raise UserError(f"{path}: is no file; give a PLY of points")
+            raise UserError(f"{path}: is not a regular file; give a PLY of points")
         with np.errstate(over="ignore"):  # Numbers in text may overflow to infinity; such points are left out.
             check_ply_counts(path)
             elements = PlyData.read(str(path))

@@ -72,20 +72,20 @@ def check_metadata(metadata: Mapping[str, Any], source: str) -> None:
     """
     for name in ("config", "normalisation", "overview"):
         if not isinstance(metadata.get(name), dict):
-            raise _unusable(source, f"metadata.{name} is missing or no object")
+            raise _unusable(source, f"metadata.{name} is missing or not an object")
     unit, overview = metadata["normalisation"], metadata["overview"]
     for name, value in (("normalisation.centre", unit.get("centre")), ("overview.centre", overview.get("centre"))):
         if not _vector(value):
             raise _unusable(source, f"metadata.{name} is not three numbers")
     if not _vector(overview.get("up")) or not any(abs(x) > 1e-6 for x in overview["up"]):
-        raise _unusable(source, "metadata.overview.up is no direction")
+        raise _unusable(source, "metadata.overview.up is not a direction")
     ranges = {"radius": (0, MAX_MAGNITUDE), "fov_x": (1e-3, 179.0), "aspect": (1e-3, 1e3)}
     for name, value in overview.items():
         low, high = ranges.get(name, (-MAX_MAGNITUDE, MAX_MAGNITUDE))
         if name not in ("centre", "up") and not _number(value, low, high):
-            raise _unusable(source, f"metadata.overview.{name} is no number from {low:g} to {high:g}")
+            raise _unusable(source, f"metadata.overview.{name} is not a number from {low:g} to {high:g}")
     if not _number(unit.get("scale"), 1 / MAX_MAGNITUDE, MAX_MAGNITUDE):
-        raise _unusable(source, "metadata.normalisation.scale is no positive number")
+        raise _unusable(source, "metadata.normalisation.scale is not a positive number")
     step = metadata.get("step")
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < MAX_MAGNITUDE:
         raise _unusable(source, "metadata.step is no whole number")
@@ -104,7 +104,7 @@ def check_settings(settings: Any, source: str) -> None:
         raise UserError(f"{source}: must hold a JSON object, and data another; restore it or train again")
     for name in ("folder", "resample", "background"):
         if not isinstance(data.get(name, ""), (str, type(None))):
-            raise UserError(f"{source}: data.{name} is no text; restore it or train again")
+            raise UserError(f"{source}: data.{name} is not text; restore it or train again")
 
 
 def _number(value: Any, low: float, high: float) -> bool:
@@ -156,7 +156,7 @@ def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], so
             if mean is None or mean.shape != value.shape or _beyond(mean, value):
                 raise _unusable(source, f"{name} and its exp_avg are not of the same gradients")
         if name.endswith(".step") and (value.ndim != 0 or not 0 <= float(value) < MAX_MAGNITUDE):
-            raise _unusable(source, f"{name} is no number of steps")
+            raise _unusable(source, f"{name} is not a number of steps")
     if not _number(metadata.get("extent"), 1 / MAX_MAGNITUDE, MAX_MAGNITUDE) or metadata.get("stage") not in (
         "pretrain",
         "main",

@@ -51,7 +51,7 @@ def test_what_is_no_film_is_refused(tmp_path):
         for frame in pan(range(0, 60, 3)):
             out.write(frame)
     (tmp_path / "cut.mp4").write_bytes((tmp_path / "cut.mp4").read_bytes()[:300])
-    for name, said in (("film.mp4", "is no video"), ("empty", "holds no images"), ("nowhere", "no such file")):
+    for name, said in (("film.mp4", "is not a video"), ("empty", "holds no images"), ("nowhere", "no such file")):
         with pytest.raises(UserError, match=said):
             open_source(tmp_path / name)
     with pytest.raises(UserError, match=r"cut\.mp4"):
@@ -61,5 +61,5 @@ def test_what_is_no_film_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"010\.png.*one size"):
         list(open_source(mixed).frames(64))
     (mixed / "010.png").write_bytes(b"x")
-    with pytest.raises(UserError, match=r"010\.png: is no image"):
+    with pytest.raises(UserError, match=r"010\.png: is not an image"):
         list(open_source(mixed).frames(64))

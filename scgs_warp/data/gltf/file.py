@@ -175,7 +175,7 @@ class GltfFile:
         path = inside(self.path.parent, unquote(uri), f"{self.path}: {field}")
         try:
             if not is_regular(path):
-                raise OSError(None, "it is no file")
+                raise OSError(None, "it is not a regular file")
             data = path.read_bytes()
             self._digest.update(data)
             return data
@@ -215,17 +215,17 @@ def _checked(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a .glb or .gltf with --mesh")
     if path.suffix.lower() not in (".glb", ".gltf"):
-        raise UserError(f"{path}: is no glTF by its name; give a .glb or .gltf (Blender exports them)")
+        raise UserError(f"{path}: does not end in .glb or .gltf; give a .glb or .gltf (Blender exports them)")
     data = read_bytes(path, "give a .glb or .gltf with --mesh")
     try:
         if path.suffix.lower() == ".glb":
             magic, _, _, length = struct.unpack_from("<4sIII", data)
             if magic != b"glTF" or 20 + length > len(data):
-                raise ValueError("cut short, or no GLB")
+                raise ValueError("truncated or not a GLB")
             data = data[20 : 20 + length]
         content = parse_json(data.decode("utf-8-sig"))
     except (ValueError, struct.error) as error:
-        raise UserError(f"{path}: is no glTF that can be read ({str(error)[:80]}); export it again") from None
+        raise UserError(f"{path}: is not a readable glTF ({str(error)[:80]}); export it again") from None
     found = find_problem(content)
     if found is not None:
         raise UserError(f"{path}: {found[0]} {found[1]}; export the file again")
@@ -245,9 +245,9 @@ def _parse(path: Path) -> Any:
             document = pygltflib.GLTF2().load(path)
     except Exception as error:  # The parser passes on the exceptions of struct, json, dataclasses and unicode.
         reason = " ".join(str(error).split())[:80] or type(error).__name__
-        raise UserError(f"{path}: is no glTF that can be read ({reason}); export it again") from None
+        raise UserError(f"{path}: is not a readable glTF ({reason}); export it again") from None
     finally:
         logging.disable(logging.NOTSET)
     if document is None or document.asset is None:
-        raise UserError(f"{path}: asset is missing, so this is no glTF; export it again")
+        raise UserError(f"{path}: asset is missing, so this is not a glTF; export it again")
     return document

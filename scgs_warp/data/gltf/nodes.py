@@ -79,7 +79,7 @@ class Nodes:
         rotation = numbers("rotation", [0.0, 0.0, 0.0, 1.0])
         length = float(np.linalg.norm(rotation))
         if length == 0.0:
-            raise self.file.error(f"nodes[{index}].rotation", "is no rotation (all zeros); export the file again")
+            raise self.file.error(f"nodes[{index}].rotation", "is not a rotation (all zeros); export the file again")
         translation, scale = numbers("translation", [0.0] * 3), numbers("scale", [1.0] * 3)
         return {"translation": translation, "rotation": rotation / length, "scale": scale}
 

@@ -73,7 +73,7 @@ def find_problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, st
     kind = FIELDS if kind is None else kind
     if isinstance(kind, list):
         if not isinstance(value, list):
-            return field, "is no list"
+            return field, "is not a list"
         for index, inner in enumerate(value):
             found = find_problem(inner, kind[0], f"{field}[{index}]")
             if found is not None:
@@ -82,7 +82,7 @@ def find_problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, st
     if not isinstance(kind, dict):
         return None if _fits(value, kind) else (field, f"is not {kind}")
     if not isinstance(value, dict):
-        return field or "the document", "is no object"
+        return field or "the document", "is not an object"
     for name in kind.get("", ()):
         if value.get(name) is None:
             return f"{field}.{name}".strip("."), "is missing"

@@ -81,7 +81,7 @@ def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
     for key in ("ids", "train_ids", "val_ids"):
         values = content.get(key, [])
         if not isinstance(values, list) or not all(isinstance(item, (str, int)) for item in values):
-            raise UserError(f"{path}: {key} is no list of names; list the frames there")
+            raise UserError(f"{path}: {key} is not a list of names; list the frames there")
         lists[key] = list(dict.fromkeys(str(item) for item in values))
         for item in lists[key]:
             if not re.fullmatch(r"[\w.+=@, -]{1,200}", item) or item.strip() != item or item[0] == ".":
@@ -112,7 +112,7 @@ def _times(path: Path, names: list[str]) -> dict[str, float]:
         key = "time_id" if isinstance(entry, dict) and "time_id" in entry else "warp_id"
         value = as_number(entry.get(key)) if isinstance(entry, dict) else None
         if value is None:
-            raise UserError(f"{path}: {name}.{key} is missing or no number; give every frame the number of its instant")
+            raise UserError(f"{path}: {name}.{key} is missing or not a number; give each frame its instant")
         found[name] = value
     first, last = min(found.values()), max(found.values())
     return {name: (value - first) / (last - first) if last > first else 0.0 for name, value in found.items()}
@@ -126,7 +126,7 @@ def _world(path: Path) -> World:
     if centre is None:
         raise UserError(f"{path}: center is missing or not three numbers; restore it, or remove the file")
     if scale is None or scale <= 0:
-        raise UserError(f"{path}: scale is missing or no positive number; restore it, or remove the file")
+        raise UserError(f"{path}: scale is missing or not a positive number; restore it, or remove the file")
     return World(centre, scale)
 
 
@@ -147,7 +147,7 @@ def _images(folder: Path, downscale: float) -> tuple[Path, int]:
 def _viewmat(path: Path, content: dict[str, Any], world: World) -> np.ndarray:
     rotation, position = as_array(content.get("orientation"), (3, 3)), as_array(content.get("position"), (3,))
     if rotation is None or not is_rotation(rotation):
-        raise UserError(f"{path}: orientation is no rotation of 3 x 3 numbers; correct it or drop the id")
+        raise UserError(f"{path}: orientation is not a rotation of 3 x 3 numbers; correct it or drop the id")
     if position is None:
         raise UserError(f"{path}: position is not three finite numbers; correct it or drop the id")
     viewmat = np.eye(4)
@@ -169,9 +169,9 @@ def _lens(path: Path, content: dict[str, Any], ratio: int, source: tuple[int, in
     focal, centre = as_number(content.get("focal_length")), as_array(content.get("principal_point"), (2,))
     aspect, skew = as_number(content.get("pixel_aspect_ratio", 1.0)), as_number(content.get("skew", 0.0))
     if focal is None or focal <= 0 or aspect is None or aspect <= 0:
-        raise UserError(f"{path}: focal_length or pixel_aspect_ratio is missing or no positive number; give pixels")
+        raise UserError(f"{path}: focal_length or pixel_aspect_ratio is missing or not a positive number; give pixels")
     if centre is None or skew is None:
-        raise UserError(f"{path}: principal_point or skew is missing or no number; give pixels")
+        raise UserError(f"{path}: principal_point or skew is missing or not a number; give pixels")
     radial = as_array(content.get("radial_distortion", [0.0] * 3), (2,), (3,), (4,))
     tangential = as_array(content.get("tangential_distortion", content.get("tangential", [0.0] * 2)), (2,))
     if radial is None or tangential is None or (len(radial) == 4 and radial[3] != 0):

@@ -62,7 +62,7 @@ def _record(path: Path, folder: Path, content: dict[str, Any], index: int, file:
     fields = {**content, **entry}
     mask = entry.get("mask_path")
     if mask is not None and not (isinstance(mask, str) and mask):
-        raise UserError(f"{path}: frames[{index}].mask_path is no text; name the mask's file or leave it out")
+        raise UserError(f"{path}: frames[{index}].mask_path is not text; name the mask's file or leave it out")
     return FrameRecord(
         file,
         read_pose(path, index, entry),
@@ -98,7 +98,7 @@ def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) 
         raise UserError(f"{path}: {split}_filenames is missing while other splits are listed; list the files there")
     listed = lists[name]
     if not isinstance(listed, list) or not listed or not all(isinstance(item, str) for item in listed):
-        raise UserError(f"{path}: {name}_filenames is empty or no list of file names; name at least one frame's file")
+        raise UserError(f"{path}: {name}_filenames is empty or not a list of file names; name at least one file")
     known = {entry["file_path"]: index for index, entry in enumerate(content["frames"])}
     for item in listed:
         if item not in known:
@@ -116,7 +116,7 @@ def _points(
     if name is None:
         return None, None
     if not isinstance(name, str) or not name:
-        raise UserError(f"{path}: ply_file_path is no text; name the file of points or leave it out")
+        raise UserError(f"{path}: ply_file_path is not text; name the file of points or leave it out")
     points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
     moved = _applied(path, content, points)
     # Some writers apply the poses' transform to the points and some do not: keep what more cameras see.

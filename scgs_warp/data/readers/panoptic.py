@@ -50,13 +50,13 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         for place, name in enumerate(names):
             where = f"[{instant}][{place}]"
             if not isinstance(name, str) or not name:
-                raise UserError(f"{path}: fn{where} is no text; name the image file")
+                raise UserError(f"{path}: fn{where} is not text; name the image file")
             viewmat = as_array(rows["w2c"][instant][place], (4, 4), (3, 4))
             if viewmat is None or not is_rotation(viewmat[:3, :3]):
-                raise UserError(f"{path}: w2c{where} is no rigid 4 x 4 matrix of finite numbers; correct the pose")
+                raise UserError(f"{path}: w2c{where} is not a rigid 4 x 4 matrix of finite numbers; correct the pose")
             K = as_array(rows["k"][instant][place], (3, 3))
             if K is None or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - (0, 0, 1)).max() > 1e-6:
-                raise UserError(f"{path}: k{where} is no 3 x 3 matrix of intrinsics in pixels; correct the camera")
+                raise UserError(f"{path}: k{where} is not a 3 x 3 matrix of intrinsics in pixels; correct the camera")
             file = inside(folder / "ims", name, f"{path}: fn{where}", "image")
             pose = np.vstack([viewmat[:3], (0.0, 0.0, 0.0, 1.0)])
             label = Path(name).with_suffix("").as_posix().replace("/", "_").strip("._")
@@ -71,7 +71,7 @@ def _rows(path: Path, content: dict[str, Any], key: str) -> list[list[Any]]:
     """Return the field's list of cameras for each instant."""
     rows = content.get(key)
     if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
-        raise UserError(f"{path}: {key} is missing or no list of lists; give one list of cameras for each instant")
+        raise UserError(f"{path}: {key} is missing or not a list of lists; give one list of cameras for each instant")
     return rows
 
 

@@ -113,7 +113,7 @@ def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
     down, right, backwards, position = pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3]
     rotation = np.stack([right, down, -backwards])
     if not np.isfinite(pose).all() or not is_rotation(rotation):
-        raise UserError(f"{path}: row {index} holds no rotation of finite numbers; restore the file")
+        raise UserError(f"{path}: row {index} holds a matrix that is not a finite rotation; restore the file")
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
     return viewmat
@@ -123,7 +123,7 @@ def _lens(path: Path, index: int, column: np.ndarray, source: tuple[int, int]) -
     """Return the lens of images that may be smaller than those of the calibration."""
     height, width, focal = column
     if min(height, width, focal) < 1:
-        raise UserError(f"{path}: row {index} has no positive height, width and focal length; restore the file")
+        raise UserError(f"{path}: row {index} has a non-positive height, width or focal length; restore the file")
     sx, sy = source[0] / width, source[1] / height
     if abs(sx / sy - 1.0) > MAX_ASPECT_ERROR:
         raise UserError(

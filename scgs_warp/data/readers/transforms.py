@@ -33,10 +33,10 @@ def read_transforms(path: Path) -> dict[str, Any]:
     content = read_json(path, "this split needs it, or choose another split")
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise UserError(f"{path}: 'frames' is missing, empty or no list; list at least one frame there")
+        raise UserError(f"{path}: 'frames' is missing, empty or not a list; list at least one frame there")
     for index, entry in enumerate(frames):
         if not isinstance(entry, dict):
-            raise UserError(f"{path}: frames[{index}] is no object; give file_path and transform_matrix")
+            raise UserError(f"{path}: frames[{index}] is not an object; give file_path and transform_matrix")
     return content
 
 
@@ -87,7 +87,7 @@ def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> P
     """Return the frame's image file; complete a name without suffix."""
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
-        raise UserError(f"{path}: frames[{index}].file_path is missing or no text; name the image file")
+        raise UserError(f"{path}: frames[{index}].file_path is missing or not text; name the image file")
     base = inside(folder, name, f"{path}: frames[{index}].file_path", "image")
     if base.suffix.lower() in SUFFIXES or base.is_file():
         return base
@@ -140,7 +140,7 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
 def _parameter(path: Path, key: str, value: Any) -> float:
     number = as_number(value)
     if number is None:
-        raise UserError(f"{path}: {key} is {str(value)[:40]!r}, no number; give the lens distortion, or 0")
+        raise UserError(f"{path}: {key} is {str(value)[:40]!r}, not a number; give the lens distortion, or 0")
     return number
 
 
@@ -174,7 +174,7 @@ def read_intrinsics(
         value = as_number(fields.get(key))
         if value is None or (positive and value <= 0):
             kind = "positive number" if positive else "number"
-            raise UserError(f"{path}: {key} (frame {index}) is missing or no {kind}; give it in pixels")
+            raise UserError(f"{path}: {key} (frame {index}) is missing or not a {kind}; give it in pixels")
         return value
 
     width, height = source

@@ -131,7 +131,7 @@ def test_masks_of_frames(tmp_path):
 
 
 FAULTS = {
-    "distortion": (lambda content: content.__setitem__("k1", "much"), "k1 is 'much', no number"),
+    "distortion": (lambda content: content.__setitem__("k1", "much"), "k1 is 'much', not a number"),
     "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", None), "p2 is 'None'"),
     "k5": (lambda content: content.__setitem__("k5", 0.1), "k5 is 0.1, a lens distortion that camera_model None does"),
     "tangential fisheye": (
@@ -149,7 +149,7 @@ FAULTS = {
     ),
     "no text": (lambda content: content.__setitem__("camera_model", 3), "camera_model is '3'"),
     "no points": (lambda content: content.__setitem__("ply_file_path", "none.ply"), "none.ply: no such file"),
-    "points": (lambda content: content.__setitem__("ply_file_path", 3), "ply_file_path is no text"),
+    "points": (lambda content: content.__setitem__("ply_file_path", 3), "ply_file_path is not text"),
     "mask": (lambda content: content["frames"][0].__setitem__("mask_path", 3), "frames[0].mask_path"),
     "no mask": (lambda content: content["frames"][0].__setitem__("mask_path", "no.png"), "no.png: no such image"),
     "transform": (lambda content: content.__setitem__("applied_transform", [[1, 2]]), "applied_transform must be"),
