@@ -162,7 +162,7 @@ def is_transparent(pixels: np.ndarray) -> bool:
 
 
 def decode(path: Path) -> np.ndarray:
-    """[H, W, 3 or 4] RGB(A), uint8 or uint16; UserError if the file is missing or not an image."""
+    """Decode a file to RGB(A) [H, W, 3 or 4], uint8 or uint16; raise UserError if it is missing or not an image."""
     try:
         if not is_regular(path):
             raise UserError(f"{path}: is not a regular file; give an image, or drop the frame")

@@ -85,7 +85,7 @@ def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list
 
 
 def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) -> list[int]:
-    """Indices of the frames of this split, in the order of the file."""
+    """Return the indices of the frames of this split, in the order of the file."""
     lists = {name: content[f"{name}_filenames"] for name in ("train", "val", "test") if f"{name}_filenames" in content}
     for name in ("val", "test"):  # Exporters write all three lists, of which one may be empty.
         if lists.get(name) == []:

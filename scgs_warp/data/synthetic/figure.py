@@ -179,7 +179,7 @@ class Figure:
 
 
 def _cube(divisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Grid the surface of [-1, 1]^3 with welded seams: vertices [P, 3], outward faces [F, 3]."""
+    """Tessellate the surface of [-1, 1]^3 with welded seams: vertices [P, 3], outward faces [F, 3]."""
     ticks = np.tan(np.linspace(-1, 1, divisions + 1) * np.pi / 4)  # Even angles avoid crowding at the corners.
     u, v = np.meshgrid(ticks, ticks, indexing="ij")
     corner = np.arange(divisions)[:, None] * (divisions + 1) + np.arange(divisions)

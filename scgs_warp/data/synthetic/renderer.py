@@ -220,7 +220,7 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None
         raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
     try:
         write(work)
-        os.chmod(work, 0o755)  # mkdtemp makes private folders.
+        os.chmod(work, 0o755)  # Folders of mkdtemp are private.
         _replace(folder, work)
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror}); make room or choose another folder") from None
