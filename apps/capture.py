@@ -57,13 +57,13 @@ def main(args: list[str] | None) -> None:
 
     import cv2
 
-    from scgs_warp.capture import Request, capture
+    from scgs_warp.capture import CaptureRequest, capture
     from scgs_warp.runtime import environment
 
     cv2.setNumThreads(environment.thread_count())
     o = options
     film = (o.video, o.frames, o.start, o.end, o.size, o.masks)
-    request = Request(*film, o.matching, o.camera_model, o.fov, o.features, o.least, o.seed)
+    request = CaptureRequest(*film, o.matching, o.camera_model, o.fov, o.features, o.least, o.seed)
     made = capture(request, o.output, device=device)
     print("\n".join(made.lines))
     registered = f"{made.outcome.registered} of {made.outcome.picked} frames have a camera"

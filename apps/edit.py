@@ -81,16 +81,16 @@ def open_session(options: Options, device: str) -> EditSession:
     """The scene, ready to be edited, with the script's edit if there is one."""
     from scgs_warp.edit import EditSession
     from scgs_warp.motion import Static
-    from scgs_warp.scene.from_gaussians import open_ply, rig_static
+    from scgs_warp.scene.from_gaussians import open_gaussians, with_control_points
     from scgs_warp.scene.scene import Scene
 
     if options.ply is not None:
-        scene = open_ply(options.ply, device, options.nodes)
+        scene = open_gaussians(options.ply, device, options.nodes)
     else:
         assert options.run is not None
         scene = Scene.load(options.run, device=device)
         if isinstance(scene.motion, Static):
-            scene = rig_static(scene, options.nodes)
+            scene = with_control_points(scene, options.nodes)
     session = EditSession(scene)
     if options.script is not None:
         session.load(options.script)

@@ -68,23 +68,25 @@ def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="synthesize.py")
     device = prepare(options.device, options.threads)
 
-    from scgs_warp.data.synthetic.from_mesh import SHEET, Request, film, plan
-    from scgs_warp.data.synthetic.mesh import Look
-    from scgs_warp.data.synthetic.orbit_cameras import Filming
+    from scgs_warp.data.synthetic.from_mesh import SHEET, SynthesisRequest, plan_synthesis, synthesize
+    from scgs_warp.data.synthetic.mesh import Shading
+    from scgs_warp.data.synthetic.orbit_cameras import FilmingSettings
     from scgs_warp.errors import UserError
     from scgs_warp.runtime.progress import progress
 
     if len(options.size) not in (1, 2):
         raise UserError(f"--size {' '.join(map(str, options.size))}: give one number, or width and height")
     o = options
-    filming = Filming(o.size[0], o.size[-1], o.train, o.test, o.val, o.cameras, o.views, o.fov, o.elevation, o.turns)
-    look = Look(o.light, o.ambient, o.diffuse, o.unlit)
-    request = Request(o.mesh, o.clip, o.start, o.end, filming, look, o.samples, o.background, o.seed)
-    planned = plan(o.output, request, device)
+    filming = FilmingSettings(
+        o.size[0], o.size[-1], o.train, o.test, o.val, o.cameras, o.views, o.fov, o.elevation, o.turns
+    )
+    shading = Shading(o.light, o.ambient, o.diffuse, o.unlit)
+    request = SynthesisRequest(o.mesh, o.clip, o.start, o.end, filming, shading, o.samples, o.background, o.seed)
+    planned = plan_synthesis(o.output, request, device)
     print("\n".join(planned.lines), flush=True)
     if not planned.made:
         with progress(sum(planned.counts.values()), "filming") as bar:
-            film(planned, lambda done, total: bar.advance())
+            synthesize(planned, lambda done, total: bar.advance())
     pictures = ", ".join(f"{count} {split}" for split, count in planned.counts.items())
     print(f"{o.output}: {pictures}; ground_truth.npz, {SHEET}{' (made before)' if planned.made else ''}")
     print(f"next: python apps/train.py --data {o.output}")

@@ -75,9 +75,9 @@ def open_scene(options: Options, device: str) -> Scene:
     from scgs_warp.scene.scene import Scene
 
     if options.ply is not None:
-        from scgs_warp.scene.from_gaussians import open_ply
+        from scgs_warp.scene.from_gaussians import open_gaussians
 
-        return open_ply(options.ply, device)
+        return open_gaussians(options.ply, device)
     assert options.run is not None
     return Scene.load(options.run, device=device)
 

@@ -1,7 +1,7 @@
-"""From a video to a data set: frames, what moves in them, where the camera was (pycolmap), a folder that trains."""
+"""Capture of a data set from a video: frame selection, motion masks, camera poses (pycolmap) and undistortion."""
 
 from __future__ import annotations
 
-from .pipeline import Captured, Request, capture
+from .pipeline import CaptureRequest, CaptureResult, capture
 
-__all__ = ["Captured", "Request", "capture"]
+__all__ = ["CaptureRequest", "CaptureResult", "capture"]

@@ -1,8 +1,8 @@
-"""Features of the picked frames and what of them agrees between frames, in COLMAP's database. Interrupted work goes on.
+"""Features of the picked frames and their matches, in COLMAP's database. Interrupted work is resumed.
 
-pycolmap finds the features (SIFT) and the geometry of two views. Descriptors are compared here, all with all: they are
-bytes, whose products are exact in float32, so that no bit depends on the device or on the number of threads, as it does
-with the search trees of COLMAP's own matcher on CPUs.
+pycolmap extracts the features (SIFT) and estimates two-view geometry. Descriptors are matched here, exhaustively: they
+are bytes, whose products are exact in float32, so that matches depend neither on the device nor on the number of
+threads, unlike those of COLMAP's own CPU matcher, which uses search trees.
 """
 
 from __future__ import annotations
@@ -24,41 +24,41 @@ Tensor = torch.Tensor
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Matching = Literal["auto", "sequential", "exhaustive"]
-RATIO = 0.8
-"""Largest ratio of the angles to the best and the second best descriptor (Lowe 2004)."""
-ANGLE = 0.7
-"""Largest angle between descriptors that match, radians."""
-UNIT = 512.0
-"""Length of a descriptor of bytes."""
+MAX_ANGLE_RATIO = 0.8
+"""Largest ratio of the angles to the best and the second-best descriptor (Lowe 2004)."""
+MAX_ANGLE = 0.7
+"""Largest angle between matching descriptors, radians."""
+DESCRIPTOR_LENGTH = 512.0
+"""Euclidean length of a descriptor of bytes."""
 EXHAUSTIVE_VIDEO = 40
-"""Up to so many frames of a video are compared each with each ..."""
+"""Largest number of video frames that are all compared with each other."""
 EXHAUSTIVE_FOLDER = 120
-"""... and up to so many images of a folder, which need not be in order."""
-FOLLOWING = 8
-"""Frames that a frame is compared with; then those 16, 32, 64 ... later ..."""
-LOOP = 10
-"""... and every tenth with every tenth: the camera may come back."""
+"""The same for images of a folder, which need not be in order."""
+NEXT_FRAMES = 8
+"""Number of following frames that a frame is compared with, besides those 16, 32, 64 ... later."""
+LOOP_STRIDE = 10
+"""Stride of the frames that are all compared with each other, because the camera may return."""
 INITIAL_FOCAL = 1.2
-"""Focal length over the longer side, where nobody knows: 45 degrees."""
+"""Initial focal length over the longer side if the field of view is unknown: 45 degrees."""
 
 
-class Shots(NamedTuple):
-    """What features are taken from."""
+class FrameFiles(NamedTuple):
+    """Files of the picked frames and their masks."""
 
     folder: Path
-    """Of the frames."""
+    """Folder of the frames."""
     names: list[str]
-    """Files in the folder, in order of time; all of one size and one camera."""
+    """Names in the folder, in order of time; all frames have one size and one camera."""
     masks: Path | None
-    """Folder of masks of the same names, black where something moves."""
+    """Folder of masks with the same names, black on moving pixels; None without masks."""
 
 
 @contextmanager
 def quiet() -> Iterator[Any]:
-    """pycolmap without its log.
+    """Provide pycolmap with its log silenced.
 
     Raises:
-        UserError: it is too old.
+        UserError: pycolmap is too old.
     """
     import pycolmap
 
@@ -72,11 +72,11 @@ def quiet() -> Iterator[Any]:
         pycolmap.logging.minloglevel = before
 
 
-def begin(database: Path, shots: Shots, model: CameraModel, focal: float | None) -> None:
-    """A database of the frames, with one camera for all, unless it is there.
+def begin(database: Path, frame_files: FrameFiles, model: CameraModel, focal: float | None) -> None:
+    """Make the database of the frames, with one camera for all, unless it exists.
 
     Args:
-        focal: in pixels, where it is known.
+        focal: focal length in pixels; None if unknown.
     """
     with quiet() as pycolmap:
         with pycolmap.Database.open(database) as there:
@@ -84,33 +84,33 @@ def begin(database: Path, shots: Shots, model: CameraModel, focal: float | None)
                 return
         options = pycolmap.ImageReaderOptions(camera_model=model, default_focal_length_factor=INITIAL_FOCAL)
         if focal is not None:
-            height, width = read_rgb(shots.folder / shots.names[0]).shape[:2]
+            height, width = read_rgb(frame_files.folder / frame_files.names[0]).shape[:2]
             camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
             options.camera_params = ",".join(repr(float(value)) for value in camera.params)
         pycolmap.import_images(
-            database, shots.folder, pycolmap.CameraMode.SINGLE, image_names=shots.names, options=options
+            database, frame_files.folder, pycolmap.CameraMode.SINGLE, image_names=frame_files.names, options=options
         )
 
 
-def extract(database: Path, shots: Shots, most: int, done: Callable[[], object]) -> None:
-    """Features of every frame that has none yet, outside of its mask.
+def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[], object]) -> None:
+    """Extract features of every frame that has none yet, outside of its mask.
 
     Args:
-        most: features a frame.
+        most: largest number of features per frame.
         done: called after each frame.
     """
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
         options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
         options.sift.max_num_features = most
         extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-        for name in shots.names:
+        for name in frame_files.names:
             image = there.read_image_with_name(name).image_id
             if not there.exists_keypoints(image):
-                gray = cv2.cvtColor(read_rgb(shots.folder / name), cv2.COLOR_RGB2GRAY)
+                gray = cv2.cvtColor(read_rgb(frame_files.folder / name), cv2.COLOR_RGB2GRAY)
                 keypoints, descriptors = extractor.extract_from_uint8_array(gray)
                 rows = pycolmap.keypoints_to_matrix(keypoints)
-                if shots.masks is not None and len(rows):
-                    kept = ~_masked(shots.masks / name, rows[:, :2])
+                if frame_files.masks is not None and len(rows):
+                    kept = ~_masked(frame_files.masks / name, rows[:, :2])
                     rows, descriptors.data = rows[kept], descriptors.data[kept]
                 there.write_descriptors(image, descriptors)
                 there.write_keypoints(image, rows)
@@ -118,47 +118,52 @@ def extract(database: Path, shots: Shots, most: int, done: Callable[[], object])
 
 
 def _masked(file: Path, pixels: np.ndarray) -> np.ndarray:
-    """[N] bool: which of the pixels [N, 2] the mask hides."""
+    """Return [N] bool: which of the pixels [N, 2] are masked."""
     mask = read_rgb(file)[..., 0] < 128
     columns, rows = np.floor(pixels).astype(int).T
     return mask[rows.clip(0, mask.shape[0] - 1), columns.clip(0, mask.shape[1] - 1)]
 
 
 def pairs(count: int, matching: Matching, video: bool) -> list[tuple[int, int]]:
-    """Which of ``count`` frames are compared, ascending."""
+    """Return the pairs of ``count`` frames to compare, in ascending order."""
     if matching == "auto":
         matching = "exhaustive" if count <= (EXHAUSTIVE_VIDEO if video else EXHAUSTIVE_FOLDER) else "sequential"
     if matching == "exhaustive":
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
-    steps = [*range(1, FOLLOWING + 1)]
+    steps = [*range(1, NEXT_FRAMES + 1)]
     while 2 * steps[-1] < count:
         steps.append(2 * steps[-1])
     found = {(i, i + step) for i in range(count) for step in steps if i + step < count}
-    found |= {(i, j) for i in range(0, count, LOOP) for j in range(i + LOOP, count, LOOP)}
+    found |= {(i, j) for i in range(0, count, LOOP_STRIDE) for j in range(i + LOOP_STRIDE, count, LOOP_STRIDE)}
     return sorted(found)
 
 
 def match(
-    database: Path, shots: Shots, chosen: Sequence[tuple[int, int]], seed: int, device: str, done: Callable[..., object]
+    database: Path,
+    frame_files: FrameFiles,
+    chosen: Sequence[tuple[int, int]],
+    seed: int,
+    device: str,
+    done: Callable[..., object],
 ) -> None:
-    """Matches of every pair of frames that has none yet, and the geometry that they agree with.
+    """Match every pair of frames that has no matches yet, and estimate its two-view geometry.
 
     Args:
-        chosen: numbers of frames.
-        device: where descriptors are compared.
+        chosen: pairs of frame numbers, ascending.
+        device: device of the comparison of descriptors.
         done: called after each pair.
     """
     kept: dict[int, Tensor] = {}
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = seed
-        images = [there.read_image_with_name(name) for name in shots.names]
+        images = [there.read_image_with_name(name) for name in frame_files.names]
         points = [there.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
         camera = there.read_camera(images[0].camera_id)
         for a, b in chosen:
             one, two = images[a].image_id, images[b].image_id
             if not there.exists_two_view_geometry(one, two):
-                kept = {k: v for k, v in kept.items() if k >= a}  # ascending pairs do not go back
+                kept = {k: v for k, v in kept.items() if k >= a}  # Ascending pairs never return to earlier frames.
                 for k in (a, b):
                     if k not in kept:
                         kept[k] = torch.from_numpy(there.read_descriptors(images[k].image_id).data.copy()).to(device)
@@ -171,17 +176,18 @@ def match(
 
 
 def forget(database: Path) -> None:
-    """Remove all matches; features stay."""
+    """Remove all matches but keep the features."""
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
         there.clear_matches()
         there.clear_two_view_geometries()
 
 
 def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
-    """[M, 2] uint32: descriptors [N, 128] uint8 of two frames that are each other's nearest, clearly so."""
+    """Return the pairs [M, 2] uint32 of descriptors [N, 128] uint8 that are mutual nearest neighbours and pass the
+    ratio test."""
     if len(one) < 2 or len(two) < 2:
         return np.zeros((0, 2), np.uint32)
-    cosines = (one.float() @ two.float().T) / UNIT**2
+    cosines = (one.float() @ two.float().T) / DESCRIPTOR_LENGTH**2
     forth, there = _distinct(cosines)
     back, here = _distinct(cosines.T)
     mutual = forth & back[there] & (here[there] == torch.arange(len(one), device=one.device))
@@ -190,29 +196,29 @@ def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
 
 
 def _distinct(cosines: Tensor) -> tuple[Tensor, Tensor]:
-    """Of each row, whether its best is good and much better than the second best; and which it is."""
+    """Return for each row whether its best column passes the angle and ratio tests, and which column it is."""
     best, where = cosines.topk(2, dim=1)
     angles = best.clamp(-1.0, 1.0).acos()
-    return (angles[:, 0] <= ANGLE) & (angles[:, 0] <= RATIO * angles[:, 1]), where[:, 0]
+    return (angles[:, 0] <= MAX_ANGLE) & (angles[:, 0] <= MAX_ANGLE_RATIO * angles[:, 1]), where[:, 0]
 
 
 class Links(NamedTuple):
-    """How much the frames have in common."""
+    """Statistics of the features and matches of a capture."""
 
     features: int
-    """Median of a frame."""
+    """Median number of features per frame."""
     inliers: int
-    """Median of the pairs of frames that follow each other: matches that agree with one geometry."""
+    """Median number of inlier matches between consecutive frames."""
     linked: float
-    """Share of these pairs that agree at all."""
+    """Share of consecutive frames with inlier matches."""
     planar: float
-    """Share of all agreeing pairs for which one homography does: the camera turned without moving, or saw a plane."""
+    """Share of matched pairs explained by one homography: the camera only rotated, or saw a plane."""
 
 
-def links(database: Path, shots: Shots) -> Links:
-    """Count what is in the database."""
+def links(database: Path, frame_files: FrameFiles) -> Links:
+    """Compute the statistics of the database."""
     with quiet() as pycolmap, pycolmap.Database.open(database) as there:
-        images = [there.read_image_with_name(name).image_id for name in shots.names]
+        images = [there.read_image_with_name(name).image_id for name in frame_files.names]
         features = [there.num_keypoints_for_image(image) for image in images]
         found = [
             there.read_two_view_geometry(a, b) if there.exists_two_view_geometry(a, b) else None

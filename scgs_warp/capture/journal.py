@@ -1,4 +1,4 @@
-"""What has been done in a folder: interrupted work goes on, finished work stays, and nothing else is touched."""
+"""Journal of the finished stages of a capture: interrupted work is resumed, finished work and other files are kept."""
 
 from __future__ import annotations
 
@@ -13,22 +13,21 @@ from ..storage.files import parse_json
 from .writing import FILE, write_text
 
 WORK = "work"
-"""Folder of what lies between the video and the data set; may be deleted when the data set is done."""
+"""Folder of intermediate files; it may be deleted when the data set is finished."""
 JOURNAL = "journal.json"
 
 
 class Journal:
-    """Stages that follow from each other. A stage counts as done as long as it, and all before it, would be done with
-    the same settings."""
+    """A chain of stages. A result is reused if the settings of its stage and of all earlier stages are unchanged."""
 
     def __init__(self, folder: Path, source: str) -> None:
         """
         Args:
-            folder: must not exist, or be empty, or hold unfinished work on the same source.
-            source: tells what was filmed from anything else.
+            folder: must not exist, or be empty, or hold work on the same source.
+            source: digest of the source.
 
         Raises:
-            UserError: it holds something else.
+            UserError: the folder holds something else.
         """
         self.folder = folder
         self.work = folder / WORK
@@ -59,15 +58,15 @@ class Journal:
             ) from None
 
     def stage(self, name: str, settings: Any, make: Callable[[], Any], clear: Callable[[], None]) -> Any:
-        """The result of a stage: of ``make``, or of the time when it was made with the same settings.
+        """Return the result of a stage, stored or newly made.
 
         Args:
-            settings: JSON, everything that the result depends on beside earlier stages and the source.
-            make: does it, or goes on with it; what it returns is JSON.
-            clear: removes what another attempt, with other settings, has left.
+            settings: JSON; everything that the result depends on besides earlier stages and the source.
+            make: runs or resumes the stage; returns JSON.
+            clear: removes the files of an attempt with other settings.
 
         Raises:
-            UserError: the folder is finished, with other settings.
+            UserError: the folder was finished with other settings.
         """
         self._key = hashlib.sha256((self._key + json.dumps([name, settings], sort_keys=True)).encode()).hexdigest()
         found = self._stages.get(name)
@@ -88,12 +87,12 @@ class Journal:
         return result
 
     def result(self, name: str) -> Any:
-        """Of a stage that is done."""
+        """Return the result of a finished stage."""
         return self._stages[name]["result"]
 
     def damaged(self, name: str) -> UserError:
-        """The error to raise where the result of a stage is not what ``make`` returns."""
-        return UserError(f"{self.file}: what it says of {name} is damaged; remove {self.folder}, and capture again")
+        """Make the error to raise for a stored result that is malformed."""
+        return UserError(f"{self.file}: the result of {name} is damaged; remove {self.folder}, and capture again")
 
     def _save(self) -> None:
         content = {"source": self._source, "stages": self._stages}

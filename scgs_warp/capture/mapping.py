@@ -1,4 +1,4 @@
-"""Where the camera was: COLMAP's incremental mapping of matched frames, the largest of its models."""
+"""Camera poses: COLMAP's incremental mapping of matched frames, of which the largest model is kept."""
 
 from __future__ import annotations
 
@@ -9,45 +9,46 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .features import Shots, quiet
+from .features import FrameFiles, quiet
 
-FEWEST_VIEWS = 3
-"""Frames that a point must be seen in ..."""
-LARGEST_ERROR = 2.0
-"""... and pixels by which its projections may miss on average."""
+MIN_VIEWS = 3
+"""Smallest number of frames in which a point is seen."""
+MAX_ERROR = 2.0
+"""Largest mean reprojection error of a point, pixels."""
 
 
-class Solved(NamedTuple):
-    """A model of the scene at rest, in COLMAP's frame and scale, which mean nothing."""
+class CameraSolution(NamedTuple):
+    """Cameras and points of the static scene, in COLMAP's arbitrary frame and scale."""
 
     model: str
-    """The camera's, COLMAP's name."""
+    """COLMAP's name of the camera model."""
     params: tuple[float, ...]
     width: int
     height: int
     places: list[int]
-    """Of the registered frames, ascending."""
+    """Indices of the registered frames, ascending."""
     viewmats: np.ndarray
     """[V, 4, 4] world-to-camera, OpenCV."""
     points: np.ndarray
-    """[P, 3] that several frames agree on."""
+    """[P, 3] points seen in several frames."""
     colors: np.ndarray
     """[P, 3] uint8"""
     error: float
-    """Mean distance of projections from features, pixels."""
+    """Mean reprojection error, pixels."""
     arc: float
-    """Degrees: how far apart rays to a point are, at the median of all points."""
+    """Median angle between the rays to a point, degrees."""
 
 
-def solve(database: Path, shots: Shots, folder: Path, seed: int, done: Callable[[], object]) -> int:
-    """Run the mapper, on one thread: sums over threads would differ from run to run. Its largest model goes to
-    ``folder``, unless there is none.
+def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done: Callable[[], object]) -> int:
+    """Run the mapper and write its largest model to ``folder``.
+
+    It runs on one thread because sums over threads would differ from run to run.
 
     Args:
-        done: called after each frame that a model takes.
+        done: called after each registered frame.
 
     Returns:
-        Registered frames of that model; 0 without one.
+        Number of registered frames of that model; 0 without a model.
     """
     attempts = folder.with_name(f"{folder.name}-attempts")
     shutil.rmtree(attempts, ignore_errors=True)
@@ -59,7 +60,7 @@ def solve(database: Path, shots: Shots, folder: Path, seed: int, done: Callable[
         options.triangulation.random_seed = seed
         pycolmap.set_random_seed(seed)
         found = pycolmap.incremental_mapping(
-            database, shots.folder, attempts, options, next_image_callback=lambda: _ignore(done())
+            database, frame_files.folder, attempts, options, next_image_callback=lambda: _ignore(done())
         )
         best = max(found.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
         if best is not None and best.num_reg_images():
@@ -71,16 +72,16 @@ def solve(database: Path, shots: Shots, folder: Path, seed: int, done: Callable[
 
 
 def _ignore(_: object) -> None:
-    """The mapper's callback must return nothing."""
+    """Discard a result: the mapper's callback must return None."""
 
 
-def read_solution(folder: Path, shots: Shots) -> Solved | None:
-    """The model that :func:`solve` left; None without one."""
+def read_solution(folder: Path, frame_files: FrameFiles) -> CameraSolution | None:
+    """Read the model that :func:`solve` wrote; return None without one."""
     if not (folder / "images.bin").is_file():
         return None
     with quiet() as pycolmap:
         model = pycolmap.Reconstruction(folder)
-        place = {name: number for number, name in enumerate(shots.names)}
+        place = {name: number for number, name in enumerate(frame_files.names)}
         images = {place[image.name]: image for image in model.images.values() if image.has_pose}
         places = sorted(images)
         viewmats = np.tile(np.eye(4), (len(places), 1, 1))
@@ -88,8 +89,8 @@ def read_solution(folder: Path, shots: Shots) -> Solved | None:
             viewmats[row, :3] = images[number].cam_from_world().matrix()
         camera = next(iter(model.cameras.values()))
         points = [model.points3D[key] for key in sorted(model.points3D)]
-        kept = [p for p in points if p.track.length() >= FEWEST_VIEWS and p.error <= LARGEST_ERROR] or points
-        return Solved(
+        kept = [p for p in points if p.track.length() >= MIN_VIEWS and p.error <= MAX_ERROR] or points
+        return CameraSolution(
             camera.model_name,
             tuple(float(value) for value in camera.params),
             camera.width,
@@ -104,7 +105,7 @@ def read_solution(folder: Path, shots: Shots) -> Solved | None:
 
 
 def _arc(model, points: list) -> float:
-    """Degrees between the first and the last camera that see a point, at the median."""
+    """Return the median angle, in degrees, between the rays to a point from the first and last camera that see it."""
     centres = {key: image.projection_center() for key, image in model.images.items() if image.has_pose}
     angles = []
     for point in points[:: max(1, len(points) // 2000)]:

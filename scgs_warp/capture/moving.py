@@ -1,8 +1,8 @@
-"""Which pixels show something that moves by itself: given masks, or motion that disagrees with the scene at rest.
+"""Masks of independently moving pixels, from the user or from optical flow that disagrees with the static scene.
 
-Between two frames, what stands still moves along its epipolar lines, wherever it is. A fundamental matrix that fits
-most of the optical flow is that of the camera's motion; pixels whose flow leaves its lines move by themselves. (What
-moves along the lines, as a car does ahead of one that follows it, is not found; robust matching copes with the rest.)
+Between two frames, the image of a static point moves along its epipolar line. The fundamental matrix that fits most of
+the optical flow is that of the camera's motion; pixels whose flow leaves the epipolar lines move independently. Motion
+along the lines, such as that of a car straight ahead, is not found; robust matching copes with it.
 """
 
 from __future__ import annotations
@@ -17,41 +17,41 @@ from ..errors import UserError
 from ..storage.files import size_text
 from .source import Folder, Source, open_source, read_rgb, shrunk
 
-SIDE = 480
-"""Longer side of the images in which flow is computed, pixels."""
+FLOW_SIDE = 480
+"""Longer side of the images for optical flow, pixels."""
 STEPS = (-2, -1, 1, 2)
-"""Frames that each frame is compared with."""
+"""Offsets of the frames that each frame is compared with."""
 GRID = 12
-"""Every so many pixels a flow vector takes part in the search for the camera's motion."""
-FEWEST = 60
-"""Flow vectors without which no motion is sought."""
-OFF_LINE = 1.5
-"""Pixels of ``SIDE`` from the epipolar line that flow is never that wrong by ..."""
-OFF_TYPICAL = 6.0
-"""... unless it usually is: times the median distance."""
-RETURN = 1.5
-"""Pixels that flow forth and back may end from where it began; more, and the pixel is hidden in one of the frames."""
-TEXTURE = 4.0
-"""Grey levels of local contrast without which flow is a guess."""
-AGREE = 0.5
-"""Share of the comparisons in which a pixel must move by itself."""
-LARGEST = 0.5
-"""A mask of more than this share of the frame says that the search has failed."""
-GROW = 0.015
-"""Masks are widened by this share of ``SIDE``: flow is blurred at outlines."""
-SPECK = 0.001
-"""Smaller areas, as shares of the frame, are errors of the flow."""
+"""Spacing, in pixels, of the flow vectors from which the camera's motion is estimated."""
+MIN_VECTORS = 60
+"""Smallest number of flow vectors for that estimate."""
+MIN_LINE_DISTANCE = 1.5
+"""Smallest distance from the epipolar line of a moving pixel, in pixels at ``FLOW_SIDE``."""
+TYPICAL_FACTOR = 6.0
+"""Factor of the median distance that a moving pixel also exceeds."""
+MAX_ROUND_TRIP = 1.5
+"""Largest distance between a pixel and its image after flow forth and back, pixels; occluded pixels exceed it."""
+MIN_CONTRAST = 4.0
+"""Smallest local contrast at which flow is trusted, grey levels."""
+MIN_AGREEMENT = 0.5
+"""Smallest share of the comparisons in which a moving pixel is found to move."""
+MAX_MASK_SHARE = 0.5
+"""Largest share of the frame that a mask covers; a larger mask is discarded as a failure."""
+DILATION = 0.015
+"""Dilation of masks as a share of ``FLOW_SIDE``, because flow is blurred at outlines."""
+MIN_AREA = 0.001
+"""Smallest connected area of a mask, as a share of the frame; smaller ones are errors of the flow."""
 
 
-def consensus(load: Callable[[int], np.ndarray], count: int, done: Callable[[], object]) -> list[np.ndarray]:
-    """Masks of ``count`` frames.
+def find_moving(load: Callable[[int], np.ndarray], count: int, done: Callable[[], object]) -> list[np.ndarray]:
+    """Find the moving pixels of ``count`` frames.
 
     Args:
         load: frame number -> [H, W, 3] uint8 RGB.
         done: called after each frame.
 
     Returns:
-        [H, W] bool at the frames' size, True where something moves by itself.
+        [H, W] bool of each frame at its size, True on moving pixels.
     """
     kept: dict[int, np.ndarray] = {}
     flows: dict[tuple[int, int], np.ndarray] = {}
@@ -72,12 +72,12 @@ def consensus(load: Callable[[int], np.ndarray], count: int, done: Callable[[], 
                 kept[k], size = _gray(image), (image.shape[1], image.shape[0])
         votes, asked = np.zeros(kept[index].shape, np.float32), np.zeros(kept[index].shape, np.float32)
         for other in around:
-            answer = off_line(kept[index], flow(index, other), flow(other, index))
+            answer = leaves_epipolar_line(kept[index], flow(index, other), flow(other, index))
             if answer is not None:
                 moves, sure = answer
                 votes += moves & sure
                 asked += sure
-        mask = (votes >= 1) & (votes >= AGREE * asked)
+        mask = (votes >= 1) & (votes >= MIN_AGREEMENT * asked)
         masks.append(_tidy(mask, size))
         gone = index + min(STEPS)
         kept.pop(gone, None)
@@ -87,47 +87,48 @@ def consensus(load: Callable[[int], np.ndarray], count: int, done: Callable[[], 
 
 
 def _gray(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(shrunk(image, SIDE), cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(shrunk(image, FLOW_SIDE), cv2.COLOR_RGB2GRAY)
 
 
-def off_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Which pixels of an image leave their epipolar lines on the way to another, and of which that can be said.
+def leaves_epipolar_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Find the pixels of an image whose flow to another image leaves the epipolar lines.
 
     Args:
         one: [H, W] uint8.
-        forth, back: [H, W, 2] flow from it to the other image, and from that to it.
+        forth, back: [H, W, 2] flow from the image to the other one, and back.
 
     Returns:
-        [H, W] bool twice; None where no motion of the camera is found.
+        [H, W] bool, which pixels leave their lines, and [H, W] bool, at which pixels the flow is reliable; None if no
+        camera motion is found.
     """
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     there = np.stack([x, y], 2) + forth
     returned = cv2.remap(back, there[..., 0], there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (there >= 0).all(2) & (there[..., 0] < width) & (there[..., 1] < height)
-    sure = inside & (np.square(forth + returned).sum(2) < RETURN**2) & _textured(one)
+    sure = inside & (np.square(forth + returned).sum(2) < MAX_ROUND_TRIP**2) & _textured(one)
     chosen = np.zeros_like(sure)
     chosen[GRID // 2 :: GRID, GRID // 2 :: GRID] = True
     chosen &= sure
-    if chosen.sum() < FEWEST:
+    if chosen.sum() < MIN_VECTORS:
         return None
     here = np.stack([x, y], 2)
     matrix, _ = cv2.findFundamentalMat(here[chosen], there[chosen], cv2.USAC_MAGSAC, 0.5, 0.999, 2000)
     if matrix is None or matrix.shape != (3, 3):
         return None
     distance = sampson(matrix, here, there)
-    limit = max(OFF_LINE, OFF_TYPICAL * float(np.median(distance[sure])))
+    limit = max(MIN_LINE_DISTANCE, TYPICAL_FACTOR * float(np.median(distance[sure])))
     return distance > limit, sure
 
 
 def _textured(gray: np.ndarray) -> np.ndarray:
     values = gray.astype(np.float32)
     mean = cv2.blur(values, (9, 9))
-    return cv2.blur(values * values, (9, 9)) - mean * mean > TEXTURE**2
+    return cv2.blur(values * values, (9, 9)) - mean * mean > MIN_CONTRAST**2
 
 
 def sampson(matrix: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """[...] distance in pixels of pairs of points [..., 2] from a fundamental matrix, to first order."""
+    """Return the Sampson distance [...] in pixels of point pairs [..., 2] from a fundamental matrix."""
     ones = np.ones((*here.shape[:-1], 1))
     a, b = np.concatenate([here, ones], -1), np.concatenate([there, ones], -1)
     lines, back = a @ matrix.T, b @ matrix
@@ -136,34 +137,35 @@ def sampson(matrix: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarr
 
 
 def _tidy(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Without specks and holes, widened, at ``size`` (width, height); nothing where too much is left."""
-    reach = max(1, round(GROW * max(mask.shape)))
+    """Remove specks and holes, dilate, and resize to ``size`` (width, height); clear a mask that is too large."""
+    reach = max(1, round(DILATION * max(mask.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     pixels = cv2.medianBlur(mask.astype(np.uint8), 5)
     pixels = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, disc)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(pixels)
-    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= SPECK * mask.size]
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= MIN_AREA * mask.size]
     pixels = cv2.dilate(np.isin(labels, large).astype(np.uint8), disc)
-    if pixels.mean() > LARGEST:
+    if pixels.mean() > MAX_MASK_SHARE:
         pixels[:] = 0
     return cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def given(path: Path, source: Source, indices: Sequence[int], names: Sequence[str], size: tuple[int, int]) -> list:
-    """Masks that the user made: black where something moves, as COLMAP and nerfstudio have it.
+def read_masks(path: Path, source: Source, indices: Sequence[int], names: Sequence[str], size: tuple[int, int]) -> list:
+    """Read the user's masks, black on moving pixels, as in COLMAP and nerfstudio.
 
-    A video of masks, or a folder with one for each frame of the source: of the same name for a folder of images, in the
-    order of names for a video; a folder may also have masks of the picked frames only, named by their numbers.
+    The masks are a video, or a folder with one mask for each frame of the source: with the same name for a folder of
+    images, in the order of names for a video. A folder may also hold masks of the picked frames only, named by their
+    numbers.
 
     Args:
-        indices, names: of the picked frames.
+        indices, names: indices and file names of the picked frames.
         size: (width, height) of the frames.
 
     Returns:
-        [H, W] bool at ``size``, True where something moves.
+        [H, W] bool for each picked frame, at ``size``, True on moving pixels.
 
     Raises:
-        UserError: there are no masks, or they do not belong to the frames.
+        UserError: masks are missing, or do not fit the frames.
     """
     masks = open_source(path)
     wanted = set(indices)
@@ -192,7 +194,7 @@ def _given(image: np.ndarray, path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def _paired(masks: Folder, source: Source, indices: Sequence[int], names: Sequence[str]) -> list[Path]:
-    """The mask of each picked frame."""
+    """Return the file of each picked frame's mask."""
     by_name = {file.name: file for file in masks.files} | {file.stem: file for file in masks.files}
     if not source.video:
         keys = [next((key for key in (f"{name}.png", Path(name).stem) if key in by_name), name) for name in names]
@@ -210,5 +212,5 @@ def _paired(masks: Folder, source: Source, indices: Sequence[int], names: Sequen
 
 
 def frame_name(index: int) -> str:
-    """Of a picked frame, without suffix."""
+    """Return the file name of a picked frame, without suffix."""
     return f"frame_{index:05d}"

@@ -1,4 +1,4 @@
-"""What a user looks at before training: the picked frames on a sheet, and where the cameras were."""
+"""Pictures for checking a capture before training: a contact sheet of the picked frames, and a plot of the cameras."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ..data.dataset import spread
 from ..visualization.video import write_png
-from .writing import Scene
+from .writing import CapturedScene
 
-MOST = 48
-"""Pictures on the sheet."""
+MAX_PICTURES = 48
+"""Largest number of pictures on the sheet."""
 COLUMNS = 8
 CELL = 200
 """Width of a picture on the sheet, pixels."""
 CAPTION = 18
 GAP = 4
 MOVING = (255, 60, 40)
-"""What masks hide is tinted in this colour."""
-LOST = (200, 30, 30)
-MOST_POINTS = 6000
-MOST_FRUSTA = 60
+"""Tint of masked pixels."""
+STRUCK_OUT = (200, 30, 30)
+MAX_POINTS = 6000
+MAX_FRUSTA = 60
 
 
 def sheet(
@@ -33,15 +34,15 @@ def sheet(
     registered: set[int],
     video: bool,
 ) -> None:
-    """Frames in order of time, what is masked in them tinted; those that no camera was found for are struck out.
+    """Write the contact sheet: frames in order of time, masked pixels tinted, frames without a camera struck out.
 
     Args:
         load: number of a picked frame -> image [H, W, 3] uint8, mask [H, W] bool or None.
-        seconds: of each picked frame; of a folder, its place.
+        seconds: time of each picked frame; of a folder, its index.
         registered: numbers of the frames with a camera.
     """
     count = len(seconds)
-    shown = sorted({round(k * (count - 1) / max(min(count, MOST) - 1, 1)) for k in range(min(count, MOST))})
+    shown = spread(count, MAX_PICTURES)
     cells = [_cell(*load(k), _caption(k, seconds[k], k in registered, video), k in registered) for k in shown]
     height, width = cells[0].shape[:2]
     columns = min(COLUMNS, len(cells))
@@ -65,16 +66,16 @@ def _cell(image: np.ndarray, mask: np.ndarray | None, text: str, found: bool) ->
         hidden = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         picture[hidden] = (picture[hidden] // 2 + np.array(MOVING) // 2).astype(np.uint8)
     if not found:
-        cv2.line(picture, (0, 0), (size[0] - 1, size[1] - 1), LOST, 2, cv2.LINE_AA)
+        cv2.line(picture, (0, 0), (size[0] - 1, size[1] - 1), STRUCK_OUT, 2, cv2.LINE_AA)
     cell = np.full((size[1] + CAPTION, CELL, 3), 255, np.uint8)
     cell[: size[1]] = picture
-    color = (40, 40, 40) if found else LOST
+    color = (40, 40, 40) if found else STRUCK_OUT
     cv2.putText(cell, text, (3, size[1] + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
     return cell
 
 
-def cameras(path: Path, scene: Scene) -> None:
-    """The scene from above and from the side: points in their colours, cameras in the colours of their time."""
+def cameras(path: Path, scene: CapturedScene) -> None:
+    """Plot the scene from above and from the side: points in their colours, cameras coloured by time."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -82,14 +83,14 @@ def cameras(path: Path, scene: Scene) -> None:
     figure = Figure(figsize=(13, 6.2), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     frusta = _frusta(scene)
-    some = slice(None, None, max(1, len(scene.points) // MOST_POINTS))
+    some = slice(None, None, max(1, len(scene.points) // MAX_POINTS))
     points, colors = scene.points[some], scene.colors[some] / 255.0
     places = frusta[:, 0, 0]
     low, high = _window(points, places)
     lines: Any = None
     for axes, (a, b), title in zip(figure.subplots(1, 2), ((0, 1), (1, 2)), ("from above", "from the side")):
         axes.scatter(points[:, a], points[:, b], s=2, c=colors, linewidths=0)
-        every = max(1, len(frusta) // MOST_FRUSTA)
+        every = max(1, len(frusta) // MAX_FRUSTA)
         chosen = frusta[::every]
         edges = chosen[..., [a, b]].reshape(-1, *chosen.shape[2:3], 2)
         lines = LineCollection(list(edges), cmap="plasma", linewidths=0.9)
@@ -103,9 +104,9 @@ def cameras(path: Path, scene: Scene) -> None:
     figure.savefig(path, metadata={"Software": None})
 
 
-def _frusta(scene: Scene) -> np.ndarray:
-    """[V, 5, 4, 3] polylines of each camera: four sides, each from the centre and back (one point repeated), and the
-    image plane (closed by its first corner)."""
+def _frusta(scene: CapturedScene) -> np.ndarray:
+    """Return polylines [V, 5, 4, 3] of each camera: four sides that start and end at the centre, and the corners of the
+    image plane."""
     p = scene.pinhole
     reach = 0.25
     corners = np.array([[0, 0], [p.width, 0], [p.width, p.height], [0, p.height]], np.float64)
@@ -121,7 +122,7 @@ def _frusta(scene: Scene) -> np.ndarray:
 
 
 def _window(points: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of what is shown: all cameras, and the points without the far ones."""
+    """Return the corners of the plotted range: all cameras, and the points without outliers."""
     if len(points):
         near, far = np.quantile(points, [0.02, 0.98], axis=0)
         points = points[((points >= near) & (points <= far)).all(1)]

@@ -1,4 +1,4 @@
-"""From a film to a folder that trains, stage by stage: frames, masks, features, matches, cameras, images."""
+"""Stages of a capture: frames, masks, features, matches, cameras, undistorted images."""
 
 from __future__ import annotations
 
@@ -19,60 +19,60 @@ from ..storage.files import as_number
 from ..visualization.video import write_png
 from . import features, mapping, moving, picking, pictures, writing
 from .diagnosis import Outcome, notes, too_few
-from .features import CameraModel, Matching, Shots
+from .features import CameraModel, FrameFiles, Matching
 from .journal import Journal
-from .source import Source, Still, open_source, read_rgb
+from .source import Source, SourceFrame, open_source, read_rgb
 
-LONGEST = 1e9
-"""Seconds; no film is as long."""
-FEWEST = 6
-"""Frames from which nothing can be learnt of a motion."""
+MAX_SECONDS = 1e9
+"""Largest plausible time in a film, seconds."""
+MIN_FRAMES = 6
+"""Smallest number of frames of a capture."""
 SHEET, CAMERAS = "contact_sheet.png", "cameras.png"
 VIDEO_FRAMES = 150
 
-Show = Callable[[int, str], AbstractContextManager[Any]]
+ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
 
 
 @dataclass(frozen=True)
-class Request:
-    """What to make of a film."""
+class CaptureRequest:
+    """Settings of a capture."""
 
     source: Path
     """A video, or a folder of images."""
     frames: int | None = None
-    """At most; None: ``VIDEO_FRAMES`` of a video, all images of a folder."""
+    """Largest number of frames; None: ``VIDEO_FRAMES`` of a video, all images of a folder."""
     start: float | None = None
     end: float | None = None
-    """Seconds of the video that are used."""
+    """Range of the video to use, seconds."""
     size: int = 1280
-    """Longer side of the images, pixels; smaller ones stay."""
+    """Largest longer side of the images, pixels."""
     masks: str = "auto"
-    """``auto``: what moves against the rest; ``none``; else a path of masks."""
+    """``auto``: masks of independently moving pixels; ``none``; else a path of masks."""
     matching: Matching = "auto"
     camera_model: CameraModel = "SIMPLE_RADIAL"
     fov: float | None = None
-    """Horizontal field of view, degrees, where it is known."""
+    """Horizontal field of view, degrees; None if unknown."""
     features: int = 4096
-    """At most, of a frame."""
+    """Largest number of features per frame."""
     least: float = 0.5
-    """Share of the frames that must get a camera."""
+    """Smallest share of the frames that must get a camera."""
     seed: int = 0
 
 
-class Frames(NamedTuple):
-    """The picked ones."""
+class PickedFrames(NamedTuple):
+    """The picked frames of a source."""
 
     indices: list[int]
-    """Places in the video."""
+    """Indices in the source."""
     seconds: list[float]
     names: list[str]
-    """Of the images in a folder that was given; empty for a video."""
+    """File names of the images of a folder; empty strings for a video."""
     span: tuple[float, float]
     """Seconds of the video that become times 0 and 1."""
     size: tuple[int, int]
     """(width, height)"""
     seen: int
-    """Frames that were looked at."""
+    """Number of frames of the source."""
     blurred: int
     alike: int
 
@@ -81,21 +81,24 @@ class Frames(NamedTuple):
         return [f"{moving.frame_name(index)}.png" for index in self.indices]
 
 
-class Captured(NamedTuple):
+class CaptureResult(NamedTuple):
+    """Result of a capture."""
+
     outcome: Outcome
     lines: list[str]
-    """What was found, for the user."""
+    """Description of the result, for the user."""
     made_before: bool
+    """True if the folder was complete before."""
 
 
-def check(request: Request) -> None:
-    """Refuse what cannot work.
+def check(request: CaptureRequest) -> None:
+    """Check the values of a request.
 
     Raises:
         UserError: naming the option, its value and the remedy.
     """
-    if request.frames is not None and request.frames < FEWEST:
-        raise UserError(f"--frames {request.frames}: give at least {FEWEST}")
+    if request.frames is not None and request.frames < MIN_FRAMES:
+        raise UserError(f"--frames {request.frames}: give at least {MIN_FRAMES}")
     if not 64 <= request.size <= 8192:
         raise UserError(f"--size {request.size}: give 64 to 8192 pixels")
     if request.fov is not None and not 5.0 <= request.fov <= 170.0:
@@ -111,15 +114,17 @@ def check(request: Request) -> None:
         raise UserError(f"--seed {request.seed}: give 0 or more")
 
 
-def capture(request: Request, folder: Path, *, device: str = "cpu", show: Show = progress) -> Captured:
-    """Make the data set in ``folder``, or go on with what an interrupted attempt has left there.
+def capture(
+    request: CaptureRequest, folder: Path, *, device: str = "cpu", show: ShowProgress = progress
+) -> CaptureResult:
+    """Make the data set in ``folder``, or resume an interrupted attempt.
 
     Args:
-        device: where descriptors are compared.
+        device: device of the comparison of descriptors.
         show: ``show(total, text)`` is a context that shows progress; its value has ``advance()``.
 
     Raises:
-        UserError: the source, the masks or an option cannot be used, or too few frames got a camera.
+        UserError: the source, the masks or an option is invalid, or too few frames got a camera.
     """
     check(request)
     source = open_source(request.source)
@@ -130,22 +135,22 @@ def capture(request: Request, folder: Path, *, device: str = "cpu", show: Show =
     journal.start()
     frames = _frames(request, source, journal, show)
     _enough(request, frames)
-    shots = _masks(request, source, frames, journal, show)
-    outcome, solved = _solve(request, source, frames, shots, journal, device, show)
+    frame_files = _masks(request, source, frames, journal, show)
+    outcome, solved = _solve(request, source, frames, frame_files, journal, device, show)
     lines = _lines(frames, outcome)
     if not before:
-        _draw_sheet(folder / SHEET, frames, shots, solved, source.video)
+        _draw_sheet(folder / SHEET, frames, frame_files, solved, source.video)
     if solved is None or outcome.registered < max(request.least * len(frames.indices), 3):
         raise UserError(too_few(str(folder), outcome))
     if not before:
-        _write(folder, frames, shots, solved, show)
-    return Captured(outcome, [*lines, *notes(outcome)], before)
+        _write(folder, frames, frame_files, solved, show)
+    return CaptureResult(outcome, [*lines, *notes(outcome)], before)
 
 
-def _enough(request: Request, frames: Frames) -> None:
-    if len(frames.indices) >= FEWEST:
+def _enough(request: CaptureRequest, frames: PickedFrames) -> None:
+    if len(frames.indices) >= MIN_FRAMES:
         return
-    if frames.seen < FEWEST:
+    if frames.seen < MIN_FRAMES:
         raise UserError(f"{request.source}: {frames.seen} frames are too few; film a few seconds, or give more images")
     raise UserError(
         f"{request.source}: {len(frames.indices)} of {frames.seen} frames are neither blurred nor alike "
@@ -153,8 +158,8 @@ def _enough(request: Request, frames: Frames) -> None:
     )
 
 
-def _frames(request: Request, source: Source, journal: Journal, show: Show) -> Frames:
-    """Pick frames and write them."""
+def _frames(request: CaptureRequest, source: Source, journal: Journal, show: ShowProgress) -> PickedFrames:
+    """Pick the frames and write them."""
     place = journal.work / "frames"
 
     def make() -> dict[str, Any]:
@@ -179,14 +184,14 @@ def _frames(request: Request, source: Source, journal: Journal, show: Show) -> F
     return frames
 
 
-def _frames_of(found: Any) -> Frames | None:
-    """What a journal holds of them; None where it is none of what ``_frames`` writes there."""
+def _frames_of(found: Any) -> PickedFrames | None:
+    """Parse the picked frames from a journal; return None if the entry is malformed."""
     try:
-        frames = Frames(**{**found, "span": tuple(found["span"]), "size": tuple(found["size"])})
+        frames = PickedFrames(**{**found, "span": tuple(found["span"]), "size": tuple(found["size"])})
         counts = (*frames.indices, *frames.size, frames.seen, frames.blurred, frames.alike)
         whole = all(isinstance(count, int) and 0 <= count < 2**31 for count in counts)
         numbers = [as_number(second) for second in (*frames.seconds, *frames.span)]
-        times = all(number is not None and abs(number) <= LONGEST for number in numbers)
+        times = all(number is not None and abs(number) <= MAX_SECONDS for number in numbers)
         names = len(frames.names) in (0, len(frames.indices)) and all(isinstance(name, str) for name in frames.names)
         lengths = len(frames.seconds) == len(frames.indices) and len(frames.span) == len(frames.size) == 2
     except (KeyError, TypeError):
@@ -194,12 +199,12 @@ def _frames_of(found: Any) -> Frames | None:
     return frames if whole and times and names and lengths else None
 
 
-def _until(stills: Iterator[Still], last: int) -> Iterator[Still]:
+def _until(stills: Iterator[SourceFrame], last: int) -> Iterator[SourceFrame]:
     return takewhile(lambda still: still.index <= last, stills)
 
 
-def _choose(request: Request, source: Source, show: Show) -> Frames:
-    """Which frames to take; of a folder, all of them unless a number is given."""
+def _choose(request: CaptureRequest, source: Source, show: ShowProgress) -> PickedFrames:
+    """Choose the frames; of a folder, all of them unless a number is given."""
     start, end = request.start or 0.0, math.inf if request.end is None else request.end
     with show(source.count, "looking at frames") as bar:
         within = (
@@ -213,35 +218,37 @@ def _choose(request: Request, source: Source, show: Show) -> Frames:
     if source.video or request.frames is not None:
         picked = picking.pick(found, request.frames or VIDEO_FRAMES)
     else:
-        picked = picking.Picked(list(range(len(found.index))), 0, 0)
+        picked = picking.Selection(list(range(len(found.index))), 0, 0)
     seconds = found.seconds[picked.places].tolist()
     span = (float(found.seconds[0]), float(found.seconds[-1]))
     indices = found.index[picked.places].tolist()
-    return Frames(indices, seconds, [], span, (0, 0), len(found.index), picked.blurred, picked.alike)
+    return PickedFrames(indices, seconds, [], span, (0, 0), len(found.index), picked.blurred, picked.alike)
 
 
-def _shown(source: Source, bar: Any) -> Iterator[Still]:
-    for still in source.frames(picking.LOOK_SIDE):
+def _shown(source: Source, bar: Any) -> Iterator[SourceFrame]:
+    for still in source.frames(picking.SHARPNESS_SIDE):
         yield still
         bar.advance()
 
 
-def _masks(request: Request, source: Source, frames: Frames, journal: Journal, show: Show) -> Shots:
-    """Write masks, if there are to be any."""
+def _masks(
+    request: CaptureRequest, source: Source, frames: PickedFrames, journal: Journal, show: ShowProgress
+) -> FrameFiles:
+    """Write the masks, if any are requested."""
     folder, place = journal.work / "frames", journal.work / "masks"
     files = frames.files
     if request.masks == "none":
         journal.stage("masks", "none", dict, lambda: shutil.rmtree(place, ignore_errors=True))
-        return Shots(folder, files, None)
+        return FrameFiles(folder, files, None)
     path = Path(request.masks)
 
     def make() -> dict[str, Any]:
         place.mkdir(exist_ok=True)
         with show(len(files), "finding what moves" if request.masks == "auto" else "reading masks") as bar:
             if request.masks == "auto":
-                found = moving.consensus(lambda k: read_rgb(folder / files[k]), len(files), bar.advance)
+                found = moving.find_moving(lambda k: read_rgb(folder / files[k]), len(files), bar.advance)
             else:
-                found = moving.given(path, source, frames.indices, frames.names, frames.size)
+                found = moving.read_masks(path, source, frames.indices, frames.names, frames.size)
                 bar.advance(len(files))
         for name, mask in zip(files, found):
             write_png(place / name, np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, 2))
@@ -249,49 +256,49 @@ def _masks(request: Request, source: Source, frames: Frames, journal: Journal, s
 
     kind = "auto" if request.masks == "auto" else open_source(path).digest()
     journal.stage("masks", kind, make, lambda: shutil.rmtree(place, ignore_errors=True))
-    return Shots(folder, files, place)
+    return FrameFiles(folder, files, place)
 
 
 def _solve(
-    request: Request,
+    request: CaptureRequest,
     source: Source,
-    frames: Frames,
-    shots: Shots,
+    frames: PickedFrames,
+    frame_files: FrameFiles,
     journal: Journal,
     device: str,
-    show: Show,
-) -> tuple[Outcome, mapping.Solved | None]:
-    """Features, matches, cameras."""
+    show: ShowProgress,
+) -> tuple[Outcome, mapping.CameraSolution | None]:
+    """Run the stages of features, matches and cameras."""
     database, model = journal.work / "database.db", journal.work / "model"
-    count = len(shots.names)
+    count = len(frame_files.names)
     focal = None if request.fov is None else 0.5 * frames.size[0] / math.tan(math.radians(request.fov) / 2)
     chosen = features.pairs(count, request.matching, source.video)
 
     def find() -> None:
-        features.begin(database, shots, request.camera_model, focal)
+        features.begin(database, frame_files, request.camera_model, focal)
         with show(count, "features") as bar:
-            features.extract(database, shots, request.features, bar.advance)
+            features.extract(database, frame_files, request.features, bar.advance)
 
     def compare() -> None:
         with show(len(chosen), "matching") as bar:
-            features.match(database, shots, chosen, request.seed, device, bar.advance)
+            features.match(database, frame_files, chosen, request.seed, device, bar.advance)
 
     def place() -> int:
         with show(count, "cameras") as bar:
-            return mapping.solve(database, shots, model, request.seed, lambda: bar.done < count and bar.advance())
+            return mapping.solve(database, frame_files, model, request.seed, lambda: bar.done < count and bar.advance())
 
     settings = [request.camera_model, request.fov, request.features]
     journal.stage("features", settings, find, lambda: database.unlink(missing_ok=True))
     journal.stage("matches", [request.matching, request.seed], compare, lambda: features.forget(database))
     journal.stage("cameras", request.seed, place, lambda: shutil.rmtree(model, ignore_errors=True))
-    solved = mapping.read_solution(model, shots)
-    masked = 0.0 if shots.masks is None else _share(journal)
+    solved = mapping.read_solution(model, frame_files)
+    masked = 0.0 if frame_files.masks is None else _share(journal)
     registered, arc = (len(solved.places), solved.arc) if solved else (0, 0.0)
-    return Outcome(count, registered, arc, features.links(database, shots), masked), solved
+    return Outcome(count, registered, arc, features.links(database, frame_files), masked), solved
 
 
 def _share(journal: Journal) -> float:
-    """Of the pixels that move, as the journal has it."""
+    """Return the share of masked pixels from the journal."""
     found = journal.result("masks")
     share = as_number(found.get("share")) if isinstance(found, dict) else None
     if share is None:
@@ -299,7 +306,7 @@ def _share(journal: Journal) -> float:
     return share
 
 
-def _lines(frames: Frames, outcome: Outcome) -> list[str]:
+def _lines(frames: PickedFrames, outcome: Outcome) -> list[str]:
     left_out = f" ({frames.blurred} blurred, {frames.alike} alike)" if frames.blurred or frames.alike else ""
     return [
         f"{outcome.picked} of {frames.seen} frames picked{left_out}, {frames.size[0]} x {frames.size[1]}; "
@@ -307,17 +314,21 @@ def _lines(frames: Frames, outcome: Outcome) -> list[str]:
     ]
 
 
-def _draw_sheet(path: Path, frames: Frames, shots: Shots, solved: mapping.Solved | None, video: bool) -> None:
+def _draw_sheet(
+    path: Path, frames: PickedFrames, frame_files: FrameFiles, solved: mapping.CameraSolution | None, video: bool
+) -> None:
     def load(k: int) -> tuple[np.ndarray, np.ndarray | None]:
-        mask = None if shots.masks is None else read_rgb(shots.masks / shots.names[k])[..., 0] < 128
-        return read_rgb(shots.folder / shots.names[k]), mask
+        mask = None if frame_files.masks is None else read_rgb(frame_files.masks / frame_files.names[k])[..., 0] < 128
+        return read_rgb(frame_files.folder / frame_files.names[k]), mask
 
     pictures.sheet(path, load, frames.seconds, set(solved.places if solved else ()), video)
 
 
-def _write(folder: Path, frames: Frames, shots: Shots, solved: mapping.Solved, show: Show) -> None:
+def _write(
+    folder: Path, frames: PickedFrames, frame_files: FrameFiles, solved: mapping.CameraSolution, show: ShowProgress
+) -> None:
     with show(len(solved.places), "undistorting") as bar:
-        pinhole = writing.undistort(shots, solved, folder, bar.advance)
-    scene = writing.scene_of(shots, solved, pinhole, frames.seconds, frames.span)
+        pinhole = writing.undistort(frame_files, solved, folder, bar.advance)
+    scene = writing.scene_of(frame_files, solved, pinhole, frames.seconds, frames.span)
     pictures.cameras(folder / CAMERAS, scene)
     writing.write_scene(folder, scene)

@@ -1,4 +1,4 @@
-"""Similarity transforms: x -> scale R x + t. Structure from motion knows a scene up to one of them."""
+"""Similarity transforms x -> scale R x + t, up to which structure from motion determines a scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from ..geometry.cameras import agreed_up
 
 MEDIAN_DISTANCE = 4.0
-"""From the middle of the scene to the cameras, in units of the written scene: about D-NeRF's."""
+"""Median distance of the cameras from the scene's centre in the written scene, similar to D-NeRF's."""
 
 
 class Similarity(NamedTuple):
@@ -20,11 +20,11 @@ class Similarity(NamedTuple):
     """[3]"""
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """Points [..., 3], moved."""
+        """Transform points [..., 3]."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def viewmats(self, viewmats: np.ndarray) -> np.ndarray:
-        """World-to-camera [V, 4, 4] in the new world, rigid again: the cameras see what they saw, ``scale`` larger."""
+        """Transform world-to-camera [V, 4, 4] to the new world; the cameras stay rigid and see the scaled scene."""
         moved = viewmats.copy()
         moved[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.T
         moved[:, :3, 3] = self.scale * viewmats[:, :3, 3] - moved[:, :3, :3] @ self.translation
@@ -32,12 +32,12 @@ class Similarity(NamedTuple):
 
 
 def centres(viewmats: np.ndarray) -> np.ndarray:
-    """[V, 3] of the cameras."""
+    """Return the camera centres [V, 3]."""
     return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
 
 
 def align(points: np.ndarray, targets: np.ndarray) -> Similarity:
-    """The similarity that brings points [N, 3] closest to targets [N, 3] in the least-squares sense.
+    """Fit the similarity that maps points [N, 3] to targets [N, 3] in the least-squares sense.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991, eq. 40-42.
     """
@@ -52,11 +52,11 @@ def align(points: np.ndarray, targets: np.ndarray) -> Similarity:
 
 
 def upright(viewmats: np.ndarray, points: np.ndarray) -> Similarity:
-    """Puts the middle of the points at the origin, what the cameras call up along +z and their mean direction along
-    +y, and the cameras ``MEDIAN_DISTANCE`` away at the median."""
+    """Return the similarity that moves the points' median to the origin, turns the cameras' common up direction to +z
+    and their mean viewing direction to +y, and scales their median distance to ``MEDIAN_DISTANCE``."""
     up, ahead = agreed_up(viewmats[:, :3, :3]), viewmats[:, 2, :3].mean(0)
     ahead = ahead - up * (up @ ahead)
-    if np.linalg.norm(ahead) < 1e-6:  # cameras all around, or looking along their up: any direction will do
+    if np.linalg.norm(ahead) < 1e-6:  # Cameras all around have no mean direction: any horizontal one will do.
         ahead = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     ahead /= np.linalg.norm(ahead)
     rotation = np.stack([np.cross(ahead, up), ahead, up])

@@ -1,4 +1,4 @@
-"""What was filmed, frame by frame: a video through PyAV, or a folder of images. Upright, with square pixels."""
+"""Sources of frames: a video decoded by PyAV, or a folder of images. Frames are upright with square pixels."""
 
 from __future__ import annotations
 
@@ -10,55 +10,55 @@ from typing import Any, NamedTuple, Protocol
 import cv2
 import numpy as np
 
-from ..data.images import bomb, whole
+from ..data.images import is_complete, oversized_claim
 from ..errors import UserError
 from ..storage.files import natural, size_text
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20
-"""Of the beginning and the end of a file, which tell it from others; videos are large."""
+"""Bytes at the beginning and the end of a file that enter its digest; videos are too large to hash whole."""
 
 
-class Still(NamedTuple):
-    """One frame."""
+class SourceFrame(NamedTuple):
+    """One frame of a source."""
 
     index: int
-    """Its place in the video, or in the order of names; from 0."""
+    """Index in the video, or in the order of names; from 0."""
     seconds: float
-    """Since the first frame; of a folder: its place."""
+    """Time since the first frame; of a folder, the index."""
     image: np.ndarray
     """[H, W, 3] uint8 RGB"""
     name: str
-    """Of the image's file; of a video: empty."""
+    """Name of the image file; empty for a video."""
 
 
 class Source(Protocol):
-    """Something that was filmed."""
+    """A video or a folder of images."""
 
     path: Path
     video: bool
-    """Whether frames follow each other in time as they were filmed; else someone chose them."""
+    """True for a video; images of a folder need not be consecutive."""
     count: int
-    """Frames, as the file says before it is decoded; may be wrong."""
+    """Number of frames according to the file's header, which may be wrong."""
 
-    def frames(self, longest: int) -> Iterator[Still]:
-        """All frames in order. ``longest``: images are made smaller until their longer side is this, or kept.
+    def frames(self, longest: int) -> Iterator[SourceFrame]:
+        """Yield all frames in order, reduced to a longer side of at most ``longest`` pixels.
 
         Raises:
-            UserError: one of them cannot be decoded.
+            UserError: a frame cannot be decoded.
         """
         ...
 
     def digest(self) -> str:
-        """Tells this source from others."""
+        """Return a hash that identifies this source."""
         ...
 
 
 def open_source(path: Path) -> Source:
-    """The video, or the folder of images, at ``path``.
+    """Open the video or the folder of images at ``path``.
 
     Raises:
-        UserError: there is none, or it cannot be read.
+        UserError: the path is missing or cannot be read.
     """
     if path.is_dir():
         return Folder(path)
@@ -68,14 +68,14 @@ def open_source(path: Path) -> Source:
 
 
 class Video:
-    """A file that ffmpeg's libraries decode."""
+    """A video file, decoded by ffmpeg's libraries."""
 
     video = True
 
     def __init__(self, path: Path) -> None:
         """
         Raises:
-            UserError: it is no video.
+            UserError: the file is not a video.
         """
         self.path = path
         with self._opened() as container:
@@ -91,17 +91,17 @@ class Video:
 
         try:
             container = av.open(str(self.path))
-        except (FFmpegError, OSError, ValueError) as error:  # ValueError: what it says of itself is no text
+        except (FFmpegError, OSError, ValueError) as error:  # ValueError: metadata that is not text
             reason = getattr(error, "strerror", None) or type(error).__name__
             raise UserError(
-                f"{self.path}: is no video that can be decoded ({reason}); save it as .mp4, or give a folder of images"
+                f"{self.path}: is not a video that decodes ({reason}); save it as .mp4, or give a folder of images"
             ) from None
         if not container.streams.video:
             container.close()
             raise UserError(f"{self.path}: holds no pictures; give a video, or a folder of images")
         return container
 
-    def frames(self, longest: int) -> Iterator[Still]:
+    def frames(self, longest: int) -> Iterator[SourceFrame]:
         from av.error import FFmpegError
 
         with self._opened() as container:
@@ -112,12 +112,12 @@ class Video:
             for packet in container.demux(stream):
                 try:
                     decoded = packet.decode()
-                except FFmpegError:  # a damaged packet; what follows may be whole
+                except FFmpegError:  # Later packets may be intact.
                     continue
                 for frame in decoded:
                     seconds = float(frame.time) if frame.time is not None else index / self.rate
                     first = seconds if first is None else first
-                    yield Still(index, seconds - first, _picture(frame, longest, shape), "")
+                    yield SourceFrame(index, seconds - first, _picture(frame, longest, shape), "")
                     index += 1
         if index == 0:
             raise UserError(f"{self.path}: no frame can be decoded; save it as .mp4, or give a folder of images")
@@ -127,19 +127,18 @@ class Video:
 
 
 def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
-    """A decoded frame as it is to be shown: pixels, ``shape`` times as wide as high, made square; turned as the phone
-    was held."""
+    """Return a decoded frame as displayed: upright, with pixels ``shape`` times as wide as high made square."""
     width, height = frame.width * shape, frame.height
     scale = min(1.0, longest / max(width, height))
     image = frame.to_ndarray(format="rgb24")
     size = max(1, round(width * scale)), max(1, round(height * scale))
     if size != (frame.width, frame.height):
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return upright(image, getattr(frame, "rotation", 0) or 0)
+    return rotate_image(image, getattr(frame, "rotation", 0) or 0)
 
 
-def upright(image: np.ndarray, degrees: float) -> np.ndarray:
-    """The image turned counter-clockwise by ``degrees``, to the nearest quarter."""
+def rotate_image(image: np.ndarray, degrees: float) -> np.ndarray:
+    """Rotate the image counter-clockwise by ``degrees``, rounded to a multiple of 90."""
     return np.ascontiguousarray(np.rot90(image, round(degrees / 90) % 4))
 
 
@@ -151,7 +150,7 @@ class Folder:
     def __init__(self, path: Path) -> None:
         """
         Raises:
-            UserError: it holds no images.
+            UserError: the folder holds no images.
         """
         self.path = path
         files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
@@ -160,7 +159,7 @@ class Folder:
         if not files:
             raise UserError(f"{path}: holds no images ({', '.join(SUFFIXES)}); give the folder that does, or a video")
 
-    def frames(self, longest: int) -> Iterator[Still]:
+    def frames(self, longest: int) -> Iterator[SourceFrame]:
         size = None
         for index, file in enumerate(self.files):
             image = read_rgb(file)
@@ -170,31 +169,31 @@ class Folder:
                     f"{file}: is {size_text(image.shape[1::-1])}, but {self.files[0].name} is {size_text(size)}; "
                     "give images of one camera and one size"
                 )
-            yield Still(index, float(index), shrunk(image, longest), file.name)
+            yield SourceFrame(index, float(index), shrunk(image, longest), file.name)
 
     def digest(self) -> str:
         return _digest(self.files)
 
 
 def read_rgb(file: Path) -> np.ndarray:
-    """[H, W, 3] uint8 RGB, turned as its EXIF tags say; UserError where it is no image."""
+    """Read [H, W, 3] uint8 RGB, rotated by its EXIF tags; raise UserError if the file is not an image."""
     try:
         data = np.fromfile(file, np.uint8)
-        claim = bomb(data.data)
+        claim = oversized_claim(data.data)
         if claim is not None:
             raise UserError(f"{file}: says it is {claim} in {data.size} bytes; save it again, smaller")
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if whole(data) else None
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if is_complete(data) else None
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
     except cv2.error:
         image = None
     if image is None:
-        raise UserError(f"{file}: is no image that decodes; save it again as PNG or JPEG, or take it out")
+        raise UserError(f"{file}: is not an image that decodes; save it again as PNG or JPEG, or take it out")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
-    """The image with its longer side at most ``longest``."""
+    """Reduce the image to a longer side of at most ``longest``."""
     scale = longest / max(image.shape[:2])
     if scale >= 1:
         return image
@@ -203,7 +202,7 @@ def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
 
 
 def _digest(files: list[Path]) -> str:
-    """Of sizes, and of both ends of each file; names and dates do not count."""
+    """Hash the sizes and both ends of the files, independently of names and dates."""
     found = hashlib.sha256()
     for file in files:
         size = file.stat().st_size

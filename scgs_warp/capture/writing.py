@@ -1,4 +1,4 @@
-"""The folder that training takes: undistorted images, cameras and times in nerfstudio's layout, points."""
+"""Output of a capture: undistorted images, cameras and times in nerfstudio's layout, and points."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from ..data.readers.transforms import OPENGL_TO_OPENCV
 from ..storage.files import held_out
 from ..visualization.video import write_png
-from .features import Shots, quiet
-from .mapping import Solved
+from .features import FrameFiles, quiet
+from .mapping import CameraSolution
 from .similarity import upright
 from .source import read_rgb
 
@@ -24,7 +24,7 @@ POINTS = "points.ply"
 
 
 class Pinhole(NamedTuple):
-    """Of the undistorted images."""
+    """Intrinsics of the undistorted images."""
 
     fx: float
     fy: float
@@ -34,8 +34,8 @@ class Pinhole(NamedTuple):
     height: int
 
 
-class Scene(NamedTuple):
-    """What is written; world: z up."""
+class CapturedScene(NamedTuple):
+    """The captured scene as written to disk; world with z up."""
 
     pinhole: Pinhole
     viewmats: np.ndarray
@@ -43,18 +43,18 @@ class Scene(NamedTuple):
     times: list[float]
     """[0, 1]"""
     seconds: list[float]
-    """In the video."""
+    """Times in the video."""
     names: list[str]
-    """Files in ``images``."""
+    """File names in ``images``."""
     points: np.ndarray
     """[P, 3]"""
     colors: np.ndarray
     """[P, 3] uint8"""
 
 
-def pinhole_of(solved: Solved) -> tuple[Pinhole, np.ndarray, np.ndarray]:
-    """The largest pinhole image without empty pixels inside a distorted one, and where its pixels lie there:
-    x [H, W], y [H, W] float32, as OpenCV counts."""
+def pinhole_of(solved: CameraSolution) -> tuple[Pinhole, np.ndarray, np.ndarray]:
+    """Return the largest pinhole image without empty pixels inside the distorted one, and the distorted coordinates of
+    its pixels, x [H, W] and y [H, W] float32 in OpenCV's convention."""
     with quiet() as pycolmap:
         camera = pycolmap.Camera(model=solved.model, width=solved.width, height=solved.height)
         camera.params = list(solved.params)
@@ -66,22 +66,22 @@ def pinhole_of(solved: Solved) -> tuple[Pinhole, np.ndarray, np.ndarray]:
     return Pinhole(fx, fy, cx, cy, flat.width, flat.height), pixels[..., 0].copy(), pixels[..., 1].copy()
 
 
-def undistort(shots: Shots, solved: Solved, folder: Path, done: Callable[[], object]) -> Pinhole:
-    """Write ``images/`` and, where there are any, ``masks/`` of the registered frames.
+def undistort(frame_files: FrameFiles, solved: CameraSolution, folder: Path, done: Callable[[], object]) -> Pinhole:
+    """Write ``images/``, and ``masks/`` if there are masks, of the registered frames.
 
     Args:
         done: called after each frame.
     """
     pinhole, x, y = pinhole_of(solved)
     (folder / "images").mkdir(exist_ok=True)
-    if shots.masks is not None:
+    if frame_files.masks is not None:
         (folder / "masks").mkdir(exist_ok=True)
     for place in solved.places:
-        name = shots.names[place]
-        image = cv2.remap(read_rgb(shots.folder / name), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        name = frame_files.names[place]
+        image = cv2.remap(read_rgb(frame_files.folder / name), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         write_png(folder / "images" / name, image)
-        if shots.masks is not None:
-            mask = read_rgb(shots.masks / name)
+        if frame_files.masks is not None:
+            mask = read_rgb(frame_files.masks / name)
             moved = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
             write_png(folder / "masks" / name, moved)
         done()
@@ -89,25 +89,29 @@ def undistort(shots: Shots, solved: Solved, folder: Path, done: Callable[[], obj
 
 
 def scene_of(
-    shots: Shots, solved: Solved, pinhole: Pinhole, seconds: Sequence[float], span: tuple[float, float]
-) -> Scene:
-    """Cameras and points upright, times from 0 to 1 over ``span`` (seconds of the video)."""
+    frame_files: FrameFiles,
+    solved: CameraSolution,
+    pinhole: Pinhole,
+    seconds: Sequence[float],
+    span: tuple[float, float],
+) -> CapturedScene:
+    """Turn cameras and points upright and scale times to [0, 1] over ``span`` (seconds of the video)."""
     moved = upright(solved.viewmats, solved.points)
     length = max(span[1] - span[0], 1e-9)
     chosen = [seconds[place] for place in solved.places]
-    return Scene(
+    return CapturedScene(
         pinhole,
         moved.viewmats(solved.viewmats),
         [min(max((second - span[0]) / length, 0.0), 1.0) for second in chosen],
         chosen,
-        [shots.names[place] for place in solved.places],
+        [frame_files.names[place] for place in solved.places],
         moved.points(solved.points),
         solved.colors,
     )
 
 
-def write_scene(folder: Path, scene: Scene) -> None:
-    """``points.ply`` and, last, ``transforms.json``: where it is, the folder is complete."""
+def write_scene(folder: Path, scene: CapturedScene) -> None:
+    """Write ``points.ply`` and then ``transforms.json``, whose presence marks a complete folder."""
     write_points(folder / POINTS, scene.points, scene.colors)
     inside = [f"images/{name}" for name in scene.names]
     lists = {split: held_out(folder, range(len(inside)), split) for split in ("train", "test")}
@@ -132,14 +136,14 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """All of it or nothing."""
+    """Write a text file atomically."""
     part = path.with_name(f".{path.name}.part")
     part.write_text(text, encoding="utf-8")
     os.replace(part, path)
 
 
 def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """A binary PLY file of points [P, 3] and colours [P, 3] uint8."""
+    """Write a binary PLY file of points [P, 3] and colours [P, 3] uint8."""
     from plyfile import PlyData, PlyElement
 
     fields = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]

@@ -1,4 +1,4 @@
-"""Data sets: whatever lies in a folder becomes a ``Dataset`` of frames. One reader a file, chosen by what is there."""
+"""Data sets: ``load`` chooses a reader by the files in a folder and returns a ``Dataset`` of frames."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ..config.fields import CACHE_MIB
 from ..errors import UserError
 from .cache import ImageCache
 from .dataset import Dataset
-from .images import Look, check_options
+from .images import ReadOptions, check_options
 from .readers import colmap, dnerf, nerfies, nerfstudio, panoptic, poses_bounds
 
 __all__ = ["Dataset", "ImageCache", "load"]
 
 READERS = (dnerf, nerfstudio, nerfies, panoptic, poses_bounds, colmap)
-"""Asked in this order: ``recognises(folder)``, then ``read(folder, split, look)``."""
+"""Readers, tried in this order: ``recognises(folder)``, then ``read(folder, split, options)``."""
 
 
 def load(
@@ -32,15 +32,15 @@ def load(
     """Read one split of a data set. ``docs/data.md`` describes the layouts.
 
     Args:
-        folder: the layout is told by what lies in it.
+        folder: its files tell the layout.
         split: ``train``, ``test`` or ``val``.
-        downscale: images become this many times smaller; the intrinsics follow.
+        downscale: factor by which width and height are divided; the intrinsics follow.
         resample: ``area`` (float, premultiplied by alpha) or ``bicubic`` (8 bits, Pillow: as the official SC-GS).
-        background: ``black`` or ``white``: RGBA images are composited on it, once. ``random``: they stay
+        background: ``black`` or ``white``: RGBA images are composited on it once. ``random``: they stay
             premultiplied, on black, for the trainer to composite.
         progress: called with (done, total) after each image.
-        cache_mib: decoded images that are kept in memory; the rest is decoded whenever it is asked for.
-        cache: where they are kept, shared with other splits; ``cache_mib`` is then that cache's.
+        cache_mib: size of the cache of decoded images; images beyond it are decoded again at each access.
+        cache: a cache shared with other splits, in place of one of ``cache_mib``.
 
     Returns:
         Frames in the file's order, images float32 in [0, 1].
@@ -53,13 +53,15 @@ def load(
         raise UserError(f"split is {split!r}; give train, test or val")
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; give that of a data set, as docs/data.md describes them")
-    look = Look(downscale, resample, background, progress, cache if cache is not None else ImageCache(cache_mib))
+        raise UserError(f"{folder}: no such folder; give the folder of a data set (docs/data.md lists the layouts)")
+    options = ReadOptions(
+        downscale, resample, background, progress, cache if cache is not None else ImageCache(cache_mib)
+    )
     for reader in READERS:
         if reader.recognises(folder):
-            return reader.read(folder, split, look)
+            return reader.read(folder, split, options)
     raise UserError(
-        f"{folder}: nothing known lies here: no transforms_{split}.json (D-NeRF, Blender), transforms.json "
+        f"{folder}: holds no known layout: no transforms_{split}.json (D-NeRF, Blender), transforms.json "
         "(nerfstudio), dataset.json (HyperNeRF, NeRF-DS), train_meta.json (Panoptic), poses_bounds.npy "
         "(Neural 3D Video) or sparse/0 (COLMAP); give the folder that holds one of these"
     )

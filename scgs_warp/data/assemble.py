@@ -1,6 +1,6 @@
-"""From what a reader found out about each frame to a data set: every file is looked at once, and kept if there is room.
+"""Assembly of a data set from the frames that a reader found.
 
-So a file that does not decode is told before training begins, whatever is kept of it.
+Every file is decoded once and cached if there is room, so that a damaged file is reported before training begins.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from ..storage.files import size_text
 from ..types import Camera
 from .borders import border_mask, reduce_mask
 from .cache import ImageCache, Pixels
-from .dataset import Dataset, View, spread
-from .images import Decoded, Look, decode, is_transparent, parallel_map, read_image
+from .dataset import Dataset, StoredFrame, spread
+from .images import Decoded, ReadOptions, decode, is_transparent, parallel_map, read_image
 from .lens import Lens
-from .points import finite
+from .points import finite_points
 
 BORDER_FRAMES = 24
-"""At most so many frames, spread over the video, are looked at for a border: all of them are in memory at once."""
+"""Largest number of frames that the border detection decodes; all of them are in memory at once."""
 
-LARGEST = 1e30
-"""Of a camera's numbers: float32 holds them, and what is made of them."""
+MAX_CAMERA_VALUE = 1e30
+"""Largest entry of a pose or of intrinsics: float32 holds it and the products formed from it."""
 
 
 @dataclass(frozen=True)
-class Shot:
-    """A frame as its reader describes it."""
+class FrameRecord:
+    """A frame as described by its reader, before decoding."""
 
     file: Path
     viewmat: np.ndarray
     """[4, 4] float64 world-to-camera, OpenCV."""
     time: float
     lens: Callable[[tuple[int, int]], Lens]
-    """Of a file of (width, height) pixels; raises UserError if that cannot be."""
+    """(width, height) of the file -> lens; raises UserError if the size does not fit."""
     name: str
     mask: Path | None = None
-    """An image, black where the frame is not valid."""
+    """Image that is black where the frame is not valid."""
 
 
 @dataclass(frozen=True)
 class _Facts:
-    """What is remembered of a file that was decoded."""
+    """Properties of a decoded file."""
 
     camera: Camera
     source: tuple[int, int]
@@ -55,100 +55,102 @@ class _Facts:
     transparent: bool
     distorted: bool
     valid: bool
-    """Whether its own mask leaves a pixel."""
+    """True if the frame's own mask leaves a pixel."""
     valid_within_border: bool
 
 
 def assemble(
-    shots: Sequence[Shot],
-    look: Look,
+    records: Sequence[FrameRecord],
+    options: ReadOptions,
     *,
     folder: Path,
     split: str,
     one_size: bool = False,
     border: np.ndarray | None = None,
 ) -> Dataset:
-    """The data set of these frames.
+    """Decode every frame once and return the data set.
 
-    Many tools write RGBA whatever they are given; taken for cut-out objects, filled images would get neither a border
-    mask nor points on bare walls. So alpha counts if any pixel of any file is less than opaque; one image that an
-    object fills keeps its own.
+    Many tools write RGBA files even for images without transparency. Alpha therefore counts only if some pixel of
+    some file is less than opaque; otherwise it is dropped, and frames get border masks and background points.
 
     Args:
-        one_size: refuse files of different sizes.
-        border: [H, W] bool, False on the border of the video; counts for images without alpha.
+        one_size: whether to refuse files of different sizes.
+        border: [H, W] bool, False on the border of the video; applied to images without alpha.
 
     Raises:
         UserError: one line naming the file, the field and the remedy.
     """
-    cache = look.cache if look.cache is not None else ImageCache()
-    keys = [object() for _ in shots]
+    cache = options.cache if options.cache is not None else ImageCache()
+    keys = [object() for _ in records]
 
-    def examine(index: int) -> _Facts:
-        decoded = _decode(shots[index], look)
+    def inspect(index: int) -> _Facts:
+        decoded = _decode(records[index], options)
         cache.offer(keys[index], decoded.pixels)
-        return _facts(shots[index], decoded, border)
+        return _facts(records[index], decoded, border)
 
-    facts = parallel_map(examine, range(len(shots)), look.progress)
+    facts = parallel_map(inspect, range(len(records)), options.progress)
     cut_out = any(fact.transparent for fact in facts)
     borders: dict[tuple[int, int], Tensor | None] = {}
     views = []
-    for shot, fact, key in zip(shots, facts, keys):
+    for record, fact, key in zip(records, facts, keys):
         if one_size and fact.source != facts[0].source:
             raise UserError(
-                f"{shot.file}: is {size_text(fact.source)}, but {shots[0].file.name} is {size_text(facts[0].source)}; "
-                "give all images of a split one size"
+                f"{record.file}: is {size_text(fact.source)}, but {records[0].file.name} is "
+                f"{size_text(facts[0].source)}; give all images of a split one size"
             )
         has_alpha = fact.has_alpha and cut_out
         if fact.has_alpha and not has_alpha:
             cache.strip_alpha(key)
         common = None
         if not has_alpha and not fact.distorted:
-            if fact.source not in borders:  # one for all: thousands would take gigabytes
-                borders[fact.source] = _fitting(border, fact)
+            if fact.source not in borders:  # Frames share one mask: thousands of copies would take gigabytes.
+                borders[fact.source] = _reduced_border(border, fact)
             common = borders[fact.source]
         if not (fact.valid if common is None else fact.valid_within_border):
-            # Neither a step nor a score could say anything of such a frame.
+            # A frame without valid pixels has neither a loss nor a score.
             raise UserError(
-                f"{shot.file}: no pixel is left by its mask, the video's border and the reduction to "
+                f"{record.file}: no pixel is left after its mask, the video's border and the reduction to "
                 f"{size_text((fact.camera.width, fact.camera.height))}; "
                 "correct mask_path or the lens, give a smaller downscale or drop the frame"
             )
-        views.append(View(fact.camera, shot.time, shot.name, _reader(shot, look), has_alpha, common, key))
-    return Dataset(views, folder=folder, split=split, background=look.background, cache=cache)
+        views.append(
+            StoredFrame(fact.camera, record.time, record.name, _reader(record, options), has_alpha, common, key)
+        )
+    return Dataset(views, folder=folder, split=split, background=options.background, cache=cache)
 
 
 def with_points(data: Dataset, points: np.ndarray | None, colors: np.ndarray | None) -> Dataset:
-    """The data set with initial points [P, 3], world units, and colours [P, 3] in [0, 1]. Points that are not finite
-    in float32 are left out."""
+    """Attach initial points [P, 3], world units, and colours [P, 3] in [0, 1]. Points that are non-finite in float32
+    are left out."""
     if points is None:
         return data
-    kept = finite(points)
+    kept = finite_points(points)
     data.points = torch.from_numpy(points[kept]).float()
     data.colors = None if colors is None else torch.from_numpy(colors[kept]).float()
     return data
 
 
-def _decode(shot: Shot, look: Look) -> Decoded:
-    return read_image(shot.file, look, shot.lens, shot.mask)
+def _decode(record: FrameRecord, options: ReadOptions) -> Decoded:
+    return read_image(record.file, options, record.lens, record.mask)
 
 
-def _reader(shot: Shot, look: Look) -> Callable[[], Pixels]:
-    return lambda: _decode(shot, look).pixels
+def _reader(record: FrameRecord, options: ReadOptions) -> Callable[[], Pixels]:
+    return lambda: _decode(record, options).pixels
 
 
-def _facts(shot: Shot, decoded: Decoded, border: np.ndarray | None) -> _Facts:
+def _facts(record: FrameRecord, decoded: Decoded, border: np.ndarray | None) -> _Facts:
     image, alpha, mask = decoded.pixels
     height, width = image.shape[:2]
     lens, source = decoded.lens, decoded.source_size
     sx, sy = width / source[0], height / source[1]
-    numbers = np.abs([lens.fx, lens.fy, lens.cx, lens.cy, *shot.viewmat.ravel()])
-    if not (numbers < LARGEST).all() or min(lens.fx * sx, lens.fy * sy) * LARGEST < 1.0:
+    numbers = np.abs([lens.fx, lens.fy, lens.cx, lens.cy, *record.viewmat.ravel()])
+    if not (numbers < MAX_CAMERA_VALUE).all() or min(lens.fx * sx, lens.fy * sy) * MAX_CAMERA_VALUE < 1.0:
         raise UserError(
-            f"{shot.file}: its camera has numbers beyond {LARGEST:g}, or none; correct its pose and intrinsics"
+            f"{record.file}: its camera has numbers beyond {MAX_CAMERA_VALUE:g} or non-finite; "
+            "correct its pose and intrinsics"
         )
     K = np.array([[lens.fx * sx, 0.0, lens.cx * sx], [0.0, lens.fy * sy, lens.cy * sy], [0.0, 0.0, 1.0]])
-    camera = Camera(torch.from_numpy(shot.viewmat).float(), torch.from_numpy(K).float(), width, height)
+    camera = Camera(torch.from_numpy(record.viewmat).float(), torch.from_numpy(K).float(), width, height)
     valid = mask is None or bool(mask.any())
     within = valid
     if border is not None and border.shape == (source[1], source[0]):
@@ -157,17 +159,17 @@ def _facts(shot: Shot, decoded: Decoded, border: np.ndarray | None) -> _Facts:
     return _Facts(camera, source, alpha is not None, decoded.transparent, lens.distorted, valid, within)
 
 
-def _fitting(border: np.ndarray | None, fact: _Facts) -> Tensor | None:
+def _reduced_border(border: np.ndarray | None, fact: _Facts) -> Tensor | None:
     if border is None or border.shape != (fact.source[1], fact.source[0]):
         return None
     return torch.from_numpy(reduce_mask(border, (fact.camera.width, fact.camera.height)))
 
 
 def video_border(files: Sequence[Path], times: Sequence[float]) -> np.ndarray | None:
-    """[H, W] bool, False on the black border of the video, if it has one; the same whichever split is read."""
+    """Return [H, W] bool, False on the black border of the video; None without a border. Independent of the split."""
     order = sorted(range(len(files)), key=lambda index: times[index])
-    looked_at = [files[order[place]] for place in spread(len(order), BORDER_FRAMES)]
-    images = parallel_map(decode, [file for file in looked_at if file.is_file()])
+    sampled = [files[order[place]] for place in spread(len(order), BORDER_FRAMES)]
+    images = parallel_map(decode, [file for file in sampled if file.is_file()])
     if any(is_transparent(image) for image in images):
-        return None  # alpha says it better
+        return None  # Alpha marks the border more precisely.
     return border_mask([image[..., :3] for image in images])

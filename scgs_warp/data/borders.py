@@ -1,4 +1,4 @@
-"""Which pixels of a video hold nothing: the black borders that undistortion leaves."""
+"""Detection of the black borders that undistortion leaves in a video."""
 
 from __future__ import annotations
 
@@ -7,44 +7,44 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-BLACK = 4 / 255
-"""Largest channel of a pixel that counts as black: a JPEG of a black border is not quite black."""
-SHARE = 0.9
-"""Of the frames in which a border is black; something dark that comes and goes is not cut."""
-FEWEST = 4
-"""Frames that it takes to tell a border from something dark."""
-WIDEST = 0.2
-"""A border that covers more of the image, or reaches its middle, is none, but a scene on a black ground."""
+BLACK_LEVEL = 4 / 255
+"""Largest channel value of a black pixel, of 1: JPEG compression lifts black borders slightly."""
+MIN_FRAME_SHARE = 0.9
+"""Share of the frames in which a border pixel must be black, so that passing dark objects are not masked."""
+MIN_FRAMES = 4
+"""Smallest number of frames from which a border is detected."""
+MAX_AREA = 0.2
+"""Largest share of the image that a border covers; beyond it, or in the middle, black is the scene's background."""
 
 
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray | None:
-    """Where the images are not border: black in nearly all of them, and connected through such pixels to the edge.
+    """Find the border: pixels that are black in nearly all images and connected to the image's edge.
 
     Args:
         images: [H, W, 3], all of one size, uint8 or uint16, from all over the video.
 
     Returns:
-        [H, W] bool, False on the border and on the one pixel beside it that interpolation darkened. None where there
-        is no border, or nothing to tell it by.
+        [H, W] bool, False on the border and on the one pixel beside it that interpolation darkened. None without a
+        border, with too few images, or with images of different sizes.
     """
-    if len(images) < FEWEST or len({image.shape for image in images}) != 1:
+    if len(images) < MIN_FRAMES or len({image.shape for image in images}) != 1:
         return None
     black = np.zeros(images[0].shape[:2], np.float32)
     for image in images:
-        black += image[..., :3].max(axis=2) <= BLACK * np.iinfo(image.dtype).max
-    dark = (black >= SHARE * len(images)).astype(np.uint8)
+        black += image[..., :3].max(axis=2) <= BLACK_LEVEL * np.iinfo(image.dtype).max
+    dark = (black >= MIN_FRAME_SHARE * len(images)).astype(np.uint8)
     _, labels = cv2.connectedComponents(dark, connectivity=8)
     edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     border = np.isin(labels, edge[edge > 0])
     height, width = border.shape
     middle = border[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    if not border.any() or border.mean() > WIDEST or middle.any():
+    if not border.any() or border.mean() > MAX_AREA or middle.any():
         return None
     return cv2.dilate(border.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
 
 
 def reduce_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """[h, w] bool: True where every pixel of ``mask`` [H, W] underneath is. ``size`` is (w, h)."""
+    """Reduce ``mask`` [H, W] bool to ``size`` (w, h): True where every covered pixel is True."""
     if size == (mask.shape[1], mask.shape[0]):
         return mask
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1.0 - 1e-4

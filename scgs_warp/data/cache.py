@@ -1,7 +1,7 @@
-"""Decoded images in memory, up to a number of bytes; the rest is decoded again whenever it is asked for.
+"""Cache of decoded images with a limit in bytes; images beyond it are decoded again at each access.
 
-Training visits all frames in another order every epoch. What has found room therefore stays: pushing out the least
-recently used would lose, each time, what is needed next. No bit of a run depends on what is kept.
+Training visits all frames in a new order every epoch, so cached images are never evicted: evicting the least recently
+used one would discard what is needed next. The bits of a run do not depend on the cache.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from torch import Tensor
 from ..config.fields import CACHE_MIB
 from ..runtime import memory
 
-SHARE = 0.5
-"""Part of the memory that is free at the start which images may take."""
-AHEAD = 2
-"""Images that are decoded before they are asked for."""
+MEMORY_SHARE = 0.5
+"""Largest share of the memory free at the start that the cache may take."""
+READ_AHEAD = 2
+"""Images decoded ahead of their use."""
 
 
 class Pixels(NamedTuple):
-    """What a file says, reduced and composited."""
+    """Pixels of a decoded file, reduced and composited."""
 
     image: Tensor
     """[H, W, 3] float32, stored planar."""
     alpha: Tensor | None = None
     """[H, W] float32."""
     mask: Tensor | None = None
-    """[H, W] bool, the frame's own; what the video masks in all frames comes on top."""
+    """[H, W] bool, the frame's own mask, without the border of the video."""
 
     @property
     def bytes(self) -> int:
@@ -38,10 +38,10 @@ class Pixels(NamedTuple):
 
 
 class ImageCache:
-    """Shared by the splits of a run, used by several threads."""
+    """Cache shared by the splits of a run; safe to use from several threads."""
 
     def __init__(self, mib: float = CACHE_MIB) -> None:
-        self.budget = min(int(mib * 2**20), int(SHARE * memory.room("cpu")))
+        self.budget = min(int(mib * 2**20), int(MEMORY_SHARE * memory.room("cpu")))
         self.used = 0
         self._kept: dict[Hashable, Pixels] = {}
         self._coming: dict[Hashable, Future[Pixels]] = {}
@@ -52,7 +52,7 @@ class ImageCache:
         return key in self._kept
 
     def get(self, key: Hashable, read: Callable[[], Pixels]) -> Pixels:
-        """What is kept under ``key``, else what ``read`` returns, kept from now on if there is room.
+        """Return the cached pixels of ``key``, or read them and cache them if there is room.
 
         Raises:
             whatever ``read`` raises.
@@ -66,26 +66,31 @@ class ImageCache:
         return pixels
 
     def offer(self, key: Hashable, pixels: Pixels) -> None:
-        """Keep it if there is room."""
+        """Cache pixels if there is room."""
         size = pixels.bytes
         with self._lock:
             if key not in self._kept and self.used + size <= self.budget:
                 self._kept[key] = pixels
                 self.used += size
 
+    @property
+    def read_ahead(self) -> int:
+        """Number of images being read in the background or waiting to be asked for."""
+        return len(self._coming)
+
     def expect(self, key: Hashable, read: Callable[[], Pixels]) -> None:
-        """Begin to read in the background what will be asked for soon."""
+        """Start to read an image in the background before it is asked for."""
         with self._lock:
             if key in self._kept or key in self._coming:
                 return
             if self._pool is None:
                 self._pool = ThreadPoolExecutor(1, "images")
-            while len(self._coming) >= AHEAD:  # foretold wrongly: the order has changed
+            while len(self._coming) >= READ_AHEAD:  # The order has changed: drop the oldest.
                 self._coming.pop(next(iter(self._coming))).cancel()
             self._coming[key] = self._pool.submit(read)
 
     def strip_alpha(self, key: Hashable) -> None:
-        """Forget the alpha of what is kept under ``key``."""
+        """Drop the alpha of the pixels cached under ``key``."""
         with self._lock:
             found = self._kept.get(key)
             if found is not None and found.alpha is not None:

@@ -1,4 +1,4 @@
-"""A data set: posed, timed frames of one split, and what they have in common."""
+"""The data set: posed, timed frames of one split, with initial points and a background."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from .cache import ImageCache, Pixels
 
 
 def spread(count: int, most: int) -> list[int]:
-    """At most ``most`` of the indices below ``count``, evenly from the first to the last."""
+    """Choose at most ``most`` of the indices below ``count``, evenly spaced from the first to the last."""
     if count <= most:
         return list(range(count))
     return [round(index * (count - 1) / max(most - 1, 1)) for index in range(most)]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A frame whose pixels are on disk."""
+class StoredFrame:
+    """A frame whose pixels are read from disk when they are needed."""
 
     camera: Camera
     time: float
     name: str
     read: Callable[[], Pixels]
-    """Decodes the file: the same pixels every time."""
+    """Decodes the file; returns the same pixels every time."""
     has_alpha: bool = False
-    """Whether the alpha of the file counts."""
+    """True if the alpha of the file counts."""
     common_mask: Tensor | None = None
-    """[H, W] bool, on top of the frame's own mask."""
+    """[H, W] bool, combined with the frame's own mask."""
     key: object = field(default_factory=object)
-    """Under which the pixels are kept."""
+    """Key of the pixels in the cache."""
 
     def frame(self, cache: ImageCache) -> Frame:
-        """With its pixels.
+        """Read the pixels.
 
         Raises:
-            UserError: the file is gone, unreadable, or another one than when the data set was read.
+            UserError: the file is missing, unreadable, or has changed its size.
         """
         image, alpha, mask = cache.get(self.key, self.read)
         size = (self.camera.height, self.camera.width)
@@ -63,16 +63,16 @@ class View:
 class Dataset(Sequence[Frame]):
     """Frames of one split, in the order of the file that lists them.
 
-    A frame's pixels are read when the frame is asked for, and kept as long as there is room in ``cache``: walk through
-    the frames one by one, and look at ``entries`` for what needs no pixels.
+    Pixels are read when a frame is accessed and cached while there is room in ``cache``. Iterate over frames one by
+    one, and use ``entries`` for everything but pixels.
 
-    With ``background == "random"`` every image is premultiplied colour on black, and ``alpha`` is what is needed to
-    put it on any colour: ``image + (1 - alpha) * color``.
+    With ``background == "random"`` every image is premultiplied colour on black; ``image + (1 - alpha) * color``
+    composites it on any colour.
     """
 
     def __init__(
         self,
-        frames: Sequence[Frame | View],
+        frames: Sequence[Frame | StoredFrame],
         *,
         folder: Path,
         split: str,
@@ -82,18 +82,18 @@ class Dataset(Sequence[Frame]):
         cache: ImageCache | None = None,
     ) -> None:
         self.entries = tuple(frames)
-        """Camera, time and name of each frame, without its pixels if they are on disk."""
+        """Camera, time and name of each frame; pixels only of frames that are in memory."""
         self.folder = folder
         self.split = split
         self.background = background
         """``black``, ``white`` or ``random``."""
         self.points = points
-        """[P, 3] initial points, world units, where the data has some."""
+        """[P, 3] initial points, world units; None if the data has none."""
         self.colors = colors
-        """[P, 3] their colours in [0, 1], where the data has those, too."""
+        """[P, 3] colours of the initial points in [0, 1]; None if the data has none."""
         self.cache = cache if cache is not None else ImageCache()
 
-    def _with(self, entries: Sequence[Frame | View]) -> Dataset:
+    def _with(self, entries: Sequence[Frame | StoredFrame]) -> Dataset:
         return Dataset(
             entries,
             folder=self.folder,
@@ -105,11 +105,11 @@ class Dataset(Sequence[Frame]):
         )
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Dataset:
-        """The same data set seen by other cameras, one for each frame."""
+        """Return the data set with other cameras, one for each frame."""
         return self._with([dataclasses.replace(entry, camera=camera) for entry, camera in zip(self.entries, cameras)])
 
     def subset(self, indices: Sequence[int]) -> Dataset:
-        """Some of the frames, in this order."""
+        """Return the data set of these frames, in this order."""
         return self._with([self.entries[index] for index in indices])
 
     @overload
@@ -121,7 +121,7 @@ class Dataset(Sequence[Frame]):
             return tuple(self._frame(entry) for entry in self.entries[index])
         return self._frame(self.entries[index])
 
-    def _frame(self, entry: Frame | View) -> Frame:
+    def _frame(self, entry: Frame | StoredFrame) -> Frame:
         return entry if isinstance(entry, Frame) else entry.frame(self.cache)
 
     def __len__(self) -> int:
@@ -131,28 +131,28 @@ class Dataset(Sequence[Frame]):
         return (self._frame(entry) for entry in self.entries)
 
     def expect(self, index: int) -> None:
-        """Begin to read a frame that will be asked for soon."""
+        """Start to read a frame in the background before it is accessed."""
         entry = self.entries[index]
-        if isinstance(entry, View):
+        if isinstance(entry, StoredFrame):
             self.cache.expect(entry.key, entry.read)
 
     @property
     def with_alpha(self) -> list[int]:
-        """Indices of the frames that have alpha."""
+        """Indices of the frames with alpha."""
         return [
             index
             for index, entry in enumerate(self.entries)
-            if (entry.has_alpha if isinstance(entry, View) else entry.alpha is not None)
+            if (entry.has_alpha if isinstance(entry, StoredFrame) else entry.alpha is not None)
         ]
 
     @property
     def background_color(self) -> Tensor:
-        """[3] the colour that the images were composited on."""
+        """[3] colour that the images were composited on."""
         return torch.tensor(BACKGROUND_COLORS[self.background])
 
     @property
     def fingerprint(self) -> str:
-        """Of the frames' names, times, sizes and background, without any path: a run resumes on the same frames."""
+        """Hash of the frames' names, times and sizes and of the background; a run resumes only on the same one."""
         listed = [(entry.name, entry.time, entry.camera.height, entry.camera.width, 3) for entry in self.entries]
         return hashlib.sha256(repr((self.background, listed)).encode()).hexdigest()[:16]
 
@@ -167,6 +167,7 @@ class Dataset(Sequence[Frame]):
 
     @property
     def extent(self) -> float:
-        """Largest distance of a camera centre from the centres' mean, world units (official SC-GS: no 1.1 factor)."""
+        """Largest distance of a camera centre from the mean of the centres, world units (official SC-GS, without its
+        factor of 1.1)."""
         centres = torch.stack([camera.position.double().cpu() for camera in self.cameras])
         return float((centres - centres.mean(0)).norm(dim=1).max())

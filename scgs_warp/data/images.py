@@ -1,4 +1,4 @@
-"""Image files to planar float tensors: decode, reduce, composite; in a small pool of threads."""
+"""Image files to planar float tensors: decoding, undistortion, reduction and compositing, in a pool of threads."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ from ..storage.files import size_text
 from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
-from .lens import Lens, seen, undistort
+from .lens import Lens, undistort, valid_pixels
 
 RESAMPLES = ("area", "bicubic")
 SMALLEST_SIDE = 8
-"""Pixels; a smaller image is smaller than SSIM's window and surely a mistake."""
+"""Smallest side after a reduction, pixels: SSIM's window would not fit into a smaller image."""
 
-ALWAYS_FINE, THINNEST = 2**25, 64
-"""Images of more pixels have at least a byte for so many of them: a megabyte of zeros unpacks to a gigabyte."""
+TRUSTED_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 64
+"""Pixel count below which a header is trusted, and pixels per byte of the file beyond it: a megabyte of zeros may
+unpack to a gigabyte."""
 
-# What a camera wrote beside the picture is of no interest, and a warning about it goes to everybody's terminal.
+# Pixels do not depend on EXIF data, so the warning would only clutter the terminal.
 warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
 
 T = TypeVar("T")
@@ -40,17 +41,17 @@ R = TypeVar("R")
 
 class Decoded(NamedTuple):
     pixels: Pixels
-    """On the background; ``alpha`` None for a file without alpha, ``mask`` None where every pixel is valid."""
+    """Composited pixels; ``alpha`` is None for a file without alpha, ``mask`` is None if every pixel is valid."""
     source_size: tuple[int, int]
-    """(width, height) of the file, before the reduction."""
+    """(width, height) of the file before the reduction."""
     transparent: bool
-    """Whether any pixel of the file is less than opaque."""
+    """True if any pixel of the file is less than opaque."""
     lens: Lens
-    """Of the file."""
+    """Lens of the file."""
 
 
-class Look(NamedTuple):
-    """How a data set is to be read."""
+class ReadOptions(NamedTuple):
+    """Options of reading a data set."""
 
     downscale: float = 1
     resample: str = "area"
@@ -58,11 +59,11 @@ class Look(NamedTuple):
     progress: Callable[[int, int], None] | None = None
     """Called with (done, total) after each image."""
     cache: ImageCache | None = None
-    """Where decoded images go; None: one of its own."""
+    """Cache of decoded images; None: a new one."""
 
 
 def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[[int, int], None] | None = None):
-    """``work`` of every item, in order, in as many threads as the process may use; the first exception is raised.
+    """Apply ``work`` to every item, in order, in as many threads as the process may use; raise the first exception.
 
     Args:
         progress: called with (done, total) after each item.
@@ -81,7 +82,7 @@ def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[
 
 
 def check_options(downscale: float, resample: str, background: str) -> None:
-    """Raise UserError for an option that no reader takes."""
+    """Raise UserError for an invalid option."""
     if not (isinstance(downscale, (int, float)) and math.isfinite(downscale) and downscale >= 1):
         raise UserError(f"downscale is {downscale!r}; give a number >= 1 (2 halves width and height)")
     if resample not in RESAMPLES:
@@ -91,7 +92,7 @@ def check_options(downscale: float, resample: str, background: str) -> None:
 
 
 def reduced_size(width: int, height: int, downscale: float, path: Path) -> tuple[int, int]:
-    """(width, height) after ``downscale``, rounded; UserError where nothing useful is left."""
+    """Return (width, height) after ``downscale``, rounded; raise UserError if a side becomes too small."""
     size = (max(1, round(width / downscale)), max(1, round(height / downscale)))
     if downscale != 1 and min(size) < SMALLEST_SIDE:
         largest = max(1, min(width, height) // SMALLEST_SIDE)
@@ -103,17 +104,17 @@ def reduced_size(width: int, height: int, downscale: float, path: Path) -> tuple
 
 
 def read_image(
-    path: Path, look: Look, lens_of: Callable[[tuple[int, int]], Lens], mask_path: Path | None = None
+    path: Path, options: ReadOptions, lens_of: Callable[[tuple[int, int]], Lens], mask_path: Path | None = None
 ) -> Decoded:
     """Decode one file, undistort it, reduce it, and composite it on the background once.
 
-    ``area`` averages colour premultiplied by alpha over each target pixel, in float. ``bicubic`` repeats what the
-    official SC-GS does: composite, truncate to 8 bits, then Pillow's bicubic filter on colour and alpha apart.
-    With ``random`` the image is on black (= premultiplied).
+    ``area`` averages colour premultiplied by alpha over each target pixel, in float. ``bicubic`` follows the official
+    SC-GS: composite, truncate to 8 bits, then apply Pillow's bicubic filter to colour and alpha separately.
+    With ``random`` the image stays premultiplied, on black.
 
     Args:
         lens_of: called with (width, height) of the file; raises UserError if they do not fit.
-        mask_path: an image, black where the frame is not valid; not all of it.
+        mask_path: an image that is black where the frame is not valid, and not black everywhere.
 
     Raises:
         UserError: a file is missing or does not decode, or the mask has another size than the image.
@@ -121,13 +122,13 @@ def read_image(
     pixels = decode(path)
     height, width = pixels.shape[:2]
     lens = lens_of((width, height))
-    size = reduced_size(width, height, look.downscale, path)
+    size = reduced_size(width, height, options.downscale, path)
     mask = None if mask_path is None else read_mask(mask_path, path, (width, height))
     if lens.distorted:
-        moved = seen(lens, width, height)
+        moved = valid_pixels(lens, width, height)
         mask = moved if mask is None else moved & (undistort(mask.astype(np.float32), lens) > 1.0 - 1e-4)
-    color = np.asarray(BACKGROUND_COLORS[look.background], np.float32)
-    if look.resample == "bicubic" and size != (width, height):
+    color = np.asarray(BACKGROUND_COLORS[options.background], np.float32)
+    if options.resample == "bicubic" and size != (width, height):
         rgb, alpha = _bicubic(undistort(pixels, lens) if lens.distorted else pixels, size, color)
     else:
         rgb, alpha = _area(pixels, size, color, lens if lens.distorted else None)
@@ -139,14 +140,14 @@ def read_image(
 
 
 def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
-    """[H, W] bool, True where the mask is not black. ``size``: (width, height) of the image it belongs to.
+    """Read a mask: [H, W] bool, True where it is not black. ``size``: (width, height) of its image.
 
     Raises:
         UserError: the file is missing or does not decode, is all black, or has another size.
     """
     mask = decode(path)[..., :3].max(axis=2) > 0
     if not mask.any():
-        raise UserError(f"{path}: a mask that is all black leaves nothing to look at; drop the frame")
+        raise UserError(f"{path}: the mask is all black, so no pixel is valid; drop the frame")
     if mask.shape[::-1] != size:
         raise UserError(
             f"{image}: is {size_text(size)}, but its mask is {size_text(mask.shape[::-1])}; "
@@ -156,25 +157,25 @@ def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def is_transparent(pixels: np.ndarray) -> bool:
-    """Whether any pixel of a file [H, W, 3 or 4] is less than opaque."""
+    """Return whether any pixel of a file [H, W, 3 or 4] is less than opaque."""
     return pixels.shape[2] == 4 and bool((pixels[..., 3] < np.iinfo(pixels.dtype).max).any())
 
 
 def decode(path: Path) -> np.ndarray:
-    """[H, W, 3 or 4] RGB(A), uint8 or uint16; UserError where the file is missing or no image."""
+    """Decode a file to RGB(A) [H, W, 3 or 4], uint8 or uint16; raise UserError if it is missing or not an image."""
     try:
         if not is_regular(path):
-            raise UserError(f"{path}: is no file; give an image, or drop the frame")
+            raise UserError(f"{path}: is not a regular file; give an image, or drop the frame")
         data = np.fromfile(path, np.uint8)
     except FileNotFoundError:
         raise UserError(f"{path}: no such image, though a frame names it; restore the file or drop the frame") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
-    claim = bomb(data.data)
+    claim = oversized_claim(data.data)
     if claim is not None:
         raise UserError(f"{path}: says it is {claim} in {data.size} bytes; save it again, smaller")
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if whole(data) else None
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if is_complete(data) else None
     except cv2.error:
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
@@ -186,8 +187,8 @@ def decode(path: Path) -> np.ndarray:
     return cv2.cvtColor(pixels, code)
 
 
-def bomb(data: bytes | memoryview) -> str | None:
-    """The size that an image file claims, where so few bytes can be no such picture; None for all others."""
+def oversized_claim(data: bytes | memoryview) -> str | None:
+    """Return the size that an image file claims if its bytes are too few for it, else None."""
     from PIL import Image
 
     try:
@@ -196,17 +197,20 @@ def bomb(data: bytes | memoryview) -> str | None:
     except Image.DecompressionBombError:
         return "hundreds of megapixels"
     except (OSError, ValueError, SyntaxError, TypeError, struct.error):
-        return None  # whoever decodes it says what is wrong
+        return None  # The decoder reports the damage.
     count = size[0] * size[1]
-    return size_text(size) if count > ALWAYS_FINE and count > THINNEST * len(data) else None
+    return size_text(size) if count > TRUSTED_PIXELS and count > MAX_PIXELS_PER_BYTE * len(data) else None
 
 
-def whole(data: np.ndarray) -> bool:
-    """Whether a JPEG or PNG ends where it should, given as bytes. Older versions of OpenCV fill up what is missing of a
-    JPEG with grey; all make room for as many bytes as a PNG says will follow."""
+def is_complete(data: np.ndarray) -> bool:
+    """Return whether a JPEG or PNG, given as bytes, is not truncated.
+
+    Older versions of OpenCV fill the missing part of a JPEG with grey; all versions allocate as many bytes as a PNG
+    announces.
+    """
     content = data.tobytes()
     if content.startswith(b"\xff\xd8"):
-        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # the end of the image, after its last scan
+        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # The end marker follows the last scan.
     if content.startswith(b"\x89PNG\r\n\x1a\n"):
         at = 8
         while at + 8 <= len(content):
@@ -218,7 +222,7 @@ def whole(data: np.ndarray) -> bool:
 
 
 def header_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) as the file's first bytes say; None where they say nothing, or there is no such file."""
+    """Return (width, height) from the file's header; None if the file is missing or its header is unreadable."""
     from PIL import Image
 
     try:

@@ -1,7 +1,7 @@
-"""Lenses: the pinhole inside a camera model, and images as that pinhole would have taken them.
+"""Lenses: the pinhole inside a camera model, and undistortion of images to that pinhole.
 
-pycolmap knows every camera model of COLMAP, which contain those of OpenCV and nerfstudio; OpenCV moves the pixels.
-Pixel centres are at +0.5, as COLMAP has them; OpenCV's own functions count from the first pixel's centre.
+pycolmap evaluates the camera models of COLMAP, which include those of OpenCV and nerfstudio; OpenCV resamples pixels.
+Pixel centres are at +0.5, as in COLMAP; OpenCV's own functions count from the centre of the first pixel.
 """
 
 from __future__ import annotations
@@ -14,36 +14,36 @@ import cv2
 import numpy as np
 
 ROWS = 64
-"""Rows of an image whose rays are projected at once: memory stays small."""
+"""Rows of an image whose rays are projected at once, to bound memory."""
 DIRECTIONS = 16
 RADII = 512
-"""Rays towards the corners, on which a model is followed outwards to where it folds back."""
-SLACK = 0.01
-"""Pixels beyond the outermost centres that rounding may lead to."""
+"""Directions and steps along them at which a model is tested for folding back."""
+EDGE_TOLERANCE = 0.01
+"""Tolerance for rounding beyond the outermost pixel centres, pixels."""
 SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_FISHEYE", "SIMPLE_DIVISION")
 SINGLE_FOCAL += ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PINHOLE_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
-"""Models that are a pinhole where all parameters beyond the first three or four are 0."""
+"""Models that are a pinhole if all parameters beyond the first three or four are 0."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics at the size of the file, and what bends rays before them."""
+    """Intrinsics at the size of the file, and lens distortion."""
 
     fx: float
     fy: float
     cx: float
     cy: float
     model: str = "PINHOLE"
-    """COLMAP's name."""
+    """COLMAP's name of the camera model."""
     params: tuple[float, ...] = ()
-    """The model's, as COLMAP orders them, focal lengths and centre included; not needed for a pinhole."""
+    """Parameters of the model in COLMAP's order, with focal lengths and centre; empty for a pinhole."""
     skew: float = 0.0
-    """Pixels that x moves by per unit of y."""
+    """Skew in pixels: shift of x per unit of y."""
 
     @property
     def distorted(self) -> bool:
-        """Whether the file is not what the pinhole would have taken."""
+        """True if the image differs from that of the pinhole."""
         if self.skew != 0.0:
             return True
         if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
@@ -53,10 +53,10 @@ class Lens:
 
 
 def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
-    """The lens of a COLMAP model with these parameters.
+    """Make the lens of a COLMAP model with these parameters.
 
     Raises:
-        ValueError: no such model, not that many parameters, or values that no camera has; says which.
+        ValueError: unknown model, wrong number of parameters, or values that no camera has.
     """
     import pycolmap
 
@@ -79,7 +79,7 @@ def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
 
 
 def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
-    """[N, 2] where the rays [N, 3] of the camera (x right, y down, z forward) meet the file's image; NaN: nowhere."""
+    """Project camera rays [N, 3] (x right, y down, z forward) to pixels [N, 2] of the file; NaN outside the model."""
     import pycolmap
 
     model, params = lens.model, lens.params
@@ -93,9 +93,12 @@ def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
     return pixels
 
 
-def reach(lens: Lens, width: int, height: int) -> float:
-    """The tangent of the angle to the optical axis up to which the model carries rays outwards; polynomials of
-    distortion turn back beyond what they were fitted to. Infinite where it does so all over the image."""
+def valid_radius(lens: Lens, width: int, height: int) -> float:
+    """Return the tangent of the largest angle to the optical axis at which the model is still monotonic.
+
+    Distortion polynomials fold back beyond the range that they were fitted to. Infinite if the model is monotonic all
+    over the image.
+    """
     corners = [abs(x) for x in (lens.cx, width - lens.cx)], [abs(y) for y in (lens.cy, height - lens.cy)]
     farthest = math.hypot(max(corners[0]) / lens.fx, max(corners[1]) / lens.fy)
     angles = np.linspace(0.0, 2.0 * math.pi, DIRECTIONS, endpoint=False)
@@ -104,25 +107,27 @@ def reach(lens: Lens, width: int, height: int) -> float:
     rays = np.concatenate([across, np.ones((DIRECTIONS, RADII, 1))], 2)
     pixels = project(lens, rays.reshape(-1, 3)).reshape(DIRECTIONS, RADII, 2) - (lens.cx, lens.cy)
     with np.errstate(invalid="ignore"):
-        outwards = np.diff(np.linalg.norm(pixels, axis=2), axis=1) > 0  # NaN: no
+        outwards = np.diff(np.linalg.norm(pixels, axis=2), axis=1) > 0  # False for NaN
     stuck = ~outwards.all(axis=0)
     return float(radii[stuck.argmax()]) if stuck.any() else math.inf
 
 
 @functools.lru_cache(maxsize=4)
-def maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the pinhole's pixels lie in the file, as OpenCV counts: x [H, W], y [H, W] float32; and which of them the
-    file has, [H, W] bool."""
+def undistortion_maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the file's coordinates of the pinhole's pixels, x [H, W] and y [H, W] float32 in OpenCV's convention, and
+    which of them lie inside the file, [H, W] bool."""
     x = (np.arange(width) + 0.5 - lens.cx) / lens.fx
     y = (np.arange(height) + 0.5 - lens.cy) / lens.fy
-    limit = reach(lens, width, height)
+    limit = valid_radius(lens, width, height)
     columns, rows = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     valid = np.empty((height, width), bool)
     for first in range(0, height, ROWS):
         band = slice(first, min(first + ROWS, height))
         grid = np.stack(np.broadcast_arrays(x[None, :], y[band, None], 1.0), axis=2)
         pixels = project(lens, grid.reshape(-1, 3)).reshape(*grid.shape[:2], 2) - 0.5
-        inside = (pixels >= -SLACK) & (pixels <= (width - 1 + SLACK, height - 1 + SLACK))  # NaN: no
+        inside = (pixels >= -EDGE_TOLERANCE) & (
+            pixels <= (width - 1 + EDGE_TOLERANCE, height - 1 + EDGE_TOLERANCE)
+        )  # NaN: no
         valid[band] = inside.all(axis=2) & (np.hypot(grid[..., 0], grid[..., 1]) < limit)
         pixels = np.where(valid[band, :, None], pixels, -9.0)
         columns[band], rows[band] = pixels[..., 0], pixels[..., 1]
@@ -130,13 +135,13 @@ def maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, n
 
 
 def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
-    """The image [H, W, ...] as the lens's pinhole would have taken it, bilinear; 0 where the file has nothing."""
-    columns, rows, valid = maps(lens, image.shape[1], image.shape[0])
+    """Resample an image [H, W, ...] to the lens's pinhole, bilinearly; 0 outside the file."""
+    columns, rows, valid = undistortion_maps(lens, image.shape[1], image.shape[0])
     moved = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     moved[~valid] = 0
     return moved
 
 
-def seen(lens: Lens, width: int, height: int) -> np.ndarray:
-    """[H, W] bool: which pixels of the undistorted image the file has."""
-    return maps(lens, width, height)[2]
+def valid_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
+    """Return [H, W] bool: which pixels of the undistorted image lie inside the file."""
+    return undistortion_maps(lens, width, height)[2]

@@ -1,4 +1,4 @@
-"""Initial points of a data set: PLY files, and positions that training can take."""
+"""Initial points of a data set, from files of points or of Gaussians."""
 
 from __future__ import annotations
 
@@ -7,22 +7,23 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
+from ..formats.gaussian_files import gaussian_points
 from ..gaussians import SH_C0
 from ..storage.files import check_ply_counts
 from ..storage.safe_paths import is_regular
 
 
-def finite(points: np.ndarray) -> np.ndarray:
-    """[P] bool: which points [P, 3] float64 are finite in float32, as training takes them."""
+def finite_points(points: np.ndarray) -> np.ndarray:
+    """Return [P] bool: which points [P, 3] float64 are finite in float32, the type of training."""
     with np.errstate(over="ignore"):
         return np.all(np.isfinite(points.astype(np.float32)), axis=1)
 
 
 def unit_colors(vertices: np.ndarray) -> np.ndarray | None:
-    """[P, 3] in [0, 1], grey where the file says nothing finite; None where it has no colours.
+    """Return colours [P, 3] in [0, 1], grey where they are non-finite; None if the file has no colours.
 
-    Whole numbers are shares of their type's largest; others of 1, or of 255 where any is above 1. Gaussians' points
-    have the colours of their harmonics of degree 0.
+    Integers are divided by the largest value of their type; floats by 255 if any exceeds 1. Gaussians take the colours
+    of their harmonics of degree 0.
     """
     names = ("red", "green", "blue")
     harmonics = [f"f_dc_{channel}" for channel in range(3)]
@@ -41,33 +42,31 @@ def unit_colors(vertices: np.ndarray) -> np.ndarray | None:
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Initial points [P, 3] float64 and their colours [P, 3] in [0, 1], from a PLY file of points or of Gaussians, or
-    from the Gaussians of a ``.splat`` or ``.spz``.
+    """Read initial points [P, 3] float64 and their colours [P, 3] in [0, 1] from a PLY file of points or of Gaussians,
+    or from the Gaussians of a ``.splat`` or ``.spz``.
 
     Raises:
         UserError: as :func:`read_ply` and ``gaussian_files.read_gaussians``.
     """
     if path.suffix.lower() in (".splat", ".spz"):
-        from ..formats.gaussian_files import gaussian_points
-
         return gaussian_points(path)
     return read_ply(path)
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Vertices [P, 3] float64 of a PLY file, and their colours [P, 3] in [0, 1] where it has some.
+    """Read the vertices [P, 3] float64 of a PLY file and their colours [P, 3] in [0, 1]; None without colours.
 
-    Points that are not finite in float32 are left out.
+    Points that are non-finite in float32 are left out.
 
     Raises:
-        UserError: the file is missing, no PLY, has no vertices with x, y, z, or claims more than fit into memory.
+        UserError: the file is missing, not a PLY, lacks x, y, z, or claims more points than fit into memory.
     """
     from plyfile import PlyData, PlyParseError
 
     try:
         if not is_regular(path):
-            raise UserError(f"{path}: is no file; give a PLY of points")
-        with np.errstate(over="ignore"):  # of text: infinite, and left out
+            raise UserError(f"{path}: is not a regular file; give a PLY of points")
+        with np.errstate(over="ignore"):  # Numbers in text may overflow to infinity; such points are left out.
             check_ply_counts(path)
             elements = PlyData.read(str(path))
         vertices = elements["vertex"].data
@@ -81,5 +80,5 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         raise UserError(f"{path}: no PLY file of vertices with x, y, z; export the points again") from None
     except (MemoryError, OverflowError):
         raise UserError(f"{path}: says it has more points than fit into memory; export the points again") from None
-    kept = finite(points)
+    kept = finite_points(points)
     return points[kept], None if colors is None else colors[kept]

@@ -16,7 +16,7 @@ import torch
 
 from ..errors import UserError
 from ..motion.static import Static
-from ..scene.from_gaussians import rig_static
+from ..scene.from_gaussians import with_control_points
 from ..scene.scene import Scene
 from ..types import Gaussians
 from .document import Edit
@@ -69,7 +69,7 @@ class Engine:
 
     def __init__(self, scene: Scene) -> None:
         if isinstance(scene.motion, Static):
-            scene = rig_static(scene)
+            scene = with_control_points(scene)
         if not hasattr(scene.motion, "apply_pose") or not len(getattr(scene.motion, "positions", ())):
             raise UserError(
                 f"the motion model {scene.motion_name!r} has no control points to take hold of; "

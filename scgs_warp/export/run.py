@@ -11,12 +11,12 @@ import torch
 from .. import data
 from ..edit import EditSession
 from ..errors import UserError
-from ..formats.gaussian_files import fitting, read_gaussians
+from ..formats.gaussian_files import read_gaussians, shortage_as_user_error
 from ..formats.gaussian_ply import write_gaussian_ply
 from ..formats.gaussian_splat import write_splat
 from ..formats.gaussian_spz import read_antialiased, write_spz
 from ..runtime.progress import progress
-from ..scene.from_gaussians import open_ply
+from ..scene.from_gaussians import open_gaussians
 from ..scene.scene import Scene
 from ..types import Gaussians
 from .cameras import write_cameras
@@ -72,7 +72,7 @@ def _open(request: ExportRequest, device: str) -> Scene:
     if request.run is not None:
         return Scene.load(request.run, device=device)
     assert request.ply is not None
-    return open_ply(request.ply, device)
+    return open_gaussians(request.ply, device)
 
 
 def _open_session(request: ExportRequest, scene: Scene) -> EditSession:
@@ -89,7 +89,7 @@ def _export_still(request: ExportRequest, device: str) -> str:
         antialiased = read_antialiased(request.ply)
         with torch.no_grad():
             stored = read_gaussians(request.ply)
-            with fitting(request.ply):
+            with shortage_as_user_error(request.ply):
                 gaussians, when = keep_finite(stored.activate()), f"as in {request.ply}"
     else:
         scene = _open(request, device)

@@ -1,4 +1,4 @@
-"""Files of Gaussians, told apart by how their names end."""
+"""Files of Gaussians, with readers chosen by the suffix."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ READERS = {".ply": read_gaussian_ply, ".splat": read_splat, ".spz": read_spz}
 
 
 def read_gaussians(path: str | Path) -> GaussianParameters:
-    """Raw parameters as a ``.ply`` of 3D Gaussian splatting, a ``.splat`` or a ``.spz`` has them, world units.
+    """Read raw parameters, world units, from a ``.ply`` of 3D Gaussian splatting, a ``.splat`` or a ``.spz``.
 
     Raises:
-        UserError: another kind of file, missing, damaged, too large for the memory, or without a finite Gaussian.
+        UserError: the file is of another kind, missing, damaged, too large for memory, or has no finite Gaussian.
     """
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise UserError(f"{path}: Gaussians are read from {', '.join(READERS)}; give one of these or convert it")
-    with fitting(path):
+    with shortage_as_user_error(path):
         return reader(path)
 
 
 @contextmanager
-def fitting(path: Path) -> Iterator[None]:
-    """Around what needs memory for all Gaussians of a file.
+def shortage_as_user_error(path: Path) -> Iterator[None]:
+    """Report a shortage of memory inside the block as an error of the file.
 
     Raises:
-        UserError: there is not enough.
+        UserError: memory does not suffice for all Gaussians.
     """
     try:
         yield
@@ -47,7 +47,7 @@ def fitting(path: Path) -> Iterator[None]:
 
 
 def gaussian_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Where the Gaussians of a file are, [P, 3] float64, and their colours of degree 0, [P, 3] in [0, 1].
+    """Read the positions of a file's Gaussians, [P, 3] float64, and their colours of degree 0, [P, 3] in [0, 1].
 
     Raises:
         UserError: as :func:`read_gaussians`.

@@ -1,4 +1,4 @@
-"""3D-GS's own files: a ``.ply`` whose vertices are Gaussians, in the names of its reference implementation."""
+"""``.ply`` files of 3D Gaussian splatting, with the property names of its reference implementation."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from ..storage.files import check_ply_counts
 from ..types import Gaussians
 from .gaussian_parameters import to_parameters
 
-REST_COUNTS = (0, 9, 24, 45)
+REST_COLUMNS = (0, 9, 24, 45)
 """``f_rest_*`` columns of degrees 0 to 3."""
 OPAQUE_LOGIT = 80.0
-"""Opaque beyond rounding: some programs write infinity."""
+"""Largest logit of an opacity, opaque to rounding; some programs write infinity."""
 
 
 def read_gaussian_ply(path: str | Path) -> GaussianParameters:
-    """Raw parameters as the file has them, world units.
+    """Read raw parameters, world units; non-finite Gaussians are left out.
 
     Raises:
-        UserError: it is missing, no PLY, or its vertices are no Gaussians; Gaussians that are not finite are left out,
-            and a file in which none is finite is refused.
+        UserError: the file is missing, not a PLY of Gaussians, or without a finite Gaussian.
     """
     path = Path(path)
     data = _vertices(path)
@@ -41,7 +40,7 @@ def read_gaussian_ply(path: str | Path) -> GaussianParameters:
     if missing:
         raise UserError(f"{path}: vertices lack {', '.join(missing[:4])}; give a .ply of 3D Gaussian splatting")
     rest = len([name for name in names if name.startswith("f_rest_")])
-    if rest not in REST_COUNTS or any(f"f_rest_{i}" not in names for i in range(rest)):
+    if rest not in REST_COLUMNS or any(f"f_rest_{i}" not in names for i in range(rest)):
         raise UserError(f"{path}: {rest} f_rest columns; harmonics of degree 0 to 3 have 0, 9, 24 or 45")
 
     def columns(*wanted: str) -> np.ndarray:
@@ -50,7 +49,7 @@ def read_gaussian_ply(path: str | Path) -> GaussianParameters:
     means, dc = columns("x", "y", "z"), columns("f_dc_0", "f_dc_1", "f_dc_2")
     opacity = columns("opacity")[:, 0].clip(-OPAQUE_LOGIT, OPAQUE_LOGIT)
     sh_rest = np.zeros((len(data), 0, 3), np.float32)
-    if rest:  # channel by channel in the file
+    if rest:  # The file stores harmonics channel by channel.
         sh_rest = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, rest // 3).transpose(0, 2, 1)
     values = {
         "means": means, "sh_dc": dc, "sh_rest": sh_rest, "opacity_logits": opacity,
@@ -65,7 +64,7 @@ def _vertices(path: Path) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a .ply of 3D Gaussian splatting")
     try:
-        with np.errstate(over="ignore"):  # of text: infinite, and left out
+        with np.errstate(over="ignore"):  # Numbers in text may overflow to infinity; such Gaussians are left out.
             check_ply_counts(path)
             elements = PlyData.read(str(path))
         data = np.asarray(elements["vertex"].data)
@@ -80,11 +79,11 @@ def _vertices(path: Path) -> np.ndarray:
 
 
 def write_gaussian_ply(path: str | Path, gaussians: Gaussians) -> None:
-    """Write activated Gaussians, world units, as 3D-GS does: logits of opacities, logarithms of scales, unit
+    """Write activated Gaussians, world units, in the layout of 3D-GS: logits of opacities, logarithms of scales, unit
     quaternions, harmonics channel by channel. Binary, little endian; the same Gaussians give the same bytes.
 
     Raises:
-        UserError: the name does not end in .ply, or the place cannot be written.
+        UserError: the name does not end in .ply, or the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != ".ply":

@@ -1,4 +1,4 @@
-"""``.splat``: 32 bytes a Gaussian, no header, no view-dependent colour; what the first web viewers read."""
+"""``.splat`` files of the first web viewers: 32 bytes per Gaussian, no header, no view-dependent colour."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("q
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:
-    """Write activated Gaussians; those that matter most (volume times opacity) come first, for viewers that draw what
-    has arrived. Colours, opacities and rotations are rounded to 8 bits; harmonics above degree 0 are lost.
+    """Write activated Gaussians in descending order of volume times opacity, for viewers that draw while loading.
+    Colours, opacities and rotations are rounded to 8 bits; harmonics above degree 0 are lost.
 
     Raises:
-        UserError: the place cannot be written.
+        UserError: the file cannot be written.
     """
     scales = gaussians.scales.detach().cpu().double().numpy()
     opacities = gaussians.opacities.detach().cpu().double().numpy()
@@ -39,19 +39,19 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def read_splat(path: str | Path) -> GaussianParameters:
-    """Raw parameters of degree 0, world units.
+    """Read raw parameters of degree 0, world units.
 
     Raises:
-        UserError: it is missing, empty, cut short, or holds no finite Gaussian.
+        UserError: the file is missing, empty or truncated, or holds no finite Gaussian.
     """
     path = Path(path)
     content = read_bytes(path, "give a .splat")
     if not content or len(content) % ROW.itemsize:
-        raise UserError(f"{path}: {len(content)} bytes are no multiple of {ROW.itemsize}; export the .splat again")
+        raise UserError(f"{path}: {len(content)} bytes are not a multiple of {ROW.itemsize}; export the .splat again")
     rows = np.frombuffer(content, ROW)
     color = rows["color"].astype(np.float64) / 255.0
     opacity = color[:, 3].clip(1e-6, 1.0 - 1e-6)
-    with np.errstate(invalid="ignore"):  # of signalling NaN; such rows are left out
+    with np.errstate(invalid="ignore"):  # Rows of NaN are left out below.
         scales = np.maximum(rows["scale"].astype(np.float64), 1e-30)
     values = {
         "means": rows["mean"],

@@ -1,8 +1,8 @@
-"""Frames of a scene that stays as it is: recorded once as a CUDA graph, replayed with another camera and time.
+"""Frames of an unchanging scene: recorded once as a CUDA graph and replayed with other cameras and times.
 
-Nothing in a frame waits for the device. Binning has room for so many pairs of tile and splat; how many there were comes
-back with the image, and a frame that needed more is drawn again with more room before anybody sees it. On a CPU the
-same steps run one by one, which is how they are tested.
+Nothing in a frame waits for the device. Binning has a fixed capacity of tile-splat pairs; the number of pairs comes
+back with the image, and a frame that exceeds the capacity is drawn again with a larger one before it is returned. On a
+CPU the same steps run one by one, which is how they are tested.
 """
 
 from __future__ import annotations
@@ -26,36 +26,36 @@ from ..runtime import debug, memory
 from ..runtime.cuda_graph import CudaGraph
 from ..types import Camera, Image, Splats, Tiles
 
-SPARE = 1.25
-"""Room for this times the pairs of the frame that asked for more."""
-GRANULE = 1 << 16
-"""Room is a multiple of this, so that it seldom changes."""
+CAPACITY_FACTOR = 1.25
+"""Capacity relative to the pairs of the frame that exceeded it."""
+CAPACITY_STEP = 1 << 16
+"""Granularity of the capacity, so that it seldom changes."""
 RECORD_AFTER = 2
-"""Frames drawn step by step before one is recorded: for a single picture a recording does not pay."""
+"""Number of frames drawn step by step before one is recorded, since recording does not pay for a single picture."""
 
 
 @dataclass(frozen=True)
 class Pending:
-    """A frame under way."""
+    """A frame in flight."""
 
     inputs: Tensor
-    """[29] what it was asked for."""
+    """[29] camera, time and background."""
     size: tuple[int, int]
     image: Image
     total: Tensor
-    """[1] pairs of tile and splat, on the host once ``done``."""
+    """[1] number of tile-splat pairs, on the host once ``done``."""
     capacity: int
-    """Pairs there was room for."""
+    """Capacity in pairs when the frame was drawn."""
     done: torch.cuda.Event | None
 
 
 class FrameGraph:
-    """Draws frames of one scene. Not differentiable. One frame at a time, or a few under way: ``submit``, ``finish``.
+    """Renderer of one scene's frames, not differentiable. ``submit`` and ``finish`` keep several frames in flight.
 
-    A frame whose pairs would not fit into memory is not drawn from a recording, but step by step, in windows of tiles.
+    A frame whose pairs do not fit into memory is drawn step by step in windows of tiles instead of from a recording.
 
-    Attributes: ``capacity`` (pairs there is room for; 0: not known yet), ``recordings`` (how often a graph was
-    recorded), ``failure`` (why none could be; None: it could, or was not tried).
+    Attributes: ``capacity`` (in pairs; 0 before the first frame), ``recordings`` (number of recorded graphs),
+    ``failure`` (error of a failed recording, else None).
     """
 
     def __init__(
@@ -68,9 +68,9 @@ class FrameGraph:
     ) -> None:
         """
         Args:
-            gaussians, motion: read at every frame, where they lie. If one of their tensors is replaced or changed in
-                place, the next frame is recorded anew.
-            depth_of: turns depths into the caller's units.
+            gaussians, motion: read in place at every frame. If one of their tensors is replaced or modified, the next
+                frame is recorded anew.
+            depth_of: converts depths to the caller's units.
 
         Raises:
             ValueError: the motion does not take its time as a tensor.
@@ -80,16 +80,16 @@ class FrameGraph:
         self.gaussians, self.motion = gaussians, motion
         self.capacity, self.recordings, self.failure = 0, 0, None
         self._antialiased, self._depth_of = antialiased, depth_of
-        self._inputs = torch.zeros(29, device=gaussians.means.device)
+        self.inputs = torch.zeros(29, device=gaussians.means.device)
         self._size = (0, 0)
         self._state: list[Any] = []
         self._frames_of_state = 0
-        self._recorded: CudaGraph | _Steps | None = None
+        self._recorded: CudaGraph | Steps | None = None
         self._kept: list[Any] = []
         self._lock = threading.Lock()
 
     def render(self, camera: Camera, time: float, background: Tensor) -> Image:
-        """One frame, complete: no splat is missing.
+        """Draw one complete frame.
 
         Args:
             camera: in the units of the Gaussians, on any device.
@@ -102,14 +102,14 @@ class FrameGraph:
         return self.finish(self.submit(camera, time, background))
 
     def submit(self, camera: Camera, time: float, background: Tensor) -> Pending:
-        """Start a frame; arguments as in :meth:`render`. Its image may lack splats until ``finish`` has seen it."""
+        """Start a frame; arguments as in :meth:`render`. Its image may lack splats until ``finish`` returns it."""
         where = camera.viewmat.device
         instant = torch.tensor([time], device=where)
         parts = camera.viewmat.flatten(), camera.K.flatten(), instant, background.to(where)
         return self._start(torch.cat(parts).float(), (camera.width, camera.height))
 
     def finish(self, pending: Pending) -> Image:
-        """Wait until the frame is there. One that lacks splats is drawn again with more room."""
+        """Wait for the frame; draw it again with more capacity if it lacks splats."""
         while True:
             if pending.done is not None:
                 pending.done.synchronize()
@@ -117,19 +117,19 @@ class FrameGraph:
             if pairs <= pending.capacity:
                 return pending.image
             with self._lock:
-                if pairs > self.capacity and not self._make_room(pairs, pending.size):
-                    return self._drawn(pending.inputs.to(self._inputs.device), pending.size)
+                if pairs > self.capacity and not self.make_room(pairs, pending.size):
+                    return self._drawn(pending.inputs.to(self.inputs.device), pending.size)
             pending = self._start(pending.inputs, pending.size)
 
     @torch.no_grad()
     def _start(self, inputs: Tensor, size: tuple[int, int]) -> Pending:
         with self._lock:
-            device = self._inputs.device
+            device = self.inputs.device
             if device.type == "cuda" and inputs.device.type == "cpu" and not inputs.is_pinned():
                 inputs = inputs.pin_memory()
-            self._inputs.copy_(inputs, non_blocking=True)
+            self.inputs.copy_(inputs, non_blocking=True)
             self._follow(size)
-            recorded = self._recorded or _Steps(self._body)
+            recorded = self._recorded or Steps(self.draw_steps)
             image, total = recorded.replay()
             if recorded.overwrites:
                 planes = image.rgb.permute(2, 0, 1).clone()
@@ -144,50 +144,50 @@ class FrameGraph:
             return Pending(inputs, size, image, total, self.capacity, done)
 
     def _follow(self, size: tuple[int, int]) -> None:
-        """Notice another size or a changed scene, learn how much room is needed, and record when it pays."""
+        """Detect another size or a changed scene, determine the capacity, and record when that pays."""
         state = self._scene_state()
         if size != self._size or state != self._state:
-            require_image(image_demand(*size, 4), size, len(self.gaussians), self._inputs.device)
+            require_image(image_demand(*size, 4), size, len(self.gaussians), self.inputs.device)
             self._size, self._state, self._recorded, self._frames_of_state = size, state, None, 0
         if self.capacity == 0:
             self.capacity = 1
-            self._make_room(int(self._body()[1]), size)
+            self.make_room(int(self.draw_steps()[1]), size)
         self._frames_of_state += 1
-        if debug.enabled():  # its checks ask the device
+        if debug.enabled():  # Debug checks wait for the device.
             return
         if self._recorded is None and self.failure is None and self._frames_of_state > RECORD_AFTER:
             self._record()
 
     def _record(self) -> None:
-        if self._inputs.device.type != "cuda":
-            self._recorded = _Steps(self._body)
+        if self.inputs.device.type != "cuda":
+            self._recorded = Steps(self.draw_steps)
         else:
             try:
-                self._recorded = CudaGraph(self._body, self._inputs.device)
-            except RuntimeError as error:  # frames are drawn step by step then; whoever measures looks at ``failure``
+                self._recorded = CudaGraph(self.draw_steps, self.inputs.device)
+            except RuntimeError as error:  # Frames are then drawn step by step.
                 self.failure = str(error)
                 return
         self.recordings += 1
-        # The graph reads the scene's tensors where they lay: those that the motion caches must not go before it does.
+        # The graph reads the scene's tensors in place: tensors cached by the motion must outlive it.
         self._kept = [list(vars(module).values()) for module in self.motion.modules()]
 
     def _scene_state(self) -> list[Any]:
-        """Equal as long as no tensor of the scene was replaced or changed in place."""
+        """Return a state that stays equal as long as no tensor of the scene is replaced or modified."""
         tensors = (*self.gaussians.parameters(), *self.motion.parameters())
         return [(x.data_ptr(), x.shape, 0 if x.is_inference() else x._version) for x in tensors]
 
-    def _make_room(self, pairs: int, size: tuple[int, int]) -> bool:
-        """Room for so many pairs and some to spare, unless that is more than lists can index or memory can hold."""
-        capacity = min(-(-int(SPARE * max(pairs, 1)) // GRANULE) * GRANULE, MAX_ROOM)
+    def make_room(self, pairs: int, size: tuple[int, int]) -> bool:
+        """Set a capacity for ``pairs`` with a margin; return False if it exceeds the index range or memory."""
+        capacity = min(-(-int(CAPACITY_FACTOR * max(pairs, 1)) // CAPACITY_STEP) * CAPACITY_STEP, MAX_ROOM)
         tiles = -(-size[0] // TILE_SIZE) * -(-size[1] // TILE_SIZE)
         need = bytes_within(capacity, len(self.gaussians), tiles)
-        if pairs > capacity or not memory.fits(need, self._inputs.device):
+        if pairs > capacity or not memory.fits(need, self.inputs.device):
             return False
         self.capacity, self._recorded = capacity, None
         return True
 
-    def _body(self) -> tuple[Image, Tensor]:
-        """The whole frame, from the inputs' memory; also the number of pairs, [1]."""
+    def draw_steps(self) -> tuple[Image, Tensor]:
+        """Draw the whole frame from ``inputs``; return it with the number of pairs, [1]."""
         found: list[Tensor] = []
 
         def binned(splats: Splats) -> Tiles:
@@ -195,11 +195,11 @@ class FrameGraph:
             found.append(total)
             return tiles
 
-        return self._drawn(self._inputs, self._size, binned), found[0]
+        return self._drawn(self.inputs, self._size, binned), found[0]
 
     @torch.no_grad()
     def _drawn(self, inputs: Tensor, size: tuple[int, int], binned: Callable[[Splats], Tiles] | None = None) -> Image:
-        """The frame that ``inputs`` ask for; without ``binned``, in windows where need be."""
+        """Draw the frame of ``inputs``; without ``binned``, in windows of tiles if necessary."""
         viewmat, K, time, background = inputs.split((16, 9, 1, 3))
         posed = self.motion.gaussians_at(self.gaussians, time)
         camera = Camera(viewmat.view(4, 4), K.view(3, 3), *size)
@@ -208,8 +208,8 @@ class FrameGraph:
         return Image(image[:3].permute(1, 2, 0), alpha, depth)
 
 
-class _Steps:
-    """The same as a ``CudaGraph`` of ``body``, one launch after the other."""
+class Steps:
+    """Stand-in for a ``CudaGraph`` that runs ``body`` at every replay."""
 
     overwrites = False
 

@@ -1,4 +1,4 @@
-"""Static scenes with control points, from files of Gaussians."""
+"""Static scenes with control points, made from files of Gaussians or from static scenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..config.presets import preset
-from ..formats.gaussian_files import fitting, read_gaussians
+from ..formats.gaussian_files import read_gaussians, shortage_as_user_error
 from ..formats.gaussian_spz import read_antialiased
 from ..gaussians import GaussianParameters
 from ..geometry.cameras import Overview
@@ -18,36 +18,36 @@ from ..geometry.normalisation import COMMON_RADIUS, Normalisation
 from ..motion.static_nodes import COUNT, StaticNodes
 from .scene import Scene
 
-VIEW = (40.0, 10.0)
-"""Field of view and elevation, in degrees, of films of a file that says nothing about cameras."""
-BULK = (0.02, 0.98)
-"""Quantiles of the opaque Gaussians' coordinates that count as the scene."""
-OPAQUE = 0.1
+FOV_AND_ELEVATION = (40.0, 10.0)
+"""Field of view and elevation, degrees, of the overview, since files of Gaussians have no cameras."""
+BULK_QUANTILES = (0.02, 0.98)
+"""Quantiles of the opaque Gaussians' coordinates that bound the scene."""
+MIN_OPACITY = 0.1
 
 
-def open_ply(
+def open_gaussians(
     path: str | Path, device: str = "cpu", nodes: int = COUNT, up: tuple[float, float, float] | None = None
 ) -> Scene:
-    """A static scene with control points, from a file of Gaussians: ``.ply``, ``.splat`` or ``.spz``.
+    """Open a file of Gaussians (``.ply``, ``.splat`` or ``.spz``) as a static scene with control points.
 
     Args:
-        nodes: control points, sampled from the Gaussians.
-        up: for cameras of films; None: -y, as structure from motion has it.
+        nodes: number of control points, sampled from the Gaussians.
+        up: up direction of the overview; None: -y, the convention of structure from motion.
 
     Raises:
         UserError: as :func:`~scgs_warp.formats.gaussian_files.read_gaussians`.
     """
     gaussians = read_gaussians(path)
-    with fitting(Path(path)):
-        return _as_scene(Path(path), gaussians, device, nodes, up)
+    with shortage_as_user_error(Path(path)):
+        return _static_scene(Path(path), gaussians, device, nodes, up)
 
 
-def _as_scene(
+def _static_scene(
     path: Path, gaussians: GaussianParameters, device: str, nodes: int, up: tuple[float, float, float] | None
 ) -> Scene:
     world = gaussians.means.detach().double().numpy()
-    solid = world[(gaussians.opacities() > OPAQUE).numpy()]
-    low, high = np.quantile(solid if len(solid) else world, BULK, axis=0)
+    solid = world[(gaussians.opacities() > MIN_OPACITY).numpy()]
+    low, high = np.quantile(solid if len(solid) else world, BULK_QUANTILES, axis=0)
     centre = (low + high) / 2
     radius = float(np.linalg.norm(high - low)) / 2
     unit = Normalisation(centre, COMMON_RADIUS / radius if radius > 0 else 1.0)
@@ -55,7 +55,7 @@ def _as_scene(
         gaussians.means.copy_(unit.apply(gaussians.means))
         gaussians.log_scales.add_(math.log(unit.scale))
     gaussians = gaussians.to(device)
-    fov, elevation = VIEW
+    fov, elevation = FOV_AND_ELEVATION
     distance = 1.2 * max(radius, 1e-9) / math.tan(math.radians(fov) / 2)
     x, y, z = centre.tolist()
     overview = Overview((x, y, z), up or (0.0, -1.0, 0.0), distance, fov, elevation)
@@ -65,8 +65,8 @@ def _as_scene(
     return scene
 
 
-def rig_static(scene: Scene, nodes: int = COUNT) -> Scene:
-    """A static scene given control points."""
+def with_control_points(scene: Scene, nodes: int = COUNT) -> Scene:
+    """Return a static scene with control points in place of its motion."""
     motion = StaticNodes.sample(scene.gaussians, nodes)
     return Scene(
         scene.gaussians, motion, scene.normalisation, scene.config, scene.overview, step=scene.step,

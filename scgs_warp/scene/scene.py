@@ -1,4 +1,4 @@
-"""A trained scene: Gaussians, their motion, and how its units relate to the world's."""
+"""A trained scene: Gaussians, their motion, and the normalisation of world units."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from .frame_graph import FrameGraph
 from .validation import check_metadata, check_motion, check_settings, check_tensors, reason
 
 
-def moment(time: float) -> float:
-    """``time`` clamped to [0, 1].
+def clamped_time(time: float) -> float:
+    """Clamp ``time`` to [0, 1].
 
     Raises:
-        UserError: it is not finite.
+        UserError: the time is non-finite.
     """
     if not math.isfinite(time):
         raise UserError(f"time is {time}; give a number from 0 (the first moment) to 1 (the last)")
@@ -39,10 +39,10 @@ def moment(time: float) -> float:
 
 
 class Scene:
-    """What training returns and a run directory holds. All public methods speak world units.
+    """A trained scene, as returned by training and stored in a run directory. Public methods use world units.
 
     Attributes: ``gaussians`` (:class:`GaussianParameters`, normalised units), ``motion``, ``normalisation``,
-    ``config``, ``overview`` (where cameras stood), ``step``, ``settings`` (``config.json`` as a dict).
+    ``config``, ``overview`` (summary of the training cameras), ``step``, ``settings`` (``config.json`` as a dict).
     """
 
     def __init__(
@@ -63,17 +63,17 @@ class Scene:
 
     @staticmethod
     def load(run: str | Path, device: str = "cpu") -> Scene:
-        """Read a run directory, as :func:`scgs_warp.fit` and ``apps/train.py`` leave it.
+        """Load the scene of a run directory written by :func:`scgs_warp.fit` or ``apps/train.py``.
 
         Args:
             run: the folder, which holds ``checkpoint.safetensors``.
-            device: where the scene is to live and to be rendered, ``cpu`` or ``cuda``.
+            device: device of the scene's tensors and of rendering, ``cpu`` or ``cuda``.
 
         Returns:
-            the scene of the newest checkpoint, ready to render.
+            The scene of the newest checkpoint, ready to render.
 
         Raises:
-            UserError: it is missing or damaged, or training has not come to its second stage.
+            UserError: the checkpoint is missing or damaged, or training has not reached its second stage.
         """
         folder = Path(run)
         if not folder.is_dir():
@@ -91,18 +91,18 @@ class Scene:
         if metadata.get("stage") != "main":
             raise UserError(f"{folder}: training stopped in stage 1; continue it with apps/train.py --resume")
         scene.freeze_binding()
-        check_motion(scene, str(folder / checkpoint.FILE))
+        check_motion(scene.gaussians_at, str(folder / checkpoint.FILE))
         return scene
 
     def freeze_binding(self) -> None:
-        """Find every Gaussian's control points once: they do not depend on time."""
+        """Compute every Gaussian's control points once, since they do not depend on time."""
         cache = getattr(self.motion, "cache_binding", None)
         if cache is not None:
             cache(self.gaussians)
 
     @property
     def device(self) -> torch.device:
-        """Where the scene lives and is rendered."""
+        """Device of the scene's tensors and of rendering."""
         return self.gaussians.means.device
 
     @property
@@ -112,34 +112,33 @@ class Scene:
 
     @property
     def gaussian_count(self) -> int:
-        """N."""
+        """Number of Gaussians, N."""
         return len(self.gaussians)
 
     @property
     def control_point_count(self) -> int:
-        """M; 0 for motion models without."""
+        """Number of control points, M; 0 for motion models without control points."""
         return self.control_points_at(0.0).shape[0]
 
     @property
     def background_color(self) -> tuple[float, float, float]:
-        """What the truth was composited on; black where it was random."""
+        """Background of the training images; black if it was random."""
         return BACKGROUND_COLORS[self.config.data.background]
 
     @torch.no_grad()
     def gaussians_at(self, time: float) -> Gaussians:
-        """The Gaussians at one moment, activated: as other renderers take them.
+        """Return the posed, activated Gaussians at one time, in the form that other renderers take.
 
         Args:
             time: clamped to [0, 1].
 
         Returns:
-            N Gaussians in world units on the scene's device. The order is the same at every time: row i is one point
-            of the surface, followed through the motion.
+            N Gaussians in world units on the scene's device. Row i is the same Gaussian at every time.
 
         Raises:
-            UserError: the time is not finite.
+            UserError: the time is non-finite.
         """
-        posed = self.motion.gaussians_at(self.gaussians, moment(time))
+        posed = self.motion.gaussians_at(self.gaussians, clamped_time(time))
         undo = self.normalisation
         return Gaussians(
             undo.undo(posed.means),
@@ -154,21 +153,21 @@ class Scene:
     def render(
         self, camera: Camera, time: float, background: tuple[float, float, float] | Tensor | None = None
     ) -> Image:
-        """The scene at ``time`` in [0, 1], seen by a world camera; depth in world units.
+        """Render the scene at ``time`` from a camera in world units.
 
         Args:
-            camera: any device.
+            camera: on any device.
             time: clamped to [0, 1].
             background: colour in [0, 1]; None: ``background_color``.
 
         Returns:
-            ``rgb`` [H, W, 3], ``alpha`` and ``depth`` [H, W], float32 on the scene's device; ``rgb`` may leave [0, 1] a
-            little.
+            ``rgb`` [H, W, 3], ``alpha`` and ``depth`` [H, W] in world units, float32 on the scene's device; ``rgb`` may
+            slightly exceed [0, 1].
 
         Raises:
-            UserError: the time is not finite.
+            UserError: the time is non-finite.
         """
-        time = moment(time)
+        time = clamped_time(time)
         color = torch.as_tensor(self.background_color if background is None else background, dtype=torch.float32)
         view = self.normalisation.apply_camera(camera)
         if self.device.type == "cuda" and self.motion.takes_time_tensor:
@@ -178,8 +177,8 @@ class Scene:
         return Image(image.rgb, image.alpha, self.normalisation.undo_scale(image.depth))
 
     def frame_graph(self) -> FrameGraph:
-        """What draws this scene's frames on CUDA; it takes cameras of the normalised scene. The same one every time,
-        until ``gaussians`` or ``motion`` is replaced."""
+        """Return the renderer of this scene's frames on CUDA, which takes cameras in normalised units. It is kept until
+        ``gaussians`` or ``motion`` is replaced."""
         found = self._frames
         if found is None or found.gaussians is not self.gaussians or found.motion is not self.motion:
             found = self._frames = FrameGraph(
@@ -192,15 +191,16 @@ class Scene:
 
     @torch.no_grad()
     def control_points_at(self, time: float) -> Tensor:
-        """[M, 3] control points at ``time``, clamped to [0, 1], world; [0, 3] for motion models without.
+        """Return the control points [M, 3] at ``time``, clamped to [0, 1], in world units; [0, 3] for motion models
+        without control points.
 
         Raises:
-            UserError: the time is not finite.
+            UserError: the time is non-finite.
         """
-        return self.normalisation.undo(self.motion.control_points_at(moment(time)))
+        return self.normalisation.undo(self.motion.control_points_at(clamped_time(time)))
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that makes the scene, by name, for a checkpoint."""
+        """Return the scene's tensors by name, for a checkpoint."""
         found = {f"gaussians.{name}": getattr(self.gaussians, name) for name in GaussianParameters.NAMES}
         found.update({f"motion.{name}": value for name, value in self.motion.state_dict().items()})
         return found
@@ -216,10 +216,10 @@ class Scene:
 
 
 def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str, source: str) -> Scene:
-    """Inverse of :meth:`Scene.tensors` and :meth:`Scene.metadata`.
+    """Make a scene from the results of :meth:`Scene.tensors` and :meth:`Scene.metadata`.
 
     Raises:
-        UserError: tensors are missing or do not fit each other.
+        UserError: tensors are missing or inconsistent.
     """
     check_tensors(tensors, source)
     check_metadata(metadata, source)
@@ -227,7 +227,7 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
         config = from_dict(metadata["config"], source)
         check_sizes(config, f"{source}: ")
         rows = checkpoint.strip(tensors, "gaussians.")
-        rows.setdefault("shading", torch.zeros(len(rows["means"]), 0))  # runs from before there was any
+        rows.setdefault("shading", torch.zeros(len(rows["means"]), 0))  # Absent from checkpoints of older versions.
         shaded = rows["shading"].shape[1] > 0
         gaussians = GaussianParameters.empty(
             len(rows["means"]), rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, "cpu"

@@ -1,102 +1,100 @@
-"""Whether what a checkpoint holds can be a scene. Checkpoints are passed on: nothing in one is believed.
+"""Validation of checkpoints, which may come from anyone and are therefore not trusted.
 
-Sizes are checked before anything is allocated by them, numbers before anything is computed from them: a kernel that is
-given an index beyond its arrays would read, and write, what is not its own.
+Sizes are checked before memory is allocated and numbers before they are used: an index out of range would make a
+kernel read or write foreign memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..errors import UserError
-
-if TYPE_CHECKING:
-    from .scene import Scene
+from ..types import Gaussians
 
 REMEDY = "use the previous checkpoint, or train again"
 SH_COUNTS = (0, 3, 8, 15)
-"""Coefficients above degree 0, of degrees 0 to 3."""
-LARGEST = 1e12
-"""Of centre and scale, of the overview and of steps: beyond it float32 leaves no scene."""
-PLANE = "planes.3"
-MOST_TIMES = 4096
-TINY = 1e-30
-WHOLE = ("extra.graph.neighbors",)
-"""Tensors of whole numbers."""
-MOMENTS = (0.0, 0.5, 1.0)
-"""When a scene is looked at once it is loaded."""
+"""Numbers of coefficients above degree 0, for degrees 0 to 3."""
+MAX_MAGNITUDE = 1e12
+"""Largest centre, scale, overview value and step."""
+TIME_PLANE = "planes.3"
+MAX_PLANE_TIMES = 4096
+MIN_MOMENT = 1e-30
+INTEGER_TENSORS = ("extra.graph.neighbors",)
+"""Names of the int32 tensors; all others are float32."""
+CHECKED_TIMES = (0.0, 0.5, 1.0)
+"""Times at which a loaded scene is checked."""
 
 
-def _wrong(source: str, what: str) -> UserError:
+def _unusable(source: str, what: str) -> UserError:
     return UserError(f"{source}: {what}; {REMEDY}")
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """All floats are finite; those that say how many there are of something have the shape that goes with it.
+    """Check that all tensors are finite and of consistent types and shapes.
 
     Raises:
         UserError: naming the tensor.
     """
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            raise _wrong(source, f"{name} holds numbers that are not finite")
-        wanted = torch.int32 if name in WHOLE else torch.float32
+            raise _unusable(source, f"{name} holds non-finite numbers")
+        wanted = torch.int32 if name in INTEGER_TENSORS else torch.float32
         if value.dtype != wanted:
-            raise _wrong(source, f"{name} is of {value.dtype}, not of {wanted}")
+            raise _unusable(source, f"{name} is of {value.dtype}, not of {wanted}")
     rows = {name: tuple(tensors[name].shape) for name in tensors if name.startswith("gaussians.")}
     means, rest, hyper = (rows.get(f"gaussians.{name}", ()) for name in ("means", "sh_rest", "hyper"))
     if len(means) != 2 or means[0] < 1 or means[1] != 3:
-        raise _wrong(source, f"gaussians.means is {list(means)}, not [N, 3]")
+        raise _unusable(source, f"gaussians.means is {list(means)}, not [N, 3]")
     if len(rest) != 3 or rest[1] not in SH_COUNTS or rest[2] != 3:
-        raise _wrong(source, f"gaussians.sh_rest is {list(rest)}, not [N, 0 or 3 or 8 or 15, 3]")
+        raise _unusable(source, f"gaussians.sh_rest is {list(rest)}, not [N, 0 or 3 or 8 or 15, 3]")
     if len(hyper) != 2 or len(rows.get("gaussians.shading", (0, 0))) != 2:
-        raise _wrong(source, "gaussians.hyper or gaussians.shading is not [N, ...]")
+        raise _unusable(source, "gaussians.hyper or gaussians.shading is not [N, ...]")
     for name, shape in rows.items():
         if not shape or shape[0] != means[0]:
-            raise _wrong(source, f"{name} is {list(shape)}, but there are {means[0]} Gaussians")
+            raise _unusable(source, f"{name} is {list(shape)}, but there are {means[0]} Gaussians")
     nodes = tensors.get("motion.positions")
     if nodes is not None and (nodes.ndim != 2 or nodes.shape[0] < 1 or nodes.shape[1] != 3):
-        raise _wrong(source, f"motion.positions is {list(nodes.shape)}, not [M, 3]")
-    plane = tensors.get(f"motion.{PLANE}")
-    if plane is not None and (plane.ndim != 3 or not 1 <= plane.shape[0] <= MOST_TIMES or plane.numel() == 0):
-        raise _wrong(source, f"motion.{PLANE} is {list(plane.shape)}, not [T, X, channels]")
+        raise _unusable(source, f"motion.positions is {list(nodes.shape)}, not [M, 3]")
+    plane = tensors.get(f"motion.{TIME_PLANE}")
+    if plane is not None and (plane.ndim != 3 or not 1 <= plane.shape[0] <= MAX_PLANE_TIMES or plane.numel() == 0):
+        raise _unusable(source, f"motion.{TIME_PLANE} is {list(plane.shape)}, not [T, X, channels]")
 
 
 def check_metadata(metadata: Mapping[str, Any], source: str) -> None:
-    """The parts that a scene is made of are there, of their types, and finite.
+    """Check that all metadata of a scene is present, of the right type and finite.
 
     Raises:
         UserError: naming the field.
     """
     for name in ("config", "normalisation", "overview"):
         if not isinstance(metadata.get(name), dict):
-            raise _wrong(source, f"metadata.{name} is missing or no object")
+            raise _unusable(source, f"metadata.{name} is missing or not an object")
     unit, overview = metadata["normalisation"], metadata["overview"]
     for name, value in (("normalisation.centre", unit.get("centre")), ("overview.centre", overview.get("centre"))):
         if not _vector(value):
-            raise _wrong(source, f"metadata.{name} is not three numbers")
+            raise _unusable(source, f"metadata.{name} is not three numbers")
     if not _vector(overview.get("up")) or not any(abs(x) > 1e-6 for x in overview["up"]):
-        raise _wrong(source, "metadata.overview.up is no direction")
-    ranges = {"radius": (0, LARGEST), "fov_x": (1e-3, 179.0), "aspect": (1e-3, 1e3)}
+        raise _unusable(source, "metadata.overview.up is not a direction")
+    ranges = {"radius": (0, MAX_MAGNITUDE), "fov_x": (1e-3, 179.0), "aspect": (1e-3, 1e3)}
     for name, value in overview.items():
-        low, high = ranges.get(name, (-LARGEST, LARGEST))
+        low, high = ranges.get(name, (-MAX_MAGNITUDE, MAX_MAGNITUDE))
         if name not in ("centre", "up") and not _number(value, low, high):
-            raise _wrong(source, f"metadata.overview.{name} is no number from {low:g} to {high:g}")
-    if not _number(unit.get("scale"), 1 / LARGEST, LARGEST):
-        raise _wrong(source, "metadata.normalisation.scale is no positive number")
+            raise _unusable(source, f"metadata.overview.{name} is not a number from {low:g} to {high:g}")
+    if not _number(unit.get("scale"), 1 / MAX_MAGNITUDE, MAX_MAGNITUDE):
+        raise _unusable(source, "metadata.normalisation.scale is not a positive number")
     step = metadata.get("step")
-    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < LARGEST:
-        raise _wrong(source, "metadata.step is no whole number")
+    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < MAX_MAGNITUDE:
+        raise _unusable(source, "metadata.step is no whole number")
     if not isinstance(metadata.get("motion"), str):
-        raise _wrong(source, "metadata.motion names no motion model")
+        raise _unusable(source, "metadata.motion names no motion model")
 
 
 def check_settings(settings: Any, source: str) -> None:
-    """What of ``config.json`` is used beside the checkpoint: where the data lie, and how they are looked at.
+    """Check the fields of ``config.json`` that are used besides the checkpoint: the data folder and its options.
 
     Raises:
         UserError: naming the field.
@@ -106,80 +104,86 @@ def check_settings(settings: Any, source: str) -> None:
         raise UserError(f"{source}: must hold a JSON object, and data another; restore it or train again")
     for name in ("folder", "resample", "background"):
         if not isinstance(data.get(name, ""), (str, type(None))):
-            raise UserError(f"{source}: data.{name} is no text; restore it or train again")
+            raise UserError(f"{source}: data.{name} is not text; restore it or train again")
 
 
 def _number(value: Any, low: float, high: float) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high  # NaN: no
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high  # False for NaN
 
 
 def _vector(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(_number(x, -LARGEST, LARGEST) for x in value)
+    return isinstance(value, list) and len(value) == 3 and all(_number(x, -MAX_MAGNITUDE, MAX_MAGNITUDE) for x in value)
 
 
-def check_motion(scene: Scene, source: str) -> None:
-    """At the beginning, the middle and the end of the motion every Gaussian is somewhere: finite numbers may lead to
-    others that are not.
+def check_motion(gaussians_at: Callable[[float], Gaussians], source: str) -> None:
+    """Check that the Gaussians are finite at the beginning, the middle and the end of the motion: finite parameters
+    may lead to non-finite poses.
+
+    Args:
+        gaussians_at: time in [0, 1] -> posed Gaussians.
 
     Raises:
-        UserError: it does not.
+        UserError: naming the time and the attribute.
     """
-    for time in MOMENTS:
-        posed = scene.gaussians_at(time)
+    for time in CHECKED_TIMES:
+        posed = gaussians_at(time)
         for name in ("means", "quats", "scales", "sh_dc"):
             if not bool(torch.isfinite(getattr(posed, name)).all()):
-                raise _wrong(source, f"at time {time:g} the Gaussians' {name} are not finite")
+                raise _unusable(source, f"at time {time:g} the Gaussians' {name} are not finite")
 
 
 def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], source: str) -> None:
-    """What training needs beside the scene: statistics, moments, the graph of control points.
+    """Check the state that resuming needs besides the scene: statistics, moments, the graph of control points.
 
     Raises:
-        UserError: naming what is wrong.
+        UserError: naming the tensor or the field.
     """
     count = len(tensors["gaussians.means"])
     for name in ("grad_norm", "count", "max_radii"):
         found = tensors.get(f"stats.{name}")
         if found is None or found.shape != (count,):
-            raise _wrong(source, f"stats.{name} is missing or not [{count}]")
+            raise _unusable(source, f"stats.{name} is missing or not [{count}]")
     for name in ("points", "colors"):
         if name in tensors and (tensors[name].ndim != 2 or tensors[name].shape[1] != 3):
-            raise _wrong(source, f"{name} is {list(tensors[name].shape)}, not [P, 3]")
+            raise _unusable(source, f"{name} is {list(tensors[name].shape)}, not [P, 3]")
     if len(tensors.get("points", ())) != len(tensors.get("colors", ())):
-        raise _wrong(source, "points and colors are not as many")
+        raise _unusable(source, "points and colors differ in number")
     for name, value in tensors.items():
         if name.endswith(".exp_avg_sq") and value.numel():
             if float(value.min()) < 0:
-                raise _wrong(source, f"{name} holds negative numbers")
+                raise _unusable(source, f"{name} holds negative numbers")
             mean = tensors.get(name.removesuffix("_sq"))
             if mean is None or mean.shape != value.shape or _beyond(mean, value):
-                raise _wrong(source, f"{name} and its exp_avg are not of the same gradients")
-        if name.endswith(".step") and (value.ndim != 0 or not 0 <= float(value) < LARGEST):
-            raise _wrong(source, f"{name} is no number of steps")
-    if not _number(metadata.get("extent"), 1 / LARGEST, LARGEST) or metadata.get("stage") not in ("pretrain", "main"):
-        raise _wrong(source, "metadata.extent or metadata.stage is missing or none")
+                raise _unusable(source, f"{name} and its exp_avg are not of the same gradients")
+        if name.endswith(".step") and (value.ndim != 0 or not 0 <= float(value) < MAX_MAGNITUDE):
+            raise _unusable(source, f"{name} is not a number of steps")
+    if not _number(metadata.get("extent"), 1 / MAX_MAGNITUDE, MAX_MAGNITUDE) or metadata.get("stage") not in (
+        "pretrain",
+        "main",
+    ):
+        raise _unusable(source, "metadata.extent or metadata.stage is missing or none")
     _check_graph(tensors, source)
 
 
 def _beyond(mean: Tensor, square: Tensor) -> bool:
-    """Whether moments would lead to a step that no gradients do: with Adam's rates the mean is at most 7.3 times the
-    root of the mean square. What is smaller than ``TINY`` may have been rounded to 0."""
-    return bool((mean.double().square() > 1000.0 * square.double() + TINY).any())
+    """Return whether moments are impossible: with Adam's rates the mean is at most 7.3 times the root of the mean
+    square. Squares below ``MIN_MOMENT`` may have been rounded to 0."""
+    return bool((mean.double().square() > 1000.0 * square.double() + MIN_MOMENT).any())
 
 
 def _check_graph(tensors: Mapping[str, Tensor], source: str) -> None:
     neighbors, weights = tensors.get("extra.graph.neighbors"), tensors.get("extra.graph.weights")
     if neighbors is None and weights is None:
         return
-    nodes = len(tensors.get("motion.positions", tensors["gaussians.means"]))  # in stage 1 spheres are both
+    nodes = len(tensors.get("motion.positions", tensors["gaussians.means"]))  # In stage 1 the spheres are both.
     fits = neighbors is not None and weights is not None and neighbors.shape == weights.shape and neighbors.ndim == 2
     if not fits or neighbors is None or neighbors.dtype != torch.int32 or len(neighbors) != nodes:
-        raise _wrong(source, f"extra.graph.neighbors and weights are not both [{nodes}, J]")
+        raise _unusable(source, f"extra.graph.neighbors and weights are not both [{nodes}, J]")
     if neighbors.numel() and not -1 <= int(neighbors.min()) <= int(neighbors.max()) < nodes:
-        raise _wrong(source, f"extra.graph.neighbors names control points that are none of the {nodes}")
+        raise _unusable(source, f"extra.graph.neighbors names control points outside of the {nodes}")
 
 
 def reason(error: Exception) -> str:
-    """Why something did not load, in a few words: PyTorch lists every tensor."""
+    """Shorten the text of a loading error, in which PyTorch lists every tensor."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 200 else f"{text[:200]} ..."

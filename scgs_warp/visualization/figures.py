@@ -1,4 +1,4 @@
-"""What a run looks like: sheets of truth beside render, curves of the log."""
+"""Figures of a run: contact sheets of truth, render and error, and curves of the log."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ..errors import UserError
 from ..storage.checkpoint import write_atomically
 from ..storage.files import as_number, parse_json
 
-NUMBERS, LARGEST = ("step", "seconds"), 1e9
-"""Fields of a log line without which it cannot be placed, and the largest value that they can have."""
+AXIS_FIELDS, MAX_AXIS_VALUE = ("step", "seconds"), 1e9
+"""Fields that place a log line on the axes, and their largest valid value."""
 ERROR_RANGE = 0.2
-"""The mean absolute error over the channels that gets the brightest colour of an error map."""
+"""Mean absolute error over the channels at which an error map reaches its brightest colour."""
 CAPTION = 22
 """Height of a caption in pixels."""
 GAP = 4
@@ -30,7 +30,7 @@ Picture = Tensor | np.ndarray
 
 
 def to_bytes(image: Picture) -> np.ndarray:
-    """[H, W, 3] or [H, W] floats, clamped to [0, 1], as uint8 on the CPU; NaN becomes 0."""
+    """Convert floats [H, W, 3] or [H, W], clamped to [0, 1], to uint8 on the CPU; NaN becomes 0."""
     tensor = image.detach() if isinstance(image, Tensor) else torch.from_numpy(np.ascontiguousarray(image))
     scaled = tensor.float().nan_to_num(0.0, 1.0, 0.0).mul_(255.0).add_(0.5).clamp_(0.0, 255.0)
     return scaled.to(torch.uint8).cpu().contiguous().numpy()
@@ -43,7 +43,7 @@ def _floats(image: Picture) -> np.ndarray:
 
 
 def error_map(truth: Picture, render: Picture) -> np.ndarray:
-    """[H, W, 3] uint8: absolute error, averaged over the channels, in the colours of inferno; black is no error."""
+    """Map the absolute error, averaged over the channels, to inferno's colours, [H, W, 3] uint8; black is 0."""
     import cv2
 
     error = np.abs(_floats(truth) - _floats(render)).mean(-1) / ERROR_RANGE
@@ -51,13 +51,13 @@ def error_map(truth: Picture, render: Picture) -> np.ndarray:
 
 
 def psnr_of(truth: Picture, render: Picture) -> float:
-    """Peak signal-to-noise ratio of clamped floats, in dB; infinite if the images agree."""
+    """Compute the peak signal-to-noise ratio of clamped floats, in dB; infinite for equal images."""
     error = float(np.square(_floats(truth).astype(np.float64) - _floats(render)).mean())
     return -10.0 * math.log10(error) if error > 0 else math.inf
 
 
-def _write(canvas: np.ndarray, text: str, x: int, y: int, width: int) -> None:
-    """Text in a box ``width`` pixels wide and ``CAPTION`` high, smaller where it would not fit."""
+def _put_text(canvas: np.ndarray, text: str, x: int, y: int, width: int) -> None:
+    """Write text in a box ``width`` pixels wide and ``CAPTION`` high, reduced to fit."""
     import cv2
 
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.45
@@ -67,7 +67,7 @@ def _write(canvas: np.ndarray, text: str, x: int, y: int, width: int) -> None:
 
 
 def _fit(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The picture, made smaller (never larger), in the middle of a cell."""
+    """Centre the picture in a cell, reduced to fit but never enlarged."""
     import cv2
 
     scale = min(1.0, width / image.shape[1], height / image.shape[0])
@@ -87,13 +87,13 @@ def contact_sheet(
     scores: Sequence[float] = (),
     cell: int = 400,
 ) -> np.ndarray:
-    """Truth, render and error side by side, one row a pair.
+    """Draw truth, render and error side by side, one row per pair.
 
     Args:
         rows: (truth, render), each [H, W, 3]: floats in [0, 1] or uint8; the two of a row have one size.
         titles: a caption for each row; may be shorter than ``rows``.
-        scores: PSNR of each row, dB, where it is not that of the two pictures (masked pixels do not count).
-        cell: longest side of a picture on the sheet, pixels. Errors are computed before pictures are made smaller.
+        scores: PSNR of each row, dB, if it differs from that of the two pictures because of masks.
+        cell: longest side of a picture on the sheet, pixels. Errors are computed before the reduction.
 
     Returns:
         [height, width, 3] uint8 RGB.
@@ -111,7 +111,7 @@ def contact_sheet(
     sheet = np.full((CAPTION + len(rows) * (height + CAPTION + GAP), 3 * width + 4 * GAP, 3), PAPER, np.uint8)
     columns = [GAP + column * (width + GAP) for column in range(3)]
     for x, text in zip(columns, ("truth", "render", f"error (0 .. {ERROR_RANGE:g})")):
-        _write(sheet, text, x, 0, width)
+        _put_text(sheet, text, x, 0, width)
     for index, (truth, render) in enumerate(rows):
         y = CAPTION + index * (height + CAPTION + GAP)
         pictures = (to_bytes(_floats(truth)), to_bytes(_floats(render)), error_map(truth, render))
@@ -120,12 +120,12 @@ def contact_sheet(
         score = scores[index] if index < len(scores) else psnr_of(truth, render)
         captions = (titles[index] if index < len(titles) else "", "", f"PSNR {score:.2f} dB")
         for x, text in zip(columns, captions):
-            _write(sheet, text, x, y + height, width)
+            _put_text(sheet, text, x, y + height, width)
     return sheet
 
 
 def read_log(path: str | Path) -> list[dict[str, Any]]:
-    """The lines of a run's ``log.jsonl``; one that is not what a log has (cut off when a run was killed) is left out.
+    """Read the lines of a run's ``log.jsonl``; skip malformed lines, such as one truncated when a run was killed.
 
     Raises:
         UserError: the file cannot be read.
@@ -140,25 +140,25 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
             value = parse_json(line)
         except ValueError:
             continue
-        if isinstance(value, dict) and all(_sound(value.get(key)) for key in NUMBERS):
+        if isinstance(value, dict) and all(_is_axis_value(value.get(key)) for key in AXIS_FIELDS):
             lines.append(value)
     return lines
 
 
-def _sound(value: Any) -> bool:
-    """A number that a log has, or nothing."""
-    return value is None or (as_number(value) is not None and 0 <= value <= LARGEST)
+def _is_axis_value(value: Any) -> bool:
+    """Return whether a field is missing or a valid number."""
+    return value is None or (as_number(value) is not None and 0 <= value <= MAX_AXIS_VALUE)
 
 
-def _placed(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], list[tuple[str, float]]]:
-    """Where each (stage, step) lies on one axis, stage behind stage, and where each stage begins."""
+def axis_positions(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], list[tuple[str, float]]]:
+    """Place each (stage, step) on one axis, stage after stage; return the positions and the start of each stage."""
     steps: dict[str, list[int]] = {}
     for line in lines:
         if as_number(line.get("step")) is not None:
             steps.setdefault(str(line.get("stage", "")), []).append(int(line["step"]))
     positions, starts, end = {}, [], 0.0
     for stage, found in steps.items():
-        # A stage that counts from zero again is put behind the one before it
+        # A stage that counts from zero again follows the previous one.
         offset = end if min(found) < end else 0.0
         starts.append((stage, offset + min(found)))
         positions.update({(stage, step): step + offset for step in found})
@@ -166,8 +166,8 @@ def _placed(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], float], 
     return positions, starts
 
 
-def _series(lines: list[dict[str, Any]], key: str, positions: dict[tuple[str, int], float]) -> dict[float, float]:
-    """Position to value, in order; of lines for the same step (a resumed run) the last one counts."""
+def series_of(lines: list[dict[str, Any]], key: str, positions: dict[tuple[str, int], float]) -> dict[float, float]:
+    """Return position -> value in ascending order; of several lines for a step (a resumed run), the last one counts."""
     found = {}
     for line in lines:
         value = as_number(line.get(key))
@@ -181,20 +181,20 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
 
     Args:
         log_path: ``log.jsonl``: JSON objects with ``step`` and some of ``stage``, ``psnr``, ``test_psnr``, ``loss``,
-            ``l1``, ``ssim``, ``gaussians``; what is missing is not drawn.
-        out_png: where the picture goes.
+            ``l1``, ``ssim``, ``gaussians``; missing fields are not drawn.
+        out_png: path of the picture.
 
     Raises:
         UserError: the log cannot be read, or the picture cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # no display, no global backend
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # Needs neither a display nor a global backend.
     from matplotlib.figure import Figure
 
     lines = read_log(log_path)
     stage = ""
-    for line in lines:  # a line without a stage (an evaluation) belongs to that of the lines before it
+    for line in lines:  # A line without a stage (an evaluation) belongs to the stage of the lines before it.
         stage = line["stage"] = str(line.get("stage", stage))
-    positions, starts = _placed(lines)
+    positions, starts = axis_positions(lines)
     panels = (
         ("PSNR [dB]", (("psnr", "train", "-"), ("test_psnr", "test", "o-"))),
         ("loss", (("loss", "loss", "-"), ("l1", "L1", "-"))),
@@ -207,7 +207,7 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
         axes.set_xlabel("step")
         axes.grid(alpha=0.3)
         for key, label, style in series:
-            points = _series(lines, key, positions)
+            points = series_of(lines, key, positions)
             if points:
                 axes.plot(list(points), list(points.values()), style, label=label, markersize=3, linewidth=1.2)
         drawn = len(axes.lines)

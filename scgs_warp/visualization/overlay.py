@@ -1,4 +1,4 @@
-"""What lies behind the colours of a render: depth, coverage, control points and where they have been."""
+"""Layers of a render other than colour: depth, coverage, control points and their trails."""
 
 from __future__ import annotations
 
@@ -19,32 +19,34 @@ if TYPE_CHECKING:
 Show = Literal["rgb", "depth", "alpha", "nodes", "trajectories"]
 
 TRAIL = 0.15
-"""A trail shows this much of the motion's duration ..."""
+"""Length of a trail as a share of the motion's duration."""
 TRAIL_STEPS = 15
-"""... in so many straight pieces."""
+"""Number of straight segments of a trail."""
 TRACKED_GAUSSIANS = 400
-"""Trails where a motion model has no control points."""
+"""Number of Gaussians to track if a motion model has no control points."""
 RANGE_SAMPLES = 8
-"""Frames rendered beforehand for a film's range of depths."""
+"""Number of frames from which a film's range of depths is determined."""
 
 HIDDEN_OPACITY = 0.25
-"""What lies behind the surface is drawn this faintly."""
+"""Opacity of points and trails behind the surface."""
 SURFACE_THICKNESS = 0.02
-"""Control points sit inside the body they move: up to this share of their depth behind the surface counts as seen."""
-OPAQUE = 0.5
-"""Depth means something where alpha is larger."""
-SHIFT = 4
-"""Fractional bits of the coordinates given to OpenCV: dots that move by less than a pixel should not jump."""
+"""Largest distance behind the surface at which a point counts as visible, as a share of its depth: control points lie
+inside the body that they move."""
+SURFACE_ALPHA = 0.5
+"""Alpha above which depth is valid."""
+FRACTION_BITS = 4
+"""Fractional bits of the coordinates given to OpenCV, so that dots move smoothly by less than a pixel."""
 
 
 def depth_range(images: Iterable[Image]) -> tuple[float, float]:
-    """(near, far) that hold nearly all of the surfaces seen in some images of a film, one range for the whole film.
+    """Determine one range of depths (near, far) for a whole film from some of its images.
 
-    The 2nd and 98th percentiles of the depth where the images are opaque, a little widened; (0, 1) if nowhere.
+    The range is the 2nd to 98th percentile of the depth of opaque pixels, slightly widened; (0, 1) without opaque
+    pixels.
     """
     found = []
     for image in images:
-        depth = image.depth[image.alpha > OPAQUE].detach().cpu().numpy()
+        depth = image.depth[image.alpha > SURFACE_ALPHA].detach().cpu().numpy()
         found.append(depth[:: max(1, len(depth) // 50_000)])
     depths = np.concatenate(found) if found else np.zeros(0)
     if len(depths) == 0:
@@ -55,21 +57,21 @@ def depth_range(images: Iterable[Image]) -> tuple[float, float]:
 
 
 def color_depth(image: Image, near: float, far: float) -> np.ndarray:
-    """[H, W, 3] uint8: the nearest is warm and bright, the farthest blue, nothing black (turbo)."""
+    """Map depth to turbo's colours, [H, W, 3] uint8: warm and bright is near, blue is far, and no surface is black."""
     depth, alpha = image.depth.detach().cpu().numpy(), image.alpha.detach().cpu().numpy()
     nearness = np.clip((far - np.nan_to_num(depth)) / (far - near or 1.0), 0.0, 1.0)
-    # turbo is almost black at its blue end and dark at its red one
+    # Turbo is almost black at its blue end and dark at its red end, so both ends are cut.
     colors = cv2.applyColorMap(to_bytes(0.1 + 0.75 * nearness), cv2.COLORMAP_TURBO)[..., ::-1]
     return (colors * np.nan_to_num(alpha)[..., None].clip(0.0, 1.0) + 0.5).astype(np.uint8)
 
 
 def grey_alpha(image: Image) -> np.ndarray:
-    """[H, W, 3] uint8: coverage, white where opaque."""
+    """Draw coverage in grey, [H, W, 3] uint8, white where opaque."""
     return np.ascontiguousarray(np.repeat(to_bytes(image.alpha)[..., None], 3, axis=-1))
 
 
 def position_colors(points: Tensor | np.ndarray) -> np.ndarray:
-    """[M, 3] uint8 RGB from [M, 3] positions: neighbours look alike, so that the eye can follow them through a film."""
+    """Map positions [M, 3] to RGB [M, 3] uint8; neighbours have similar colours, so that a film can be followed."""
     positions = _array(points)
     if len(positions) == 0:
         return np.zeros((0, 3), np.uint8)
@@ -79,10 +81,10 @@ def position_colors(points: Tensor | np.ndarray) -> np.ndarray:
 
 
 def project_points(points: Tensor | np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Image coordinates [..., 2] in pixels (pixel centres at +0.5) and depths [...] of world points [..., 3]."""
+    """Project world points [..., 3] to pixels [..., 2] (pixel centres at +0.5) and depths [...]."""
     viewmat = camera.viewmat.detach().cpu().double().numpy()
     K = camera.K.detach().cpu().double().numpy()
-    with np.errstate(invalid="ignore", over="ignore"):  # points that are not finite stay so and are not drawn
+    with np.errstate(invalid="ignore", over="ignore"):  # Non-finite points stay non-finite and are not drawn.
         seen = _array(points) @ viewmat[:3, :3].T + viewmat[:3, 3]
     depths = seen[..., 2]
     image = seen @ K.T
@@ -94,13 +96,13 @@ def _array(points: Tensor | np.ndarray) -> np.ndarray:
 
 
 def _drawable(pixels: np.ndarray, depths: np.ndarray, camera: Camera) -> np.ndarray:
-    """[...] in front of the camera and not so far outside that OpenCV's integers overflow."""
+    """Return [...] whether points lie in front of the camera and within the range of OpenCV's integers."""
     limit = 4 * max(camera.width, camera.height)
     return np.isfinite(pixels).all(-1) & (depths > 0) & (np.abs(pixels) < limit).all(-1)
 
 
 def _hidden(pixels: np.ndarray, depths: np.ndarray, image: Image | None) -> np.ndarray:
-    """[...] whether an opaque surface lies in front of each point."""
+    """Return [...] whether an opaque surface lies in front of each point."""
     if image is None:
         return np.zeros(depths.shape, bool)
     surface, alpha = image.depth.detach().cpu().numpy(), image.alpha.detach().cpu().numpy()
@@ -110,12 +112,12 @@ def _hidden(pixels: np.ndarray, depths: np.ndarray, image: Image | None) -> np.n
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row = column.clip(0, width - 1), row.clip(0, height - 1)
     behind = depths * (1.0 - SURFACE_THICKNESS) > surface[row, column]
-    return inside & behind & (alpha[row, column] > OPAQUE)
+    return inside & behind & (alpha[row, column] > SURFACE_ALPHA)
 
 
-def _fixed(pixels: np.ndarray) -> np.ndarray:
-    """OpenCV's coordinates, whose pixel centres are whole numbers, in fixed point."""
-    return np.rint((pixels - 0.5) * (1 << SHIFT)).astype(np.int32)
+def _fixed_point(pixels: np.ndarray) -> np.ndarray:
+    """Convert to OpenCV's fixed-point coordinates, whose pixel centres are integers."""
+    return np.rint((pixels - 0.5) * (1 << FRACTION_BITS)).astype(np.int32)
 
 
 def _blend(below: np.ndarray, above: np.ndarray) -> np.ndarray:
@@ -125,14 +127,14 @@ def _blend(below: np.ndarray, above: np.ndarray) -> np.ndarray:
 def draw_points(
     rgb: np.ndarray, points: Tensor, camera: Camera, colors: np.ndarray, image: Image | None = None
 ) -> np.ndarray:
-    """Dots, the nearest on top; faint where the surface hides them.
+    """Draw points as dots, the nearest on top, and faintly where the surface hides them.
 
     Args:
-        rgb: [H, W, 3] uint8, the camera's size; it is not changed.
+        rgb: [H, W, 3] uint8, the camera's size; not modified.
         points: [M, 3] world.
-        camera: the one that made ``rgb``.
+        camera: the camera of ``rgb``.
         colors: [M, 3] uint8.
-        image: its depth decides what is hidden; None: nothing is.
+        image: render whose depth hides points; None: no point is hidden.
 
     Returns:
         [H, W, 3] uint8.
@@ -146,21 +148,21 @@ def draw_points(
     for faint in (True, False):
         layer = canvas.copy() if faint else canvas
         for index in order[(keep & (hidden == faint))[order]]:
-            x, y = _fixed(pixels[index]).tolist()
+            x, y = _fixed_point(pixels[index]).tolist()
             for size, color in ((radius + 1.0, (20, 20, 20)), (radius, colors[index].tolist())):
-                cv2.circle(layer, (x, y), round(size * (1 << SHIFT)), color, -1, cv2.LINE_AA, SHIFT)
+                cv2.circle(layer, (x, y), round(size * (1 << FRACTION_BITS)), color, -1, cv2.LINE_AA, FRACTION_BITS)
         canvas = _blend(canvas, layer) if faint else layer
     return canvas
 
 
 def draw_trails(rgb: np.ndarray, tracks: np.ndarray, camera: Camera, image: Image | None = None) -> np.ndarray:
-    """The way of each point, from dark blue (long ago) to yellow (now); faint where the surface hides it.
+    """Draw the trail of each point, from dark blue (oldest) to yellow (now), and faintly where the surface hides it.
 
     Args:
-        rgb: [H, W, 3] uint8, the camera's size; it is not changed.
+        rgb: [H, W, 3] uint8, the camera's size; not modified.
         tracks: [T, M, 3] world positions at T successive times, oldest first.
-        camera: the one that made ``rgb``.
-        image: its depth decides what is hidden; None: nothing is.
+        camera: the camera of ``rgb``.
+        image: render whose depth hides points; None: no point is hidden.
 
     Returns:
         [H, W, 3] uint8.
@@ -174,7 +176,7 @@ def draw_trails(rgb: np.ndarray, tracks: np.ndarray, camera: Camera, image: Imag
     hidden = _hidden(pixels, depths, image)
     ramp = cv2.applyColorMap(np.linspace(40, 235, steps).astype(np.uint8)[None], cv2.COLORMAP_PLASMA)[0, :, ::-1]
     thickness = max(1, round(0.002 * max(camera.width, camera.height)))
-    places = _fixed(np.where(keep[..., None], pixels, 0.0))
+    places = _fixed_point(np.where(keep[..., None], pixels, 0.0))
     ends = np.stack([places[:-1], places[1:]], axis=2)
     for faint in (True, False):
         layer = canvas.copy() if faint else canvas
@@ -182,13 +184,13 @@ def draw_trails(rgb: np.ndarray, tracks: np.ndarray, camera: Camera, image: Imag
             chosen = keep[step] & keep[step + 1] & (hidden[step + 1] == faint)
             if chosen.any():
                 lines = list(ends[step][chosen])
-                cv2.polylines(layer, lines, False, ramp[step].tolist(), thickness, cv2.LINE_AA, SHIFT)
+                cv2.polylines(layer, lines, False, ramp[step].tolist(), thickness, cv2.LINE_AA, FRACTION_BITS)
         canvas = _blend(canvas, layer) if faint else layer
     return canvas
 
 
 def interpolate_tracks(tracks: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """[S, M, 3] positions at ``times`` [S] in [0, 1] from ``tracks`` [T, M, 3] at T even times from 0 to 1."""
+    """Interpolate ``tracks`` [T, M, 3], at T evenly spaced times from 0 to 1, at ``times`` [S] to [S, M, 3]."""
     place = np.clip(times, 0.0, 1.0) * (len(tracks) - 1)
     low = np.minimum(np.floor(place).astype(int), max(len(tracks) - 2, 0))
     high = np.minimum(low + 1, len(tracks) - 1)
@@ -197,15 +199,15 @@ def interpolate_tracks(tracks: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 class Painter:
-    """Turns (camera, time) into a frame of a film; prepares once what all frames share.
+    """Painter of a film's frames from (camera, time); shared data is prepared once.
 
     Args:
-        scene: what ``Scene.load`` returns.
+        scene: the scene.
         show: ``rgb``, ``depth``, ``alpha``, ``nodes`` (control points) or ``trajectories``.
-        views: the film's (camera, time) pairs; some of them are rendered for the range of depths.
+        views: the film's (camera, time) pairs, of which some are rendered to determine the range of depths.
 
     Raises:
-        UserError: nodes are wanted and the scene has none.
+        UserError: ``nodes`` is requested and the scene has no control points.
     """
 
     def __init__(self, scene: Scene, show: Show, views: Sequence[tuple[Camera, float]]) -> None:
@@ -226,7 +228,7 @@ class Painter:
             self._tracks = tracks(scene)
 
     def paint(self, camera: Camera, time: float) -> np.ndarray:
-        """[H, W, 3] uint8"""
+        """Paint one frame, [H, W, 3] uint8."""
         image = self._scene.render(camera, time)
         if self._show == "depth":
             return color_depth(image, *self._range)
@@ -243,10 +245,11 @@ class Painter:
 
 
 def tracks(scene: Scene, samples: int = 100) -> np.ndarray:
-    """[samples, M, 3] where the control points are at even times from 0 to 1; without any, some opaque Gaussians."""
+    """Return tracks [samples, M, 3] of the control points, or of some opaque Gaussians of scenes without control
+    points, at evenly spaced times from 0 to 1."""
     times = np.linspace(0.0, 1.0, samples).tolist()
     if len(scene.control_points_at(0.0)):
         return np.stack([_array(scene.control_points_at(time)) for time in times])
-    opaque = (scene.gaussians_at(0.0).opacities > OPAQUE).nonzero()[:, 0]
+    opaque = (scene.gaussians_at(0.0).opacities > SURFACE_ALPHA).nonzero()[:, 0]
     chosen = opaque[:: max(1, len(opaque) // TRACKED_GAUSSIANS)]
     return np.stack([_array(scene.gaussians_at(time).means[chosen]) for time in times])

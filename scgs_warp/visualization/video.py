@@ -1,5 +1,4 @@
-"""Films: frames in, one at a time; out comes an .mp4, a .gif or a folder of PNGs. What is not complete never shows up
-under its final name."""
+"""Film writers: an .mp4, a .gif or a folder of PNGs, written frame by frame and renamed to its path when complete."""
 
 from __future__ import annotations
 
@@ -17,24 +16,24 @@ from ..errors import UserError
 from ..storage.output_folders import holds_only, make_parent, replace_folder
 
 SUFFIXES = (".mp4", ".gif", "")
-"""What ``film`` can write; no suffix: a folder of PNGs."""
+"""Suffixes that ``film`` writes; none stands for a folder of PNGs."""
 QUALITY = 18
-"""x264's constant rate factor; 18 is hard to tell from the original, 6 more halve the file."""
+"""x264's constant rate factor; 18 is visually almost lossless, and each 6 more halve the file."""
 PALETTE_PIXELS = 400_000
-"""Pixels, spread evenly over the film, that a GIF's one palette is chosen from."""
+"""Number of pixels, spread evenly over the film, from which a GIF's palette is chosen."""
 PIXEL_BYTES = 64
-"""Memory of a frame while it is made: colour, coverage and depth in float32, their bytes, the encoder's own."""
+"""Bytes per pixel of a frame in progress: colour, coverage and depth in float32, their bytes, the encoder's buffers."""
 GIF_PIXEL_BYTES = 4
-"""Of every frame of a GIF: its bytes, and its places in the palette."""
+"""Bytes per pixel of each frame that a GIF keeps: colour and palette index."""
 FRAME_NAME = "frame_{:05d}.png"
-FRAMES = r"frame_\d{5,}\.png"
+FRAME_PATTERN = r"frame_\d{5,}\.png"
 
 
 def check_path(path: str | Path) -> Path:
-    """Find out before the work, not after it, whether a film can be written there.
+    """Check before rendering that a film can be written to ``path``.
 
     Raises:
-        UserError: an unknown suffix, a folder that holds something else, a place that cannot be written.
+        UserError: unknown suffix, a folder with other files, or a folder that cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -45,19 +44,19 @@ def check_path(path: str | Path) -> Path:
     if not suffix and path.exists():
         if not path.is_dir():
             raise UserError(f"{path}: is a file; end the name in .mp4 or .gif, or name a folder")
-        if not holds_only(path, FRAMES):
+        if not holds_only(path, FRAME_PATTERN):
             raise UserError(f"{path}: holds other files than a film's frames; name a new folder")
     make_parent(path)
     return path
 
 
 def frame_gib(width: int, height: int | None = None) -> float:
-    """GiB that a frame takes while it is rendered and written; square without ``height``."""
+    """Return the memory in GiB that a frame takes while it is rendered and written; square without ``height``."""
     return PIXEL_BYTES * width * (height or width) / 2**30
 
 
 def require_memory(path: str | Path, width: int, height: int, frames: int, device: str) -> None:
-    """Refuse, before the first frame, a film that does not fit into memory.
+    """Check before the first frame that the film fits into memory.
 
     Raises:
         NotEnoughMemory: with the figures.
@@ -73,8 +72,8 @@ def require_memory(path: str | Path, width: int, height: int, frames: int, devic
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """What goes wrong with the disk becomes one line. PyAV's errors of that kind are OSErrors, too."""
+def _disk_errors_as_user_errors(path: Path) -> Iterator[None]:
+    """Convert OSError, which includes PyAV's disk errors, to UserError."""
     try:
         yield
     except OSError as error:
@@ -83,7 +82,7 @@ def _told(path: Path) -> Iterator[None]:
 
 
 class FilmWriter:
-    """What ``film`` yields; one subclass a format."""
+    """Writer that ``film`` yields; one subclass per format."""
 
     def __init__(self, path: Path, fps: float, quality: int) -> None:
         self.path = path
@@ -97,16 +96,16 @@ class FilmWriter:
         """Append one frame.
 
         Args:
-            frame: [H, W, 3] uint8 RGB, the same size every time.
+            frame: [H, W, 3] uint8 RGB; all frames have one size.
 
         Raises:
-            ValueError: it is anything else.
+            ValueError: wrong shape, type or size.
         """
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise ValueError(f"frame must be [H, W, 3] uint8, got {list(frame.shape)} {frame.dtype}")
         if self._shape is not None and frame.shape != self._shape:
             raise ValueError(f"frame must be {list(self._shape)} like the first one, got {list(frame.shape)}")
-        with _told(self.path):
+        with _disk_errors_as_user_errors(self.path):
             if self._shape is None:
                 self._shape = frame.shape
                 self._open(frame)
@@ -114,7 +113,7 @@ class FilmWriter:
         self.frames += 1
 
     def _open(self, frame: np.ndarray) -> None:
-        """The first frame tells the size."""
+        """Open the output for frames of this size."""
 
     def _write(self, frame: np.ndarray) -> None:
         raise NotImplementedError
@@ -123,11 +122,11 @@ class FilmWriter:
         """Complete the temporary file."""
 
     def publish(self) -> None:
-        """Give the complete film its name."""
+        """Rename the complete film to its final name."""
         os.replace(self.temporary, self.path)
 
     def discard(self) -> None:
-        """Leave nothing behind; safe to call at any time."""
+        """Remove the temporary file; safe to call at any time."""
         if self.temporary.is_dir():
             shutil.rmtree(self.temporary, ignore_errors=True)
         else:
@@ -135,7 +134,7 @@ class FilmWriter:
 
 
 class _Mp4(FilmWriter):
-    """H.264, yuv420p, BT.709: what every player and browser shows. Encoded as frames arrive."""
+    """H.264, yuv420p, BT.709, which every player and browser supports; encoded as frames arrive."""
 
     _container: Any = None
 
@@ -146,14 +145,14 @@ class _Mp4(FilmWriter):
         height, width = frame.shape[:2]
         self._container = av.open(str(self.temporary), "w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(self.fps).limit_denominator(1000)
-        # x264's macroblock tree reads memory it never wrote (AVX-512): one film in a few hundred came out other bits
+        # x264's macroblock tree reads uninitialised memory (AVX-512), which changes the bits of some films.
         options = {"crf": str(self.quality), "preset": "medium", "x264-params": "mbtree=0"}
         self._stream: Any = self._container.add_stream("libx264", rate=rate, options=options)
-        # 4:2:0 halves both sides: they must be even, so an odd one gets its last row or column twice
+        # 4:2:0 needs even sides, so the last row or column of an odd side is repeated.
         self._padding = ((0, height % 2), (0, width % 2), (0, 0))
         self._stream.width, self._stream.height = width + width % 2, height + height % 2
         self._stream.pix_fmt = "yuv420p"
-        # Said in the file as well: without it players guess, by size, and colours shift
+        # Without the tag in the file, players guess the colour space by size, and colours shift.
         context = self._stream.codec_context
         context.color_range = ColorRange.MPEG
         context.colorspace = context.color_primaries = context.color_trc = Colorspace.ITU709.value
@@ -186,7 +185,7 @@ class _Mp4(FilmWriter):
 
 
 class _Gif(FilmWriter):
-    """One palette for the whole film, so that still areas do not flicker; frames wait in memory until it is known."""
+    """GIF with one palette for the whole film, to avoid flicker; frames are kept in memory until it is chosen."""
 
     def __init__(self, path: Path, fps: float, quality: int) -> None:
         super().__init__(path, fps, quality)
@@ -204,7 +203,7 @@ class _Gif(FilmWriter):
         pictures = [
             Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in self._kept
         ]
-        # GIF counts in hundredths of a second; browsers slow down what claims less than two
+        # GIF durations are hundredths of a second; browsers slow down films with less than two.
         duration = 10 * max(2, round(100 / self.fps))
         pictures[0].save(
             self.temporary, format="GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0
@@ -212,7 +211,7 @@ class _Gif(FilmWriter):
 
 
 class _Folder(FilmWriter):
-    """Numbered PNGs; an earlier film's frames in the same folder are replaced as a whole."""
+    """Folder of numbered PNGs; the frames of an earlier film are replaced as a whole."""
 
     def _open(self, frame: np.ndarray) -> None:
         self.discard()
@@ -222,7 +221,7 @@ class _Folder(FilmWriter):
         write_png(self.temporary / FRAME_NAME.format(self.frames), frame)
 
     def publish(self) -> None:
-        if self.path.is_dir() and not holds_only(self.path, FRAMES):
+        if self.path.is_dir() and not holds_only(self.path, FRAME_PATTERN):
             raise UserError(f"{self.path}: holds other files than a film's frames; name a new folder")
         replace_folder(self.path, self.temporary)
 
@@ -231,29 +230,29 @@ def write_png(path: Path, image: np.ndarray) -> None:
     """Write [H, W, 3] uint8 RGB losslessly.
 
     Raises:
-        OSError: the place cannot be written.
+        OSError: the file cannot be written.
     """
     import cv2
 
     encoded = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 4])[1]
-    path.write_bytes(encoded.data)  # numpy's tofile does not say why it failed
+    path.write_bytes(encoded.data)  # Unlike numpy's tofile, this reports why it failed.
 
 
 @contextmanager
 def film(path: str | Path, fps: float = 30, *, quality: int = QUALITY) -> Iterator[FilmWriter]:
-    """Write a film frame by frame; on any exception nothing is left behind, and an earlier film is left alone.
+    """Write a film frame by frame; an exception removes the unfinished film and keeps an earlier one.
 
     Args:
-        path: ends in .mp4 (H.264) or .gif; without a suffix, a folder of PNGs. Missing folders above are made.
-        fps: frames a second.
-        quality: of the .mp4, x264's constant rate factor: 0 is lossless, 51 the worst.
+        path: ends in .mp4 (H.264) or .gif; without a suffix, a folder of PNGs. Missing parent folders are made.
+        fps: frames per second.
+        quality: x264's constant rate factor of an .mp4; 0 is lossless, 51 the worst.
 
     Yields:
-        A writer; hand each frame to its ``write``.
+        A writer; pass each frame to its ``write``.
 
     Raises:
-        UserError: as ``check_path``; or the disk is full; or no frame was written; or ``fps`` makes no sense.
-        OSError, anything: what the body of the ``with`` raises passes unchanged.
+        UserError: as ``check_path``; the disk is full, no frame was written, or ``fps`` is out of range.
+        Exception: exceptions of the body of the ``with`` pass unchanged.
     """
     path = check_path(path)
     if not 0 < fps <= 1000:
@@ -264,7 +263,7 @@ def film(path: str | Path, fps: float = 30, *, quality: int = QUALITY) -> Iterat
         yield writer
         if writer.frames == 0:
             raise UserError(f"{path}: a film needs at least one frame")
-        with _told(path):
+        with _disk_errors_as_user_errors(path):
             writer.close()
             writer.publish()
     finally:

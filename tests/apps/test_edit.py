@@ -13,7 +13,7 @@ from helpers.edit_scenes import dress
 from helpers.edit_scripts import SCRIPT
 from scgs_warp.apps import edit as app
 from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
     arguments = ["--ply", str(ply), "--script", str(tmp_path / "edit.json"), "--output", str(tmp_path / "film.mp4")]
     assert app.cli(arguments) == 2
     assert "film.fps" in capsys.readouterr().err and not (tmp_path / "film.mp4").exists()
-    assert open_ply(ply).gaussian_count == 300
+    assert open_gaussians(ply).gaussian_count == 300
 
 
 def test_without_viser_the_editor_says_what_to_install(tmp_path, monkeypatch, capsys):

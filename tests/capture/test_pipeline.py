@@ -18,7 +18,7 @@ pytest.importorskip("pygltflib")
 
 from helpers.paths import ROOT
 from helpers.room import Film, path_length, save, shoot
-from scgs_warp.capture import Request, capture, mapping, pipeline
+from scgs_warp.capture import CaptureRequest, capture, mapping, pipeline
 from scgs_warp.capture.similarity import align, centres
 from scgs_warp.data import load
 from scgs_warp.errors import UserError
@@ -42,7 +42,7 @@ def silent(total: int, text: str):
 
 
 def run(source: Path, folder: Path, **options):
-    return capture(Request(source, **options), folder, show=silent)
+    return capture(CaptureRequest(source, **options), folder, show=silent)
 
 
 @pytest.fixture(scope="module")

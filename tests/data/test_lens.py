@@ -11,7 +11,7 @@ import torch
 
 from helpers.warped import landing, picture, pixel_centres, straight
 from scgs_warp.data import load
-from scgs_warp.data.lens import Lens, make_lens, maps, project, reach, seen, undistort
+from scgs_warp.data.lens import Lens, make_lens, project, undistort, undistortion_maps, valid_pixels, valid_radius
 
 WIDTH, HEIGHT = 96, 72
 K = np.array([[70.0, 0.0, 46.0], [0.0, 74.0, 37.5], [0.0, 0.0, 1.0]])
@@ -118,7 +118,7 @@ def test_alpha_and_masks_are_undistorted_too(tmp_path):
     content["frames"][0]["mask_path"] = "mask.png"
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     data = load(tmp_path)
-    columns = maps(make_lens("FULL_OPENCV", (*INTRINSICS, *opencv(BULGE, False))), WIDTH, HEIGHT)[0]
+    columns = undistortion_maps(make_lens("FULL_OPENCV", (*INTRINSICS, *opencv(BULGE, False))), WIDTH, HEIGHT)[0]
     own, other = data[0].mask, data[1].mask
     assert not (own & ~other).any() and not own[torch.from_numpy(columns > 59.01)].any()
     assert own[torch.from_numpy((columns < 58.9) & other.numpy())].all()
@@ -127,10 +127,10 @@ def test_alpha_and_masks_are_undistorted_too(tmp_path):
 def test_a_polynomial_that_turns_back_shows_nothing_there():
     """Beyond r = 1 / sqrt(-3 k1) the model comes back to the middle: the file has no such ray."""
     lens = make_lens("SIMPLE_RADIAL", (40.0, 48.0, 36.0, -0.4))
-    limit = reach(lens, WIDTH, HEIGHT)
+    limit = valid_radius(lens, WIDTH, HEIGHT)
     assert limit == pytest.approx(1 / np.sqrt(1.2), rel=5e-3)
     radius = np.hypot(*(pixel_centres(WIDTH, HEIGHT) - [48.0, 36.0]).transpose(2, 0, 1)) / 40.0
-    valid = seen(lens, WIDTH, HEIGHT)
+    valid = valid_pixels(lens, WIDTH, HEIGHT)
     assert not valid[radius > 1.001 * limit].any() and valid[radius < 0.99 * limit].all()
     assert (undistort(np.ones((HEIGHT, WIDTH), np.float32), lens) == valid).all()
 

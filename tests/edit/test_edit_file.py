@@ -14,7 +14,7 @@ from scgs_warp.edit.edit_file import parse, read
 from scgs_warp.edit.rotations import from_axis
 from scgs_warp.errors import UserError
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +145,7 @@ def test_names_that_nobody_knows_are_cut_and_on_one_line(session):
 def test_another_count_of_control_points_says_how_to_ask_for_it(session, ply):
     script = {"format": "scgs-warp edit", "version": 1, "scene": {"control_points": 33}}
     with pytest.raises(UserError, match="--nodes 33"):
-        parse(script, "edit.json", EditSession(open_ply(ply, nodes=20)).engine)
+        parse(script, "edit.json", EditSession(open_gaussians(ply, nodes=20)).engine)
     with pytest.raises(UserError) as caught:
         parse(script, "edit.json", session.engine)
     assert "--nodes" not in str(caught.value)

@@ -19,7 +19,7 @@ from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.motion import Static
 from scgs_warp.motion.per_gaussian import PerGaussian
 from scgs_warp.runtime import environment
-from scgs_warp.scene.from_gaussians import rig_static
+from scgs_warp.scene.from_gaussians import with_control_points
 from scgs_warp.scene.scene import Scene
 from scgs_warp.visualization.figures import to_bytes
 
@@ -91,7 +91,7 @@ def test_a_static_scene_is_given_control_points():
     assert same(session.gaussians_at(0.1), session.gaussians_at(0.9))
     kept = (session.gaussians_at(0.0).means == still.gaussians_at(0.0).means).all(1)
     assert 20 < int(kept.sum()) < 380
-    assert len(rig_static(still, 7).motion.positions) == 7
+    assert len(with_control_points(still, 7).motion.positions) == 7
 
 
 def test_other_motion_models_say_so():

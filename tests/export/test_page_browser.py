@@ -21,7 +21,7 @@ from helpers.edit_scenes import bar_scene, rich_scene
 from scgs_warp.export.page import write_page
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.motion import build_motion
-from scgs_warp.scene.from_gaussians import rig_static
+from scgs_warp.scene.from_gaussians import with_control_points
 from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Camera
 
@@ -115,7 +115,7 @@ SCENES = {
     "rich": rich_scene,
     "one neighbour": lambda: with_neighbors(bar_scene(), 1),
     "static": lambda: plain(bar_scene()),
-    "static with control points": lambda: rig_static(plain(bar_scene()), 20),
+    "static with control points": lambda: with_control_points(plain(bar_scene()), 20),
 }
 
 

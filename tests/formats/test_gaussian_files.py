@@ -21,7 +21,7 @@ from scgs_warp.formats import gaussian_files
 from scgs_warp.formats.gaussian_files import gaussian_points, read_gaussians
 from scgs_warp.gaussians import SH_C0, GaussianParameters
 from scgs_warp.motion.static_nodes import StaticNodes
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".splat", ".spz"])
@@ -29,7 +29,7 @@ def test_files_open_as_scenes_and_as_points(tmp_path, suffix):
     truth = ordered(cloud())
     path = tmp_path / f"a{suffix}"
     write_still(path, truth)
-    scene = open_ply(path, nodes=20)
+    scene = open_gaussians(path, nodes=20)
     torch.testing.assert_close(ordered(scene.gaussians_at(0.0)).means, truth.means, atol=2e-5, rtol=0)
     assert scene.control_point_count == 20
     for points, colors in (gaussian_points(path), read_points(path)):
@@ -103,7 +103,7 @@ def test_what_does_not_fit_after_reading_is_one_line_too(tmp_path, monkeypatch, 
     with monkeypatch.context() as patch:
         patch.setattr(StaticNodes, "sample", refuse)
         with pytest.raises(UserError, match=r"a\.spz: .*fit into memory; export"):
-            open_ply(path)
+            open_gaussians(path)
     monkeypatch.setattr(GaussianParameters, "activate", refuse)
     with pytest.raises(UserError, match=r"a\.spz: .*fit into memory; export"):
         job.export(ExportRequest(tmp_path / "b.ply", ply=path))

@@ -20,7 +20,7 @@ from scgs_warp.export.run import write_still
 from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from scgs_warp.geometry import cameras
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 
 
 def make(tmp_path: Path, degree: int = 3, count: int = 300) -> Path:
@@ -54,7 +54,7 @@ def test_there_and_back(tmp_path, degree):
 
 
 def test_a_file_is_edited_and_exported(tmp_path):
-    scene = open_ply(make(tmp_path), nodes=40)
+    scene = open_gaussians(make(tmp_path), nodes=40)
     session = EditSession(scene)
     assert len(session) == 40
     before = scene.gaussians_at(0.0)
@@ -73,7 +73,7 @@ def test_a_file_is_edited_and_exported(tmp_path):
 
 
 def test_the_public_example_opens_bends_and_exports(tmp_path, data_root):
-    scene = open_ply(data_root / "splats" / "tiny_3dgs_9080.ply", nodes=300)
+    scene = open_gaussians(data_root / "splats" / "tiny_3dgs_9080.ply", nodes=300)
     assert scene.gaussian_count == 9080 and scene.gaussians.sh_degree == 3
     session = EditSession(scene)
     session.add_handle(session.ring([0], 1), 0.0, "a")
@@ -135,7 +135,7 @@ def test_gaussians_that_are_not_finite_are_left_out(tmp_path):
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_tiny_files_open(tmp_path, count):
-    scene = open_ply(make(tmp_path, 0, count))
+    scene = open_gaussians(make(tmp_path, 0, count))
     session = EditSession(scene)
     assert len(session) == count
     session.add_handle([0], 0.0, "a")

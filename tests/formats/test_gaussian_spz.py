@@ -20,7 +20,7 @@ from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.formats.gaussian_spz import FLIPS, fraction_bits, pack_quats, read_antialiased, unpack_quats
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.ops.harmonics_rotation import rotate_harmonics
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -65,7 +65,7 @@ def test_spz_keeps_the_mark_of_antialiasing(tmp_path, antialiased):
     write_still(tmp_path / "a.spz", cloud(), antialiased=antialiased)
     export(ExportRequest(tmp_path / "b.spz", ply=tmp_path / "a.spz"))
     assert gzip.decompress((tmp_path / "b.spz").read_bytes())[14] == antialiased
-    assert open_ply(tmp_path / "b.spz", nodes=5).config.antialiased == antialiased
+    assert open_gaussians(tmp_path / "b.spz", nodes=5).config.antialiased == antialiased
     (tmp_path / "c.spz").write_bytes(b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, antialiased, 5, 32))
     assert read_antialiased(tmp_path / "c.spz") == antialiased
     for content in (b"", b"no Gaussians"):

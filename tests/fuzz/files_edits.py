@@ -83,7 +83,7 @@ def silent(total: int, text: str) -> Any:
 
 
 def _result() -> dict[str, Any]:
-    return pipeline.Frames([0, 3, 5], [0.0, 0.3, 0.5], ["a", "b", "c"], (0.0, 1.0), (64, 48), 9, 1, 1)._asdict()
+    return pipeline.PickedFrames([0, 3, 5], [0.0, 0.3, 0.5], ["a", "b", "c"], (0.0, 1.0), (64, 48), 9, 1, 1)._asdict()
 
 
 def write_journal(folder: Path) -> None:
@@ -102,7 +102,7 @@ def load_journal(folder: Path) -> None:
     source = SimpleNamespace(count=9, video=True, path=Path("film.mp4"))
     before, pipeline._choose = pipeline._choose, lambda *_: (_ for _ in ()).throw(_Again)  # type: ignore[assignment]
     try:
-        frames = pipeline._frames(pipeline.Request(Path("film.mp4")), source, journal, silent)  # type: ignore[arg-type]
+        frames = pipeline._frames(pipeline.CaptureRequest(Path("film.mp4")), source, journal, silent)  # type: ignore[arg-type]
         check_numbers(frames._asdict(), "frames")
         expect(len(frames.indices) == len(frames.seconds), "frames without a time")
         expect(all(name.endswith(".png") for name in frames.files), "names")

@@ -14,12 +14,12 @@ import torch
 from fuzz.files_cases import Format, check_gaussians, expect, finite, within
 from helpers.edit_scenes import bar_points, dress
 from helpers.gltf_files import bar, box, quad
-from scgs_warp.data.synthetic.from_mesh import Request, load_subject
+from scgs_warp.data.synthetic.from_mesh import SynthesisRequest, load_subject
 from scgs_warp.formats.gaussian_files import gaussian_points
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
 from scgs_warp.formats.gaussian_splat import write_splat
 from scgs_warp.formats.gaussian_spz import write_spz
-from scgs_warp.scene.from_gaussians import open_ply
+from scgs_warp.scene.from_gaussians import open_gaussians
 from scgs_warp.types import Gaussians
 
 COUNT = 40
@@ -70,7 +70,7 @@ def maker(name: str, write: Any) -> Any:
 def load_gaussians(name: str, folder: Path) -> None:
     """Open as ``apps/export.py --ply``, ``apps/edit.py --ply`` and training from points do."""
     path = folder / name
-    scene = open_ply(path, nodes=8)
+    scene = open_gaussians(path, nodes=8)
     check_gaussians(scene.gaussians_at(0.3))
     check_gaussians(scene.gaussians.activate())
     finite("overview", scene.overview.radius, *scene.overview.centre)
@@ -92,7 +92,7 @@ def write_gltf(folder: Path) -> None:
 def load_mesh(name: str, folder: Path) -> None:
     """Open as ``apps/synthesize.py --mesh`` does."""
     path = folder / name
-    subject, _, lines = load_subject(Request(mesh=path), "cpu")
+    subject, _, lines = load_subject(SynthesisRequest(mesh=path), "cpu")
     expect(all("\n" not in line for line in lines), "a line of several")
     points = subject.sample(64, np.random.default_rng(0))
     finite("tracks", subject.track(points, (0.0, 0.3, 1.0)))

@@ -135,12 +135,12 @@ def shoot(
 ) -> Film:
     """Film the room: ``count`` frames while time goes from 0 to 1."""
     from scgs_warp.data.gltf.scene import read_scene
-    from scgs_warp.data.synthetic.mesh import Look, MeshSubject
+    from scgs_warp.data.synthetic.mesh import MeshSubject, Shading
     from scgs_warp.types import Camera
 
     with tempfile.TemporaryDirectory() as folder:
         scene = read_scene(room(seed, contrast).save(Path(folder) / "room.glb"))
-    subject = MeshSubject(scene, (0.0, 1.0), Look(unlit=True))
+    subject = MeshSubject(scene, (0.0, 1.0), Shading(unlit=True))
     bodies = (len(FURNITURE) + 1) * len(FACES) * 2  # triangles of what stands still come first
     K = np.array([[0.85 * width, 0.0, width / 2], [0.0, 0.85 * width, height / 2], [0.0, 0.0, 1.0]])
     frames, viewmats, moving = [], [], []

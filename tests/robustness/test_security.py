@@ -259,7 +259,7 @@ def test_what_is_no_file_is_not_read(tmp_path):
     for name in ("pipe.png", "zero.png"):
         done: list[str] = []
         worker = threading.Thread(
-            target=lambda name=name, done=done: done.append(refused(lambda: decode(tmp_path / name), "is no file")),
+            target=lambda name=name, done=done: done.append(refused(lambda: decode(tmp_path / name), "not a regular")),
             daemon=True,
         )
         worker.start()

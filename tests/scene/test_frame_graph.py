@@ -17,7 +17,7 @@ from scgs_warp.motion.base import Motion
 from scgs_warp.rendering.render import render
 from scgs_warp.runtime import memory
 from scgs_warp.scene import frame_graph
-from scgs_warp.scene.frame_graph import GRANULE, RECORD_AFTER, FrameGraph
+from scgs_warp.scene.frame_graph import CAPACITY_STEP, RECORD_AFTER, FrameGraph
 from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Camera, Image
 
@@ -59,7 +59,7 @@ class Overwriting:
 
 @pytest.fixture(autouse=True)
 def graphs_overwrite(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_graph, "_Steps", Overwriting)
+    monkeypatch.setattr(frame_graph, "Steps", Overwriting)
 
 
 @pytest.mark.parametrize("model", MOTIONS)
@@ -78,12 +78,15 @@ def test_frames_are_those_drawn_step_by_step(device: str, model: str):
         assert_same(actual, image)
 
 
-def test_scene_renders_through_it_on_cuda_only(device: str):
+def test_scene_renders_through_it_on_cuda_only(device: str, monkeypatch: pytest.MonkeyPatch):
     scene = scene_of("control-points", device)
     camera = scenes.scene_camera(scene, (64, 48))
+    asked = []
+    original = scene.frame_graph
+    monkeypatch.setattr(scene, "frame_graph", lambda: asked.append(True) or original())
     image = scene.render(camera, 2.0, (0.2, 0.3, 0.4))
     assert_same(image, truth(scene, camera, 1.0, torch.tensor([0.2, 0.3, 0.4])))
-    assert (scene._frames is not None) == (device == "cuda")
+    assert bool(asked) == (device == "cuda")
 
 
 def test_a_motion_that_needs_the_time_on_the_host_is_refused(device: str):
@@ -95,7 +98,7 @@ def test_a_motion_that_needs_the_time_on_the_host_is_refused(device: str):
 
 
 def test_overflow_draws_the_frame_again_with_more_room(device: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(frame_graph, "GRANULE", 16)
+    monkeypatch.setattr(frame_graph, "CAPACITY_STEP", 16)
     scene = scene_of("control-points", device)
     frames = scene.frame_graph()
     color = torch.zeros(3)
@@ -169,11 +172,11 @@ def test_nothing_in_a_frame_asks_the_host(model: str, monkeypatch: pytest.Monkey
     frames = scene.frame_graph()
     frames.render(scenes.scene_camera(scene, (64, 48)), 0.5, torch.zeros(3))
     with NoHost():
-        frames._body()
+        frames.draw_steps()
         with pytest.raises(AssertionError, match="in a frame"):
             torch.tensor([1.0])
         with pytest.raises(AssertionError, match="in a frame"):
-            float(frames._inputs[0])
+            float(frames.inputs[0])
 
 
 def test_a_single_picture_is_not_recorded(device: str):
@@ -186,15 +189,15 @@ def test_a_single_picture_is_not_recorded(device: str):
 
 def test_room_is_a_multiple_and_has_a_limit(monkeypatch: pytest.MonkeyPatch):
     frames = FrameGraph(*(getattr(scene_of("static", "cpu"), name) for name in ("gaussians", "motion")))
-    for pairs in (0, 1, GRANULE, 10 * GRANULE + 1):
-        assert frames._make_room(pairs, (64, 48))
-        assert frames.capacity % GRANULE == 0 and frames.capacity >= max(1.2 * pairs, 1)
+    for pairs in (0, 1, CAPACITY_STEP, 10 * CAPACITY_STEP + 1):
+        assert frames.make_room(pairs, (64, 48))
+        assert frames.capacity % CAPACITY_STEP == 0 and frames.capacity >= max(1.2 * pairs, 1)
     monkeypatch.setattr(memory, "fits", lambda need, device: True)
-    assert frames._make_room(frame_graph.MAX_ROOM, (64, 48))
+    assert frames.make_room(frame_graph.MAX_ROOM, (64, 48))
     assert frames.capacity == frame_graph.MAX_ROOM
-    assert not frames._make_room(frame_graph.MAX_ROOM + 1, (64, 48))
+    assert not frames.make_room(frame_graph.MAX_ROOM + 1, (64, 48))
     monkeypatch.setattr(memory, "fits", lambda need, device: False)
-    assert not frames._make_room(1, (64, 48))
+    assert not frames.make_room(1, (64, 48))
     assert frames.capacity == frame_graph.MAX_ROOM
 
 
@@ -209,4 +212,4 @@ def test_a_frame_without_room_is_drawn_step_by_step(device: str, monkeypatch: py
     assert frames.capacity == 1
     for time in (0.4, 0.5, 0.6, 0.7):
         assert_same(frames.render(camera, time, color), truth(scene, camera, time, color))
-    assert frames.capacity >= GRANULE and frames.recordings == 1
+    assert frames.capacity >= CAPACITY_STEP and frames.recordings == 1

@@ -78,9 +78,9 @@ def test_stages_follow_each_other_and_resumed_steps_count_once() -> None:
     lines = [{"step": 0, "stage": "a", "psnr": 1.0}, {"step": 10, "stage": "a", "psnr": 2.0},
              {"step": 0, "stage": "b", "psnr": 3.0}, {"step": 5, "stage": "b", "psnr": 4.0},
              {"step": 5, "stage": "b", "psnr": 5.0}, {"step": 7, "stage": "b", "psnr": math.nan}]  # fmt: skip
-    positions, starts = figures._placed(lines)
+    positions, starts = figures.axis_positions(lines)
     assert starts == [("a", 0.0), ("b", 10.0)]
-    assert figures._series(lines[:2] + lines[3:], "psnr", positions) == {0.0: 1.0, 10.0: 2.0, 15.0: 5.0}
+    assert figures.series_of(lines[:2] + lines[3:], "psnr", positions) == {0.0: 1.0, 10.0: 2.0, 15.0: 5.0}
 
 
 def test_an_evaluation_in_the_first_stage_does_not_shift_the_second(tmp_path: Path, monkeypatch) -> None:
@@ -88,8 +88,8 @@ def test_an_evaluation_in_the_first_stage_does_not_shift_the_second(tmp_path: Pa
              {"step": 30, "stage": "main"}, {"step": 30, "test_psnr": 25.0}]  # fmt: skip
     write_log(tmp_path / "log.jsonl", lines)
     seen = {}
-    placed = figures._placed
-    monkeypatch.setattr(figures, "_placed", lambda lines: seen.setdefault("placed", placed(lines)))
+    placed = figures.axis_positions
+    monkeypatch.setattr(figures, "axis_positions", lambda lines: seen.setdefault("placed", placed(lines)))
     figures.curves(tmp_path / "log.jsonl", tmp_path / "curves.png")
     assert list(seen["placed"][0].values()) == [10, 20, 30]
 

@@ -1,4 +1,4 @@
-"""glTF animation clips: what each sampler says at an instant. All float64; quaternions as glTF stores them, xyzw.
+"""glTF animation clips and their samplers. All float64; quaternions as glTF stores them, xyzw.
 
 Formulas: glTF 2.0 specification, appendix C (interpolation).
 """
@@ -13,7 +13,7 @@ from ...errors import UserError
 from .file import GltfFile
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
-"""Components of what a channel can move; ``weights`` has as many as the mesh has morph targets."""
+"""Number of components of each animated property; ``weights`` has one per morph target of the mesh."""
 
 
 class Sampler(NamedTuple):
@@ -43,11 +43,11 @@ class Clip(NamedTuple):
 
 
 def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
-    """The unit quaternion ``share`` of the shorter way from a to b, [4]."""
+    """Interpolate unit quaternions [4] along the shorter arc from a (``share`` 0) to b (``share`` 1)."""
     cosine = float(a @ b)
     sign = -1.0 if cosine < 0.0 else 1.0
     angle = float(np.arccos(min(abs(cosine), 1.0)))
-    if angle < 1e-6:  # sine and angle agree to 1e-13, and their quotient would be 0 / 0
+    if angle < 1e-6:  # Sine and angle agree to 1e-13; the quotient below would be 0 / 0.
         mixed = (1.0 - share) * a + share * sign * b
     else:
         mixed = (np.sin((1.0 - share) * angle) * a + np.sin(share * angle) * sign * b) / np.sin(angle)
@@ -55,7 +55,7 @@ def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
 
 
 def interpolate(sampler: Sampler, seconds: float, rotation: bool = False) -> np.ndarray:
-    """[C] the curve at ``seconds``; before the first keyframe and after the last one it stands still."""
+    """Evaluate the curve at ``seconds``, [C]; it is constant before the first keyframe and after the last one."""
     times, values = sampler.times, sampler.values
     cubic = sampler.interpolation == "CUBICSPLINE"
     if seconds <= times[0] or seconds >= times[-1]:
@@ -86,10 +86,10 @@ def _unit(value: np.ndarray, rotation: bool) -> np.ndarray:
 
 
 def read_clips(file: GltfFile) -> list[Clip]:
-    """Every animation of the file, in its order; nameless ones are called ``animation_0`` and so on.
+    """Read every animation of the file, in its order; unnamed ones are called ``animation_0`` and so on.
 
     Raises:
-        UserError: a sampler cannot be used; the message names it.
+        UserError: a sampler is invalid; the message names it.
     """
     clips = []
     for index, animation in enumerate(file.document.animations or []):
@@ -108,10 +108,10 @@ def read_clips(file: GltfFile) -> list[Clip]:
 def _channel(file: GltfFile, animation: Any, channel: Any, where: str) -> Channel | None:
     target = channel.target
     if target is None or target.node is None:
-        return None  # the specification asks to leave such channels out
+        return None  # The specification says to ignore channels without a node.
     path = target.path
     if path not in PATHS and path != "weights":
-        return None  # of an extension
+        return None  # The path belongs to an extension.
     file.item("nodes", target.node, f"{where}.target.node")
     samplers = animation.samplers or []
     if not isinstance(channel.sampler, int) or not 0 <= channel.sampler < len(samplers):
@@ -136,13 +136,13 @@ def _sampler(file: GltfFile, sampler: Any, path: str, where: str) -> Sampler:
 
 
 def choose_clip(file: GltfFile, clips: list[Clip], name: str | None) -> Clip | None:
-    """The clip of that name (case does not matter where it is the only one), the first without a name.
+    """Choose the clip of that name, ignoring case if none matches exactly; without a name, the first one.
 
     Returns:
         None for a file without animations.
 
     Raises:
-        UserError: there is no such clip; the message lists those there are.
+        UserError: there is no such clip; the message lists the clips.
     """
     if name is None:
         return clips[0] if clips else None

@@ -1,7 +1,7 @@
-"""glTF 2.0 files: numbers and images, out of a container that pygltflib parses.
+"""glTF 2.0 files: arrays and images of a document that pygltflib parses.
 
-Everything that other files of this package take from a glTF document goes through ``GltfFile``, which knows where it
-came from: a message names the file and the field, as ``figure.glb: accessors[3].count``.
+All access to a document goes through ``GltfFile``, so that messages name the file and the field, as in
+``figure.glb: accessors[3].count``.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import parse_json, read_bytes
 from ...storage.safe_paths import inside, is_regular
-from ..images import bomb, whole
-from .schema import problem
+from ..images import is_complete, oversized_claim
+from .schema import find_problem
 
-UNDERSTOOD = {
+SUPPORTED_EXTENSIONS = {
     "KHR_mesh_quantization",
     "KHR_texture_transform",
     "KHR_materials_unlit",
     "KHR_materials_pbrSpecularGlossiness",
     "EXT_texture_webp",
 }
-"""Extensions whose data are read; others matter only where a file requires them."""
-HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights")
-"""They change how light is reflected, not what moves where: left out even where required."""
+"""Extensions whose data is read; others are refused if a file requires them."""
+IGNORABLE_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights")
+"""Prefixes of extensions that change reflection but not geometry; they are ignored even if a file requires them."""
 REMEDIES = {
     "KHR_draco_mesh_compression": "export it again without Draco compression",
     "EXT_meshopt_compression": "export it again without meshopt compression",
@@ -45,13 +45,13 @@ TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: n
 
 
 class GltfFile:
-    """A parsed .glb or .gltf: look-ups that explain themselves when they fail."""
+    """A parsed .glb or .gltf, whose look-ups raise errors that name the file and the field."""
 
     def __init__(self, path: str | Path) -> None:
         """
         Raises:
-            UserError: there is no such file, it is no glTF 2.0, it requires an extension that is not read, or the
-                parser is not installed.
+            UserError: the file is missing, is not glTF 2.0 or requires an unsupported extension, or the parser is not
+                installed.
         """
         self.path = Path(path)
         self._json = _checked(self.path)
@@ -62,34 +62,34 @@ class GltfFile:
         if not version.startswith("2."):
             raise self.error("asset.version", f"is {version or 'missing'}; export it again as glTF 2.0")
         for name in self.document.extensionsRequired or []:
-            if name not in UNDERSTOOD and not name.startswith(HARMLESS):
+            if name not in SUPPORTED_EXTENSIONS and not name.startswith(IGNORABLE_EXTENSIONS):
                 remedy = REMEDIES.get(name, "export it again without this extension")
                 raise self.error("extensionsRequired", f"names {name}, which is not supported; {remedy}")
 
     def error(self, field: str, text: str) -> UserError:
-        """The error to raise: file, field, and what is wrong with it and how to put it right."""
+        """Make the error to raise, from the field, the fault and its remedy."""
         return UserError(f"{self.path}: {field} {text}")
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the file and of the files beside it that were read so far."""
+        """SHA-256 of the file and of the resources read so far."""
         return self._digest.hexdigest()
 
     def item(self, kind: str, index: Any, field: str) -> Any:
-        """Element ``index`` of the document's list ``kind``; ``field`` is what refers to it."""
+        """Return element ``index`` of the document's list ``kind``; ``field`` names the reference in messages."""
         items = getattr(self.document, kind) or []
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
             raise self.error(field, f"is {index!r}, but there are {len(items)} {kind}; export the file again")
         return items[index]
 
     def node_weights(self, index: int) -> list[float] | None:
-        """``nodes[index].weights`` of morph targets, which the parser leaves out; None where there are none."""
+        """Return ``nodes[index].weights`` of morph targets, which the parser drops; None if the node has none."""
         return self._json["nodes"][index].get("weights")
 
     def array(self, index: Any, field: str, components: int | None = None) -> np.ndarray:
-        """[count, components] of an accessor; matrices [count, 4, 4] row-major, as mathematicians write them.
+        """Read an accessor, [count, components]; 4 x 4 matrices as [count, 4, 4], row-major.
 
-        float64 for floats and for normalised integers, else the integers themselves.
+        Floats and normalised integers become float64, other integers keep their type.
         """
         accessor = self.item("accessors", index, field)
         where = f"accessors[{index}]"
@@ -129,7 +129,7 @@ class GltfFile:
         return np.ndarray((count, width), dtype.newbyteorder("<"), data, offset, strides).astype(dtype)
 
     def _with_sparse(self, raw: np.ndarray, sparse: Any, where: str) -> np.ndarray:
-        """The array with the elements that a sparse accessor replaces."""
+        """Replace the elements that a sparse accessor lists."""
         kind = TYPES.get(sparse.indices.componentType)
         if kind is None or not isinstance(sparse.count, int):
             raise self.error(f"{where}.sparse", "has an unknown componentType or count; export the file again")
@@ -146,7 +146,7 @@ class GltfFile:
         return result
 
     def view(self, index: Any, field: str) -> tuple[bytes, int]:
-        """(bytes, stride or 0) of a buffer view."""
+        """Return (bytes, stride or 0) of a buffer view."""
         view = self.item("bufferViews", index, f"{field}.bufferView")
         data = self._buffer(view.buffer, f"bufferViews[{index}]")
         start, length = view.byteOffset or 0, view.byteLength or 0
@@ -166,7 +166,7 @@ class GltfFile:
         return self._buffers[index]
 
     def resource(self, uri: str, field: str) -> bytes:
-        """What a URI stands for: data in the URI itself, or a file beside this one."""
+        """Read the bytes of a URI: embedded data, or a file next to this one."""
         if uri.startswith("data:"):
             try:
                 return base64.b64decode(uri.partition(",")[2], validate=False)
@@ -175,7 +175,7 @@ class GltfFile:
         path = inside(self.path.parent, unquote(uri), f"{self.path}: {field}")
         try:
             if not is_regular(path):
-                raise OSError(None, "it is no file")
+                raise OSError(None, "it is not a regular file")
             data = path.read_bytes()
             self._digest.update(data)
             return data
@@ -186,16 +186,16 @@ class GltfFile:
             ) from None
 
     def image(self, index: Any, field: str) -> np.ndarray:
-        """[H, W, 4] uint8 RGBA of an image."""
+        """Decode an image to [H, W, 4] uint8 RGBA."""
         image = self.item("images", index, field)
         where = f"images[{index}]"
         data = self.resource(image.uri, f"{where}.uri") if image.uri else self.view(image.bufferView, where)[0]
-        claim = bomb(data)
+        claim = oversized_claim(data)
         if claim is not None:
             raise self.error(where, f"says it is {claim} in {len(data)} bytes; export the file with smaller textures")
         try:
             raw = np.frombuffer(data, np.uint8)
-            pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if whole(raw) else None
+            pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if is_complete(raw) else None
         except cv2.error:
             pixels = None
         if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
@@ -211,29 +211,29 @@ class GltfFile:
 
 
 def _checked(path: Path) -> dict[str, Any]:
-    """The document as JSON, whose fields have the types that they should have."""
+    """Parse the document as JSON and check the types of its fields."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a .glb or .gltf with --mesh")
     if path.suffix.lower() not in (".glb", ".gltf"):
-        raise UserError(f"{path}: is no glTF by its name; give a .glb or .gltf (Blender exports them)")
+        raise UserError(f"{path}: does not end in .glb or .gltf; give a .glb or .gltf (Blender exports them)")
     data = read_bytes(path, "give a .glb or .gltf with --mesh")
     try:
         if path.suffix.lower() == ".glb":
             magic, _, _, length = struct.unpack_from("<4sIII", data)
             if magic != b"glTF" or 20 + length > len(data):
-                raise ValueError("cut short, or no GLB")
+                raise ValueError("truncated or not a GLB")
             data = data[20 : 20 + length]
         content = parse_json(data.decode("utf-8-sig"))
     except (ValueError, struct.error) as error:
-        raise UserError(f"{path}: is no glTF that can be read ({str(error)[:80]}); export it again") from None
-    found = problem(content)
+        raise UserError(f"{path}: is not a readable glTF ({str(error)[:80]}); export it again") from None
+    found = find_problem(content)
     if found is not None:
         raise UserError(f"{path}: {found[0]} {found[1]}; export the file again")
     return content
 
 
 def _parse(path: Path) -> Any:
-    """pygltflib's document."""
+    """Parse the document with pygltflib."""
     try:
         import pygltflib
     except ImportError:
@@ -241,13 +241,13 @@ def _parse(path: Path) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            logging.disable(logging.WARNING)  # the parser logs what it then raises
+            logging.disable(logging.WARNING)  # The parser logs errors before it raises them.
             document = pygltflib.GLTF2().load(path)
-    except Exception as error:  # struct, json, dataclasses, unicode: each raises its own
+    except Exception as error:  # The parser passes on the exceptions of struct, json, dataclasses and unicode.
         reason = " ".join(str(error).split())[:80] or type(error).__name__
-        raise UserError(f"{path}: is no glTF that can be read ({reason}); export it again") from None
+        raise UserError(f"{path}: is not a readable glTF ({reason}); export it again") from None
     finally:
         logging.disable(logging.NOTSET)
     if document is None or document.asset is None:
-        raise UserError(f"{path}: asset is missing, so this is no glTF; export it again")
+        raise UserError(f"{path}: asset is missing, so this is not a glTF; export it again")
     return document

@@ -1,7 +1,7 @@
-"""The triangles of a glTF scene, and what carries each vertex: one set of arrays for all meshes and primitives.
+"""Triangles of a glTF scene and the bones that move each vertex, in one set of arrays for all meshes and primitives.
 
-A vertex of a skin is carried by joints, any other by its node; both are rows of one palette of matrices, so that posing
-a file is one formula (``gltf_scene.GltfScene``).
+A skinned vertex follows joints, any other vertex its node. Both are rows of one palette of matrices, so that one
+formula poses the whole file (``scene.GltfScene``).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ class Bone(NamedTuple):
 
     node: int
     inverse_bind: np.ndarray
-    """[4, 4]; of a vertex without a skin the identity."""
+    """[4, 4]; the identity for vertices without a skin."""
 
 
 class Morph(NamedTuple):
-    """Targets that a mesh of a node blends into."""
+    """Morph targets of a mesh at a node."""
 
     node: int
     first: int
@@ -34,18 +34,18 @@ class Morph(NamedTuple):
     positions: np.ndarray
     """[targets, P, 3]"""
     normals: np.ndarray
-    """[targets, P, 3], zeros where the file gives none."""
+    """[targets, P, 3]; zeros if the file has none."""
     weights: np.ndarray
-    """[targets] at rest."""
+    """[targets], at rest."""
 
 
-class Part(NamedTuple):
+class MeshPart(NamedTuple):
     """One primitive at one node."""
 
     positions: np.ndarray
     """[P, 3]"""
     normals: np.ndarray
-    """[P, 3], zeros: none are given, faces are flat."""
+    """[P, 3]; zeros if the file has none, so that faces are flat."""
     uv: np.ndarray
     """[P, 2]"""
     colors: np.ndarray
@@ -62,9 +62,9 @@ class Part(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """Everything a file draws."""
+    """All triangles of a file."""
 
-    parts: list[Part]
+    parts: list[MeshPart]
     palette: list[Bone]
     morphs: list[Morph]
     skipped: int
@@ -72,12 +72,12 @@ class Geometry(NamedTuple):
 
 
 def read_geometry(file: GltfFile, nodes: Nodes, materials: list[Material]) -> Geometry:
-    """Every triangle of the scene.
+    """Read every triangle of the scene.
 
     Raises:
-        UserError: there is none, or an attribute cannot be used; the message names it.
+        UserError: the scene has no triangles, or an attribute is invalid; the message names it.
     """
-    parts: list[Part] = []
+    parts: list[MeshPart] = []
     palette: list[Bone] = []
     morphs: list[Morph] = []
     skins: dict[int, int] = {}
@@ -139,7 +139,7 @@ def _skin(file: GltfFile, index: int, field: str) -> list[Bone]:
 
 def _part(
     file: GltfFile, primitive: Any, mode: int, materials: list[Material], first: int, joints: int, where: str
-) -> Part:
+) -> MeshPart:
     attributes = primitive.attributes
     accessor = _attribute(attributes, "POSITION")
     if accessor is None:
@@ -171,8 +171,8 @@ def _part(
     normals = _unit_rows(numbers("NORMAL", 3, np.zeros((count, 3))))
     faces = _faces(file, primitive, mode, count, where)
     targets = _targets(file, primitive, count, where)
-    used, faces = np.unique(faces, return_inverse=True)  # primitives often share one long list of vertices
-    return Part(
+    used, faces = np.unique(faces, return_inverse=True)  # Primitives often share one long list of vertices.
+    return MeshPart(
         positions=positions[used],
         normals=normals[used],
         uv=transformed(uv, material)[used],
@@ -193,11 +193,11 @@ def _unit_rows(vectors: np.ndarray) -> np.ndarray:
 def _carriers(
     numbers: Any, count: int, first: int, joints: int, file: GltfFile, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bones [P, K] and weights [P, K] that sum to 1; a vertex that no joint claims follows its first."""
+    """Return bones [P, K] and weights [P, K] that sum to 1; a vertex without weights follows its first joint."""
     if not joints:
         return np.full((count, 1), first), np.ones((count, 1))
     indices, weights = [], []
-    for number in range(8):  # sets of four; beyond two hardly anybody writes them
+    for number in range(8):  # Sets of four; files rarely have more than two.
         none = np.zeros((count, 0))
         found, share = numbers(f"JOINTS_{number}", 4, none), numbers(f"WEIGHTS_{number}", 4, none)
         if found.shape != share.shape:
@@ -205,7 +205,7 @@ def _carriers(
         indices.append(found.astype(np.int64))
         weights.append(share.astype(np.float64))
     bones, share = np.concatenate(indices, axis=1), np.concatenate(weights, axis=1)
-    bones = np.where(share > 0, bones, 0)  # what has no weight may say anything
+    bones = np.where(share > 0, bones, 0)  # Indices without weight may be out of range.
     if bones.size and (int(bones.max()) >= joints or int(bones.min()) < 0):
         raise file.error(f"{where}.attributes.JOINTS_0", f"names joint {int(bones.max())} of {joints}; export it again")
     share = share.clip(0.0)
@@ -215,7 +215,7 @@ def _carriers(
 
 
 def _faces(file: GltfFile, primitive: Any, mode: int, count: int, where: str) -> np.ndarray:
-    """[F, 3] of triangles, strips and fans, with or without indices."""
+    """Return faces [F, 3] of triangles, strips and fans, with or without indices."""
     if primitive.indices is None:
         indices = np.arange(count)
     else:

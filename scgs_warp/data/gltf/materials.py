@@ -1,7 +1,7 @@
-"""glTF materials reduced to what a diffuse surface needs: a base colour, its texture, and how alpha is meant.
+"""glTF materials reduced to diffuse surfaces: a base colour, its texture and the alpha mode.
 
-Factors and vertex colours are linear, textures are sRGB (glTF 2.0, 3.9). Metal has no diffuse colour of its own; it is
-shown in its base colour all the same.
+Factors and vertex colours are linear, textures are sRGB (glTF 2.0, 3.9). Metals, which have no diffuse colour, are
+shown in their base colour.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ALPHA_MODES = {"OPAQUE": OPAQUE, "MASK": MASK, "BLEND": BLEND}
 
 
 class Texture(NamedTuple):
-    """An image and how it is looked up."""
+    """An image with its wrapping and filtering."""
 
     pixels: np.ndarray
     """[H, W, 4] uint8, sRGB and alpha."""
@@ -37,9 +37,9 @@ class Material:
     factor: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     """Linear colour and alpha."""
     texture: int = -1
-    """Index into the textures that were read; -1: none."""
+    """Index of the texture; -1 without one."""
     coordinates: int = 0
-    """Which TEXCOORD the texture uses."""
+    """Number of the TEXCOORD set that the texture uses."""
     transform: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 1.0, 1.0)
     """Offset u, v, rotation in radians, scale u, v (KHR_texture_transform)."""
     alpha_mode: int = OPAQUE
@@ -49,7 +49,7 @@ class Material:
 
 
 def transformed(uv: np.ndarray, material: Material) -> np.ndarray:
-    """[P, 2] texture coordinates moved as KHR_texture_transform says: scaled, then turned, then shifted."""
+    """Apply KHR_texture_transform to texture coordinates [P, 2]: scale, then rotate, then translate."""
     u0, v0, angle, su, sv = material.transform
     c, s = math.cos(angle), math.sin(angle)
     u, v = uv[:, 0] * su, uv[:, 1] * sv
@@ -57,10 +57,10 @@ def transformed(uv: np.ndarray, material: Material) -> np.ndarray:
 
 
 def read_materials(file: GltfFile) -> tuple[list[Material], list[Texture]]:
-    """All materials in the file's order, then the default one; and the textures they name.
+    """Read all materials in the file's order, followed by the default one, and their textures.
 
     Raises:
-        UserError: a texture or an image that cannot be read, a factor that is no colour.
+        UserError: a texture, an image or a colour factor is invalid.
     """
     textures: list[Texture] = []
     read: dict[int, int] = {}
@@ -99,7 +99,7 @@ def read_materials(file: GltfFile) -> tuple[list[Material], list[Texture]]:
 
 
 def _field(info: Any, name: str) -> Any:
-    """Of an object of the parser, or of a plain one inside an extension."""
+    """Return a field of the parser's object, or of a dictionary inside an extension."""
     return info.get(name) if isinstance(info, dict) else getattr(info, name, None)
 
 
@@ -114,7 +114,7 @@ def _color(file: GltfFile, factor: Any, where: str) -> tuple[float, float, float
 
 
 def _placing(info: Any) -> tuple[int, tuple[float, float, float, float, float]]:
-    """(TEXCOORD set, transform) of a texture's use."""
+    """Return (TEXCOORD set, transform) of a reference to a texture."""
     if info is None:
         return 0, Material.transform
     moved = (_field(info, "extensions") or {}).get("KHR_texture_transform") or {}
@@ -131,7 +131,7 @@ def _texture(file: GltfFile, texture: Any, where: str) -> Texture:
         wrap = (WRAPS.get(sampler.wrapS, REPEAT), WRAPS.get(sampler.wrapT, REPEAT))
         nearest = sampler.magFilter == NEAREST
     source = texture.source
-    for extension in (texture.extensions or {}).values():  # WebP and others keep a fallback beside them, or none
+    for extension in (texture.extensions or {}).values():  # WebP and others may come without a fallback image.
         if source is None and isinstance(extension, dict):
             source = extension.get("source")
     return Texture(file.image(source, f"{where}.source"), wrap, nearest)

@@ -1,4 +1,4 @@
-"""The node hierarchy of a glTF file: where every node stands at an instant of a clip. All float64."""
+"""Node hierarchy of a glTF file, and its world transforms at an instant of a clip. All float64."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .file import GltfFile
 
 
 def rotation_matrix(quat: np.ndarray) -> np.ndarray:
-    """[3, 3] of a unit quaternion xyzw (glTF's order, not this package's)."""
+    """Convert a unit quaternion xyzw (glTF's order, not this package's) to a rotation [3, 3]."""
     x, y, z, w = quat
     return np.array(
         [
@@ -23,7 +23,7 @@ def rotation_matrix(quat: np.ndarray) -> np.ndarray:
 
 
 def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """[4, 4] T R S."""
+    """Compose translation, rotation and scale to [4, 4], T R S."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrix(rotation) * scale
     matrix[:3, 3] = translation
@@ -31,12 +31,12 @@ def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) ->
 
 
 class Nodes:
-    """Local transforms, who is whose parent, and what a clip changes."""
+    """Parents and local transforms of all nodes."""
 
     def __init__(self, file: GltfFile) -> None:
         """
         Raises:
-            UserError: a node has two parents or is its own ancestor, or a transform is misshapen.
+            UserError: a node has two parents or is its own ancestor, or a transform is malformed.
         """
         self.file = file
         self.nodes = file.document.nodes or []
@@ -55,9 +55,9 @@ class Nodes:
         return parent
 
     def _order(self) -> list[int]:
-        """Parents before children."""
+        """Sort the nodes so that parents precede children."""
         order = [index for index, parent in enumerate(self.parent) if parent < 0]
-        for index in order:  # grows while it is walked
+        for index in order:  # The list grows during the iteration.
             order.extend(self.nodes[index].children or [])
         if len(order) != len(self.nodes):
             missing = min(set(range(len(self.nodes))) - set(order))
@@ -65,7 +65,7 @@ class Nodes:
         return order
 
     def _local(self, index: int, node: Any) -> dict[str, np.ndarray]:
-        """Either ``matrix``, or ``translation``, ``rotation`` and ``scale``."""
+        """Return either ``matrix``, or ``translation``, ``rotation`` and ``scale``."""
 
         def numbers(name: str, default: list[float]) -> np.ndarray:
             value = getattr(node, name)
@@ -79,21 +79,21 @@ class Nodes:
         rotation = numbers("rotation", [0.0, 0.0, 0.0, 1.0])
         length = float(np.linalg.norm(rotation))
         if length == 0.0:
-            raise self.file.error(f"nodes[{index}].rotation", "is no rotation (all zeros); export the file again")
+            raise self.file.error(f"nodes[{index}].rotation", "is not a rotation (all zeros); export the file again")
         translation, scale = numbers("translation", [0.0] * 3), numbers("scale", [1.0] * 3)
         return {"translation": translation, "rotation": rotation / length, "scale": scale}
 
     def check_clip(self, clip: Clip) -> None:
-        """Raise UserError where a clip moves a node that stands by a matrix: which part of it would it replace?"""
+        """Raise UserError if a clip animates a node given by a matrix, whose parts it could not replace."""
         for channel in clip.channels:
             if channel.path != "weights" and "matrix" in self.local[channel.node]:
                 raise self.file.error(
                     f"nodes[{channel.node}].matrix",
-                    f"stands on a node that clip {clip.name} animates; export it with translation, rotation and scale",
+                    f"belongs to a node that clip {clip.name} animates; export it with translation, rotation and scale",
                 )
 
     def drawn(self) -> list[int]:
-        """The nodes of the scene that the file shows first, parents first; all if it has no scenes."""
+        """Return the nodes of the file's default scene, parents first; all nodes if it has no scenes."""
         scenes = self.file.document.scenes or []
         if not scenes:
             return self.order
@@ -107,7 +107,7 @@ class Nodes:
         return list(dict.fromkeys(found))
 
     def world(self, clip: Clip | None, seconds: float) -> np.ndarray:
-        """[nodes, 4, 4] node to world at an instant of a clip; without one, as the file says."""
+        """Return node-to-world [nodes, 4, 4] at an instant of a clip; without a clip, at rest."""
         moved: dict[int, dict[str, np.ndarray]] = {}
         for channel in clip.channels if clip else []:
             if channel.path != "weights":

@@ -1,4 +1,4 @@
-"""A glTF file as a moving triangle mesh: ``read_scene``, then ``GltfScene.posed`` at any instant. All float64."""
+"""Moving triangle mesh of a glTF file: ``read_scene``, then ``GltfScene.posed`` at any instant. All float64."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from .animation import Clip, choose_clip, interpolate, read_clips
 from .file import GltfFile
-from .geometry import Bone, Morph, Part, read_geometry
+from .geometry import Bone, MeshPart, Morph, read_geometry
 from .materials import Material, Texture, read_materials
 from .nodes import Nodes
 
@@ -19,7 +19,7 @@ UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 class Triangles(NamedTuple):
-    """What does not change with time."""
+    """Faces, materials, texture coordinates and colours, which do not change with time."""
 
     faces: np.ndarray
     """[F, 3] int32"""
@@ -37,42 +37,42 @@ class Vertices(NamedTuple):
     positions: np.ndarray
     """[P, 3]"""
     normals: np.ndarray
-    """[P, 3] unit; zeros where faces are flat."""
+    """[P, 3] unit; zeros for flat faces."""
 
 
 @dataclass
 class GltfScene:
-    """Everything that one clip of one file draws."""
+    """Meshes, materials and motion of one clip of a file."""
 
     path: Path
     clips: list[Clip]
     clip: Clip | None
-    """None: the file has no animation and nothing moves."""
+    """None if the file has no animation."""
     nodes: Nodes
-    parts: list[Part]
+    parts: list[MeshPart]
     palette: list[Bone]
     morphs: list[Morph]
     materials: list[Material]
-    """The last one is that of primitives without a material."""
+    """Materials; the last one is for primitives without a material."""
     textures: list[Texture]
     triangles: Triangles
     skipped: int
-    """Primitives that are points or lines and are not drawn."""
+    """Number of primitives of points or lines, which are not drawn."""
     digest: str
-    """SHA-256 of everything that was read."""
+    """SHA-256 of the file and its resources."""
     world_from_gltf: np.ndarray
-    """[4, 4] applied to everything; ``UPRIGHT`` until somebody fits the scene into a room."""
+    """[4, 4] applied to everything; ``UPRIGHT`` until the scene is fitted into a room."""
 
     def palette_at(self, seconds: float) -> np.ndarray:
-        """[B, 4, 4] the matrix that carries each bone's vertices.
+        """Return the matrix [B, 4, 4] that moves each bone's vertices.
 
-        ``world(joint) @ inverse_bind``; that of the node that holds a skinned mesh plays no part (glTF 2.0, 3.7.3.3).
+        ``world(joint) @ inverse_bind``; the transform of the node of a skinned mesh is ignored (glTF 2.0, 3.7.3.3).
         """
         world = self.nodes.world(self.clip, seconds)
         return np.stack([self.world_from_gltf @ world[bone.node] @ bone.inverse_bind for bone in self.palette])
 
     def posed(self, seconds: float) -> Vertices:
-        """Linear blend skinning of all vertices, at an instant of the clip."""
+        """Pose all vertices at an instant of the clip by linear blend skinning."""
         matrices = self.palette_at(seconds)
         rest, normals = self._morphed(seconds)
         blended = np.zeros((len(rest), 4, 4))
@@ -84,10 +84,10 @@ class GltfScene:
             start = rows.stop
         linear = blended[:, :3, :3]
         positions = np.einsum("pij,pj->pi", linear, rest) + blended[:, :3, 3]
-        return Vertices(positions, _turned(normals, linear))
+        return Vertices(positions, _transformed_normals(normals, linear))
 
     def _morphed(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rest positions and normals [P, 3] with the morph targets of the instant added."""
+        """Add the morph targets of the instant to the rest positions and normals [P, 3]."""
         rest = np.concatenate([part.positions for part in self.parts])
         normals = np.concatenate([part.normals for part in self.parts])
         curves = {c.node: c.sampler for c in (self.clip.channels if self.clip else []) if c.path == "weights"}
@@ -103,8 +103,8 @@ class GltfScene:
         return rest, normals
 
 
-def _turned(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """[P, 3] unit normals after the linear maps [P, 3, 3]: by cofactors, which exist where an inverse does not."""
+def _transformed_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Transform normals by linear maps [P, 3, 3] to unit normals [P, 3], by cofactors, which need no inverse."""
     a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     sign = np.where(np.einsum("pi,pi->p", a, cofactors[:, 0]) < 0, -1.0, 1.0)
@@ -121,7 +121,7 @@ def read_scene(path: str | Path, clip: str | None = None) -> GltfScene:
         clip: name of an animation; None: the first one.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy; for an unknown clip, those there are.
+        UserError: the file is invalid, or the clip unknown; one line names the field and the remedy, or the clips.
     """
     file = GltfFile(path)
     clips = read_clips(file)
@@ -150,7 +150,7 @@ def read_scene(path: str | Path, clip: str | None = None) -> GltfScene:
     return scene
 
 
-def _triangles(parts: list[Part]) -> Triangles:
+def _triangles(parts: list[MeshPart]) -> Triangles:
     faces, material, count = [], [], 0
     for part in parts:
         faces.append(part.faces + count)
@@ -165,7 +165,7 @@ def _triangles(parts: list[Part]) -> Triangles:
 
 
 def _face_outward(scene: GltfScene) -> None:
-    """Turn round the triangles of mirrored nodes, whose winding the specification asks to read backwards."""
+    """Reverse the triangles of mirrored nodes, whose winding order the specification inverts."""
     matrices = scene.palette_at(scene.clip.start if scene.clip else 0.0)
     start = 0
     for part in scene.parts:

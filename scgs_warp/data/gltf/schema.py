@@ -1,7 +1,6 @@
-"""What a glTF document must look like before anything of it is used: every field that is read has the type that the
-specification gives it. The parser takes whatever JSON holds; beyond this file nobody has to ask again.
+"""Types of all glTF fields that are read, checked once before use because the parser accepts any JSON.
 
-Names and types: glTF 2.0 specification, chapter 5, and the extensions that ``gltf_file.py`` lists.
+Names and types: glTF 2.0 specification, chapter 5, and the extensions listed in ``file.py``.
 """
 
 from __future__ import annotations
@@ -10,9 +9,9 @@ import math
 from typing import Any
 
 INT, NUMBER, TEXT, FLAG = "a whole number from 0 on", "a finite number", "text", "true or false"
-LARGEST_INT = 2**40
-LARGEST = 1e12
-"""Of numbers of a scene: beyond it, products of a few matrices leave float64."""
+MAX_INT = 2**40
+MAX_NUMBER = 1e12
+"""Largest number in a scene: products of a few matrices of such numbers stay in the range of float64."""
 
 _TEXTURE = {
     "index": INT,
@@ -25,7 +24,7 @@ _GLOSSY = {"diffuseFactor": [NUMBER], "diffuseTexture": {**_TEXTURE, "": ("index
 _PLACED = {"bufferView": INT, "byteOffset": INT, "componentType": INT}
 
 ANY_INT: dict[str, Any] = {"*": INT}
-"""An object of whatever keys."""
+"""An object with any keys."""
 FIELDS: dict[str, Any] = {
     "asset": {"version": TEXT, "": ("version",)},
     "scene": INT,
@@ -66,24 +65,24 @@ FIELDS: dict[str, Any] = {
     ],
     "": ("asset",),
 }  # fmt: skip
-"""A type, a list of a type, or an object; what is there under "" must not be missing. Other fields are not read."""
+"""A type, a list of a type, or an object; "" lists the required fields of an object. Other fields are ignored."""
 
 
-def problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, str] | None:
-    """The first field that is not what it should be, and what is wrong with it; None where all is well."""
+def find_problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, str] | None:
+    """Return the first invalid field and its fault; None if the document is valid."""
     kind = FIELDS if kind is None else kind
     if isinstance(kind, list):
         if not isinstance(value, list):
-            return field, "is no list"
+            return field, "is not a list"
         for index, inner in enumerate(value):
-            found = problem(inner, kind[0], f"{field}[{index}]")
+            found = find_problem(inner, kind[0], f"{field}[{index}]")
             if found is not None:
                 return found
         return None
     if not isinstance(kind, dict):
         return None if _fits(value, kind) else (field, f"is not {kind}")
     if not isinstance(value, dict):
-        return field or "the document", "is no object"
+        return field or "the document", "is not an object"
     for name in kind.get("", ()):
         if value.get(name) is None:
             return f"{field}.{name}".strip("."), "is missing"
@@ -91,7 +90,7 @@ def problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, str] | 
         wanted = kind.get(name) if name else None
         wanted = kind.get("*") if wanted is None else wanted
         if wanted is not None and inner is not None:
-            found = problem(inner, wanted, f"{field}.{name[:40]}".strip("."))
+            found = find_problem(inner, wanted, f"{field}.{name[:40]}".strip("."))
             if found is not None:
                 return found
     return None
@@ -99,8 +98,8 @@ def problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, str] | 
 
 def _fits(value: Any, kind: str) -> bool:
     if kind == INT:
-        return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < LARGEST_INT
+        return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MAX_INT
     if kind == NUMBER:
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return is_number and abs(value) <= LARGEST and math.isfinite(value)
+        return is_number and abs(value) <= MAX_NUMBER and math.isfinite(value)
     return isinstance(value, bool if kind == FLAG else str)

@@ -1,1 +1,1 @@
-"""Readers of data sets, one layout per file."""
+"""Readers of data sets, one file per layout."""

@@ -10,29 +10,29 @@ from pathlib import Path, PurePosixPath
 from ...errors import UserError
 from ...storage.files import held_out, natural, size_text
 from ...storage.safe_paths import inside
-from ..assemble import Shot, assemble, video_border, with_points
+from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..dataset import Dataset
-from ..images import Look, header_size
+from ..images import ReadOptions, header_size
 from ..lens import Lens, make_lens
-from .colmap_model import ModelCamera, ModelImage, find, read_model
+from .colmap_model import ModelCamera, ModelImage, find_model, read_model
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
-    return find(folder) is not None
+    """Return whether the folder holds this layout."""
+    return find_model(folder) is not None
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: every eighth image, in the order of names, is held out for ``test`` and ``val`` alike.
 
-    A model says nothing of time. Where every name has a number, those of the last folder or file name are the times
-    (so that images that COLMAP did not register leave a gap, and cameras whose files are numbered alike share theirs);
-    else the images follow each other evenly in the order of their names.
+    A model has no times. If every file name contains a number, the last number of each name is its time: images that
+    COLMAP did not register leave a gap, and cameras with equally numbered files share times. Otherwise the images are
+    evenly spaced in the order of their names.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
-    place = find(folder)
+    place = find_model(folder)
     assert place is not None, "recognises(folder)"
     model = read_model(place)
     images = sorted(model.images, key=lambda image: natural(image.name))
@@ -40,10 +40,10 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
     files = [_file(base, image, place) for image in images]
     lenses = [partial(_lens, place, image, model.cameras[image.camera]) for image in images]
     _check_sizes(files, lenses)
-    times = _times([image.name for image in images])
+    times = times_from_names([image.name for image in images])
     chosen = held_out(place, range(len(images)), split)
-    shots = [
-        Shot(
+    records = [
+        FrameRecord(
             files[index],
             images[index].viewmat,
             times[index],
@@ -52,7 +52,7 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
         )
         for index in chosen
     ]
-    data = assemble(shots, look, folder=folder, split=split, border=video_border(files, times))
+    data = assemble(records, options, folder=folder, split=split, border=video_border(files, times))
     return with_points(data, model.points, model.colors) if len(model.points) else data
 
 
@@ -66,7 +66,7 @@ def _file(base: Path, image: ModelImage, place: Path) -> Path:
 
 
 def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Lens]]) -> None:
-    """All files, whichever split is read, and before any is decoded: a model of other images is refused at once."""
+    """Check the files of all splits before any is decoded, so that a model of other images is refused at once."""
     for file, lens in zip(files, lenses):
         size = header_size(file)
         if size is not None:
@@ -75,12 +75,12 @@ def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Len
     if missing:
         raise UserError(
             f"{missing[0]}: no such image, though the model has it ({len(missing)} of {len(files)} are missing); give "
-            "the images that the model was made from, under their names"
+            "the images that the model was made from, with their names"
         )
 
 
-def _times(names: list[str]) -> list[float]:
-    """[0, 1], from the numbers in the names where all have one and they differ; else by order."""
+def times_from_names(names: list[str]) -> list[float]:
+    """Return times in [0, 1]: from the last number in each name if all have one and they differ, else by order."""
     found = [re.findall(r"[0-9]{1,15}", PurePosixPath(name).stem) for name in names]
     if all(found):
         numbers = [int(digits[-1]) for digits in found]

@@ -1,8 +1,7 @@
-"""COLMAP's sparse models, binary and text: cameras, poses of images, points. Of the observations nothing is kept.
+"""COLMAP's sparse models, binary and text: cameras, poses of images and points, without observations.
 
-pycolmap gives the camera models their meaning, but does not read the files: it keeps every observation in memory, wants
-rigs and frames to agree with the images, and does not come back from some truncated files. Here nothing is believed
-before the file is known to be long enough.
+The files are parsed here rather than by pycolmap, which keeps every observation in memory, requires rigs and frames
+that agree with the images, and hangs on some truncated files. Every count is checked against the file's length first.
 Format: https://colmap.github.io/format.html
 """
 
@@ -18,7 +17,7 @@ import numpy as np
 
 from ...errors import UserError
 
-LONGEST_NAME = 4096
+MAX_NAME_BYTES = 4096
 
 
 class ModelCamera(NamedTuple):
@@ -35,7 +34,7 @@ class ModelImage(NamedTuple):
     """[4, 4] world-to-camera, OpenCV."""
 
 
-class Model(NamedTuple):
+class SparseModel(NamedTuple):
     cameras: dict[int, ModelCamera]
     images: list[ModelImage]
     points: np.ndarray
@@ -45,11 +44,11 @@ class Model(NamedTuple):
 
 
 class _Damaged(Exception):
-    """What is wrong with a file, in a few words."""
+    """A file is damaged; the message says how in a few words."""
 
 
-def find(folder: Path) -> Path | None:
-    """The folder of the model: the one with most about images, if COLMAP left several; None where there is none."""
+def find_model(folder: Path) -> Path | None:
+    """Find the folder of the model: of several, the one with the largest file of images; None without a model."""
     places = [folder, *(folder / name for name in ("sparse", "colmap/sparse", "colmap_sparse", "colmap"))]
     candidates = []
     for place in places:
@@ -65,11 +64,11 @@ def _files(place: Path, name: str) -> list[Path]:
     return [place / f"{name}{suffix}" for suffix in (".bin", ".txt") if (place / f"{name}{suffix}").is_file()]
 
 
-def read_model(place: Path) -> Model:
-    """Cameras, images and points of the model in ``place``; binary if it is there, else text.
+def read_model(place: Path) -> SparseModel:
+    """Read cameras, images and points of the model in ``place``, binary if present, else text.
 
     Raises:
-        UserError: a file is missing, or damaged.
+        UserError: a file is missing or damaged.
     """
     suffix = ".bin" if _files(place, "cameras")[0].suffix == ".bin" and (place / "images.bin").is_file() else ".txt"
     readers = _BINARY if suffix == ".bin" else _TEXT
@@ -85,7 +84,7 @@ def read_model(place: Path) -> Model:
                 f"{place / f'images{suffix}'}: {image.name} is of camera {image.camera}, which cameras{suffix} does "
                 "not have; export the model again"
             )
-    return Model(cameras, images, points, colors)
+    return SparseModel(cameras, images, points, colors)
 
 
 def _read(file: Path, reader: Callable[[bytes], Any]) -> Any:
@@ -102,11 +101,11 @@ def _read(file: Path, reader: Callable[[bytes], Any]) -> Any:
 
 
 def _pose(quaternion: np.ndarray, translation: np.ndarray, name: str) -> np.ndarray:
-    """[4, 4] from wxyz and the translation of world-to-camera."""
-    with np.errstate(over="ignore"):  # infinite, and refused
+    """Return world-to-camera [4, 4] of a wxyz quaternion and a translation."""
+    with np.errstate(over="ignore"):  # An infinite length is refused below.
         length = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(translation).all() and 0.99 < length < 1.01):  # NaN: no
-        raise _Damaged(f"the pose of {name[:60]!r} is no unit quaternion and translation of finite numbers")
+    if not (np.isfinite(translation).all() and 0.99 < length < 1.01):  # False for NaN
+        raise _Damaged(f"the pose of {name[:60]!r} is not a unit quaternion and a finite translation")
     w, x, y, z = quaternion / length
     viewmat = np.eye(4)
     viewmat[:3, :3] = [
@@ -134,7 +133,7 @@ def _parameter_count(model: str) -> int:
 def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
     names, cameras = _model_names(), {}
     (count,), place = struct.unpack_from("<Q", data), 8
-    for _ in range(_believed(count, len(data) - place, 24)):
+    for _ in range(_plausible_count(count, len(data) - place, 24)):
         identity, model, width, height = struct.unpack_from("<iiQQ", data, place)
         if model not in names:
             raise _Damaged(f"camera {identity} is of model {model}, which is not known")
@@ -147,31 +146,31 @@ def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
 def _binary_images(data: bytes) -> list[ModelImage]:
     images = []
     (count,), place = struct.unpack_from("<Q", data), 8
-    for _ in range(_believed(count, len(data) - place, 73)):
+    for _ in range(_plausible_count(count, len(data) - place, 73)):
         values = struct.unpack_from("<i7di", data, place)
         place += 64
-        end = data.index(b"\0", place, place + LONGEST_NAME)
+        end = data.index(b"\0", place, place + MAX_NAME_BYTES)
         name = data[place:end].decode("utf-8")
         (observations,) = struct.unpack_from("<Q", data, end + 1)
-        place = end + 9 + 24 * _believed(observations, len(data) - end - 9, 24)
+        place = end + 9 + 24 * _plausible_count(observations, len(data) - end - 9, 24)
         images.append(ModelImage(name, values[8], _pose(np.array(values[1:5]), np.array(values[5:8]), name)))
     return images
 
 
 def _binary_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     (count,), place = struct.unpack_from("<Q", data), 8
-    count = _believed(count, len(data) - place, 51)
+    count = _plausible_count(count, len(data) - place, 51)
     points, colors = np.empty((count, 3)), np.empty((count, 3))
     unpack = struct.Struct("<Q3d3BdQ").unpack_from
     for index in range(count):
         values = unpack(data, place)
         points[index], colors[index] = values[1:4], values[4:7]
-        place += 51 + 8 * _believed(values[8], len(data) - place - 51, 8)
+        place += 51 + 8 * _plausible_count(values[8], len(data) - place - 51, 8)
     return points, colors / 255.0
 
 
-def _believed(count: int, left: int, least: int) -> int:
-    """``count``, where the bytes that are left can hold so many of at least ``least`` bytes."""
+def _plausible_count(count: int, left: int, least: int) -> int:
+    """Return ``count`` if ``left`` bytes can hold so many entries of at least ``least`` bytes; raise otherwise."""
     if count * least > left:
         raise _Damaged(f"truncated or damaged: lists {count} entries, more than the file holds")
     return count
@@ -201,7 +200,7 @@ def _text_images(data: bytes) -> list[ModelImage]:
         words = line.split(maxsplit=9)
         values = np.array([float(word) for word in words[1:8]])
         images.append(ModelImage(words[9].strip(), int(words[8]), _pose(values[:4], values[4:], words[9])))
-        if next(lines, None) is None:  # the image's observations, an empty line if there are none
+        if next(lines, None) is None:  # The line of observations is present even if it is empty.
             raise _Damaged(f"truncated after {words[9][:60]!r}: its line of observations is missing")
     return images
 

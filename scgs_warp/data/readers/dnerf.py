@@ -10,9 +10,9 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from ..assemble import Shot, assemble
+from ..assemble import FrameRecord, assemble
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
 
 
@@ -21,15 +21,15 @@ def transforms_path(folder: Path, split: str) -> Path:
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return any(transforms_path(folder, split).is_file() for split in ("train", "test", "val"))
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = transforms_path(folder, split)
     content = read_transforms(path)
@@ -37,9 +37,9 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
     poses = [read_pose(path, index, entry) for index, entry in enumerate(entries)]
     times = read_times(path, entries)
     files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
-    shots = []
+    records = []
     for index, (entry, viewmat, time, file) in enumerate(zip(entries, poses, times, files)):
         fields = {**content, **entry}
         read_distortion(path, fields)
-        shots.append(Shot(file, viewmat, time, partial(read_lens, path, fields, index), file.stem))
-    return assemble(shots, look, folder=folder, split=split, one_size=True)
+        records.append(FrameRecord(file, viewmat, time, partial(read_lens, path, fields, index), file.stem))
+    return assemble(records, options, folder=folder, split=split, one_size=True)

@@ -1,4 +1,4 @@
-"""Reader of the Nerfies layout, which HyperNeRF and NeRF-DS share: one JSON file for each camera, images at scales.
+"""Reader of the Nerfies layout, shared by HyperNeRF and NeRF-DS: one JSON file per camera, images at several scales.
 
 ``dataset.json``: ``ids``, ``train_ids``, ``val_ids``; ``metadata.json``: for each id ``time_id``, or ``warp_id`` in
 older data; ``camera/ID.json``: ``orientation`` (world-to-camera, OpenCV), ``position``, ``focal_length``,
@@ -6,7 +6,7 @@ older data; ``camera/ID.json``: ``orientation`` (world-to-camera, OpenCV), ``pos
 ``image_size``; ``scene.json``: ``center`` and ``scale`` of the world; ``points.npy``; ``rgb/1x/ID.png``, ``rgb/2x`` ...
 Layout: Park et al., Nerfies, ICCV 2021; HyperNeRF, SIGGRAPH Asia 2021; Yan et al., NeRF-DS, CVPR 2023.
 
-The masks of NeRF-DS are black where something moves. They do not say where pixels are valid, and are left alone.
+The masks of NeRF-DS mark moving pixels, not invalid ones, and are ignored.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 
 from ...errors import UserError
 from ...storage.files import as_array, as_number, held_out, is_rotation, read_json, read_npy, size_text
-from ..assemble import Shot, assemble, with_points
+from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from ..lens import Lens, make_lens
 
 FILE = "dataset.json"
@@ -30,37 +30,37 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class World(NamedTuple):
-    """``scene.json``: scaled = (file - centre) * scale, as all programs that read this layout have it."""
+    """World transform of ``scene.json``: scaled = (file - centre) * scale."""
 
     centre: np.ndarray
     scale: float
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return (folder / FILE).is_file() and (folder / "camera").is_dir()
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
-    """Read one split: the ids that ``dataset.json`` lists for it, with their own cameras and images.
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
+    """Read one split: the ids listed in ``dataset.json``, each with its camera and image.
 
-    ``test`` and ``val`` are ``val_ids``, never trained on. Where none are listed, every eighth of ``ids`` is held out.
-    Times are ``time_id``, from the first to the last of all listed frames.
+    ``test`` and ``val`` are ``val_ids``, which are never trained on; if that list is empty, every eighth id is held
+    out. Times are ``time_id``, scaled to [0, 1] over all listed frames.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     listed, chosen = _ids(folder / FILE, split)
     times = _times(folder / "metadata.json", listed)
     world = _world(folder / "scene.json")
-    images, ratio = _images(folder / "rgb", look.downscale)
-    shots = []
+    images, ratio = _images(folder / "rgb", options.downscale)
+    records = []
     for name in chosen:
         path = folder / "camera" / f"{name}.json"
         content = read_json(path, "each listed id needs its camera; restore it or drop the id from dataset.json")
         file = next((images / f"{name}{s}" for s in SUFFIXES if (images / f"{name}{s}").is_file()), None)
-        shots.append(
-            Shot(
+        records.append(
+            FrameRecord(
                 file if file is not None else images / f"{name}.png",
                 _viewmat(path, content, world),
                 times[name],
@@ -68,18 +68,20 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
                 name,
             )
         )
-    data = assemble(shots, look._replace(downscale=max(1.0, look.downscale / ratio)), folder=folder, split=split)
+    data = assemble(
+        records, options._replace(downscale=max(1.0, options.downscale / ratio)), folder=folder, split=split
+    )
     return with_points(data, _points(folder / "points.npy", world), None)
 
 
 def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
-    """All ids that are listed anywhere, and those of this split."""
+    """Return all listed ids, and those of this split."""
     content = read_json(path)
     lists: dict[str, list[str]] = {}
     for key in ("ids", "train_ids", "val_ids"):
         values = content.get(key, [])
         if not isinstance(values, list) or not all(isinstance(item, (str, int)) for item in values):
-            raise UserError(f"{path}: {key} is no list of names; list the frames there")
+            raise UserError(f"{path}: {key} is not a list of names; list the frames there")
         lists[key] = list(dict.fromkeys(str(item) for item in values))
         for item in lists[key]:
             if not re.fullmatch(r"[\w.+=@, -]{1,200}", item) or item.strip() != item or item[0] == ".":
@@ -100,7 +102,7 @@ def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
 
 
 def _times(path: Path, names: list[str]) -> dict[str, float]:
-    """[0, 1], from the first to the last time of all frames; in the order of the list where there is no metadata."""
+    """Return times in [0, 1] from the metadata of all frames; evenly spaced in the listed order without metadata."""
     if not path.is_file():
         return {name: index / max(len(names) - 1, 1) for index, name in enumerate(names)}
     content = read_json(path)
@@ -110,7 +112,7 @@ def _times(path: Path, names: list[str]) -> dict[str, float]:
         key = "time_id" if isinstance(entry, dict) and "time_id" in entry else "warp_id"
         value = as_number(entry.get(key)) if isinstance(entry, dict) else None
         if value is None:
-            raise UserError(f"{path}: {name}.{key} is missing or no number; give every frame the number of its instant")
+            raise UserError(f"{path}: {name}.{key} is missing or not a number; give each frame its instant")
         found[name] = value
     first, last = min(found.values()), max(found.values())
     return {name: (value - first) / (last - first) if last > first else 0.0 for name, value in found.items()}
@@ -124,20 +126,20 @@ def _world(path: Path) -> World:
     if centre is None:
         raise UserError(f"{path}: center is missing or not three numbers; restore it, or remove the file")
     if scale is None or scale <= 0:
-        raise UserError(f"{path}: scale is missing or no positive number; restore it, or remove the file")
+        raise UserError(f"{path}: scale is missing or not a positive number; restore it, or remove the file")
     return World(centre, scale)
 
 
 def _images(folder: Path, downscale: float) -> tuple[Path, int]:
-    """The folder of images to read, and how much smaller than the cameras' size they are: the smallest images that are
-    large enough, or the largest there are."""
+    """Choose the folder of the smallest images that are large enough, or else of the largest; return it with the ratio
+    of the cameras' image size to its own."""
     found = {}
     for place in folder.iterdir() if folder.is_dir() else ():
         match = re.fullmatch(r"([1-9][0-9]{0,2})x", place.name)
         if match and place.is_dir():
             found[int(match[1])] = place
     if not found:
-        raise UserError(f"{folder}: no folder of images, 1x, 2x, 4x ...; put the images of full size into {folder}/1x")
+        raise UserError(f"{folder}: no folder of images, 1x, 2x, 4x ...; put the full-size images into {folder}/1x")
     ratio = max([ratio for ratio in found if ratio <= downscale], default=min(found))
     return found[ratio], ratio
 
@@ -145,7 +147,7 @@ def _images(folder: Path, downscale: float) -> tuple[Path, int]:
 def _viewmat(path: Path, content: dict[str, Any], world: World) -> np.ndarray:
     rotation, position = as_array(content.get("orientation"), (3, 3)), as_array(content.get("position"), (3,))
     if rotation is None or not is_rotation(rotation):
-        raise UserError(f"{path}: orientation is no rotation of 3 x 3 numbers; correct it or drop the id")
+        raise UserError(f"{path}: orientation is not a rotation of 3 x 3 numbers; correct it or drop the id")
     if position is None:
         raise UserError(f"{path}: position is not three finite numbers; correct it or drop the id")
     viewmat = np.eye(4)
@@ -155,7 +157,7 @@ def _viewmat(path: Path, content: dict[str, Any], world: World) -> np.ndarray:
 
 
 def _lens(path: Path, content: dict[str, Any], ratio: int, source: tuple[int, int]) -> Lens:
-    """The lens at the size of the images that are read, ``ratio`` times smaller than the camera's."""
+    """Return the lens at the size of the images, which are ``ratio`` times smaller than the camera's."""
     size = as_array(content.get("image_size"), (2,))
     if size is None or (size < 1).any():
         raise UserError(f"{path}: image_size is not two positive numbers; give width and height in pixels")
@@ -167,9 +169,9 @@ def _lens(path: Path, content: dict[str, Any], ratio: int, source: tuple[int, in
     focal, centre = as_number(content.get("focal_length")), as_array(content.get("principal_point"), (2,))
     aspect, skew = as_number(content.get("pixel_aspect_ratio", 1.0)), as_number(content.get("skew", 0.0))
     if focal is None or focal <= 0 or aspect is None or aspect <= 0:
-        raise UserError(f"{path}: focal_length or pixel_aspect_ratio is missing or no positive number; give pixels")
+        raise UserError(f"{path}: focal_length or pixel_aspect_ratio is missing or not a positive number; give pixels")
     if centre is None or skew is None:
-        raise UserError(f"{path}: principal_point or skew is missing or no number; give pixels")
+        raise UserError(f"{path}: principal_point or skew is missing or not a number; give pixels")
     radial = as_array(content.get("radial_distortion", [0.0] * 3), (2,), (3,), (4,))
     tangential = as_array(content.get("tangential_distortion", content.get("tangential", [0.0] * 2)), (2,))
     if radial is None or tangential is None or (len(radial) == 4 and radial[3] != 0):

@@ -1,4 +1,4 @@
-"""Reader of the nerfstudio layout: one ``transforms.json`` for all frames, with intrinsics, poses, and maybe points.
+"""Reader of the nerfstudio layout: one ``transforms.json`` for all frames, with intrinsics, poses and optional points.
 
 ``fl_x, fl_y, cx, cy, w, h`` (pixels; for all frames or in each), per frame ``file_path``, ``transform_matrix``
 (camera-to-world, OpenGL), ``time`` in [0, 1] and ``mask_path``; ``ply_file_path``, sparse points in the frame of the
@@ -19,9 +19,9 @@ from ...errors import UserError
 from ...storage.files import by_name, held_out
 from ...storage.safe_paths import inside
 from ...types import Camera
-from ..assemble import Shot, assemble, video_border, with_points
+from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from ..points import read_points
 from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
 
@@ -29,20 +29,19 @@ FILE = "transforms.json"
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return (folder / FILE).is_file()
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
-    Frames without a time are taken to be evenly spaced in the order of their names (9 before 10). Without lists of
-    files every eighth frame is held out, for ``test`` and ``val`` alike; with lists that leave out one of these two, or
-    leave it empty, it is the other. A frame's mask is False where ``mask_path`` is black, and on borders that
-    undistortion left.
+    Frames without times are evenly spaced in the order of their names (9 before 10). Without lists of files, every
+    eighth frame is held out for ``test`` and ``val`` alike. If only one of these two lists is present and not empty,
+    it serves for both. A frame's mask is False where ``mask_path`` is black and on the borders of undistorted images.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = folder / FILE
     content = read_transforms(path)
@@ -52,19 +51,19 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
     for entry in entries:
         read_distortion(path, {**content, **entry})
     chosen = _chosen(path, content, files, split)
-    shots = [_shot(path, folder, content, index, files[index], times[index]) for index in chosen]
+    records = [_record(path, folder, content, index, files[index], times[index]) for index in chosen]
     border = video_border(files, times)
-    data = assemble(shots, look, folder=folder, split=split, one_size=True, border=border)
+    data = assemble(records, options, folder=folder, split=split, one_size=True, border=border)
     return with_points(data, *_points(path, folder, content, data.cameras))
 
 
-def _shot(path: Path, folder: Path, content: dict[str, Any], index: int, file: Path, time: float) -> Shot:
+def _record(path: Path, folder: Path, content: dict[str, Any], index: int, file: Path, time: float) -> FrameRecord:
     entry = content["frames"][index]
     fields = {**content, **entry}
     mask = entry.get("mask_path")
     if mask is not None and not (isinstance(mask, str) and mask):
-        raise UserError(f"{path}: frames[{index}].mask_path is no text; name the mask's file or leave it out")
-    return Shot(
+        raise UserError(f"{path}: frames[{index}].mask_path is not text; name the mask's file or leave it out")
+    return FrameRecord(
         file,
         read_pose(path, index, entry),
         time,
@@ -86,9 +85,9 @@ def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list
 
 
 def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) -> list[int]:
-    """Indices of the frames of this split, in the order of the file."""
+    """Return the indices of the frames of this split, in the order of the file."""
     lists = {name: content[f"{name}_filenames"] for name in ("train", "val", "test") if f"{name}_filenames" in content}
-    for name in ("val", "test"):  # exporters write all three lists, whether or not they hold frames out twice
+    for name in ("val", "test"):  # Exporters write all three lists, of which one may be empty.
         if lists.get(name) == []:
             del lists[name]
     if not lists:
@@ -99,7 +98,7 @@ def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) 
         raise UserError(f"{path}: {split}_filenames is missing while other splits are listed; list the files there")
     listed = lists[name]
     if not isinstance(listed, list) or not listed or not all(isinstance(item, str) for item in listed):
-        raise UserError(f"{path}: {name}_filenames is empty or no list of file names; name at least one frame's file")
+        raise UserError(f"{path}: {name}_filenames is empty or not a list of file names; name at least one file")
     known = {entry["file_path"]: index for index, entry in enumerate(content["frames"])}
     for item in listed:
         if item not in known:
@@ -112,22 +111,22 @@ def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) 
 def _points(
     path: Path, folder: Path, content: dict[str, Any], cameras: list[Camera]
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Points [P, 3] in the frame of the poses and their colours [P, 3], where the file names any."""
+    """Read points [P, 3] in the frame of the poses and their colours [P, 3]; None if the file names no points."""
     name = content.get("ply_file_path")
     if name is None:
         return None, None
     if not isinstance(name, str) or not name:
-        raise UserError(f"{path}: ply_file_path is no text; name the file of points or leave it out")
+        raise UserError(f"{path}: ply_file_path is not text; name the file of points or leave it out")
     points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
     moved = _applied(path, content, points)
-    # Writers disagree whether the transform that was applied to the poses was applied to the points, too.
+    # Some writers apply the poses' transform to the points and some do not: keep what more cameras see.
     if moved is not None and _seen(moved, cameras) > _seen(points, cameras):
         points = moved
     return points, colors
 
 
 def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndarray | None:
-    """The points after ``applied_transform`` and ``applied_scale``; None where the file has neither."""
+    """Apply ``applied_transform`` and ``applied_scale`` to the points; return None if the file has neither."""
     if "applied_transform" not in content and "applied_scale" not in content:
         return None
     try:
@@ -144,7 +143,7 @@ def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndar
 
 
 def _seen(points: np.ndarray, cameras: list[Camera]) -> int:
-    """In how many (point, camera) pairs the point falls into the image."""
+    """Count the (point, camera) pairs in which the point falls into the image."""
     total = 0
     for camera in cameras:
         viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()

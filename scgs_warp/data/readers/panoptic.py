@@ -1,9 +1,8 @@
-"""Reader of the layout of Dynamic 3D Gaussians, in which the CMU Panoptic sequences are passed on: many cameras, shared
-instants.
+"""Reader of the layout of Dynamic 3D Gaussians, used for the CMU Panoptic sequences: many cameras with shared times.
 
 ``train_meta.json`` and ``test_meta.json``: ``w, h``; ``fn [T][C]``, images in ``ims/``; ``k [T][C][3][3]``, pixels;
 ``w2c [T][C][4][4]``, world-to-camera, OpenCV; ``cam_id [T][C]``. ``init_pt_cld.npz``: ``data [P, 7]``, positions,
-colours in [0, 1], foreground. ``seg/`` tells people from the dome; both are learnt. Layout: Luiten et al., 3DV 2024.
+colours in [0, 1], foreground. ``seg/`` separates people from the dome and is ignored. Layout: Luiten et al., 3DV 2024.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import as_array, as_number, is_rotation, read_json, read_npy, size_text
 from ...storage.safe_paths import inside
-from ..assemble import Shot, assemble, with_points
+from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from ..lens import Lens
 
 TRAIN, TEST = "train_meta.json", "test_meta.json"
@@ -27,23 +26,23 @@ POINTS = "init_pt_cld.npz"
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return (folder / TRAIN).is_file() or (folder / TEST).is_file()
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the cameras of ``train_meta.json``, or of ``test_meta.json`` for ``test`` and ``val``.
 
-    All cameras of an instant share its time, the place of the instant in the list.
+    All cameras of an instant share its time; instants are evenly spaced in the order of the list.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = folder / (TRAIN if split == "train" else TEST)
     content = read_json(path, "this split needs it, or choose another split")
     rows = {key: _rows(path, content, key) for key in ("fn", "k", "w2c")}
     files, last = rows["fn"], max(len(rows["fn"]) - 1, 1)
-    shots = []
+    records = []
     for instant, names in enumerate(files):
         for key in ("k", "w2c"):
             if len(rows[key]) != len(files) or len(rows[key][instant]) != len(names):
@@ -51,28 +50,28 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
         for place, name in enumerate(names):
             where = f"[{instant}][{place}]"
             if not isinstance(name, str) or not name:
-                raise UserError(f"{path}: fn{where} is no text; name the image file")
+                raise UserError(f"{path}: fn{where} is not text; name the image file")
             viewmat = as_array(rows["w2c"][instant][place], (4, 4), (3, 4))
             if viewmat is None or not is_rotation(viewmat[:3, :3]):
-                raise UserError(f"{path}: w2c{where} is no rigid 4 x 4 matrix of finite numbers; correct the pose")
+                raise UserError(f"{path}: w2c{where} is not a rigid 4 x 4 matrix of finite numbers; correct the pose")
             K = as_array(rows["k"][instant][place], (3, 3))
             if K is None or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - (0, 0, 1)).max() > 1e-6:
-                raise UserError(f"{path}: k{where} is no 3 x 3 matrix of intrinsics in pixels; correct the camera")
+                raise UserError(f"{path}: k{where} is not a 3 x 3 matrix of intrinsics in pixels; correct the camera")
             file = inside(folder / "ims", name, f"{path}: fn{where}", "image")
             pose = np.vstack([viewmat[:3], (0.0, 0.0, 0.0, 1.0)])
             label = Path(name).with_suffix("").as_posix().replace("/", "_").strip("._")
-            shots.append(Shot(file, pose, instant / last, partial(_lens, path, content, K), label))
-    if not shots:
+            records.append(FrameRecord(file, pose, instant / last, partial(_lens, path, content, K), label))
+    if not records:
         raise UserError(f"{path}: fn lists no frame; list at least one")
-    data = assemble(shots, look, folder=folder, split=split)
+    data = assemble(records, options, folder=folder, split=split)
     return with_points(data, *_points(folder / POINTS))
 
 
 def _rows(path: Path, content: dict[str, Any], key: str) -> list[list[Any]]:
-    """One list of cameras for each instant."""
+    """Return the field's list of cameras for each instant."""
     rows = content.get(key)
     if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
-        raise UserError(f"{path}: {key} is missing or no list of lists; give one list of cameras for each instant")
+        raise UserError(f"{path}: {key} is missing or not a list of lists; give one list of cameras for each instant")
     return rows
 
 

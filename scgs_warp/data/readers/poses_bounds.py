@@ -1,4 +1,4 @@
-"""Reader of the layout of Neural 3D Video: ``poses_bounds.npy`` of LLFF for a rig of cameras, and each camera's images.
+"""Reader of the Neural 3D Video layout: LLFF's ``poses_bounds.npy`` for a rig of cameras, and a folder of images each.
 
 ``poses_bounds.npy [C, 17]``: rows of 3 x 5, the camera-to-world rotation in columns (down, right, backwards),
 position, and (height, width, focal length) in pixels; nearest and farthest depth. Row c belongs to the c-th camera in
@@ -15,34 +15,34 @@ import numpy as np
 
 from ...errors import UserError
 from ...storage.files import is_rotation, natural, read_npy, size_text
-from ..assemble import Shot, assemble, with_points
+from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import Look
+from ..images import ReadOptions
 from ..lens import Lens
 from ..points import read_points
 from .transforms import SUFFIXES
 
 FILE = "poses_bounds.npy"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
-HELD_OUT = 0
-"""The camera that is held out: the central one of Neural 3D Video, and what others report."""
+HELD_OUT_CAMERA = 0
+"""Index of the held-out camera: the central one of Neural 3D Video, as in published results."""
 POINTS = ("points3D.ply", "points3D_downsample2.ply", "points3d.ply")
-TALLER = 0.01
-"""Largest relative difference between the reductions of width and height that rounding explains."""
+MAX_ASPECT_ERROR = 0.01
+"""Largest relative difference between the reductions of width and height that is attributed to rounding."""
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds this layout."""
+    """Return whether the folder holds this layout."""
     return (folder / FILE).is_file()
 
 
-def read(folder: Path, split: str, look: Look) -> Dataset:
-    """Read one split: the first camera is ``test`` and ``val``, the others are trained on.
+def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
+    """Read one split: the first camera is ``test`` and ``val``, the others are ``train``.
 
-    All cameras share the times, the place of each image in the order of names.
+    All cameras share their times, which are evenly spaced in the order of the images' names.
 
     Raises:
-        UserError: one line naming the file, the field and the remedy, for anything in the data that cannot be used.
+        UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = folder / FILE
     rows = read_npy(path)
@@ -56,33 +56,35 @@ def read(folder: Path, split: str, look: Look) -> Dataset:
             f"{path}: has {len(rows)} rows, but {folder} holds {len(cameras)} folders of images "
             f"({cameras[0].name} to {cameras[-1].name}); give each camera a row and a folder"
         )
-    chosen = [index for index in range(len(cameras)) if (index == HELD_OUT) != (split == "train")]
+    chosen = [index for index in range(len(cameras)) if (index == HELD_OUT_CAMERA) != (split == "train")]
     files = [_files(camera) for camera in cameras]
-    shots = []
+    records = []
     for index in chosen:
-        if len(files[index]) != len(files[HELD_OUT]):
+        if len(files[index]) != len(files[HELD_OUT_CAMERA]):
             raise UserError(
-                f"{cameras[index]}: holds {len(files[index])} images, but {cameras[HELD_OUT].name} "
-                f"{len(files[HELD_OUT])}; all cameras need the same instants"
+                f"{cameras[index]}: holds {len(files[index])} images, but {cameras[HELD_OUT_CAMERA].name} "
+                f"{len(files[HELD_OUT_CAMERA])}; all cameras need the same instants"
             )
         viewmat = _viewmat(path, index, rows[index, :15].reshape(3, 5))
         lens = partial(_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4])
         last = max(len(files[index]) - 1, 1)
         for place, file in enumerate(files[index]):
-            shots.append(Shot(file, viewmat, place / last, lens, f"{_label(folder, cameras[index])}_{file.stem}"))
-    data = assemble(shots, look, folder=folder, split=split)
+            records.append(
+                FrameRecord(file, viewmat, place / last, lens, f"{_label(folder, cameras[index])}_{file.stem}")
+            )
+    data = assemble(records, options, folder=folder, split=split)
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     return data if points is None else with_points(data, *read_points(points))
 
 
 def _label(folder: Path, camera: Path) -> str:
-    """The camera's name, where the folder of its images is called ``images``."""
+    """Return the name of a camera's folder, or of its parent if the folder is called ``images``."""
     parts = camera.relative_to(folder).parts
     return parts[-2] if parts[-1] == "images" else parts[-1]
 
 
 def _cameras(folder: Path) -> list[Path]:
-    """The cameras' folders of images, in the order of their names."""
+    """Return the cameras' folders of images, in the order of their names."""
     base = folder / "frames" if (folder / "frames").is_dir() else folder
     found = []
     for place in sorted((p for p in base.iterdir() if p.is_dir()), key=lambda p: natural(p.name)):
@@ -107,23 +109,23 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
-    """[4, 4] world-to-camera, OpenCV."""
+    """Return world-to-camera [4, 4], OpenCV, of a row's pose."""
     down, right, backwards, position = pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3]
     rotation = np.stack([right, down, -backwards])
     if not np.isfinite(pose).all() or not is_rotation(rotation):
-        raise UserError(f"{path}: row {index} holds no rotation of finite numbers; restore the file")
+        raise UserError(f"{path}: row {index} holds a matrix that is not a finite rotation; restore the file")
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
     return viewmat
 
 
 def _lens(path: Path, index: int, column: np.ndarray, source: tuple[int, int]) -> Lens:
-    """The lens of images that may be smaller than those the rig was calibrated with."""
+    """Return the lens of images that may be smaller than those of the calibration."""
     height, width, focal = column
     if min(height, width, focal) < 1:
-        raise UserError(f"{path}: row {index} has no positive height, width and focal length; restore the file")
+        raise UserError(f"{path}: row {index} has a non-positive height, width or focal length; restore the file")
     sx, sy = source[0] / width, source[1] / height
-    if abs(sx / sy - 1.0) > TALLER:
+    if abs(sx / sy - 1.0) > MAX_ASPECT_ERROR:
         raise UserError(
             f"{path}: row {index} is of {width:g} x {height:g} pixels, but the images are {size_text(source)}; "
             "reduce width and height alike"

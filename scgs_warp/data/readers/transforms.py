@@ -1,4 +1,4 @@
-"""What the ``transforms*.json`` layouts share: poses, times, intrinsics, lenses, and errors that name the field.
+"""Fields shared by the ``transforms*.json`` layouts: poses, times, intrinsics and lenses.
 
 Poses are camera-to-world, OpenGL (x right, y up, z backward), as NeRF's Blender scenes and nerfstudio write them.
 """
@@ -19,29 +19,29 @@ from ..lens import Lens, make_lens
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""What ``distortion_params`` lists, in nerfstudio's order."""
+LISTED_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Parameters in ``distortion_params``, in nerfstudio's order."""
 PERSPECTIVES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Camera models (COLMAP's and nerfstudio's names) that are a pinhole where all distortion is 0: r, tangential, and with
-FULL_OPENCV a quotient of polynomials."""
+"""Camera models (names of COLMAP and nerfstudio) that are a pinhole if all distortion is 0: radial, tangential, and
+with FULL_OPENCV a quotient of polynomials."""
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-"""Those in which the angle to the optical axis, times a polynomial, is the distance from the centre."""
+"""Camera models in which the distance from the centre is a polynomial of the angle to the optical axis."""
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
-    """The JSON object in ``path``, with at least one frame; UserError otherwise."""
+    """Read the JSON object in ``path``; raise UserError if it lists no frame."""
     content = read_json(path, "this split needs it, or choose another split")
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise UserError(f"{path}: 'frames' is missing, empty or no list; list at least one frame there")
+        raise UserError(f"{path}: 'frames' is missing, empty or not a list; list at least one frame there")
     for index, entry in enumerate(frames):
         if not isinstance(entry, dict):
-            raise UserError(f"{path}: frames[{index}] is no object; give file_path and transform_matrix")
+            raise UserError(f"{path}: frames[{index}] is not an object; give file_path and transform_matrix")
     return content
 
 
 def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
-    """[4, 4] float64 world-to-camera, OpenCV."""
+    """Return world-to-camera [4, 4] float64, OpenCV."""
     where = f"{path}: frames[{index}].transform_matrix"
     if "transform_matrix" not in entry:
         raise UserError(f"{where} is missing; give the 4 x 4 camera-to-world matrix")
@@ -64,7 +64,7 @@ def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
 
 
 def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
-    """Every frame's time in [0, 1]; where no frame has one, evenly spread in the order of the file."""
+    """Return every frame's time in [0, 1]; evenly spaced in the order of the file if no frame has one."""
     given = ["time" in entry for entry in entries]
     if not any(given):
         last = max(len(entries) - 1, 1)
@@ -73,7 +73,7 @@ def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
     for index, entry in enumerate(entries):
         where = f"{path}: frames[{index}].time"
         if "time" not in entry:
-            raise UserError(f"{where} is missing while other frames have one; give every frame a time, or none")
+            raise UserError(f"{where} is missing, but other frames have one; give a time to every frame or to no frame")
         time = as_number(entry["time"])
         if time is None:
             raise UserError(f"{where} is {str(entry['time'])[:40]!r}, not a number; give a number from 0 to 1")
@@ -84,10 +84,10 @@ def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
 
 
 def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path:
-    """The frame's image; a name without suffix is completed."""
+    """Return the frame's image file; complete a name without suffix."""
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
-        raise UserError(f"{path}: frames[{index}].file_path is missing or no text; name the image file")
+        raise UserError(f"{path}: frames[{index}].file_path is missing or not text; name the image file")
     base = inside(folder, name, f"{path}: frames[{index}].file_path", "image")
     if base.suffix.lower() in SUFFIXES or base.is_file():
         return base
@@ -96,11 +96,13 @@ def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> P
 
 
 def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's model and what follows (fx, fy, cx, cy) among its parameters. ``fields``: the file's, and a frame's over
-    them.
+    """Return COLMAP's camera model and its parameters after (fx, fy, cx, cy).
+
+    Args:
+        fields: the fields of the file, overridden by those of a frame.
 
     Raises:
-        UserError: a camera model that is not known, or parameters that are none of its.
+        UserError: an unknown camera model, or parameters that it does not have.
     """
     name = fields.get("camera_model")
     if name is not None and (not isinstance(name, str) or name.upper() not in (*PERSPECTIVES, *FISHEYES)):
@@ -111,11 +113,14 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
     values = {key: _parameter(path, key, fields.get(key, 0.0)) for key in DISTORTION}
     listed = fields.get("distortion_params")
     if listed is not None:
-        if not isinstance(listed, list) or len(listed) > len(LISTED):
+        if not isinstance(listed, list) or len(listed) > len(LISTED_DISTORTION):
             raise UserError(
-                f"{path}: distortion_params is {repr(listed)[:60]}; give up to six numbers, {', '.join(LISTED)}"
+                f"{path}: distortion_params is {repr(listed)[:60]}; give up to six numbers, "
+                f"{', '.join(LISTED_DISTORTION)}"
             )
-        values |= {key: _parameter(path, f"distortion_params ({key})", value) for key, value in zip(LISTED, listed)}
+        values |= {
+            key: _parameter(path, f"distortion_params ({key})", value) for key, value in zip(LISTED_DISTORTION, listed)
+        }
     k1, k2, k3, k4, k5, k6, p1, p2 = values.values()
     if not any(values.values()) and (name is None or name.upper() in PERSPECTIVES) and not fields.get("is_fisheye"):
         return "PINHOLE", ()
@@ -135,15 +140,18 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
 def _parameter(path: Path, key: str, value: Any) -> float:
     number = as_number(value)
     if number is None:
-        raise UserError(f"{path}: {key} is {str(value)[:40]!r}, no number; give the lens distortion, or 0")
+        raise UserError(f"{path}: {key} is {str(value)[:40]!r}, not a number; give the lens distortion, or 0")
     return number
 
 
 def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int, int]) -> Lens:
-    """The lens at the files' size, from ``fields`` of the file and of a frame over them.
+    """Return the lens at the size of the file, ``source`` (width, height).
+
+    Args:
+        fields: the fields of the file, overridden by those of a frame.
 
     Raises:
-        UserError: intrinsics are missing, no numbers, or of images of another size than ``source`` (width, height).
+        UserError: intrinsics are missing, invalid, or of images of another size than ``source``.
     """
     fx, fy, cx, cy = read_intrinsics(path, fields, index, source)
     model, further = read_distortion(path, fields)
@@ -158,7 +166,7 @@ def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int,
 def read_intrinsics(
     path: Path, fields: dict[str, Any], index: int, source: tuple[int, int]
 ) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy) in pixels of the file's full size."""
+    """Return (fx, fy, cx, cy) in pixels of the file's full size."""
 
     def number(key: str, default: float | None = None, positive: bool = False) -> float:
         if key not in fields and default is not None:
@@ -166,7 +174,7 @@ def read_intrinsics(
         value = as_number(fields.get(key))
         if value is None or (positive and value <= 0):
             kind = "positive number" if positive else "number"
-            raise UserError(f"{path}: {key} (frame {index}) is missing or no {kind}; give it in pixels")
+            raise UserError(f"{path}: {key} (frame {index}) is missing or not a {kind}; give it in pixels")
         return value
 
     width, height = source

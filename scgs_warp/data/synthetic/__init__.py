@@ -1,1 +1,1 @@
-"""Synthesised data sets with known motion: the built-in figure and animated meshes."""
+"""Synthetic data sets with known motion: the built-in figure and animated meshes."""

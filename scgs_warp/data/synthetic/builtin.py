@@ -1,6 +1,6 @@
-"""The built-in synthetic scene, written in the D-NeRF layout with the true motion beside it.
+"""The built-in synthetic scene, written in the D-NeRF layout together with its true motion.
 
-Monocular as D-NeRF is: each training frame has a time of its own and a camera of its own, drawn from the upper
+The scene is monocular like D-NeRF: each training frame has its own time and its own camera, drawn from the upper
 hemisphere; test frames are spread over time and have other cameras. The same arguments give the same bytes.
 """
 
@@ -16,14 +16,13 @@ import numpy as np
 
 from ...errors import UserError
 from ...storage.files import parse_json
-from ...types import Camera
 from .figure import Figure, build_figure
-from .orbit_cameras import Shot, camera_of, instants, on_sphere
+from .orbit_cameras import PlannedPicture, instants, random_on_sphere
 from .raycast import Raycaster
-from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_pictures, write_whole
+from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_folder_atomically, write_pictures
 
 VERSION = 4
-"""Raised whenever the scene's pictures or its ground truth change; folders of another version are made anew."""
+"""Version of the pictures and the ground truth; folders of another version are replaced."""
 MARKER = "synthetic.json"
 RADIUS = 4.0311
 FIELD_OF_VIEW = 0.6911112070083618
@@ -42,20 +41,21 @@ def make_synthetic(
     progress: Callable[[int, int], None] | None = None,
     device: str = "cpu",
 ) -> Path:
-    """Make the scene in ``folder``, unless it is there already with these arguments.
+    """Make the scene in ``folder``, unless it exists with these arguments.
 
-    An interrupted run leaves nothing half made (``write_whole``).
+    An interrupted run leaves no incomplete folder (``write_folder_atomically``).
 
     Args:
         size: width and height in pixels.
-        train: number of frames to train on, each with its own camera.
-        test: number of frames held out, each with its own camera.
-        seed: of the cameras and of the surface points.
+        train: number of training frames, each with its own camera.
+        test: number of held-out frames, each with its own camera.
+        seed: seed of the cameras and of the surface points.
         progress: called with (done, total) after each picture.
-        device: where rays are cast, ``cpu`` or ``cuda``.
+        device: device of the ray casting, ``cpu`` or ``cuda``.
 
     Returns:
-        The folder: ``transforms_{train,test}.json``, ``train/``, ``test/``, ``ground_truth.npz``, ``synthetic.json``.
+        The folder, with ``transforms_{train,test}.json``, ``train/``, ``test/``, ``ground_truth.npz`` and
+        ``synthetic.json``.
 
     Raises:
         UserError: the folder holds something else, or cannot be written.
@@ -67,7 +67,7 @@ def make_synthetic(
     if _recipe_of(folder) == recipe:
         return folder
     _check_replaceable(folder)
-    write_whole(folder, lambda work: _write_scene(work, recipe, progress, device))
+    write_folder_atomically(folder, lambda work: _write_scene(work, recipe, progress, device))
     return folder
 
 
@@ -79,14 +79,14 @@ def _recipe_of(folder: Path) -> dict[str, Any] | None:
 
 
 def _check_replaceable(folder: Path) -> None:
-    """Only a synthetic scene or an empty folder gives way."""
+    """Refuse to replace anything but a synthetic scene or an empty folder."""
     if not folder.exists() or (folder.is_dir() and (_recipe_of(folder) is not None or not any(folder.iterdir()))):
         return
     raise UserError(f"{folder}: exists and holds no synthetic scene ({MARKER}); give another folder, or remove it")
 
 
 class FigureSubject:
-    """The built-in figure, as ``synthesis`` films it."""
+    """The built-in figure as a ``Subject`` of the renderer."""
 
     def __init__(self, device: str = "cpu") -> None:
         self.device = device
@@ -95,11 +95,11 @@ class FigureSubject:
         self.pose, self.render, self.visible = self.raycaster.pose, self.raycaster.render, self.raycaster.visible
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Part and place of surface points: see ``sample_surface``."""
+        """Sample surface points: part and position in its bone's frame, as ``sample_surface``."""
         return sample_surface(self.figure, count, rng)
 
     def track(self, points: tuple[np.ndarray, np.ndarray], times: Sequence[float]) -> np.ndarray:
-        """[T, P, 3] float64 world positions of surface points."""
+        """Return world positions [T, P, 3] float64 of surface points."""
         part, local = points
         tracks = []
         for time in times:
@@ -112,8 +112,9 @@ def _write_scene(work: Path, recipe: dict[str, Any], progress: Callable[[int, in
     subject = FigureSubject(device)
     rng = np.random.default_rng(recipe["seed"])
     points = subject.sample(SURFACE_POINTS, rng)
-    shots = {
-        split: [Shot(time, random_camera(rng), 0) for time in instants(recipe[split])] for split in ("train", "test")
+    pictures = {
+        split: [PlannedPicture(time, random_camera(rng), 0) for time in instants(recipe[split])]
+        for split in ("train", "test")
     }
     total = recipe["train"] + recipe["test"]
     counter = itertools.count(1)
@@ -123,23 +124,19 @@ def _write_scene(work: Path, recipe: dict[str, Any], progress: Callable[[int, in
             progress(next(counter), total)
 
     optics = Optics(FIELD_OF_VIEW, recipe["size"], recipe["size"], SAMPLES)
-    write_pictures(work, subject, points, shots, optics, done)
+    write_pictures(work, subject, points, pictures, optics, done)
     (work / MARKER).write_text(json.dumps(recipe) + "\n")
 
 
 def random_camera(rng: np.random.Generator) -> np.ndarray:
-    """[4, 4] camera-to-world, OpenGL: on the upper hemisphere, evenly over its area, looking at the origin."""
-    return on_sphere(rng, SINE_OF_ELEVATION, RADIUS)
-
-
-def _camera(camera_to_world: np.ndarray, size: int) -> Camera:
-    return camera_of(camera_to_world, FIELD_OF_VIEW, size, size)
+    """Draw a camera, [4, 4] camera-to-world, OpenGL: uniform on the upper hemisphere, looking at the origin."""
+    return random_on_sphere(rng, SINE_OF_ELEVATION, RADIUS)
 
 
 def sample_surface(figure: Figure, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points spread evenly by area over all parts: part of each [P], position in that part's bone frame [P, 3].
+    """Sample points evenly by area over all parts: part [P], and position in its bone's frame [P, 3].
 
-    Some lie inside a neighbouring part, where no camera sees them; visibility tells.
+    Points inside a neighbouring part are never visible.
     """
     face, u, v = pick_on_triangles(figure.local[figure.faces], count, rng)
     a, b, c = figure.local[figure.faces[face]].transpose(1, 0, 2)

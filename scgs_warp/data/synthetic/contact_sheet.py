@@ -1,4 +1,4 @@
-"""A look at a synthesised data set: training pictures, the same with their true surface points, held-out pictures."""
+"""Contact sheet of a synthetic data set: training pictures, their true surface points, and held-out pictures."""
 
 from __future__ import annotations
 
@@ -8,44 +8,47 @@ import cv2
 import numpy as np
 
 from ...types import Camera
-from .orbit_cameras import Shot
-from .renderer import over
+from ..dataset import spread
+from .orbit_cameras import PlannedPicture
+from .renderer import over_gray
 
 COLUMNS = 6
 CELL = 240
-"""Width of a picture on the sheet, pixels; smaller pictures stay as they are."""
+"""Largest width of a picture on the sheet, pixels."""
 GAP = 4
 GROUND = 0.85
-"""Grey level behind what is transparent."""
+"""Grey level behind transparent pixels."""
 DOT = 1
 
 
-class Sheet:
-    """Collects some of the pictures while they are made: a ``Watcher``."""
+class ContactSheet:
+    """A ``Watcher`` that collects some of the pictures while they are made."""
 
     def __init__(self, counts: dict[str, int]) -> None:
         """
         Args:
             counts: pictures of each split.
         """
-        self._wanted = {split: spread(count, COLUMNS) for split, count in counts.items() if split != "val"}
+        self._wanted = {split: set(spread(count, COLUMNS)) for split, count in counts.items() if split != "val"}
         self._rows: dict[str, list[np.ndarray]] = {"train": [], "tracks": [], "test": []}
         self._colors: np.ndarray | None = None
 
-    def __call__(self, split: str, index: int, shot: Shot, camera: Camera, image: np.ndarray, seen: Any) -> None:
+    def __call__(
+        self, split: str, index: int, planned: PlannedPicture, camera: Camera, image: np.ndarray, seen: Any
+    ) -> None:
         if seen is not None and self._colors is None:
-            self._colors = hues(seen[0])
+            self._colors = position_hues(seen[0])
         if index not in self._wanted.get(split, ()):
             return
-        picture = np.rint(over(image, GROUND).clip(0.0, 1.0) * 255.0).astype(np.uint8)
-        caption = f"{split} {index}  t {shot.time:.2f}"
+        picture = np.rint(over_gray(image, GROUND).clip(0.0, 1.0) * 255.0).astype(np.uint8)
+        caption = f"{split} {index}  t {planned.time:.2f}"
         self._rows[split].append(_captioned(_reduced(picture), caption))
         if seen is not None and self._colors is not None:
             points, visible = seen
             self._rows["tracks"].append(_captioned(self._dotted(picture, camera, points, visible), "visible points"))
 
     def _dotted(self, picture: np.ndarray, camera: Camera, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
-        """The picture, pale, with a dot at each visible surface point; a point keeps its colour over time."""
+        """Fade the picture and draw a dot at each visible surface point; a point keeps its colour over time."""
         assert self._colors is not None
         reduced = _reduced((0.4 * picture + 0.6 * 255 * GROUND).astype(np.uint8))
         pixels = project(camera, points[visible]) * (reduced.shape[1] / picture.shape[1])
@@ -54,7 +57,7 @@ class Sheet:
         return reduced
 
     def draw(self) -> np.ndarray:
-        """[height, width, 3] uint8 RGB."""
+        """Draw the sheet, [height, width, 3] uint8 RGB."""
         rows = [row for row in self._rows.values() if row]
         height, width = rows[0][0].shape[:2]
         columns = max(len(row) for row in rows)
@@ -67,22 +70,15 @@ class Sheet:
         return sheet
 
 
-def spread(count: int, wanted: int) -> set[int]:
-    """At most ``wanted`` of ``count`` indices, at equal distances, the first and the last among them."""
-    if count <= wanted:
-        return set(range(count))
-    return {round(k * (count - 1) / (wanted - 1)) for k in range(wanted)}
-
-
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """[P, 2] pixels of world points [P, 3]."""
+    """Project world points [P, 3] to pixels [P, 2]."""
     viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
     seen = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
     return seen[:, :2] / seen[:, 2:]
 
 
-def hues(points: np.ndarray) -> np.ndarray:
-    """[P, 3] RGB bytes: each point's place at the first time as a colour."""
+def position_hues(points: np.ndarray) -> np.ndarray:
+    """Map positions [P, 3] to RGB bytes [P, 3]."""
     low, high = points.min(0), points.max(0)
     return np.rint(255.0 * (points - low) / np.maximum(high - low, 1e-9)).astype(np.uint8)
 

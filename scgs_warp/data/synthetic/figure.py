@@ -1,7 +1,7 @@
 """The figure of the built-in scene: a small robot of rounded solids, each rigid on one bone, with solid textures.
 
-Rest frame of the figure: z up, it faces -y, its left is +x, units such that it is about 2 tall. A part's own frame
-(in which its texture is defined) has the same axes and its origin in the part's middle.
+Rest frame: z up, the figure faces -y, its left is +x, and it is about 2 units tall. A part's own frame, in which its
+texture is defined, has the same axes and its origin at the part's centre.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STEEL = (0.62, 0.68, 0.76)
 
 
 class Part(NamedTuple):
-    """A rounded box on a bone: ``half`` extents, edge ``radius`` (before scaling), ``offset`` of its middle."""
+    """A rounded box on a bone: ``half`` extents, edge ``radius`` (before scaling), ``offset`` of its centre."""
 
     bone: str
     half: Vector
@@ -36,11 +36,11 @@ class Part(NamedTuple):
     """Relative growth of the cross section from the bottom to the top."""
     divisions: int = 6
     hole: float = 0.0
-    """Above 0: a torus about z instead, with this radius; ``half[2]`` is the tube's."""
+    """Radius of a torus about z that replaces the box, if above 0; ``half[2]`` is the radius of its tube."""
 
 
 def _arm(side: str, sign: float) -> list[Part]:
-    """Joints are spheres, so neighbours may turn without a gap."""
+    """Make the parts of an arm; joints are spheres, so that neighbours rotate without a gap."""
     sleeve = (TEAL, CREAM, MUSTARD)
     return [
         Part(
@@ -162,7 +162,7 @@ PARTS: tuple[Part, ...] = (
 
 @dataclass(frozen=True)
 class Figure:
-    """All parts as one triangle mesh, in rest coordinates of their own."""
+    """All parts as one triangle mesh."""
 
     rest: np.ndarray
     """[P, 3] float64 vertices in their part's frame."""
@@ -179,8 +179,8 @@ class Figure:
 
 
 def _cube(divisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Surface of [-1, 1]^3 as a grid, seams welded: vertices [P, 3], outward faces [F, 3]."""
-    ticks = np.tan(np.linspace(-1, 1, divisions + 1) * np.pi / 4)  # even angles: no crowding at the corners
+    """Tessellate the surface of [-1, 1]^3 with welded seams: vertices [P, 3], outward faces [F, 3]."""
+    ticks = np.tan(np.linspace(-1, 1, divisions + 1) * np.pi / 4)  # Even angles avoid crowding at the corners.
     u, v = np.meshgrid(ticks, ticks, indexing="ij")
     corner = np.arange(divisions)[:, None] * (divisions + 1) + np.arange(divisions)
     a, b, c, d = corner, corner + divisions + 1, corner + divisions + 2, corner + 1
@@ -199,7 +199,7 @@ def _cube(divisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rounded_box(half: Vector, radius: float, divisions: int = 10, taper: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A box with rounded edges: the points at ``radius`` from an inner box. A capsule or a ball at the extremes.
+    """Make a box with rounded edges, the points at ``radius`` from an inner box; a capsule or a ball at the extremes.
 
     Returns:
         vertices [P, 3] and faces [F, 3], counter-clockwise from outside.
@@ -207,7 +207,7 @@ def rounded_box(half: Vector, radius: float, divisions: int = 10, taper: float =
     cube, faces = _cube(divisions)
     extent = np.asarray(half, np.float64)
     core = np.maximum(extent - radius, 0.0)
-    # A third of the grid lines goes to the flat middle, two thirds to the rounded edges, at even angles there.
+    # A third of the grid lines goes to the flat centre, two thirds at even angles to the rounded edges.
     share = np.arctan(np.abs(cube)) * (4.0 / np.pi)
     edge = core + (extent - core) * np.tan(np.clip(1.5 * share - 0.5, 0.0, 1.0) * np.pi / 4)
     beyond = np.where(share < 1.0 / 3.0, 3.0 * share * core, edge)
@@ -220,7 +220,7 @@ def rounded_box(half: Vector, radius: float, divisions: int = 10, taper: float =
 
 
 def torus(radius: float, tube: float, divisions: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """A ring about z: vertices [P, 3], faces [F, 3]."""
+    """Make a torus about z: vertices [P, 3], faces [F, 3]."""
     rings, sides = 2 * divisions, divisions
     around, across = np.meshgrid(
         np.arange(rings) * 2 * np.pi / rings, np.arange(sides) * 2 * np.pi / sides, indexing="ij"
@@ -235,7 +235,7 @@ def torus(radius: float, tube: float, divisions: int = 12) -> tuple[np.ndarray, 
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[P, 3] unit, weighted by area."""
+    """Compute unit vertex normals [P, 3], weighted by area."""
     corners = vertices[faces]
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros_like(vertices)
@@ -245,7 +245,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def build_figure(parts: tuple[Part, ...] = PARTS) -> Figure:
-    """The mesh of all parts."""
+    """Build the mesh of all parts."""
     rest, local, faces, normals, vertex_part, face_part = [], [], [], [], [], []
     count = 0
     for index, part in enumerate(parts):

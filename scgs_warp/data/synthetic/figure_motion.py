@@ -1,7 +1,7 @@
-"""How the figure of the built-in scene moves: joint angles as smooth functions of time, and the skeleton they turn.
+"""Motion of the built-in figure: its skeleton, and joint angles as smooth functions of time.
 
-From 0 to 1, one way: the right arm swings up from the hip into a wave (137 degrees at the shoulder) while the figure
-takes a step on the spot, looks from one side to the other, and its scarf and antenna follow.
+From time 0 to 1 the right arm swings up from the hip into a wave (137 degrees at the shoulder) while the figure takes
+a step on the spot and looks from one side to the other; its scarf and antenna follow.
 """
 
 from __future__ import annotations
@@ -14,40 +14,40 @@ import numpy as np
 Vector = tuple[float, float, float]
 
 
-class Bone(NamedTuple):
-    """A joint: its place in the parent's frame (None: the world's)."""
+class Joint(NamedTuple):
+    """A joint of the skeleton: its parent and its position in the parent's frame (None: the world)."""
 
     parent: str | None
     place: Vector
 
 
-BONES: dict[str, Bone] = {
-    "hips": Bone(None, (0.0, 0.0, -0.40)),
-    "torso": Bone("hips", (0.0, 0.0, 0.04)),
-    "neck": Bone("torso", (0.0, 0.0, 0.60)),
-    "head": Bone("neck", (0.0, 0.0, 0.03)),
-    "antenna": Bone("head", (0.0, 0.0, 0.56)),
-    "scarf": Bone("neck", (0.15, -0.20, -0.02)),
-    "scarf_tip": Bone("scarf", (0.0, 0.0, -0.24)),
-    "shoulder_left": Bone("torso", (0.365, 0.0, 0.45)),
-    "elbow_left": Bone("shoulder_left", (0.0, 0.0, -0.28)),
-    "shoulder_right": Bone("torso", (-0.365, 0.0, 0.45)),
-    "elbow_right": Bone("shoulder_right", (0.0, 0.0, -0.28)),
-    "hip_left": Bone("hips", (0.145, 0.0, -0.06)),
-    "knee_left": Bone("hip_left", (0.0, 0.0, -0.26)),
-    "hip_right": Bone("hips", (-0.145, 0.0, -0.06)),
-    "knee_right": Bone("hip_right", (0.0, 0.0, -0.26)),
+BONES: dict[str, Joint] = {
+    "hips": Joint(None, (0.0, 0.0, -0.40)),
+    "torso": Joint("hips", (0.0, 0.0, 0.04)),
+    "neck": Joint("torso", (0.0, 0.0, 0.60)),
+    "head": Joint("neck", (0.0, 0.0, 0.03)),
+    "antenna": Joint("head", (0.0, 0.0, 0.56)),
+    "scarf": Joint("neck", (0.15, -0.20, -0.02)),
+    "scarf_tip": Joint("scarf", (0.0, 0.0, -0.24)),
+    "shoulder_left": Joint("torso", (0.365, 0.0, 0.45)),
+    "elbow_left": Joint("shoulder_left", (0.0, 0.0, -0.28)),
+    "shoulder_right": Joint("torso", (-0.365, 0.0, 0.45)),
+    "elbow_right": Joint("shoulder_right", (0.0, 0.0, -0.28)),
+    "hip_left": Joint("hips", (0.145, 0.0, -0.06)),
+    "knee_left": Joint("hip_left", (0.0, 0.0, -0.26)),
+    "hip_right": Joint("hips", (-0.145, 0.0, -0.06)),
+    "knee_right": Joint("hip_right", (0.0, 0.0, -0.26)),
 }
 
 
 def smoother_step(x: float) -> float:
-    """0 to 1 with zero first and second derivatives at both ends (Perlin's quintic)."""
+    """Rise from 0 to 1 with zero first and second derivatives at both ends (Perlin's quintic)."""
     x = min(max(x, 0.0), 1.0)
     return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
 
 
 def rotation(x: float, y: float, z: float) -> np.ndarray:
-    """[3, 3] Rz Ry Rx of angles in degrees."""
+    """Return the rotation [3, 3] Rz Ry Rx of angles in degrees."""
     result = np.eye(3)
     for axis, degrees in ((2, z), (1, y), (0, x)):
         c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
@@ -59,7 +59,8 @@ def rotation(x: float, y: float, z: float) -> np.ndarray:
 
 
 def joint_angles(time: float) -> dict[str, Vector]:
-    """Degrees about x, y, z of every joint that moves. Forward is -y: a negative x angle swings a limb forward."""
+    """Return the angles in degrees about x, y, z of every moving joint; a negative x angle swings a limb forward, to
+    -y."""
     wave = math.sin(2.0 * math.pi * time)
     rise = smoother_step(time)
     return {
@@ -81,10 +82,10 @@ def joint_angles(time: float) -> dict[str, Vector]:
 
 
 def bone_transforms(time: float) -> dict[str, np.ndarray]:
-    """[4, 4] bone to world of every bone at ``time`` in [0, 1]."""
+    """Return bone-to-world [4, 4] of every bone at ``time`` in [0, 1]."""
     angles = joint_angles(time)
     transforms: dict[str, np.ndarray] = {}
-    for name, bone in BONES.items():  # parents come first
+    for name, bone in BONES.items():  # Parents precede children.
         own = np.eye(4)
         own[:3, :3] = rotation(*angles.get(name, (0.0, 0.0, 0.0)))
         own[:3, 3] = bone.place

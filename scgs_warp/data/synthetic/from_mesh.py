@@ -1,4 +1,4 @@
-"""From a glTF file, or the built-in figure, to a folder that trains: ``plan`` looks, ``film`` makes."""
+"""Data sets of a glTF file or the built-in figure: ``plan_synthesis`` checks a request, ``synthesize`` writes it."""
 
 from __future__ import annotations
 
@@ -15,69 +15,69 @@ from ...errors import UserError
 from ...storage.files import parse_json
 from ..gltf.scene import GltfScene, read_scene
 from .builtin import FigureSubject
-from .contact_sheet import Sheet
-from .mesh import Look, MeshSubject
-from .orbit_cameras import Filming, Shot, shots
-from .renderer import SURFACE_POINTS, Background, Optics, Subject, write_pictures, write_png, write_whole
+from .contact_sheet import ContactSheet
+from .mesh import MeshSubject, Shading
+from .orbit_cameras import FilmingSettings, PlannedPicture, plan_pictures
+from .renderer import SURFACE_POINTS, Background, Optics, Subject, write_folder_atomically, write_pictures, write_png
 
 MARKER = "synthesis.json"
 SHEET = "contact_sheet.png"
 VERSION = 1
-"""Raised whenever the same request gives other pictures or another ground truth."""
-LARGEST = 8192
+"""Version of the pictures and the ground truth of a request."""
+MAX_SIDE = 8192
 
 
 @dataclass(frozen=True)
-class Request:
-    """What to make; everything that its bytes depend on, the file's contents apart."""
+class SynthesisRequest:
+    """Settings of a data set: everything that its bytes depend on but the contents of the mesh file."""
 
     mesh: Path | None = None
-    """None: the built-in figure."""
+    """A glTF file; None: the built-in figure."""
     clip: str | None = None
-    """None: the file's first."""
+    """Name of the clip; None: the file's first."""
     start: float | None = None
     """Seconds of the clip that become time 0; None: its first keyframe."""
     end: float | None = None
     """Seconds of the clip that become time 1; None: its last keyframe."""
-    filming: Filming = field(default_factory=Filming)
-    look: Look = field(default_factory=Look)
+    filming: FilmingSettings = field(default_factory=FilmingSettings)
+    shading: Shading = field(default_factory=Shading)
     samples: int = 4
     """Rays per pixel and axis."""
     background: Background = "transparent"
     seed: int = 0
 
 
-class Plan(NamedTuple):
-    """A request that was looked at and can be carried out: see ``film``."""
+class SynthesisPlan(NamedTuple):
+    """A checked request, ready for ``synthesize``."""
 
     folder: Path
-    request: Request
+    request: SynthesisRequest
     subject: Subject
     points: Any
     """Surface points whose tracks become the ground truth."""
-    shots: dict[str, list[Shot]]
+    pictures: dict[str, list[PlannedPicture]]
     recipe: dict[str, Any]
-    """Goes into the marker: the request, and what was found in the file."""
+    """Content of the marker file: the request and the identity of the mesh file."""
     lines: list[str]
-    """What was found, for the user."""
+    """Description of the subject, for the user."""
     made: bool
-    """The folder holds just this already."""
+    """True if the folder already holds this data set."""
 
     @property
     def counts(self) -> dict[str, int]:
-        """Pictures of each split."""
-        return {split: len(found) for split, found in self.shots.items()}
+        """Number of pictures of each split."""
+        return {split: len(found) for split, found in self.pictures.items()}
 
 
-def check(request: Request) -> None:
-    """Refuse what cannot work.
+def check(request: SynthesisRequest) -> None:
+    """Check the values of a request.
 
     Raises:
         UserError: naming the option, its value and the remedy.
     """
     filming = request.filming
-    if not (8 <= filming.width <= LARGEST and 8 <= filming.height <= LARGEST):
-        raise UserError(f"--size {filming.width} {filming.height}: give 8 to {LARGEST} pixels")
+    if not (8 <= filming.width <= MAX_SIDE and 8 <= filming.height <= MAX_SIDE):
+        raise UserError(f"--size {filming.width} {filming.height}: give 8 to {MAX_SIDE} pixels")
     for name, least in (("train", 2), ("test", 1), ("val", 0), ("views", 1)):
         if getattr(filming, name) < least:
             raise UserError(f"--{name} {getattr(filming, name)}: give at least {least}")
@@ -93,17 +93,17 @@ def check(request: Request) -> None:
     if request.seed < 0:
         raise UserError(f"--seed {request.seed}: give 0 or more")
     for name in ("ambient", "diffuse"):
-        if not 0.0 <= getattr(request.look, name) <= 100.0:
-            raise UserError(f"--{name} {getattr(request.look, name):g}: give 0 to 100 (1 is full daylight)")
+        if not 0.0 <= getattr(request.shading, name) <= 100.0:
+            raise UserError(f"--{name} {getattr(request.shading, name):g}: give 0 to 100 (1 is full daylight)")
     if request.mesh is None:
         set_anyway = [name for name in ("clip", "start", "end") if getattr(request, name) is not None]
-        if set_anyway or request.look != Look():
+        if set_anyway or request.shading != Shading():
             name = set_anyway[0] if set_anyway else "light, --ambient, --diffuse, --unlit"
             raise UserError(f"--{name}: is for glTF files; give one with --mesh, or leave it out")
 
 
 def span_of(scene: GltfScene, start: float | None, end: float | None) -> tuple[float, float]:
-    """The seconds of the clip that become times 0 and 1.
+    """Return the seconds of the clip that become times 0 and 1.
 
     Raises:
         UserError: they lie outside the clip, or in the wrong order.
@@ -125,17 +125,17 @@ def span_of(scene: GltfScene, start: float | None, end: float | None) -> tuple[f
     return first, last
 
 
-def load_subject(request: Request, device: str) -> tuple[Subject, dict[str, Any], list[str]]:
-    """The subject, what of it goes into the marker, and lines that say what was found.
+def load_subject(request: SynthesisRequest, device: str) -> tuple[Subject, dict[str, Any], list[str]]:
+    """Load the subject; return it with its part of the recipe and its description.
 
     Raises:
-        UserError: the mesh, the clip or the time range cannot be used.
+        UserError: the mesh, the clip or the time range is invalid.
     """
     if request.mesh is None:
         return FigureSubject(device), {"subject": "built-in figure"}, ["the built-in figure"]
     scene = read_scene(request.mesh, request.clip)
     span = span_of(scene, request.start, request.end)
-    subject = MeshSubject(scene, span, request.look, device)
+    subject = MeshSubject(scene, span, request.shading, device)
     clip = scene.clip
     found = {
         "subject": scene.path.name,
@@ -148,7 +148,7 @@ def load_subject(request: Request, device: str) -> tuple[Subject, dict[str, Any]
 
 
 def describe(scene: GltfScene, span: tuple[float, float]) -> list[str]:
-    """What a user wants to know about a file before it is filmed."""
+    """Describe a file for the user: sizes, clips and omitted primitives."""
     triangles = scene.triangles
     lines = [
         f"{scene.path.name}: {len(triangles.faces):,} triangles, {len(scene.materials) - 1} materials, "
@@ -165,12 +165,12 @@ def describe(scene: GltfScene, span: tuple[float, float]) -> list[str]:
     return lines
 
 
-def plan(folder: str | Path, request: Request, device: str = "cpu") -> Plan:
-    """Read what there is to read and refuse what cannot be made; nothing is written yet.
+def plan_synthesis(folder: str | Path, request: SynthesisRequest, device: str = "cpu") -> SynthesisPlan:
+    """Load the subject and check the request; write nothing.
 
     Args:
         folder: must not exist, or be empty, or hold the result of the same request.
-        device: where rays are cast, ``cpu`` or ``cuda``.
+        device: device of the ray casting, ``cpu`` or ``cuda``.
 
     Raises:
         UserError: one line naming the option or the file, the field and the remedy.
@@ -184,11 +184,11 @@ def plan(folder: str | Path, request: Request, device: str = "cpu") -> Plan:
         raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
     rng = np.random.default_rng(request.seed)
     points = subject.sample(SURFACE_POINTS, rng)
-    return Plan(folder, request, subject, points, shots(request.filming, rng), recipe, lines, made)
+    return SynthesisPlan(folder, request, subject, points, plan_pictures(request.filming, rng), recipe, lines, made)
 
 
-def film(planned: Plan, progress: Callable[[int, int], None] | None = None) -> Path:
-    """Make the data set, unless it is there already. The same request gives the same bytes.
+def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | None = None) -> Path:
+    """Make the data set, unless it exists. The same request gives the same bytes.
 
     Args:
         progress: called with (done, total) after each picture.
@@ -197,13 +197,13 @@ def film(planned: Plan, progress: Callable[[int, int], None] | None = None) -> P
         The folder.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the folder cannot be written.
     """
     if planned.made:
         return planned.folder
     filming, request = planned.request.filming, planned.request
     optics = Optics(float(np.radians(filming.fov)), filming.width, filming.height, request.samples, request.background)
-    total, sheet, count = sum(planned.counts.values()), Sheet(planned.counts), 0
+    total, sheet, count = sum(planned.counts.values()), ContactSheet(planned.counts), 0
 
     def done() -> None:
         nonlocal count
@@ -212,17 +212,23 @@ def film(planned: Plan, progress: Callable[[int, int], None] | None = None) -> P
             progress(count, total)
 
     def write(work: Path) -> None:
-        write_pictures(work, planned.subject, planned.points, planned.shots, optics, done, sheet)
+        write_pictures(work, planned.subject, planned.points, planned.pictures, optics, done, sheet)
         write_png(work / SHEET, cv2.cvtColor(sheet.draw(), cv2.COLOR_RGB2BGR))
         (work / MARKER).write_text(json.dumps(planned.recipe, indent=1) + "\n")
 
-    write_whole(planned.folder, write)
+    write_folder_atomically(planned.folder, write)
     return planned.folder
 
 
-def _recipe(request: Request, found: dict[str, Any]) -> dict[str, Any]:
-    """What JSON gives back as it was: no path, no date, no host."""
-    options = {key: value for key, value in asdict(request).items() if key not in ("mesh", "clip", "start", "end")}
+def _recipe(request: SynthesisRequest, found: dict[str, Any]) -> dict[str, Any]:
+    """Make the content of the marker, which holds no path, date or host."""
+    options = {
+        "filming": asdict(request.filming),
+        "look": asdict(request.shading),
+        "samples": request.samples,
+        "background": request.background,
+        "seed": request.seed,
+    }
     return json.loads(json.dumps({"version": VERSION, **found, **options}))
 
 

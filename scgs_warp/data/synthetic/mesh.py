@@ -1,4 +1,4 @@
-"""A glTF scene fitted into a room and made ready for rays: one of the subjects that ``synthesis`` writes."""
+"""A glTF scene as a ``Subject`` of the renderer: fitted into the room and uploaded for ray casting."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from ...kernels import raycast_mesh as kernels
 from ...runtime.launch import launch
 from ...types import Camera
 from ..gltf.scene import GltfScene
-from .raycast import TOLERANCE, mesh_over, window
-from .renderer import ROOM, SurfacePoints, points_on_triangles
+from .raycast import TOLERANCE, mesh_over, pixel_window
+from .renderer import ROOM_RADIUS, SurfacePoints, points_on_triangles
 
 FIT_TIMES = 101
-"""Instants of the clip that are looked at to find out how much room it takes."""
-NUDGE = 1e-5
-"""Times the room's radius: how far behind a surface that did not stop it a ray goes on."""
-FAR = 1000.0
+"""Number of instants of the clip at which its extent is measured."""
+RAY_OFFSET = 1e-5
+"""Distance, in room radii, behind a transparent surface at which a ray continues."""
+MAX_RAY_LENGTH = 1000.0
 
 
 @dataclass(frozen=True)
-class Look:
-    """The one light, and how surfaces answer it."""
+class Shading:
+    """Light and diffuse shading."""
 
     light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
     """Direction to the light, world (z up, the subject faces -y)."""
@@ -38,7 +38,7 @@ class Look:
     """Show bare base colours."""
 
 
-class Posed(NamedTuple):
+class PosedMesh(NamedTuple):
     """The mesh at one instant, ready for queries."""
 
     mesh: wp.Mesh
@@ -48,26 +48,26 @@ class Posed(NamedTuple):
     """[P, 3]"""
 
 
-def decoding() -> np.ndarray:
-    """[256] float32 linear value of an sRGB byte (IEC 61966-2-1)."""
+def srgb_to_linear() -> np.ndarray:
+    """Return the linear value of each sRGB byte, [256] float32 (IEC 61966-2-1)."""
     x = np.arange(256) / 255.0
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 class MeshSubject:
-    """Poses, pictures and tracks of a glTF scene; ``time`` from 0 to 1 goes through ``span`` seconds of its clip."""
+    """Poses, pictures and tracks of a glTF scene; ``time`` from 0 to 1 covers ``span``, seconds of its clip."""
 
-    def __init__(self, scene: GltfScene, span: tuple[float, float], look: Look, device: str = "cpu") -> None:
+    def __init__(self, scene: GltfScene, span: tuple[float, float], shading: Shading, device: str = "cpu") -> None:
         """
         Raises:
             UserError: the scene has no extent, or the light no direction.
         """
         self.scene = scene
         self.span = span
-        self.look = look
+        self.shading = shading
         self.device = device
         self._fit()
-        direction = np.asarray(look.light, np.float64)
+        direction = np.asarray(shading.light, np.float64)
         if not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
             raise UserError("--light: give a direction that is not zero, as --light -0.4 -0.6 0.7")
         triangles = scene.triangles
@@ -76,18 +76,18 @@ class MeshSubject:
         self.uv = self._tensor(triangles.uv)
         self.colors = self._tensor(triangles.colors)
         self.light = self._tensor(direction[None] / np.linalg.norm(direction))
-        self.decode = self._tensor(decoding())
+        self.decode = self._tensor(srgb_to_linear())
         self._upload_materials()
 
     def _tensor(self, values) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(self.device)
 
     def seconds(self, time: float) -> float:
-        """Of the clip."""
+        """Convert ``time`` in [0, 1] to seconds of the clip."""
         return self.span[0] + time * (self.span[1] - self.span[0])
 
     def _fit(self) -> None:
-        """Move and scale the scene so that it stays in a ball of radius ``ROOM`` around the origin at all times."""
+        """Translate and scale the scene into a ball of radius ``ROOM_RADIUS`` around the origin at all times."""
         times = np.linspace(0.0, 1.0, FIT_TIMES if self.scene.clip else 1)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for time in times:
@@ -101,13 +101,13 @@ class MeshSubject:
         if not np.isfinite(radius) or radius <= 0.0:
             raise UserError(f"{self.scene.path}: meshes have no extent (radius {radius:g}); export a surface")
         fitted = np.eye(4)
-        fitted[:3, :3] *= ROOM / radius
-        fitted[:3, 3] = -centre * ROOM / radius
+        fitted[:3, :3] *= ROOM_RADIUS / radius
+        fitted[:3, 3] = -centre * ROOM_RADIUS / radius
         self.scene.world_from_gltf = fitted @ self.scene.world_from_gltf
 
     def _upload_materials(self) -> None:
         materials, textures = self.scene.materials, self.scene.textures
-        kinds = [(m.texture, m.alpha_mode, int(m.double_sided), int(m.unlit or self.look.unlit)) for m in materials]
+        kinds = [(m.texture, m.alpha_mode, int(m.double_sided), int(m.unlit or self.shading.unlit)) for m in materials]
         self.factors = self._tensor([m.factor for m in materials])
         self.cutoffs = self._tensor([m.cutoff for m in materials])
         self.kinds = torch.tensor(kinds, dtype=torch.int32, device=self.device)
@@ -117,49 +117,49 @@ class MeshSubject:
             rows.append((offset, width, height, *texture.wrap, int(texture.nearest)))
             texels.append(texture.pixels.reshape(-1, 4))
             offset += width * height
-        if not textures:  # an array with no element has no address
+        if not textures:  # Kernels need the address of at least one element.
             rows, texels = [(0, 1, 1, 0, 0, 0)], [np.zeros((1, 4), np.uint8)]
         self.textures = torch.tensor(rows, dtype=torch.int32, device=self.device)
         self.texels = torch.from_numpy(np.concatenate(texels)).to(self.device)
 
     def _surface(self) -> tuple[Tensor, ...]:
-        """What both kernels take to know the surface."""
+        """Return the kernel arguments that describe the surface."""
         return (self.uv, self.colors, self.material, self.factors, self.kinds, self.cutoffs, self.texels,
                 self.textures, self.decode)  # fmt: skip
 
-    def pose(self, time: float) -> Posed:
-        """The scene at ``time`` in [0, 1]."""
+    def pose(self, time: float) -> PosedMesh:
+        """Pose the scene at ``time`` in [0, 1]."""
         vertices = self.scene.posed(self.seconds(time))
         points, normals = self._tensor(vertices.positions), self._tensor(vertices.normals)
-        return Posed(mesh_over(points, self.faces), points, normals)
+        return PosedMesh(mesh_over(points, self.faces), points, normals)
 
-    def render(self, posed: Posed, camera: Camera, samples: int) -> Tensor:
-        """[H, W, 4] premultiplied colour and coverage, ``samples`` x ``samples`` rays a pixel."""
+    def render(self, posed: PosedMesh, camera: Camera, samples: int) -> Tensor:
+        """Render [H, W, 4] premultiplied colour and coverage with ``samples`` x ``samples`` rays per pixel."""
         image = torch.zeros(camera.height, camera.width, 4, device=self.device)
-        left, top, columns, rows = window(posed.vertices, camera)
+        left, top, columns, rows = pixel_window(posed.vertices, camera)
         camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
         launch(
             kernels.raycast_mesh, columns * rows, posed.mesh.id, self.faces, posed.normals, *self._surface(),
-            self.light, self.look.ambient, self.look.diffuse, camera_to_world, camera.K.to(self.device), left, top,
-            columns, samples, NUDGE * ROOM, FAR, image, grain=64,
+            self.light, self.shading.ambient, self.shading.diffuse, camera_to_world, camera.K.to(self.device), left,
+            top, columns, samples, RAY_OFFSET * ROOM_RADIUS, MAX_RAY_LENGTH, image, grain=64,
         )  # fmt: skip
         return image
 
-    def visible(self, posed: Posed, camera: Camera, points: Tensor) -> Tensor:
-        """[P] bool: which surface points [P, 3] the camera sees."""
+    def visible(self, posed: PosedMesh, camera: Camera, points: Tensor) -> Tensor:
+        """Return [P] bool: which surface points [P, 3] the camera sees."""
         seen = torch.empty(len(points), dtype=torch.int32, device=self.device)
         launch(
             kernels.visible_on_mesh, len(points), posed.mesh.id, points, self.faces, *self._surface(),
             camera.viewmat.to(self.device), camera.K.to(self.device), camera.width, camera.height, TOLERANCE,
-            NUDGE * ROOM, seen,
+            RAY_OFFSET * ROOM_RADIUS, seen,
         )  # fmt: skip
         return seen.bool()
 
     def sample(self, count: int, rng: np.random.Generator) -> SurfacePoints:
-        """Points spread evenly by area over the surface at time 0.
+        """Sample points evenly by area over the surface at time 0.
 
         Raises:
-            UserError: it has no area then.
+            UserError: the surface has no area at time 0.
         """
         positions = self.scene.posed(self.seconds(0.0)).positions
         a, b, c = positions[self.scene.triangles.faces].transpose(1, 0, 2)
@@ -169,7 +169,7 @@ class MeshSubject:
         return points_on_triangles(positions, self.scene.triangles.faces, count, rng)
 
     def track(self, points: SurfacePoints, times) -> np.ndarray:
-        """[T, P, 3] float64 world positions of surface points."""
+        """Return world positions [T, P, 3] float64 of surface points."""
         corners = self.scene.triangles.faces[points.face]
         tracks = []
         for time in times:

@@ -1,4 +1,4 @@
-"""Cameras around a subject at the origin, for synthesised data: at random on a sphere, or along a path round it.
+"""Cameras around a subject at the origin, for synthetic data: random on a sphere, or along a path around it.
 
 ``camera_to_world`` matrices are OpenGL's (x right, y up, z backward), as the D-NeRF layout writes them. Angles are in
 degrees.
@@ -16,51 +16,51 @@ import torch
 from ...types import Camera
 
 Arrangement = Literal["sphere", "path"]
-REACH = 1.365
-"""Cameras stand where a ball of this radius around the origin just fits into their pictures."""
+FRAMED_RADIUS = 1.365
+"""Radius of the ball around the origin that just fits into the pictures; it sets the distance of the cameras."""
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True)
-class Filming:
-    """How a scene is filmed."""
+class FilmingSettings:
+    """Settings of the pictures and cameras of a scene."""
 
     width: int = 400
     height: int = 400
     train: int = 150
-    """Instants; each is seen by all cameras of a rig."""
+    """Number of training instants; each is seen by all cameras of a rig."""
     test: int = 20
     val: int = 10
     cameras: Arrangement = "sphere"
     views: int = 1
-    """1: monocular; more: a rig of so many synchronised cameras."""
+    """Number of synchronised cameras of a rig; 1 is monocular."""
     fov: float = 39.597752
     """Horizontal field of view; the default is D-NeRF's."""
     elevation: tuple[float, float] = (2.866, 58.212)
-    """Lowest and highest."""
+    """Lowest and highest elevation of a camera."""
     turns: float = 1.0
-    """How often a path goes round."""
+    """Number of turns of a path around the subject."""
 
 
-class Shot(NamedTuple):
-    """One picture to be made."""
+class PlannedPicture(NamedTuple):
+    """A picture to be rendered."""
 
     time: float
     camera_to_world: np.ndarray
     """[4, 4]"""
     view: int
-    """Camera of a rig; 0 for one camera."""
+    """Index of the camera in a rig; 0 for a single camera."""
 
 
-def distance(filming: Filming) -> float:
-    """Of the cameras from the origin."""
+def camera_distance(filming: FilmingSettings) -> float:
+    """Return the distance of the cameras from the origin."""
     half_x = math.tan(math.radians(filming.fov) / 2)
     narrower = math.atan(half_x * min(1.0, filming.height / filming.width))
-    return REACH / math.sin(narrower)
+    return FRAMED_RADIUS / math.sin(narrower)
 
 
-def stand(azimuth: float, sine: float, radius: float) -> np.ndarray:
-    """[4, 4] camera-to-world at an azimuth (radians) and a sine of the elevation, looking at the origin, z up."""
+def camera_at(azimuth: float, sine: float, radius: float) -> np.ndarray:
+    """Return camera-to-world [4, 4] at an azimuth (radians) and a sine of the elevation, facing the origin, z up."""
     flat = math.sqrt(1.0 - sine * sine)
     backward = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), sine])
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
@@ -70,41 +70,43 @@ def stand(azimuth: float, sine: float, radius: float) -> np.ndarray:
     return matrix
 
 
-def on_sphere(rng: np.random.Generator, sines: tuple[float, float], radius: float) -> np.ndarray:
-    """A camera at random, evenly over the area of the sphere between two sines of elevation."""
+def random_on_sphere(rng: np.random.Generator, sines: tuple[float, float], radius: float) -> np.ndarray:
+    """Draw a camera, uniform over the area of the sphere between two sines of elevation."""
     azimuth = rng.uniform(0.0, 2.0 * math.pi)
-    return stand(azimuth, rng.uniform(*sines), radius)
+    return camera_at(azimuth, rng.uniform(*sines), radius)
 
 
-def _sines(filming: Filming) -> tuple[float, float]:
+def _sines(filming: FilmingSettings) -> tuple[float, float]:
     low, high = filming.elevation
     return math.sin(math.radians(low)), math.sin(math.radians(high))
 
 
-def rig(filming: Filming, start: float) -> list[np.ndarray]:
-    """Cameras that stand still, spread evenly over the sphere between the elevations (a golden-angle spiral)."""
+def rig(filming: FilmingSettings, start: float) -> list[np.ndarray]:
+    """Place static cameras evenly over the sphere between the elevations, on a golden-angle spiral."""
     low, high = _sines(filming)
     return [
-        stand(start + GOLDEN_ANGLE * view, low + (high - low) * (view + 0.5) / filming.views, distance(filming))
+        camera_at(
+            start + GOLDEN_ANGLE * view, low + (high - low) * (view + 0.5) / filming.views, camera_distance(filming)
+        )
         for view in range(filming.views)
     ]
 
 
-def along_path(filming: Filming, time: float, start: float, view: int) -> np.ndarray:
-    """Where a moving camera stands: ``turns`` round the subject, up and down once for every turn; those of a rig
-    follow each other at equal angles."""
+def along_path(filming: FilmingSettings, time: float, start: float, view: int) -> np.ndarray:
+    """Place a moving camera: ``turns`` around the subject, up and down once per turn; cameras of a rig follow each
+    other at equal angles."""
     low, high = filming.elevation
     angle = 2.0 * math.pi * (filming.turns * time + view / filming.views)
     height = math.radians((low + high) / 2 + (high - low) / 2 * math.sin(angle))
-    return stand(start + angle, math.sin(height), distance(filming))
+    return camera_at(start + angle, math.sin(height), camera_distance(filming))
 
 
 def instants(count: int) -> list[float]:
     return [index / max(count - 1, 1) for index in range(count)]
 
 
-def shots(filming: Filming, rng: np.random.Generator) -> dict[str, list[Shot]]:
-    """All pictures of each split that has any. Held-out views are spread over time, each from a random place."""
+def plan_pictures(filming: FilmingSettings, rng: np.random.Generator) -> dict[str, list[PlannedPicture]]:
+    """Plan the pictures of each split. Held-out pictures are spread over time, each from a random camera."""
     start = float(rng.uniform(0.0, 2.0 * math.pi))
     standing = rig(filming, start) if filming.cameras == "sphere" and filming.views > 1 else []
     train = []
@@ -115,18 +117,18 @@ def shots(filming: Filming, rng: np.random.Generator) -> dict[str, list[Shot]]:
             elif filming.cameras == "path":
                 matrix = along_path(filming, time, start, view)
             else:
-                matrix = on_sphere(rng, _sines(filming), distance(filming))
-            train.append(Shot(time, matrix, view))
+                matrix = random_on_sphere(rng, _sines(filming), camera_distance(filming))
+            train.append(PlannedPicture(time, matrix, view))
     found = {"train": train}
     for split, count in (("test", filming.test), ("val", filming.val)):
         if count:
-            places = [on_sphere(rng, _sines(filming), distance(filming)) for _ in range(count)]
-            found[split] = [Shot(time, place, 0) for time, place in zip(instants(count), places)]
+            places = [random_on_sphere(rng, _sines(filming), camera_distance(filming)) for _ in range(count)]
+            found[split] = [PlannedPicture(time, place, 0) for time, place in zip(instants(count), places)]
     return found
 
 
 def camera_of(camera_to_world: np.ndarray, fov: float, width: int, height: int) -> Camera:
-    """The camera of a picture. ``fov``: horizontal, radians."""
+    """Make the camera of a picture. ``fov``: horizontal, radians."""
     viewmat = np.linalg.inv(camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0]))
     focal = 0.5 * width / math.tan(0.5 * fov)
     K = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Pictures of the posed figure: Warp's mesh queries behind functions of tensors."""
+"""Ray casting of the built-in figure with Warp's mesh queries, on tensors."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ LIGHT_SPREAD = 0.35
 SKY_RAYS, KEY_RAYS = 40, 16
 OCCLUSION_REACH = 0.5
 TOLERANCE = 2e-3
-"""World units by which a visible point may lie behind the first hit."""
+"""Largest distance of a visible point behind the first hit, world units."""
 
 
-class Posed(NamedTuple):
-    """The figure at one time, ready for queries."""
+class PosedFigure(NamedTuple):
+    """The figure at one time, ready for ray queries."""
 
     mesh: wp.Mesh
     vertices: Tensor
-    """[P, 3] world; the mesh lies over this memory."""
+    """[P, 3] world; the mesh shares this memory."""
     light: Tensor
     """[P, 3] irradiance."""
 
 
 class Raycaster:
-    """Casts rays at one figure on one device; uploads what does not change once."""
+    """Ray caster of one figure on one device; constant data is uploaded once."""
 
     def __init__(self, figure: Figure, device: str = "cpu", parts: tuple[Part, ...] = PARTS) -> None:
         self.figure = figure
@@ -54,12 +54,12 @@ class Raycaster:
         return torch.as_tensor(np.asarray(values, np.float32)).to(self.device)
 
     def part_transforms(self, time: float) -> np.ndarray:
-        """[parts, 4, 4] bone to world of each part."""
+        """Return bone-to-world [parts, 4, 4] of each part."""
         transforms = bone_transforms(time)
         return np.stack([transforms[bone] for bone in self.bones])
 
-    def pose(self, time: float) -> Posed:
-        """The figure at ``time`` in [0, 1], lit."""
+    def pose(self, time: float) -> PosedFigure:
+        """Pose and light the figure at ``time`` in [0, 1]."""
         transforms = self.part_transforms(time)[self.figure.vertex_part]
         vertices = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.local) + transforms[:, :3, 3]
         normals = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.normals)
@@ -70,12 +70,12 @@ class Raycaster:
             kernels.light_vertices, len(points), mesh.id, points, directions, self.light_direction, LIGHT_SPREAD,
             SKY_RAYS, KEY_RAYS, OCCLUSION_REACH, light, grain=64,
         )  # fmt: skip
-        return Posed(mesh, points, light)
+        return PosedFigure(mesh, points, light)
 
-    def render(self, posed: Posed, camera: Camera, samples: int = 4) -> Tensor:
-        """[H, W, 4] premultiplied colour and coverage, ``samples`` x ``samples`` rays a pixel."""
+    def render(self, posed: PosedFigure, camera: Camera, samples: int = 4) -> Tensor:
+        """Render [H, W, 4] premultiplied colour and coverage with ``samples`` x ``samples`` rays per pixel."""
         image = torch.zeros(camera.height, camera.width, 4, device=self.device)
-        left, top, columns, rows = window(posed.vertices, camera)
+        left, top, columns, rows = pixel_window(posed.vertices, camera)
         camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
         launch(
             kernels.raycast, columns * rows, posed.mesh.id, self.faces, self.rest, posed.light, self.face_part,
@@ -84,8 +84,8 @@ class Raycaster:
         )  # fmt: skip
         return image
 
-    def visible(self, posed: Posed, camera: Camera, points: Tensor) -> Tensor:
-        """[P] bool: which surface points [P, 3] the camera sees."""
+    def visible(self, posed: PosedFigure, camera: Camera, points: Tensor) -> Tensor:
+        """Return [P] bool: which surface points [P, 3] the camera sees."""
         seen = torch.empty(len(points), dtype=torch.int32, device=self.device)
         launch(
             kernels.visible, len(points), posed.mesh.id, points, camera.viewmat.to(self.device),
@@ -95,15 +95,15 @@ class Raycaster:
 
 
 def mesh_over(vertices: Tensor, faces: Tensor) -> wp.Mesh:
-    """Warp's mesh over the memory of vertices [P, 3] and faces [3 F], built on torch's stream like all else."""
+    """Make a Warp mesh that shares the memory of vertices [P, 3] and faces [3 F], on torch's stream."""
     if not vertices.is_cuda:
         return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
     with wp.ScopedStream(warp_stream(vertices.device)):
         return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
 
 
-def window(vertices: Tensor, camera: Camera) -> tuple[int, int, int, int]:
-    """(left, top, columns, rows) of the pixels that a mesh of vertices [P, 3] may touch."""
+def pixel_window(vertices: Tensor, camera: Camera) -> tuple[int, int, int, int]:
+    """Return (left, top, columns, rows) of the pixels that a mesh of vertices [P, 3] may touch."""
     view = camera.to(vertices.device)
     points = vertices @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     if bool((points[:, 2] < 1e-3).any()):

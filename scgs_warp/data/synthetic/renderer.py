@@ -1,7 +1,7 @@
-"""Moving scenes as data sets: pictures in the D-NeRF layout, with the true motion of their surface beside them.
+"""Data sets rendered from moving subjects: pictures in the D-NeRF layout, with the true motion of their surface.
 
-A ``Subject`` knows how it moves and what rays see of it: the built-in figure (``synthetic``) and glTF files
-(``synthesis_mesh``) are two. This file films it and writes what a reader expects.
+A ``Subject`` poses and renders itself: the built-in figure (``builtin``) or a glTF file (``mesh``). This file renders
+the planned pictures and writes the folder that a reader expects.
 """
 
 from __future__ import annotations
@@ -22,54 +22,54 @@ from torch import Tensor
 
 from ...errors import UserError
 from ...types import Camera
-from .orbit_cameras import Shot, camera_of
+from .orbit_cameras import PlannedPicture, camera_of
 
-ROOM = 1.3
-"""World radius of the ball around the origin that a subject never leaves: what D-NeRF's scenes take."""
+ROOM_RADIUS = 1.3
+"""World radius of the ball around the origin that a subject never leaves, as in D-NeRF's scenes."""
 SURFACE_POINTS = 2000
-TRUTH_TIMES = 51
+GROUND_TRUTH_TIMES = 51
 
 Background = Literal["transparent", "black", "white"]
 
 
 class Subject(Protocol):
-    """Something that moves while time goes from 0 to 1, inside the ball of radius ``ROOM`` (world, z up)."""
+    """A moving subject: time in [0, 1], inside the ball of radius ``ROOM_RADIUS`` (world, z up)."""
 
     device: str
 
     def pose(self, time: float) -> Any:
-        """The subject at an instant, for the methods below; has ``vertices [P, 3]``."""
+        """Pose the subject for the methods below; the result has ``vertices [P, 3]``."""
         ...
 
     def render(self, posed: Any, camera: Camera, samples: int) -> Tensor:
-        """[H, W, 4] premultiplied colour and coverage in [0, 1], ``samples`` x ``samples`` rays a pixel."""
+        """Render [H, W, 4] premultiplied colour and coverage in [0, 1], ``samples`` x ``samples`` rays per pixel."""
         ...
 
     def visible(self, posed: Any, camera: Camera, points: Tensor) -> Tensor:
-        """[P] bool: which surface points [P, 3] the camera sees."""
+        """Return [P] bool: which surface points [P, 3] the camera sees."""
         ...
 
     def sample(self, count: int, rng: np.random.Generator) -> Any:
-        """Surface points, spread evenly by area, in whatever form ``track`` takes."""
+        """Sample surface points evenly by area, in the form that ``track`` takes."""
         ...
 
     def track(self, points: Any, times: Sequence[float]) -> np.ndarray:
-        """[T, P, 3] float64 world positions of surface points."""
+        """Return world positions [T, P, 3] float64 of surface points."""
         ...
 
 
 class SurfacePoints(NamedTuple):
-    """Points that stay where they are on their triangle."""
+    """Points fixed to triangles of a mesh."""
 
     face: np.ndarray
     """[P]"""
     shares: np.ndarray
-    """[P, 3] of the triangle's corners, rows sum to 1."""
+    """[P, 3] barycentric coordinates; rows sum to 1."""
 
 
 @dataclass(frozen=True)
 class Optics:
-    """What all pictures of a scene have in common."""
+    """Camera and output settings common to all pictures of a scene."""
 
     fov: float
     """Horizontal field of view, radians."""
@@ -83,7 +83,7 @@ class Optics:
 def pick_on_triangles(
     corners: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangle [P] and coordinates u [P, 1], v [P, 1] of points spread evenly by area over triangles [F, 3, 3].
+    """Sample points evenly by area over triangles [F, 3, 3]: triangle [P] and coordinates u [P, 1], v [P, 1].
 
     A point is ``a + u (b - a) + v (c - a)``.
     """
@@ -99,13 +99,13 @@ def pick_on_triangles(
 def points_on_triangles(
     positions: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
 ) -> SurfacePoints:
-    """Points spread evenly by area over a mesh of vertices [P, 3] and triangles [F, 3]."""
+    """Sample points evenly by area over a mesh of vertices [P, 3] and triangles [F, 3]."""
     face, u, v = pick_on_triangles(positions[faces], count, rng)
     return SurfacePoints(face, np.concatenate([1.0 - u - v, u, v], axis=1))
 
 
 def write_rgba(path: Path, image: np.ndarray) -> None:
-    """Write premultiplied [H, W, 4] in [0, 1] as an 8-bit PNG, whose colour is not premultiplied.
+    """Write a premultiplied picture [H, W, 4] in [0, 1] as an 8-bit PNG with straight alpha.
 
     Raises:
         OSError: the file cannot be written.
@@ -116,13 +116,13 @@ def write_rgba(path: Path, image: np.ndarray) -> None:
     write_png(path, cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_RGBA2BGRA))
 
 
-def over(image: np.ndarray, gray: float) -> np.ndarray:
-    """[H, W, 3] a premultiplied picture [H, W, 4] on a grey ground."""
+def over_gray(image: np.ndarray, gray: float) -> np.ndarray:
+    """Composite a premultiplied picture [H, W, 4] on grey, [H, W, 3]."""
     return image[..., :3] + (1.0 - image[..., 3:]) * gray
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Pixels in OpenCV's order; OSError where they cannot be written."""
+    """Write pixels in OpenCV's channel order; raise OSError if that fails."""
     ok, data = cv2.imencode(".png", pixels)
     if not ok:
         raise OSError(0, "PNG encoding failed")
@@ -130,47 +130,49 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def write_picture(path: Path, image: np.ndarray, background: Background) -> None:
-    """A premultiplied picture [H, W, 4] with its alpha, or on a ground and without."""
+    """Write a premultiplied picture [H, W, 4] with its alpha, or composited on the background without alpha."""
     if background == "transparent":
         write_rgba(path, image)
         return
-    pixels = over(image, 1.0 if background == "white" else 0.0).clip(0.0, 1.0) * 255.0
+    pixels = over_gray(image, 1.0 if background == "white" else 0.0).clip(0.0, 1.0) * 255.0
     write_png(path, cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_RGB2BGR))
 
 
 class Watcher(Protocol):
-    """Looks at pictures as they are made."""
+    """Callback that receives each picture when it is made."""
 
-    def __call__(self, split: str, index: int, shot: Shot, camera: Camera, image: np.ndarray, seen: Any) -> None: ...
+    def __call__(
+        self, split: str, index: int, planned: PlannedPicture, camera: Camera, image: np.ndarray, seen: Any
+    ) -> None: ...
 
 
 def write_pictures(
     folder: Path,
     subject: Subject,
     points: Any,
-    shots: Mapping[str, Sequence[Shot]],
+    pictures: Mapping[str, Sequence[PlannedPicture]],
     optics: Optics,
     done: Callable[[], None],
     watch: Watcher | None = None,
 ) -> None:
-    """``transforms_SPLIT.json`` and ``SPLIT/r_000.png`` of every split, and ``ground_truth.npz``.
+    """Render and write ``SPLIT/r_000.png`` and ``transforms_SPLIT.json`` of every split, and ``ground_truth.npz``.
 
     Args:
-        points: of ``subject.sample``; their visibility is that in the training pictures.
+        points: surface points of ``subject.sample``; their visibility is recorded in the training pictures.
         done: called after each picture.
-        watch: sees each picture; ``seen`` is (positions [P, 3], visible [P]) in training pictures, else None.
+        watch: receives each picture; ``seen`` is (positions [P, 3], visible [P]) in training pictures, else None.
 
     Raises:
-        OSError: something cannot be written.
+        OSError: a file cannot be written.
     """
     visible = []
-    for split, planned in shots.items():
+    for split, split_pictures in pictures.items():
         (folder / split).mkdir()
         entries, time, posed = [], float("nan"), None
-        for index, shot in enumerate(planned):
-            if shot.time != time:
-                time, posed = shot.time, subject.pose(shot.time)
-            camera = camera_of(shot.camera_to_world, optics.fov, optics.width, optics.height)
+        for index, planned in enumerate(split_pictures):
+            if planned.time != time:
+                time, posed = planned.time, subject.pose(planned.time)
+            camera = camera_of(planned.camera_to_world, optics.fov, optics.width, optics.height)
             image = subject.render(posed, camera, optics.samples).cpu().numpy()
             name = f"{split}/r_{index:03d}"
             write_picture(folder / f"{name}.png", image, optics.background)
@@ -180,31 +182,33 @@ def write_pictures(
                 tensor = torch.from_numpy(places.astype(np.float32)).to(subject.device)
                 seen = places, subject.visible(posed, camera, tensor).cpu().numpy()
                 visible.append(seen[1])
-            entries.append({"file_path": f"./{name}", "time": time, "transform_matrix": shot.camera_to_world.tolist()})
+            entries.append(
+                {"file_path": f"./{name}", "time": time, "transform_matrix": planned.camera_to_world.tolist()}
+            )
             if watch is not None:
-                watch(split, index, shot, camera, image, seen)
+                watch(split, index, planned, camera, image, seen)
             done()
         content = {"camera_angle_x": optics.fov, "frames": entries}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1) + "\n")
-    times = np.linspace(0.0, 1.0, TRUTH_TIMES)
+    times = np.linspace(0.0, 1.0, GROUND_TRUTH_TIMES)
     np.savez(
         folder / "ground_truth.npz",
         points=subject.track(points, times.tolist()).astype(np.float32),
         times=times.astype(np.float32),
         visible=np.stack(visible),
-        height=np.float32(height_of(subject)),
+        height=np.float32(subject_height(subject)),
     )
 
 
-def height_of(subject: Subject) -> float:
-    """Extent along z at time 0; of something that lies flat, the largest extent."""
+def subject_height(subject: Subject) -> float:
+    """Return the extent along z at time 0, or the largest extent of a subject that lies flat."""
     vertices = subject.pose(0.0).vertices.cpu().numpy()
     extent = vertices.max(0) - vertices.min(0)
     return extent[2] if extent[2] > 0.05 * extent.max() else extent.max()
 
 
-def write_whole(folder: Path, write: Callable[[Path], None]) -> None:
-    """Have ``write`` fill a temporary folder beside ``folder`` and rename it: nothing is ever left half made.
+def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None:
+    """Let ``write`` fill a temporary folder next to ``folder``, then rename it; an incomplete folder never remains.
 
     Raises:
         UserError: the folder cannot be written.
@@ -216,7 +220,7 @@ def write_whole(folder: Path, write: Callable[[Path], None]) -> None:
         raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
     try:
         write(work)
-        os.chmod(work, 0o755)  # mkdtemp's 0700 is for secrets
+        os.chmod(work, 0o755)  # Folders of mkdtemp are private.
         _replace(folder, work)
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror}); make room or choose another folder") from None

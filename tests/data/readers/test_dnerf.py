@@ -1,8 +1,7 @@
-"""The D-NeRF reader: what it reads, how it composites and reduces, and what it says about bad input."""
+"""The D-NeRF layout: cameras, times, intrinsics, faults."""
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -11,40 +10,10 @@ import pytest
 import torch
 from PIL import Image as PillowImage
 
+from helpers.dnerf_files import HEIGHT, HUGE, WIDTH, edit, write_scene
 from scgs_warp.data import load
 from scgs_warp.errors import UserError
-from scgs_warp.geometry.normalisation import COMMON_RADIUS, Normalisation
-from scgs_warp.types import Camera
-
-WIDTH, HEIGHT = 24, 16
-IDENTITY = [[1, 0, 0, 0.5], [0, 1, 0, 0.25], [0, 0, 1, 4], [0, 0, 0, 1]]
-
-
-def write_scene(folder: Path, frames: int = 3, mode: str = "RGBA", seed: int = 0, **fields) -> list[np.ndarray]:
-    """A tiny valid data set of random pixels; returns the images."""
-    rng = np.random.default_rng(seed)
-    (folder / "train").mkdir(parents=True)
-    images, entries = [], []
-    for index in range(frames):
-        pixels = rng.integers(0, 256, (HEIGHT, WIDTH, len(mode)), dtype=np.uint8)
-        PillowImage.fromarray(pixels).save(folder / f"train/r_{index:03d}.png")
-        images.append(pixels)
-        time = index / max(frames - 1, 1)
-        entries.append({"file_path": f"./train/r_{index:03d}", "time": time, "transform_matrix": IDENTITY})
-    content = {"camera_angle_x": 0.8, "frames": entries, **fields}
-    (folder / "transforms_train.json").write_text(json.dumps(content))
-    return images
-
-
-HUGE = "a number of 5,000 digits"
-"""Python refuses to read such a number, and to write it."""
-
-
-def edit(folder: Path, change) -> None:
-    path = folder / "transforms_train.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content).replace(f'"{HUGE}"', "9" * 5_000))
+from scgs_warp.geometry.normalisation import Normalisation
 
 
 def test_camera_and_times(tmp_path):
@@ -63,82 +32,12 @@ def test_camera_and_times(tmp_path):
     assert data.extent == 0.0 and data[0].name == "r_000"
 
 
-@pytest.mark.parametrize("background", ["black", "white", "random"])
-def test_composited_once(tmp_path, background):
-    images = write_scene(tmp_path / "s", frames=1)
-    data = load(tmp_path / "s", "train", background=background)
-    frame = data[0]
-    rgba = torch.from_numpy(images[0]).double() / 255
-    color = 1.0 if background == "white" else 0.0
-    expected = rgba[..., :3] * rgba[..., 3:] + color * (1 - rgba[..., 3:])
-    assert frame.image.dtype == torch.float32 and frame.image.permute(2, 0, 1).is_contiguous()
-    assert (frame.image - expected).abs().max() < 1e-6
-    assert frame.alpha is not None and (frame.alpha - rgba[..., 3]).abs().max() < 1e-6
-    assert data.background == background and data.background_color.tolist() == [color] * 3
-
-
-def test_alpha_that_says_nothing_is_none(tmp_path):
-    """A file that an object fills keeps its alpha as long as others have something to say."""
-    folder = tmp_path / "s"
-    images = write_scene(folder, frames=2)
-    for index, image in enumerate(images):
-        image[..., 3] = 255
-        PillowImage.fromarray(image).save(folder / f"train/r_{index:03d}.png")
-        alphas = [frame.alpha for frame in load(folder, "train")]
-        assert all(alpha is not None for alpha in alphas) == (index == 0), "all or none"
-    assert alphas == [None, None]
-
-
-def test_area_averages_premultiplied(tmp_path):
-    images = write_scene(tmp_path / "s", frames=1)
-    frame = load(tmp_path / "s", "train", downscale=2, background="white")[0]
-    rgba = torch.from_numpy(images[0]).double() / 255
-    composited = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
-    expected = composited.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean((1, 3))
-    assert (frame.image - expected).abs().max() < 1e-6
-    assert frame.image.permute(2, 0, 1).is_contiguous()
-    focal = 0.25 * WIDTH / math.tan(0.4)
-    assert torch.allclose(frame.camera.K, torch.tensor([[focal, 0, WIDTH / 4], [0, focal, HEIGHT / 4], [0, 0, 1]]))
-
-
-def test_bicubic_is_pillows(tmp_path):
-    images = write_scene(tmp_path / "s", frames=1)
-    frame = load(tmp_path / "s", "train", downscale=2, resample="bicubic", background="white")[0]
-    rgba = images[0] / 255.0
-    composited = ((rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])) * 255).astype(np.uint8)
-    reduced = np.asarray(PillowImage.fromarray(composited).resize((WIDTH // 2, HEIGHT // 2))) / 255.0
-    assert np.abs(frame.image.numpy() - reduced).max() < 1e-6
-    alpha = np.asarray(PillowImage.fromarray(images[0][..., 3]).resize((WIDTH // 2, HEIGHT // 2))) / 255.0
-    assert frame.alpha is not None and np.abs(frame.alpha.numpy() - alpha).max() < 1e-6
-
-
-def test_uneven_downscale_scales_each_axis(tmp_path):
-    write_scene(tmp_path / "s", frames=1)
-    camera = load(tmp_path / "s", "train", downscale=1.7)[0].camera
-    assert (camera.width, camera.height) == (14, 9)
-    focal = 0.5 * WIDTH / math.tan(0.4)
-    assert camera.K[0, 0] == pytest.approx(focal * 14 / WIDTH) and camera.K[1, 1] == pytest.approx(focal * 9 / HEIGHT)
-
-
 def test_pixel_intrinsics_and_index_times(tmp_path):
     write_scene(tmp_path / "s", frames=3, mode="RGB", fl_x=30.0, fl_y=31.0, cx=11.0, cy=7.5, w=WIDTH, h=HEIGHT)
     edit(tmp_path / "s", lambda content: [frame.pop("time") for frame in content["frames"]])
     data = load(tmp_path / "s", "train", background="random")
     assert data[1].camera.K.tolist() == [[30.0, 0.0, 11.0], [0.0, 31.0, 7.5], [0.0, 0.0, 1.0]]
     assert data.times.tolist() == [0.0, 0.5, 1.0] and data[0].alpha is None
-
-
-def test_progress_and_threads_change_nothing(tmp_path, all_threads):
-    from scgs_warp.runtime import environment
-
-    write_scene(tmp_path / "s", frames=5)
-    seen = []
-    environment.configure(threads=1)
-    one = load(tmp_path / "s", "train", progress=lambda done, total: seen.append((done, total)))
-    environment.configure(threads=2)
-    two = load(tmp_path / "s", "train")
-    assert seen == [(index, 5) for index in range(1, 6)]
-    assert all(torch.equal(a.image, b.image) for a, b in zip(one, two))
 
 
 def frame_field(key, value):
@@ -226,56 +125,3 @@ def test_jumpingjacks(data_root):
     assert all(frame.image[90:110, 90:110].mean() > 0.02 for frame in data)
     transform = Normalisation.fit(data.cameras)
     assert np.abs(transform.centre).max() < 1e-4 and transform.scale == pytest.approx(1.0, abs=1e-3)
-
-
-def ring(count: int, centre: np.ndarray, radius: float) -> list[Camera]:
-    cameras = []
-    for index in range(count):
-        angle, height = 2 * math.pi * index / count, 0.3 + 0.1 * (index % 3)
-        backward = np.array([math.cos(angle), math.sin(angle), height])
-        backward /= np.linalg.norm(backward)
-        right = np.cross([0.0, 0.0, 1.0], backward)
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, -np.cross(backward, right), -backward])
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ (centre + radius * backward)
-        K = torch.tensor([[500.0, 0, 200], [0, 500.0, 200], [0, 0, 1]])
-        cameras.append(Camera(torch.from_numpy(viewmat).float(), K, 400, 400))
-    return cameras
-
-
-def test_normalisation_of_cameras():
-    centre, radius = np.array([10.0, -20.0, 5.0]), 40.0
-    transform = Normalisation.fit(ring(7, centre, radius))
-    assert np.abs(transform.centre - centre).max() < 1e-3
-    assert transform.scale * radius * math.sin(math.atan(200 / 500)) == pytest.approx(COMMON_RADIUS, rel=1e-4)
-    assert transform.centre.dtype == np.float64
-
-
-def test_normalisation_of_points_and_round_trip():
-    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * 30 + torch.tensor([5.0, 6.0, 7.0])
-    cameras = ring(5, np.array([5.0, 6.0, 7.0]), 200.0)
-    transform = Normalisation.fit(cameras, points)
-    normal = transform.apply(points)
-    assert normal.norm(dim=1).quantile(0.95) == pytest.approx(COMMON_RADIUS, rel=1e-2)
-    assert torch.allclose(transform.undo(normal), points, atol=1e-4)
-    assert transform.undo_scale(normal.new_tensor(transform.scale)) == pytest.approx(1.0)
-    # A point is seen at the same pixel in either frame; its depth scales.
-    camera = transform.apply_camera(cameras[0])
-    before = points @ cameras[0].viewmat[:3, :3].T + cameras[0].viewmat[:3, 3]
-    after = normal @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    assert torch.allclose(after, before * transform.scale, atol=1e-4)
-    assert torch.allclose(transform.undo_camera(camera).viewmat, cameras[0].viewmat, atol=1e-4)
-
-
-def test_normalisation_of_parallel_cameras_is_finite():
-    cameras = []
-    for x in (-1.0, 0.0, 1.0):
-        viewmat = torch.eye(4)
-        viewmat[0, 3] = -x
-        cameras.append(Camera(viewmat, torch.tensor([[300.0, 0, 100], [0, 300.0, 100], [0, 0, 1]]), 200, 200))
-    transform = Normalisation.fit(cameras)
-    assert np.isfinite(transform.centre).all() and 0 < transform.scale < math.inf
-    assert transform.centre[2] > 0  # in front of the cameras
-    single = Normalisation.fit(cameras[:1])
-    assert np.isfinite(single.centre).all() and 0 < single.scale < math.inf

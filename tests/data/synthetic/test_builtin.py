@@ -12,9 +12,10 @@ import torch
 
 from reference.raycast import first_hit
 from scgs_warp.data import load
-from scgs_warp.data.synthetic.builtin import _camera, make_synthetic, random_camera, sample_surface
+from scgs_warp.data.synthetic.builtin import FIELD_OF_VIEW, make_synthetic, random_camera, sample_surface
 from scgs_warp.data.synthetic.figure import PARTS, build_figure, rounded_box, torus, vertex_normals
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
+from scgs_warp.data.synthetic.orbit_cameras import camera_of
 from scgs_warp.data.synthetic.raycast import Raycaster
 from scgs_warp.data.synthetic.renderer import write_rgba
 from scgs_warp.errors import UserError
@@ -82,7 +83,7 @@ def test_rays_match_float64(device, seed):
     figure = build_figure()
     caster = Raycaster(figure, device)
     posed = caster.pose(0.2 + 0.5 * seed)
-    camera = _camera(random_camera(np.random.default_rng(seed)), 20)
+    camera = camera_of(random_camera(np.random.default_rng(seed)), FIELD_OF_VIEW, 20, 20)
     image = caster.render(posed, camera, samples=1).cpu()
     position = camera.position.double()
     ys, xs = torch.meshgrid(torch.arange(20) + 0.5, torch.arange(20) + 0.5, indexing="ij")
@@ -101,7 +102,7 @@ def test_visibility_matches_float64(device):
     figure = build_figure()
     caster = Raycaster(figure, device)
     posed = caster.pose(0.4)
-    camera = _camera(random_camera(np.random.default_rng(3)), 64)
+    camera = camera_of(random_camera(np.random.default_rng(3)), FIELD_OF_VIEW, 64, 64)
     part, local = sample_surface(figure, 200, np.random.default_rng(0))
     transforms = caster.part_transforms(0.4)[part]
     points = np.einsum("pij,pj->pi", transforms[:, :3, :3], local) + transforms[:, :3, 3]

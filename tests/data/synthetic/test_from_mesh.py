@@ -22,29 +22,29 @@ from helpers.paths import ROOT
 from scgs_warp.data import load
 from scgs_warp.data.gltf.scene import read_scene
 from scgs_warp.data.synthetic.contact_sheet import project
-from scgs_warp.data.synthetic.from_mesh import Request, check, film, plan
-from scgs_warp.data.synthetic.mesh import Look, MeshSubject, decoding
-from scgs_warp.data.synthetic.orbit_cameras import Filming, camera_of, distance, stand
-from scgs_warp.data.synthetic.renderer import ROOM, height_of
+from scgs_warp.data.synthetic.from_mesh import SynthesisRequest, check, plan_synthesis, synthesize
+from scgs_warp.data.synthetic.mesh import MeshSubject, Shading, srgb_to_linear
+from scgs_warp.data.synthetic.orbit_cameras import FilmingSettings, camera_at, camera_distance, camera_of
+from scgs_warp.data.synthetic.renderer import ROOM_RADIUS, subject_height
 from scgs_warp.errors import UserError
 from scgs_warp.evaluation.motion_metrics import load_ground_truth, score_motion
 from scgs_warp.runtime import environment
 from scgs_warp.types import Camera
 
-HALF = ROOM / math.sqrt(0.5) / 2
+HALF = ROOM_RADIUS / math.sqrt(0.5) / 2
 """Half the side of the unit square after it was fitted into the room."""
-UNLIT = Look(unlit=True)
+UNLIT = Shading(unlit=True)
 
 
-def subject_of(glb: Glb, folder: Path, look: Look = UNLIT, device: str = "cpu") -> MeshSubject:
+def subject_of(glb: Glb, folder: Path, shading: Shading = UNLIT, device: str = "cpu") -> MeshSubject:
     scene = read_scene(glb.save(folder / "x.glb"))
     clip = scene.clip
-    return MeshSubject(scene, (clip.start, clip.end) if clip else (0.0, 0.0), look, device)
+    return MeshSubject(scene, (clip.start, clip.end) if clip else (0.0, 0.0), shading, device)
 
 
 def front(size: int = 40, azimuth: float = -90.0, sine: float = 0.0) -> Camera:
     """In front of what faces -y, so far away that the room fills the picture."""
-    return camera_of(stand(math.radians(azimuth), sine, 4.0311), 0.6911, size, size)
+    return camera_of(camera_at(math.radians(azimuth), sine, 4.0311), 0.6911, size, size)
 
 
 def picture(subject: MeshSubject, camera: Camera, samples: int = 1, time: float = 0.0) -> np.ndarray:
@@ -84,7 +84,7 @@ def test_bilinear_texture_in_linear_light(tmp_path, device, wrap):
     image = picture(subject, front())
     u, v = on_square(front())
     inside = (abs(u - 0.5) < 0.499) & (abs(v - 0.5) < 0.499)
-    linear = decoding().astype(np.float64)[pixels]
+    linear = srgb_to_linear().astype(np.float64)[pixels]
 
     def at(row: np.ndarray, column: np.ndarray) -> np.ndarray:
         if wrap == 10497:
@@ -108,12 +108,12 @@ def srgb(x: float) -> float:
 def test_one_light_and_lambert(tmp_path, device):
     """The square faces -y: cosine of the light with it, sky light for a level normal, factors in linear light."""
     glb = quad(pbr={"baseColorFactor": [0.5, 0.25, 0.01, 1.0]})
-    look = Look(light=(0.0, -3.0, 4.0), ambient=0.4, diffuse=0.5)
-    image = picture(subject_of(glb, tmp_path, look, device), front())
+    shading = Shading(light=(0.0, -3.0, 4.0), ambient=0.4, diffuse=0.5)
+    image = picture(subject_of(glb, tmp_path, shading, device), front())
     light = 0.4 * 0.75 + 0.5 * 0.6
     expected = [srgb(0.5 * light), srgb(0.25 * light), srgb(0.01 * light), 1.0]
     assert np.abs(image[20, 20] - expected).max() < 1e-5
-    behind = picture(subject_of(glb, tmp_path, Look(light=(0, 1, 0), ambient=0.4), device), front())
+    behind = picture(subject_of(glb, tmp_path, Shading(light=(0, 1, 0), ambient=0.4), device), front())
     assert behind[20, 20, 0] == pytest.approx(srgb(0.5 * 0.4 * 0.75), abs=1e-5)
 
 
@@ -123,7 +123,7 @@ def test_both_sides_are_lit_from_where_they_look(tmp_path, device, given):
     if given:
         attributes = glb.document["meshes"][0]["primitives"][0]["attributes"]
         attributes["NORMAL"] = glb.array([[0, 0, 1]] * 4)
-    subject = subject_of(glb, tmp_path, Look((0, 1, 0), ambient=0.4, diffuse=0.3), device)
+    subject = subject_of(glb, tmp_path, Shading((0, 1, 0), ambient=0.4, diffuse=0.3), device)
     lit, dark = picture(subject, front(azimuth=90.0))[20, 20, 0], picture(subject, front())[20, 20, 0]
     assert lit == pytest.approx(srgb(0.6), abs=1e-5) and dark == pytest.approx(srgb(0.3), abs=1e-5)
 
@@ -188,10 +188,14 @@ def test_silhouette_of_a_bent_bar_matches_float64(tmp_path, device, time):
 def test_the_whole_motion_fits_into_the_room_and_the_pictures(tmp_path):
     subject = subject_of(box(), tmp_path)
     reach = max(np.linalg.norm(subject.scene.posed(second).positions, axis=1).max() for second in np.linspace(0, 1, 31))
-    assert reach == pytest.approx(ROOM, rel=2e-3)
-    for filming in (Filming(), Filming(width=60, height=40, fov=60.0), Filming(width=40, height=60)):
+    assert reach == pytest.approx(ROOM_RADIUS, rel=2e-3)
+    for filming in (
+        FilmingSettings(),
+        FilmingSettings(width=60, height=40, fov=60.0),
+        FilmingSettings(width=40, height=60),
+    ):
         for time in (0.0, 0.5, 1.0):
-            matrix = stand(2.0 * time, 0.3, distance(filming))
+            matrix = camera_at(2.0 * time, 0.3, camera_distance(filming))
             camera = camera_of(matrix, math.radians(filming.fov), filming.width, filming.height)
             pixels = project(camera, subject.scene.posed(time).positions)
             assert (pixels > 0).all() and (pixels < [filming.width, filming.height]).all()
@@ -213,20 +217,20 @@ def test_tracks_are_exact(tmp_path):
     rest = subject.scene.posed(0.0).positions[corners]
     assert np.abs(np.einsum("pk,pki->pi", points.shares, rest) - tracks[0]).max() < 1e-12
     assert np.bincount(points.face, minlength=12).std() < 1  # evenly by area
-    assert height_of(subject) == pytest.approx(2 * scale, rel=1e-5)
-    assert height_of(subject_of(quad(), tmp_path)) == pytest.approx(2 * HALF, rel=1e-5)
+    assert subject_height(subject) == pytest.approx(2 * scale, rel=1e-5)
+    assert subject_height(subject_of(quad(), tmp_path)) == pytest.approx(2 * HALF, rel=1e-5)
 
 
-def request(mesh: Path | None, **fields) -> Request:
-    filming = fields.pop("filming", Filming(width=32, height=32, train=4, test=2, val=1))
-    return Request(mesh, filming=filming, samples=2, **fields)
+def request(mesh: Path | None, **fields) -> SynthesisRequest:
+    filming = fields.pop("filming", FilmingSettings(width=32, height=32, train=4, test=2, val=1))
+    return SynthesisRequest(mesh, filming=filming, samples=2, **fields)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("synthesis")
     mesh = bar()[0].save(folder / "bar.glb")
-    return film(plan(folder / "scene", request(mesh, filming=Filming(48, 40, 6, 3, 1))))
+    return synthesize(plan_synthesis(folder / "scene", request(mesh, filming=FilmingSettings(48, 40, 6, 3, 1))))
 
 
 def test_a_made_folder_is_a_data_set(made):
@@ -271,36 +275,36 @@ def test_same_bytes_for_any_number_of_threads(tmp_path, all_threads, subject):
     found = []
     for threads in (1, 2):
         environment.configure(threads=threads)
-        found.append(contents(film(plan(tmp_path / str(threads), request(mesh)))))
+        found.append(contents(synthesize(plan_synthesis(tmp_path / str(threads), request(mesh)))))
     assert found[0] == found[1] and len(found[0]) == 4 + 2 + 1 + 3 + 3
-    other = contents(film(plan(tmp_path / "other", request(mesh, seed=1))))
+    other = contents(synthesize(plan_synthesis(tmp_path / "other", request(mesh, seed=1))))
     assert other["train/r_000.png"] != found[0]["train/r_000.png"]
 
 
 def test_a_folder_is_made_once_and_never_overwritten(tmp_path):
     mesh = box().save(tmp_path / "box.glb")
-    folder = film(plan(tmp_path / "scene", request(mesh)))
+    folder = synthesize(plan_synthesis(tmp_path / "scene", request(mesh)))
     before = contents(folder)
-    planned = plan(folder, request(mesh))
-    assert planned.made and film(planned) == folder and contents(folder) == before
+    planned = plan_synthesis(folder, request(mesh))
+    assert planned.made and synthesize(planned) == folder and contents(folder) == before
     with pytest.raises(UserError, match="holds something else; give another --output"):
-        plan(folder, request(mesh, seed=2))
+        plan_synthesis(folder, request(mesh, seed=2))
     box((0, 1, 0, 1)).save(mesh)
     with pytest.raises(UserError, match="holds something else"):
-        plan(folder, request(mesh))
+        plan_synthesis(folder, request(mesh))
 
 
 def test_time_range_rig_background_and_still_scenes(tmp_path):
     mesh = box().save(tmp_path / "box.glb")
-    filming = Filming(32, 32, 2, 1, 0, views=2)
-    part = plan(tmp_path / "part", request(mesh, start=0.25, end=0.5, background="white", filming=filming))
+    filming = FilmingSettings(32, 32, 2, 1, 0, views=2)
+    part = plan_synthesis(tmp_path / "part", request(mesh, start=0.25, end=0.5, background="white", filming=filming))
     assert part.subject.track(part.points, [0.0])[0].shape == (2000, 3) and part.counts == {"train": 4, "test": 1}
-    folder = film(part)
+    folder = synthesize(part)
     pixels = cv2.imread(str(folder / "train" / "r_000.png"), cv2.IMREAD_UNCHANGED)
     assert pixels is not None and pixels.shape == (32, 32, 3) and (pixels[0, 0] == 255).all()
     truth = load_ground_truth(folder)
     assert truth is not None and truth.visible.shape == (4, 2000)
-    still = film(plan(tmp_path / "still", request(quad().save(tmp_path / "quad.glb"))))
+    still = synthesize(plan_synthesis(tmp_path / "still", request(quad().save(tmp_path / "quad.glb"))))
     truth = load_ground_truth(still)
     assert truth is not None and (truth.points == truth.points[0]).all()
     assert json.loads((still / "synthesis.json").read_text())["clip"] is None
@@ -311,21 +315,21 @@ def test_a_surface_that_grows_from_nothing_is_explained(tmp_path):
     glb.animate(0, 1, "scale", [0.0, 1.0], [[0, 0, 0], [1, 1, 1]])
     mesh = glb.save(tmp_path / "box.glb")
     with pytest.raises(UserError, match="no area at second 0; give a later --start"):
-        plan(tmp_path / "scene", request(mesh))
-    assert plan(tmp_path / "scene", request(mesh, start=0.5)).counts["train"] == 4
+        plan_synthesis(tmp_path / "scene", request(mesh))
+    assert plan_synthesis(tmp_path / "scene", request(mesh, start=0.5)).counts["train"] == 4
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"filming": Filming(width=4)}, "--size 4 400"),
-        ({"filming": Filming(train=1)}, "--train 1: give at least 2"),
-        ({"filming": Filming(views=0)}, "--views 0"),
-        ({"filming": Filming(fov=170)}, "--fov 170"),
-        ({"filming": Filming(elevation=(50, 10))}, "--elevation 50 10"),
+        ({"filming": FilmingSettings(width=4)}, "--size 4 400"),
+        ({"filming": FilmingSettings(train=1)}, "--train 1: give at least 2"),
+        ({"filming": FilmingSettings(views=0)}, "--views 0"),
+        ({"filming": FilmingSettings(fov=170)}, "--fov 170"),
+        ({"filming": FilmingSettings(elevation=(50, 10))}, "--elevation 50 10"),
         ({"seed": -1}, "--seed -1"),
-        ({"look": Look(ambient=-1)}, "--ambient -1"),
-        ({"look": Look(light=(0, 0, 0))}, "--light"),
+        ({"shading": Shading(ambient=-1)}, "--ambient -1"),
+        ({"shading": Shading(light=(0, 0, 0))}, "--light"),
         ({"start": 0.5, "end": 0.2}, "lasts from 0 to 1 seconds"),
         ({"end": 3.0}, "lasts from 0 to 1 seconds"),
     ],
@@ -333,14 +337,14 @@ def test_a_surface_that_grows_from_nothing_is_explained(tmp_path):
 def test_wrong_requests_are_explained(tmp_path, fields, message):
     mesh = box().save(tmp_path / "box.glb")
     with pytest.raises(UserError, match=message):
-        plan(tmp_path / "scene", request(mesh, **fields))
+        plan_synthesis(tmp_path / "scene", request(mesh, **fields))
     assert not (tmp_path / "scene").exists()
 
 
 def test_options_of_files_need_a_file():
-    for fields, name in (({"clip": "Walk"}, "--clip"), ({"end": 1.0}, "--end"), ({"look": UNLIT}, "--light")):
+    for fields, name in (({"clip": "Walk"}, "--clip"), ({"end": 1.0}, "--end"), ({"shading": UNLIT}, "--light")):
         with pytest.raises(UserError, match=f"{name}.*give one with --mesh"):
-            check(Request(**fields))
+            check(SynthesisRequest(**fields))
 
 
 def app(*arguments: str) -> subprocess.CompletedProcess:
@@ -370,6 +374,6 @@ def test_real_characters(data_root, name, clip, bones, textures):
         pytest.skip(f"no {path.name} in the folder of data sets")
     scene = read_scene(path, clip)
     assert len(scene.palette) == bones and len(scene.textures) == textures and scene.clip is not None
-    subject = MeshSubject(scene, (scene.clip.start, scene.clip.end), Look())
+    subject = MeshSubject(scene, (scene.clip.start, scene.clip.end), Shading())
     image = picture(subject, front(64), 2, 0.3)
     assert 0.05 < image[..., 3].mean() < 0.5 and image[image[..., 3] > 0.9][:, :3].std(0).min() > 0.05

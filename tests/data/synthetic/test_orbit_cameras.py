@@ -7,32 +7,50 @@ import math
 import numpy as np
 import pytest
 
-from scgs_warp.data.synthetic.orbit_cameras import Filming, along_path, distance, shots
+from scgs_warp.data.synthetic.orbit_cameras import FilmingSettings, along_path, camera_distance, plan_pictures
 
 
 def test_cameras_of_every_arrangement():
     rng = np.random.default_rng(0)
-    sphere = shots(Filming(train=40, elevation=(10, 50)), rng)
+    sphere = plan_pictures(FilmingSettings(train=40, elevation=(10, 50)), rng)
     assert {split: len(found) for split, found in sphere.items()} == {"train": 40, "test": 20, "val": 10}
-    places = np.stack([shot.camera_to_world[:3, 3] for shot in sphere["train"]])
+    places = np.stack([picture.camera_to_world[:3, 3] for picture in sphere["train"]])
     elevations = np.degrees(np.arcsin(places[:, 2] / np.linalg.norm(places, axis=1)))
     assert elevations.min() > 10 - 1e-9 and elevations.max() < 50 + 1e-9 and np.ptp(elevations) > 25
-    assert [shot.time for shot in sphere["test"]] == pytest.approx(np.linspace(0, 1, 20).tolist())
-    rig = shots(Filming(train=5, views=3, val=0), rng)
-    assert [shot.view for shot in rig["train"]] == [0, 1, 2] * 5 and "val" not in rig
-    assert [shot.time for shot in rig["train"]] == [0, 0, 0, 0.25, 0.25, 0.25, 0.5, 0.5, 0.5, 0.75, 0.75, 0.75, 1, 1, 1]
-    still = np.stack([shot.camera_to_world for shot in rig["train"]]).reshape(5, 3, 4, 4)
+    assert [picture.time for picture in sphere["test"]] == pytest.approx(np.linspace(0, 1, 20).tolist())
+    rig = plan_pictures(FilmingSettings(train=5, views=3, val=0), rng)
+    assert [picture.view for picture in rig["train"]] == [0, 1, 2] * 5 and "val" not in rig
+    assert [picture.time for picture in rig["train"]] == [
+        0,
+        0,
+        0,
+        0.25,
+        0.25,
+        0.25,
+        0.5,
+        0.5,
+        0.5,
+        0.75,
+        0.75,
+        0.75,
+        1,
+        1,
+        1,
+    ]
+    still = np.stack([picture.camera_to_world for picture in rig["train"]]).reshape(5, 3, 4, 4)
     assert (still == still[0]).all() and np.linalg.norm(still[0, 0] - still[0, 1]) > 1
-    path = shots(Filming(train=100, cameras="path", turns=2.0), rng)["train"]
-    places = np.stack([shot.camera_to_world[:3, 3] for shot in path])
+    path = plan_pictures(FilmingSettings(train=100, cameras="path", turns=2.0), rng)["train"]
+    places = np.stack([picture.camera_to_world[:3, 3] for picture in path])
     turned = np.unwrap(np.arctan2(places[:, 1], places[:, 0]))
     assert (
         turned[-1] - turned[0] == pytest.approx(4 * math.pi)
         and np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 1
     )
-    followers = [along_path(Filming(cameras="path", views=2), 0.0, 0.0, view)[:3, 3] for view in (0, 1)]
+    followers = [along_path(FilmingSettings(cameras="path", views=2), 0.0, 0.0, view)[:3, 3] for view in (0, 1)]
     assert followers[0][0] > 0 > followers[1][0]
-    for shot in [*sphere["train"], *path]:
-        rotation = shot.camera_to_world[:3, :3]
+    for picture in [*sphere["train"], *path]:
+        rotation = picture.camera_to_world[:3, :3]
         assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) == pytest.approx(1)
-        assert np.allclose(shot.camera_to_world[:3, 3] / distance(Filming()), rotation[:, 2])  # looks at the origin
+        assert np.allclose(
+            picture.camera_to_world[:3, 3] / camera_distance(FilmingSettings()), rotation[:, 2]
+        )  # looks at the origin

@@ -1,0 +1,22 @@
+"""Messages about captures in which too few frames got a camera."""
+
+from __future__ import annotations
+
+from scgs_warp.capture.diagnosis import Outcome, likely_reason, notes, too_few
+from scgs_warp.capture.features import Links
+
+LINKS = Links(2000, 300, 1.0, 0.3)
+
+
+def test_the_likeliest_reason_is_given():
+    assert "texture" in likely_reason(Outcome(50, 0, 0, Links(30, 0, 0.0, 0.0), 0.1))
+    assert "--frames 100" in likely_reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.1))
+    assert "--masks none" in likely_reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.4))
+    assert "walking" in likely_reason(Outcome(50, 0, 0, Links(2000, 300, 1.0, 1.0), 0.1))
+    assert "walking" in likely_reason(Outcome(50, 50, 0.4, LINKS, 0.1))
+    assert "--matching" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1))
+    line = too_few("out", Outcome(50, 20, 9, LINKS, 0.1))
+    assert line.startswith("out: 20 of 50 frames registered") and "--least 0.4 " in line
+    assert "--least" not in too_few("out", Outcome(50, 0, 0, LINKS, 0.1))
+    assert not notes(Outcome(50, 50, 9, LINKS, 0.1)) and len(notes(Outcome(50, 40, 9, LINKS, 0.1))) == 1
+    assert "uncertain" in notes(Outcome(50, 50, 1.0, LINKS, 0.1))[0]

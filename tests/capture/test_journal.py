@@ -1,0 +1,40 @@
+"""The journal of a capture: finished stages are not repeated, other work is left alone."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from scgs_warp.capture.journal import Journal
+from scgs_warp.errors import UserError
+
+
+def test_the_journal_does_work_once(tmp_path):
+    made: list[str] = []
+
+    def run(folder, source="film", **settings):
+        journal = Journal(folder, source)
+        journal.start()
+        for name in ("a", "b"):
+            value = settings.get(name, 0)
+            journal.stage(name, value, lambda n=name, v=value: made.append(f"{n}{v}") or {"v": v}, lambda: None)
+        return journal
+
+    run(tmp_path / "x")
+    run(tmp_path / "x")
+    assert made == ["a0", "b0"]
+    run(tmp_path / "x", b=1)
+    assert made[2:] == ["b1"]
+    assert run(tmp_path / "x", a=1, b=1).result("a") == {"v": 1} and made[3:] == ["a1", "b1"]
+    with pytest.raises(UserError, match="another video"):
+        run(tmp_path / "x", "other")
+    (tmp_path / "x/transforms.json").write_text("{}")
+    run(tmp_path / "x", a=1, b=1)
+    with pytest.raises(UserError, match="finished"):
+        run(tmp_path / "x", a=2, b=1)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/letter.txt").write_text("dear")
+    with pytest.raises(UserError, match="something else"):
+        run(tmp_path / "mine")
+    assert json.loads((tmp_path / "x/work/journal.json").read_text())["stages"]["a"]["result"] == {"v": 1}

@@ -1,0 +1,65 @@
+"""Sources of frames: videos and folders of images, and files that are neither."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from helpers.films import mask_images, pan
+from scgs_warp.capture.source import Video, open_source, rotate_image
+from scgs_warp.errors import UserError
+from scgs_warp.visualization.video import film, write_png
+
+
+def test_a_video_keeps_its_moments(tmp_path):
+    with film(tmp_path / "film.mp4", 12.5) as out:
+        for frame in pan(range(0, 30, 3)):
+            out.write(frame)
+    video = open_source(tmp_path / "film.mp4")
+    stills = list(video.frames(80))
+    assert video.count == 10 and [still.index for still in stills] == list(range(10))
+    np.testing.assert_allclose([still.seconds for still in stills], np.arange(10) / 12.5, atol=1e-3)
+    assert stills[0].image.shape == (60, 80, 3)
+
+
+def test_pixels_are_made_square(tmp_path):
+    import av
+
+    with av.open(str(tmp_path / "film.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 144, 120, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        for frame in pan([0, 3], 120, 144):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    assert {still.image.shape for still in Video(tmp_path / "film.mp4").frames(1000)} == {(120, 192, 3)}
+
+
+def test_pictures_are_turned_as_they_were_held():
+    image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    assert np.array_equal(rotate_image(image, 0), image)
+    assert np.array_equal(rotate_image(image, 90), np.rot90(image)), "counter-clockwise"
+    assert np.array_equal(rotate_image(image, -90.0), np.rot90(image, 3))
+
+
+def test_what_is_no_film_is_refused(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(b"not a film" * 1000)
+    (tmp_path / "empty").mkdir()
+    with film(tmp_path / "cut.mp4") as out:
+        for frame in pan(range(0, 60, 3)):
+            out.write(frame)
+    (tmp_path / "cut.mp4").write_bytes((tmp_path / "cut.mp4").read_bytes()[:300])
+    for name, said in (("film.mp4", "is not a video"), ("empty", "holds no images"), ("nowhere", "no such file")):
+        with pytest.raises(UserError, match=said):
+            open_source(tmp_path / name)
+    with pytest.raises(UserError, match=r"cut\.mp4"):
+        list(open_source(tmp_path / "cut.mp4").frames(64))
+    mixed = mask_images(tmp_path / "mixed", 3)
+    write_png(mixed / "010.png", np.zeros((50, 50, 3), np.uint8))
+    with pytest.raises(UserError, match=r"010\.png.*one size"):
+        list(open_source(mixed).frames(64))
+    (mixed / "010.png").write_bytes(b"x")
+    with pytest.raises(UserError, match=r"010\.png: is not an image"):
+        list(open_source(mixed).frames(64))

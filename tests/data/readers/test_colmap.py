@@ -1,0 +1,197 @@
+"""COLMAP's layout: camera models, names, times, sizes, faults."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.data_faults import gone, message, noise, text
+from helpers.layouts import (
+    COLORS,
+    HEIGHT,
+    POINTS,
+    WIDTH,
+    K,
+    save_image,
+    share_found,
+    viewmat,
+    write_colmap,
+)
+from scgs_warp.data import load
+from scgs_warp.data.readers import colmap
+from scgs_warp.errors import UserError
+
+FOUND = 0.75
+"""Share of the points whose colour is at their pixel; the others hide."""
+
+
+def test_the_measure_notices_three_pixels(tmp_path):
+    write_colmap(tmp_path)
+    data = load(tmp_path)
+    for entry in data.entries:
+        entry.camera.K[0, 2] += 3
+    assert share_found(data) < 0.2
+
+
+MODELS = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
+MODELS += ["SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FOV"]
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("model", MODELS)
+def test_colmap(tmp_path, model, text):
+    write_colmap(tmp_path, model=model, text=text)
+    train, test = load(tmp_path, "train"), load(tmp_path, "test")
+    assert share_found(train, 0.02) > FOUND and share_found(test, 0.02) > FOUND
+    assert (train[0].mask is None) == (model in ("SIMPLE_PINHOLE", "PINHOLE"))
+    assert [frame.name for frame in test] == ["frame_5", "frame_13"]
+    assert not {frame.name for frame in train} & {frame.name for frame in test} and len(train) == 12
+    np.testing.assert_allclose(train.points, POINTS, atol=1e-6)
+    np.testing.assert_allclose(train.colors, COLORS / 255.0, atol=1e-6)
+    np.testing.assert_allclose(train[0].camera.viewmat, viewmat(0), atol=1e-6)
+    np.testing.assert_allclose(test.times, [4 / 13, 12 / 13], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["frame_9.png", "frame_10.png", "frame_12.png"], [0.0, 1 / 3, 1.0]),  # 11 was not registered
+        (["left/1.png", "left/2.png", "right/1.png"], [0.0, 1.0, 0.0]),
+        (["a.png", "b.png", "c.png"], [0.0, 0.5, 1.0]),
+        (["a1.png", "b.png", "c1.png"], [0.0, 0.5, 1.0]),
+        (["7.png", "b7.png", "c7.png"], [0.0, 0.5, 1.0]),
+        (["only 1.png"], [0.0]),
+    ],
+)
+def test_times_in_names(names, expected):
+    assert colmap.times_from_names(names) == pytest.approx(expected)
+
+
+def test_any_names(tmp_path):
+    names = ["Kamera A/Bild (3).png", "Kamera A/Bild (4).png", "π/x.png", "b b.png"]
+    write_colmap(tmp_path, count=4, names=lambda index: names[index])
+    assert share_found(load(tmp_path)) > FOUND
+    (tmp_path / "text").mkdir()
+    write_colmap(tmp_path / "text", count=4, names=lambda index: names[index], text=True)
+    assert {frame.name for frame in load(tmp_path / "text")} == {frame.name for frame in load(tmp_path)}
+
+
+def test_cameras_of_different_sizes(tmp_path):
+    """Phones and drones in one model: sizes may differ between images, not between an image and its camera."""
+    import pycolmap
+
+    write_colmap(tmp_path)
+    place = tmp_path / "sparse/0"
+    reconstruction = pycolmap.Reconstruction(str(place))
+    wide = pycolmap.Camera(
+        model="PINHOLE", width=WIDTH + 2, height=HEIGHT, params=K[[0, 1, 0, 1], [0, 1, 2, 2]], camera_id=9
+    )
+    reconstruction.add_camera_with_trivial_rig(wide)
+    image = pycolmap.Image(name="wide_99.png", camera_id=9, image_id=99)
+    view = viewmat(3)
+    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3]))
+    reconstruction.write_binary(str(place))
+    save_image(tmp_path / "images/wide_99.png", np.full((HEIGHT, WIDTH + 2, 3), 90, np.uint8))
+    data = load(tmp_path)
+    assert {frame.camera.width for frame in data} == {WIDTH, WIDTH + 2}
+
+
+def test_a_model_of_other_images(data_root):
+    folder = data_root / "colmap"
+    if not folder.is_dir():
+        pytest.skip("no such model here")
+    with pytest.raises(UserError, match=r"camera \d+, of \d+\.jpg, is of 269\d x 20\d\d pixels, but the image is 2704"):
+        load(folder)
+
+
+def test_a_video_is_the_same_from_transforms_and_from_colmap(data_root, tmp_path):
+    """The handheld video, and a model that pycolmap writes of its poses and points: the same frames to train on."""
+    import pycolmap
+
+    folder = data_root / "handheld"
+    if not folder.is_dir():
+        pytest.skip("no such video here")
+    reconstruction = pycolmap.Reconstruction()
+    splits = {split: load(folder, split, downscale=4, cache_mib=0) for split in ("train", "test")}
+    content = json.loads((folder / "transforms.json").read_text())
+    params = [content[key] for key in ("fl_x", "fl_y", "cx", "cy")]
+    camera = pycolmap.Camera(model="PINHOLE", width=content["w"], height=content["h"], params=params, camera_id=1)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for point, color in zip(splits["train"].points.tolist(), (splits["train"].colors * 255).round().byte().numpy()):
+        reconstruction.add_point3D(np.array(point), pycolmap.Track(), color)
+    entries = sorted((e for data in splits.values() for e in data.entries), key=lambda entry: entry.name)
+    for index, entry in enumerate(entries):
+        view = entry.camera.viewmat.double().numpy()
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3])
+        image = pycolmap.Image(name=f"{entry.name}.png", camera_id=1, image_id=index + 1)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    reconstruction.write_binary(str(tmp_path / "sparse/0"))
+    (tmp_path / "images").symlink_to((folder / "images").resolve())
+    for split, expected in splits.items():
+        data = load(tmp_path, split, downscale=4, cache_mib=0)
+        assert [frame.name for frame in data.entries] == [frame.name for frame in expected.entries]
+        torch.testing.assert_close(data.times, expected.times, atol=1e-6, rtol=0)
+        torch.testing.assert_close(data.points, expected.points)
+        for ours, theirs in zip(data, expected):
+            torch.testing.assert_close(ours.camera.viewmat, theirs.camera.viewmat, atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(ours.camera.K, theirs.camera.K)
+            assert torch.equal(ours.image, theirs.image) and torch.equal(ours.mask, theirs.mask)
+
+
+def model_text(file: str, edit):
+    def fault(folder: Path) -> None:
+        path = folder / "sparse/0" / file
+        path.write_text("".join(edit(path.read_text().splitlines(keepends=True))))
+
+    return fault
+
+
+def words(line: int, place: int, value: str):
+    def edit(lines: list[str]) -> list[str]:
+        data = [index for index, content in enumerate(lines) if not content.startswith("#")][line]
+        parts = lines[data].split()
+        parts[place] = value
+        lines[data] = " ".join(parts) + "\n"
+        return lines
+
+    return edit
+
+
+FAULTS = {
+    "nan": (model_text("images.txt", words(0, 2, "nan")), "images.txt: the pose of 'frame_1.png'"),
+    "quaternion": (model_text("images.txt", words(0, 2, "7.0")), "images.txt: the pose of 'frame_1.png'"),
+    "no number": (model_text("images.txt", words(0, 2, "x")), "images.txt: truncated or damaged"),
+    "camera": (model_text("images.txt", words(0, 8, "3")), "frame_1.png is of camera 3, which cameras.txt does"),
+    "outside": (
+        model_text("images.txt", words(0, 9, "../f.png")),
+        "name of an image is '../f.png', which leads out",
+    ),
+    "truncated": (model_text("images.txt", lambda lines: lines[:-1]), "its line of observations is missing"),
+    "empty": (text("sparse/0/images.txt", "# nothing\n"), "no image is registered"),
+    "model": (model_text("cameras.txt", words(0, 1, "PLATE")), "camera '7' is of no model that is known"),
+    "params": (model_text("cameras.txt", words(0, 1, "OPENCV")), "camera '7' has 4 parameters, but OPENCV"),
+    "focal": (model_text("cameras.txt", words(0, 4, "-3")), "the focal length is not positive"),
+    "size": (model_text("cameras.txt", words(0, 2, "81")), "is of 81 x 60 pixels, but the image is 80 x 60"),
+    "binary": (lambda folder: (folder / "sparse/0/images.txt").write_bytes(b"\xff\xfe\x80"), "truncated or damaged"),
+    "points": (model_text("points3D.txt", words(0, 2, "far")), "points3D.txt: truncated or damaged"),
+    "no image": (gone("images/frame_3.png"), "frame_3.png: no such image, though the model has it (1 of 14"),
+    "undecodable": (noise("images/frame_3.png"), "frame_3.png: not an image"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_named(tmp_path, fault):
+    edit, expected = FAULTS[fault]
+    write_colmap(tmp_path, text=True)
+    edit(tmp_path)
+    assert expected in message(tmp_path)
+
+
+def test_one_frame_cannot_be_split(tmp_path):
+    write_colmap(tmp_path, count=1)
+    assert "one frame cannot be both" in message(tmp_path)

@@ -1,0 +1,90 @@
+"""The layout of Neural 3D Video: a rig of cameras, reduced images, faults."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from helpers.data_faults import NAN, gone, message, noise
+from helpers.layouts import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    share_found,
+    viewmat,
+    write_poses_bounds,
+)
+from scgs_warp.data import load
+from scgs_warp.errors import UserError
+
+FOUND = 0.75
+"""Share of the points whose colour is at their pixel; the others hide."""
+
+
+@pytest.mark.parametrize("inner", ["images", "."])
+def test_poses_bounds(tmp_path, inner):
+    write_poses_bounds(tmp_path, inner=inner)
+    train, test = load(tmp_path, "train"), load(tmp_path, "test")
+    assert share_found(train) > FOUND and share_found(test) > FOUND
+    assert [frame.name for frame in test] == ["cam00_0000", "cam00_0001", "cam00_0002"]
+    assert train.times.tolist() == [0.0, 0.5, 1.0] * 3 and len(train) == 9
+    np.testing.assert_allclose(test[0].camera.viewmat, viewmat(0, 0.4), atol=1e-6)
+
+
+def test_poses_bounds_of_reduced_images(tmp_path):
+    write_poses_bounds(tmp_path)
+    for file in tmp_path.glob("cam*/images/*.png"):
+        image = cv2.imread(str(file))
+        cv2.imwrite(str(file), cv2.resize(image, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA))
+    camera = load(tmp_path)[0].camera
+    assert [float(camera.K[0, 0]), float(camera.K[1, 2])] == [FOCAL / 2, HEIGHT / 4]
+
+
+def test_videos_are_to_be_unpacked(tmp_path):
+    write_poses_bounds(tmp_path)
+    for camera in range(4):
+        for file in (tmp_path / f"cam{camera:02d}/images").iterdir():
+            file.unlink()
+        (tmp_path / f"cam{camera:02d}.mp4").write_bytes(b"film")
+    with pytest.raises(UserError, match=r"cam00\.mp4: a video, not images; .*ffmpeg -i"):
+        load(tmp_path)
+
+
+def bounds(edit):
+    def fault(folder: Path) -> None:
+        rows = np.load(folder / "poses_bounds.npy")
+        np.save(folder / "poses_bounds.npy", edit(rows))
+
+    return fault
+
+
+def entry(row: int, column: int, value: float):
+    def edit(rows: np.ndarray) -> np.ndarray:
+        rows[row, column] = value
+        return rows
+
+    return bounds(edit)
+
+
+FAULTS = {
+    "damaged": (noise("poses_bounds.npy"), "poses_bounds.npy: no sound"),
+    "shape": (bounds(lambda rows: rows[:, :15]), "has shape [4, 15]"),
+    "rows": (bounds(lambda rows: rows[:3]), "has 3 rows, but"),
+    "nan": (entry(1, 0, NAN), "row 1 holds a matrix that is not a finite rotation"),
+    "scaled": (entry(2, 0, 5.0), "row 2 holds a matrix that is not a finite rotation"),
+    "focal": (entry(1, 14, 0.0), "row 1 has a non-positive"),
+    "aspect": (entry(1, 9, 300.0), "row 1 is of 300 x 60 pixels, but the images are 80 x 60"),
+    "one camera less": (gone("cam01/images/0002.png"), "cam01/images: holds 2 images, but images 3"),
+    "undecodable": (noise("cam01/images/0001.png"), "0001.png: not an image"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_named(tmp_path, fault):
+    edit, expected = FAULTS[fault]
+    write_poses_bounds(tmp_path)
+    edit(tmp_path)
+    assert expected in message(tmp_path)
