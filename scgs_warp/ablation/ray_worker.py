@@ -19,7 +19,7 @@ from typing import Any
 from .. import __version__
 from ..errors import UserError
 from ..runtime import environment, memory
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from ..training.run_folder import LOCK
 from .cells import LOG, attempt, cell_from_json
 

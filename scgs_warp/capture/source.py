@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol
 import cv2
 import numpy as np
 
-from ..data.images import bomb, whole
+from ..data.images import bomb, size_text, whole
+from ..data.natural_order import natural
 from ..errors import UserError
-from ..storage.files import natural, size_text
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20

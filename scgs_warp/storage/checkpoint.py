@@ -19,7 +19,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ..errors import UserError
-from .files import parse_json
+from . import files
+from .json_files import parse_json
 
 FILE = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
@@ -37,57 +38,6 @@ WORDS = ""
 
 class DamagedCheckpoint(UserError):
     """The newest checkpoint cannot be used; the one before may be sound (:func:`fall_back`)."""
-
-
-def temporary_of(path: Path) -> Path:
-    """What ``path`` is called while it is written: one name, so that those who are killed leave one file, not many."""
-    return path.with_name(f".{path.name}.tmp")
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames in ``folder`` outlast a loss of power, where the system can do that."""
-    with suppress(OSError):  # not on Windows, nor on every network share
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
-
-
-def _write_through(path: Path, content: bytes) -> None:
-    """All of it, on the disk when this returns; on any exception there is no such file.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    try:
-        path.unlink(missing_ok=True)  # in a stranger's folder it may be a link to somewhere else
-        with open(path, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-    except BaseException:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
-        raise
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write beside, flush to disk, rename: a reader sees the old file or the new one, never half of it, also after a
-    loss of power.
-
-    Raises:
-        UserError: the disk is full or the folder cannot be written; the old file is intact.
-    """
-    temporary = temporary_of(path)
-    try:
-        _write_through(temporary, content)
-        os.replace(temporary, path)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise UserError(f"{path}: cannot be written ({error.strerror}); the previous file is intact") from error
-    sync_folder(path.parent)
 
 
 def _sum_of_words(metadata: Mapping[str, Any]) -> int:
@@ -117,15 +67,15 @@ def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, An
     text = json.dumps({**words, "crc32": sums}, sort_keys=True, separators=(",", ":"))
     content = save(saved, {METADATA_KEY: text})
     path = folder / FILE
-    temporary = temporary_of(path)
+    temporary = files.temporary_of(path)
     try:
         try:
-            _write_through(temporary, content)
+            files.write_and_flush(temporary, content)
         except OSError as error:
             if error.errno not in NO_ROOM or not os.path.exists(path):
                 raise
             (folder / PREVIOUS).unlink(missing_ok=True)  # room for two, not for three
-            _write_through(temporary, content)
+            files.write_and_flush(temporary, content)
         if os.path.exists(path):
             _name_also(path, folder / PREVIOUS)
         os.replace(temporary, path)
@@ -138,12 +88,12 @@ def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, An
             else "nothing is saved yet: make room or choose another --output"
         )
         raise UserError(f"{path}: cannot be written ({error.strerror}); {remedy}") from error
-    sync_folder(folder)
+    files.sync_folder(folder)
 
 
 def _name_also(path: Path, name: Path) -> None:
     """Let ``name`` be what ``path`` is; where there can be no hard links, a copy of it."""
-    temporary = temporary_of(name)
+    temporary = files.temporary_of(name)
     with suppress(OSError):  # then there is no previous checkpoint; the newest is written all the same
         temporary.unlink(missing_ok=True)
         try:
@@ -219,7 +169,7 @@ def fall_back(folder: Path, error: DamagedCheckpoint) -> str:
         path.stat()
     except OSError as failure:
         raise UserError(f"{path}: cannot be replaced ({failure.strerror}); make the folder writable") from error
-    sync_folder(folder)
+    files.sync_folder(folder)
     return f"{path}: damaged (kept as {DAMAGED}); training goes on from {PREVIOUS}, step {step}"
 
 

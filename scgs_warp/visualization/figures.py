@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
-from ..storage.checkpoint import write_atomically
-from ..storage.files import as_number, parse_json
+from ..storage.files import write_atomically
+from ..storage.json_files import as_number, parse_json
 
 NUMBERS, LARGEST = ("step", "seconds"), 1e9
 """Fields of a log line without which it cannot be placed, and the largest value that they can have."""

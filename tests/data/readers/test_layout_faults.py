@@ -18,7 +18,7 @@ from helpers.nerfstudio_files import write as write_nerfstudio
 from scgs_warp.data import load
 from scgs_warp.data.readers.colmap_model import read_model
 from scgs_warp.errors import UserError
-from scgs_warp.storage.files import read_npy
+from scgs_warp.storage.numpy_files import read_npy
 
 NAN = float("nan")
 
