@@ -66,7 +66,7 @@ def _chunks(ends: np.ndarray) -> list[Chunk]:
     return [(begin, end - begin) for begin, end in zip(begins, ends.tolist())]
 
 
-class _Helpers:
+class HelperThreads:
     """Threads that wait for work for as long as the process lives."""
 
     def __init__(self, flush_denormals: bool) -> None:
@@ -92,13 +92,13 @@ class _Helpers:
             job()
 
 
-_helpers = _Helpers(False)
+helpers = HelperThreads(False)
 
 
 def _forked() -> None:
     """A child process has none of its parent's threads."""
-    global _helpers
-    _helpers = _Helpers(_helpers.flush_denormals)
+    global helpers
+    helpers = HelperThreads(helpers.flush_denormals)
 
 
 if hasattr(os, "register_at_fork"):
@@ -111,11 +111,11 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
     Returns when all are done. It waits for chunks, not for threads: a helper that wakes up late finds nothing left and
     holds up nobody, nor does it hold on to ``call`` and its tensors: their memory is wanted by what comes next.
     """
-    global _helpers
+    global helpers
     flush = environment.configured()
-    if _helpers.flush_denormals != flush:
-        _helpers.dismiss()
-        _helpers = _Helpers(flush)
+    if helpers.flush_denormals != flush:
+        helpers.dismiss()
+        helpers = HelperThreads(flush)
     ticket, finished, all_done = itertools.count(), itertools.count(1), threading.Lock()
     all_done.acquire()
     errors: list[BaseException] = []
@@ -136,7 +136,7 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
         work()
         left.release()
 
-    _helpers.submit(help_out, copies)
+    helpers.submit(help_out, copies)
     try:
         work()
         all_done.acquire()

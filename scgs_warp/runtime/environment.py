@@ -27,6 +27,24 @@ def prepare_environment() -> None:
     os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
 
 
+def init_warp() -> None:
+    """Initialise Warp without its banner, and without the CUDA driver's message on a machine that has no GPU."""
+    import warp as wp
+
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    if os.path.exists("/dev/nvidiactl") or os.name != "posix":
+        wp.init()
+        return
+    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)  # the driver's message comes from C
+    try:
+        os.dup2(sink, 2)
+        wp.init()
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)
+
+
 def available_threads() -> int:
     """Cores this process may use: those it may run on, and no more than a container's share of processor time."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
