@@ -11,7 +11,7 @@ from ..runtime import debug
 from ..runtime.launch import launch
 from ..types import Splats, Tiles
 from . import checks, memory_windows
-from .binning_cuda import MAX_PAIRS, RadixCount, geometry_of
+from .binning_cuda import MAX_PAIRS, RadixBinning, geometry_of
 from .memory_windows import Demand, Window
 
 CHUNK_SIZE = 1024
@@ -70,23 +70,23 @@ def bin_window(splats: Splats, tiles: Tiles, window: Window) -> Tiles:
     return _listed(splats, size, _count(splats, size, window))
 
 
-def _count(splats: Splats, size: tuple[int, ...], window: Window) -> BandCount | RadixCount:
-    counted = BandCount if splats.means2d.device.type == "cpu" else RadixCount
+def _count(splats: Splats, size: tuple[int, ...], window: Window) -> BandBinning | RadixBinning:
+    counted = BandBinning if splats.means2d.device.type == "cpu" else RadixBinning
     return counted(geometry_of(splats), size, window)
 
 
-def _listed(splats: Splats, size: tuple[int, int, int, int, int], count: BandCount | RadixCount) -> Tiles:
+def _listed(splats: Splats, size: tuple[int, int, int, int, int], count: BandBinning | RadixBinning) -> Tiles:
     tiles = Tiles(*count.lists(), *size)
     if debug.enabled():
         checks.check_tiles(splats, tiles)
     return tiles
 
 
-class BandCount:
+class BandBinning:
     """On a CPU, a ``bands.Count``: what each splat touches, to be dealt to the rows of tiles, each of which is sorted
     by itself; see ``kernels.binning_cpu``."""
 
-    most = MAX_PAIRS
+    max_entries = MAX_PAIRS
 
     def __init__(self, geometry: list[Tensor], size: tuple[int, ...], window: Window) -> None:
         count, (_, _, columns, rows, _) = len(geometry[0]), size
@@ -106,12 +106,12 @@ class BandCount:
         self.entries = max(self.pairs, self._stretches)
 
     @property
-    def kept(self) -> int:
+    def list_bytes(self) -> int:
         rows, columns = self._tiles
         return 8 * self.pairs + 8 * len(self._geometry[0]) + 8 * rows * columns
 
     @property
-    def scratch(self) -> int:
+    def scratch_bytes(self) -> int:
         rows, columns = self._tiles
         return 32 * self._stretches + 4 * self._begins.numel() + 4 * rows * columns
 

@@ -1,6 +1,6 @@
 """Splats to tiles on CUDA: a radix sort of the splats by depth, then one of all pairs by tile.
 
-Two ways in. ``RadixCount`` asks the device for the number of pairs, once, in the middle. ``bin_within`` never asks:
+Two ways in. ``RadixBinning`` asks the device for the number of pairs, once, in the middle. ``bin_within`` never asks:
 it has room for so many pairs and says afterwards, on the device, how many there were. Both run on a CPU as well, where
 they are tested.
 """
@@ -61,10 +61,10 @@ def bin_within(
     return tiles, total
 
 
-class RadixCount:
+class RadixBinning:
     """On a GPU, a ``bands.Count``: as many pairs as there are, which takes one wait."""
 
-    most = MAX_ROOM
+    max_entries = MAX_ROOM
 
     def __init__(self, geometry: list[Tensor], size: tuple[int, ...], window: tuple[int, int]) -> None:
         self._geometry, self._size = geometry, (*size, *window)
@@ -73,11 +73,11 @@ class RadixCount:
         self.pairs = self.entries = int(self._offsets[-1])
 
     @property
-    def kept(self) -> int:
+    def list_bytes(self) -> int:
         return 12 * self.pairs + 8 * len(self._counts) + 8 * self._size[2] * self._size[3]
 
     @property
-    def scratch(self) -> int:
+    def scratch_bytes(self) -> int:
         return 16 * self.pairs + 12 * len(self._counts)
 
     def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

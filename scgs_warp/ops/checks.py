@@ -12,7 +12,7 @@ UNWRITTEN = -1
 """In debug mode, what lists hold before they are written."""
 UNWRITTEN_BITS = 0x7FABCDEF
 """The same of gradient slots: a NaN that no arithmetic makes."""
-LARGEST = 1e30
+SAFE_MAGNITUDE = 1e30
 """Beyond this, sums of finite values need not be finite."""
 
 
@@ -128,7 +128,7 @@ def check_image(image: Tensor, channels: Tensor, background: Tensor) -> None:
         BrokenInvariant: the image is not finite, although what it is made of is.
     """
     finite = channels[channels.isfinite()]
-    if _tame(finite, background):
+    if _safe(finite, background):
         expect(image.isfinite(), "an image of finite colours is finite")
 
 
@@ -147,11 +147,11 @@ def check_gradients(gradients: tuple[Tensor | None, ...], v_image: Tensor, v_alp
     Raises:
         BrokenInvariant: a gradient is not finite, although what came in is.
     """
-    if _tame(v_image, v_alpha):
+    if _safe(v_image, v_alpha):
         for gradient in gradients:
             expect(gradient is None or gradient.isfinite(), "gradients of finite gradients are finite")
 
 
-def _tame(*tensors: Tensor) -> bool:
+def _safe(*tensors: Tensor) -> bool:
     """Finite, and far from the largest numbers."""
-    return all(bool((tensor.abs() <= LARGEST).all()) for tensor in tensors)
+    return all(bool((tensor.abs() <= SAFE_MAGNITUDE).all()) for tensor in tensors)

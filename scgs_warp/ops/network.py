@@ -13,14 +13,14 @@ from ..kernels.cpu import network_adjoint as kernels_adjoint
 from ..kernels.cpu.network_panels import BLOCK, PANEL
 from ..runtime.launch import launch
 
-ROWS = 8
+ROW_MULTIPLE = 8
 """Matrices have a multiple of this many rows."""
 
-LARGEST = 8192
+ROWS_AT_ONCE = 8192
 """Rows evaluated at once where no gradient is wanted: what they pass from layer to layer stays in the cache."""
 
 
-LARGEST_ADJOINT = 2048
+ADJOINT_ROWS_AT_ONCE = 2048
 """The same for the adjoint; the bits do not depend on it."""
 
 
@@ -64,7 +64,7 @@ class Layers:
     def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Inputs and hidden values in panels, and the outputs [T M, out]."""
         count = where.shape[0] * when.shape[0]
-        rows = -(-count // ROWS) * ROWS
+        rows = -(-count // ROW_MULTIPLE) * ROW_MULTIPLE
         inputs = torch.empty(-(-self.inputs // PANEL), rows, PANEL)
         launch(kernels.pack_inputs, rows, where, when, inputs)
         hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * PANEL)
@@ -83,10 +83,10 @@ class Layers:
         table = self.table.clone()
         table[:, 8] = torch.tensor(self.gradient_begin) * flat.element_size() + flat.data_ptr()
         v_inputs = None if sizes is None else torch.empty(count, sizes[2])
-        v_hidden = torch.empty(layers, min(rows, LARGEST_ADJOINT), hidden.shape[2])
+        v_hidden = torch.empty(layers, min(rows, ADJOINT_ROWS_AT_ONCE), hidden.shape[2])
         parts = 2
-        for begin in range(0, rows, LARGEST_ADJOINT):
-            own = min(LARGEST_ADJOINT, rows - begin)
+        for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
+            own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
             grid, where = -(-own // BLOCK), (BLOCK, begin, table, self.packed)
             launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
             if v_inputs is not None:
@@ -186,12 +186,12 @@ def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Ten
 
 def evaluate(layers: Layers, where: Tensor, when: Tensor) -> Tensor:
     """:func:`network` without gradients, of weights that are packed already."""
-    if where.shape[0] * when.shape[0] <= LARGEST:
+    if where.shape[0] * when.shape[0] <= ROWS_AT_ONCE:
         return layers.values(where, when, keep=False)[2]
     parts = [
         layers.values(rows, when[t : t + 1], keep=False)[2]
         for t in range(when.shape[0])
-        for rows in where.split(LARGEST)
+        for rows in where.split(ROWS_AT_ONCE)
     ]
     return torch.cat(parts)
 

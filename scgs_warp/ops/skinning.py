@@ -148,7 +148,7 @@ def skin(
     return _Skin.apply(*values, indices, lists)  # type: ignore[return-value]
 
 
-NEAR = 0.7072
+SAME_SIDE = 0.7072
 """Unit quaternions whose first component is at least this are less than 45 degrees from the identity (as directions in
 four dimensions), and so on the same side as each other."""
 
@@ -175,7 +175,7 @@ def _palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None)
         *(log_scales, int(log_scales is not None), motion, reach),
         grain=128,
     )
-    return _Palette(motion, reach, int(bool((motion[:, 12] > NEAR).all())))
+    return _Palette(motion, reach, int(bool((motion[:, 12] > SAME_SIDE).all())))
 
 
 class _SkinRbf(torch.autograd.Function):

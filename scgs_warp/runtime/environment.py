@@ -48,11 +48,11 @@ def init_warp() -> None:
 def available_threads() -> int:
     """Cores this process may use: those it may run on, and no more than a container's share of processor time."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.ceil(min(cores, _quota())))
+    return max(1, math.ceil(min(cores, container_quota())))
 
 
 @functools.cache
-def _quota(folder: str = "/sys/fs/cgroup") -> float:
+def container_quota(folder: str = "/sys/fs/cgroup") -> float:
     """Processors' worth of time that the control group grants (Linux); infinite where nothing is said."""
     for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):  # version 2, version 1
         try:

@@ -137,7 +137,7 @@ class Progress:
         return "  ".join(f"{name} {_text(value)}" for name, value in self.fields.items() if value is not None)
 
 
-class _Lines(Progress):
+class _LogLines(Progress):
     """For log files: one plain line from time to time."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
@@ -165,7 +165,7 @@ class _Lines(Progress):
         self._line(f"{rate:.1f} it/s  {'done' if completed else 'stopped'} after {clock(elapsed)}")
 
 
-class _Bar(Progress):
+class _TerminalBar(Progress):
     """For terminals, drawn by rich. Refreshed from ``advance``: no thread of its own that would compete for a core."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
@@ -216,7 +216,7 @@ def progress(total: int, description: str, *, start: int = 0, stream: TextIO | N
         An object whose ``advance(n=1, **fields)`` is to be called as the work proceeds.
     """
     shown_on: TextIO = stream or sys.stdout or open(os.devnull, "w")  # a daemon may have no standard output
-    shown = (_Bar if shown_on.isatty() else _Lines)(total, description, shown_on, start)
+    shown = (_TerminalBar if shown_on.isatty() else _LogLines)(total, description, shown_on, start)
     try:
         yield shown
     except BaseException:

@@ -252,17 +252,17 @@ def test_every_view_once_an_epoch():
         assert sorted(seen) == list(range(6))
 
 
-def test_place(monkeypatch):
+def test_rank_of_a_process(monkeypatch):
     for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR"):
         monkeypatch.delenv(name, raising=False)
-    assert torchrun.place() is None and torchrun.label() == ""
-    with team_of(torchrun.place(), "cpu") as team:
+    assert torchrun.process_rank() is None and torchrun.process_label() == ""
+    with team_of(torchrun.process_rank(), "cpu") as team:
         assert team is None
     values = {"RANK": "3", "WORLD_SIZE": "8", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "localhost"}
     for name, value in values.items():
         monkeypatch.setenv(name, value)
-    found = torchrun.place()
-    assert found == torchrun.Place(3, 8, 1, 2) and torchrun.label() == " (process 3 of 8)"
+    found = torchrun.process_rank()
+    assert found == torchrun.ProcessRank(3, 8, 1, 2) and torchrun.process_label() == " (process 3 of 8)"
     monkeypatch.setattr(torchrun, "available_threads", lambda: 7)
     assert found.threads == 3
     monkeypatch.setattr(torchrun, "available_threads", lambda: 1)
@@ -270,7 +270,7 @@ def test_place(monkeypatch):
     for name, value in (("LOCAL_RANK", "2"), ("RANK", "8"), ("LOCAL_WORLD_SIZE", "two")):
         with monkeypatch.context() as patch, pytest.raises(UserError, match="torchrun"):
             patch.setenv(name, value)
-            torchrun.place()
+            torchrun.process_rank()
     monkeypatch.delenv("LOCAL_RANK")
     with pytest.raises(UserError, match="LOCAL_RANK"):
-        torchrun.place()
+        torchrun.process_rank()
