@@ -82,7 +82,7 @@ def _blocks(points: Tensor) -> int:
     return -(-points.shape[0] // neighbors.LANES)
 
 
-class _Lists(NamedTuple):
+class CandidateLists(NamedTuple):
     """Candidate nodes of every block of sixteen points, with the nodes' positions at the time of the search."""
 
     k: int
@@ -111,8 +111,10 @@ class NeighborSearch:
     """
 
     def __init__(self) -> None:
-        self._lists: _Lists | None = None
-        self._searched = 0
+        self.lists: CandidateLists | None = None
+        """Candidates in use."""
+        self.full_searches = 0
+        """Number of blocks searched in full since the lists were made."""
 
     def __call__(self, points: Tensor, nodes: Tensor, k: int) -> Tensor:
         """Return exactly the indices of ``nearest(points, nodes, k)``, [N, k] int32.
@@ -125,21 +127,21 @@ class NeighborSearch:
             return nearest(points, nodes, k)[0]
         blocks = _blocks(points)
         # New lists cost about as much as a full search of every block: they are due after as many full searches.
-        own = self._lists  # read once: another thread may replace them
-        if own is None or self._searched > blocks or not own.fit(points, nodes, k):
+        own = self.lists  # read once: another thread may replace them
+        if own is None or self.full_searches > blocks or not own.fit(points, nodes, k):
             indices, distances = nearest(points, nodes, k)
-            self._lists, self._searched = _make_lists(points, nodes, distances), 0
+            self.lists, self.full_searches = _make_lists(points, nodes, distances), 0
             return indices
         shift, failed = torch.empty(1), torch.empty(blocks, dtype=torch.int32)
         launch(neighbor_lists.largest_shift, 1, own.nodes, nodes, shift)
         indices = torch.empty(points.shape[0], k, dtype=torch.int32)
         lists = own.order, own.centres, own.counts, own.lists, shift
         launch(neighbors.nearest_listed, blocks, points, nodes, k, *lists, indices, failed, grain=16)
-        self._searched += int(failed.sum())
+        self.full_searches += int(failed.sum())
         return indices
 
 
-def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> _Lists:
+def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> CandidateLists:
     codes = torch.empty(points.shape[0], dtype=torch.int32)
     corners = torch.zeros(2, 3)
     if points.shape[0]:
@@ -153,7 +155,7 @@ def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> _Lists:
     lists = torch.empty(blocks, int(neighbor_lists.LIST_SIZE), dtype=torch.int32)
     columns = nodes.T.contiguous()
     launch(neighbor_lists.list_blocks, blocks, points, columns, order, distances, centres, counts, lists, grain=16)
-    return _Lists(distances.shape[1], order, centres, counts, lists, nodes.clone())
+    return CandidateLists(distances.shape[1], order, centres, counts, lists, nodes.clone())
 
 
 def _node_sums(

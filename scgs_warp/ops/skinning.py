@@ -56,10 +56,10 @@ class _Skin(torch.autograd.Function):
 
 
 def _skin_lanes(means, quats, nodes, translations, rotations, shapes, log_scales, weights, indices) -> tuple:
-    """Run ``skin`` without gradients, on a CPU."""
+    """Run ``skin`` on a CPU, without gradients."""
     scaled = int(log_scales is not None)
     outputs = _like(means, quats, means if scaled else None)
-    palette = _palette(nodes, (translations, rotations, shapes, log_scales))
+    palette = pack_palette(nodes, (translations, rotations, shapes, log_scales))
     launch(skinning.skin_lanes, _lanes(means), means, quats, *palette, scaled, indices, weights, *outputs, grain=32)
     return tuple(outputs)
 
@@ -153,7 +153,7 @@ SAME_SIDE = 0.7072
 dimensions), hence less than 90 degrees from each other."""
 
 
-class _Palette(NamedTuple):
+class Palette(NamedTuple):
     """The control points as rows, for the SIMD kernels."""
 
     motion: Tensor
@@ -162,7 +162,7 @@ class _Palette(NamedTuple):
     """1 if all shape rotations are less than 90 degrees apart: no sign has to be flipped. Saves time, same result."""
 
 
-def _palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None) -> _Palette:
+def pack_palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None) -> Palette:
     """Pack contiguous tensors; ``pose`` is translations, rotations, shape rotations and log scales."""
     translations, rotations, shapes, log_scales = pose
     count = nodes.shape[0]
@@ -175,7 +175,7 @@ def _palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None)
         *(log_scales, int(log_scales is not None), motion, reach),
         grain=128,
     )
-    return _Palette(motion, reach, int(bool((motion[:, 12] > SAME_SIDE).all())))
+    return Palette(motion, reach, int(bool((motion[:, 12] > SAME_SIDE).all())))
 
 
 class _SkinRbf(torch.autograd.Function):
@@ -183,7 +183,7 @@ class _SkinRbf(torch.autograd.Function):
     def forward(ctx: Any, means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose_and_indices):
         *pose, indices = pose_and_indices
         has_hyper, has_strengths, has_log_scales = (int(value is not None) for value in (hyper, strengths, pose[3]))
-        palette = _palette(nodes, tuple(pose), radii, strengths, hyper_nodes)
+        palette = pack_palette(nodes, tuple(pose), radii, strengths, hyper_nodes)
         weights = torch.empty(indices.shape)
         outputs = _like(means, quats, means if has_log_scales else None)
         launch(
