@@ -86,15 +86,15 @@ class GaussianParameters(nn.Module):
         return Gaussians(self.means, self.quats, self.scales(), self.opacities(), self.sh_dc, self.sh_rest)
 
 
-def neighbor_distance(points: Tensor, count: int = 3) -> Tensor:
-    """Return the root mean squared distance of each point to its ``count`` nearest neighbours, [N].
+def neighbor_distance(points: Tensor) -> Tensor:
+    """Return the root mean squared distance of each point to its three nearest neighbours, [N].
 
     Distances are at least 1e-3; that of a lone point is 1e-2.
     """
     total = points.shape[0]
     if total <= 1:
         return torch.full((total,), 1e-2, device=points.device)
-    count = min(count, total - 1)
+    count = min(3, total - 1)
     array = points.detach().cpu().double().numpy()
     distances, _ = KDTree(array).query(array, k=count + 1)
     mean = torch.from_numpy((distances[:, 1:] ** 2).mean(axis=1) ** 0.5)

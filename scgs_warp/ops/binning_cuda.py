@@ -25,16 +25,13 @@ MAX_ROOM = MAX_PAIRS // 2
 """Largest number of pairs that a radix sort can hold: its lists are twice as long."""
 
 
-def bin_within(
-    splats: Splats, capacity: int, *, slots: bool = True, tile_size: int = TILE_SIZE
-) -> tuple[Tiles, Tensor]:
+def bin_within(splats: Splats, capacity: int, *, slots: bool = True) -> tuple[Tiles, Tensor]:
     """Bin splats without waiting for the device: the size of every buffer follows from the arguments.
 
     Args:
         splats: N projected Gaussians, on any device; shapes are not checked.
         capacity: number of pairs of splat and tile that the lists hold, at least 1.
         slots: whether to make ``Tiles.slots``, which compositing needs for gradients only; otherwise it is empty.
-        tile_size: side of a tile in pixels.
 
     Returns:
         Tiles whose lists have ``capacity`` entries, and the true number of pairs, int64 [1] on the device. If it is
@@ -46,8 +43,8 @@ def bin_within(
     """
     if not 1 <= capacity <= MAX_ROOM:
         raise ValueError(f"capacity must be in 1 .. {MAX_ROOM}, got {capacity}")
-    columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
-    size = (splats.width, splats.height, columns, rows, tile_size)
+    columns, rows = -(-splats.width // TILE_SIZE), -(-splats.height // TILE_SIZE)
+    size = (splats.width, splats.height, columns, rows, TILE_SIZE)
     geometry = geometry_of(splats)
     whole = (*size, 0, columns * rows)
     counts, order = _count(geometry, whole)

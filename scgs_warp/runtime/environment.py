@@ -94,7 +94,7 @@ def _keep_freed_memory() -> None:
     mallopt(trim_threshold, 1 << 30)
 
 
-def configure(threads: int | None = None, deterministic: bool = True) -> None:
+def configure(threads: int | None = None) -> None:
     """Set the number of CPU threads for Warp and torch, flush denormals to zero, choose deterministic algorithms.
 
     Call it before the first tensor operation: OpenMP's workers inherit the flush-to-zero mode from the thread that
@@ -102,7 +102,6 @@ def configure(threads: int | None = None, deterministic: bool = True) -> None:
 
     Args:
         threads: number of CPU threads. None: all available ones.
-        deterministic: whether torch uses its deterministic algorithms.
     """
     global _threads, _configured
     import numpy as np
@@ -114,7 +113,7 @@ def configure(threads: int | None = None, deterministic: bool = True) -> None:
     _keep_freed_memory()
     torch.set_flush_denormal(True)
     torch.set_num_threads(thread_count())
-    torch.use_deterministic_algorithms(deterministic, warn_only=True)
+    torch.use_deterministic_algorithms(True, warn_only=True)
     # This switch would make torch.empty fill every buffer with NaN; the kernels write all they allocate.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 
