@@ -11,7 +11,7 @@ from typing import Literal
 
 from scgs_warp.errors import UserError, is_shortage, one_line
 from scgs_warp.runtime import environment
-from scgs_warp.runtime.torchrun import label
+from scgs_warp.runtime.torchrun import process_label
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -42,7 +42,7 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
     try:
         main(args)
     except UserError as error:
-        _tell(f"error{label()}: {one_line(error)}")
+        _tell(f"error{process_label()}: {one_line(error)}")
         return 2
     except OSError as error:
         if isinstance(error, BrokenPipeError):  # the reader (head, a pager) has seen enough
@@ -53,7 +53,7 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
     except (MemoryError, RuntimeError) as error:
         if not is_shortage(error):
             raise
-        _tell(f"error{label()}: there is not enough memory for this; free some, or give less at once")
+        _tell(f"error{process_label()}: there is not enough memory for this; free some, or give less at once")
         return 2
     except KeyboardInterrupt:
         _tell("interrupted")
@@ -72,5 +72,5 @@ def prepare(device: Device, threads: int | None, memory_gib: float | None = None
         from scgs_warp.runtime import memory
 
         memory.set_limit(memory_gib)
-        os.environ[memory.VARIABLE] = str(memory_gib)  # for processes of our own, too
+        os.environ[memory.LIMIT_VARIABLE] = str(memory_gib)  # for processes of our own, too
     return choose_device(device)

@@ -58,7 +58,7 @@ def load_data(scene: Scene, options: Options) -> Dataset:
 
 def training_seconds(folder: Path) -> float | None:
     """What ``metrics.json`` of the run says; None if it does not."""
-    from scgs_warp.storage.files import as_number, parse_json
+    from scgs_warp.storage.json_files import as_number, parse_json
 
     try:
         value = parse_json((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]

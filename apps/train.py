@@ -12,7 +12,7 @@ import tyro
 from scgs_warp.apps.cli import prepare, run
 from scgs_warp.apps.settings import BUILTIN, Settings, builtin_scene, configuration
 from scgs_warp.config.presets import MotionName
-from scgs_warp.runtime.torchrun import place
+from scgs_warp.runtime.torchrun import process_rank
 
 if TYPE_CHECKING:
     from scgs_warp.data import Dataset
@@ -53,7 +53,7 @@ def default_output(options: Options) -> Path:
 
 def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="train.py")
-    where = place()
+    where = process_rank()
     threads = where.threads if where and options.threads is None else options.threads
     device = prepare(options.device, threads, options.memory_gib)
     output = options.output or default_output(options)

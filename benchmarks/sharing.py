@@ -32,7 +32,7 @@ from scgs_warp.benchmark.scenes import synthetic_scene, training_data, training_
 from scgs_warp.benchmark.timing import machine, now
 from scgs_warp.optim import Adam
 from scgs_warp.runtime import environment
-from scgs_warp.runtime.torchrun import place
+from scgs_warp.runtime.torchrun import process_rank
 from scgs_warp.training import step as training
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.process_group import Team, team_of
@@ -96,7 +96,7 @@ def main(arguments: list[str] | None) -> None:
     parser.add_argument("--threads", type=int)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    where = place()
+    where = process_rank()
     device = prepare(options.device, where.threads if where and options.threads is None else options.threads)
     with team_of(where, device) as team:
         scene = synthetic_scene("control-points", options.gaussians, options.nodes, device)

@@ -1,6 +1,6 @@
 """scgs_warp: Sparse-Controlled Gaussian Splatting (SC-GS) on NVIDIA Warp, for the CPU and CUDA.
 
-Importing this package is cheap; torch and Warp are loaded when one of the names below is first used.
+Importing the package is cheap: torch and Warp are loaded when one of its names is first used.
 """
 
 from __future__ import annotations

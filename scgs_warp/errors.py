@@ -1,16 +1,16 @@
-"""What the user did wrong, said in one line; apps turn it into exit status 2."""
+"""Errors of the user's input, told in one line; apps turn them into exit status 2."""
 
 from __future__ import annotations
 
-LONGEST = 1000
-"""Letters of a message: names and reasons in it may come from anywhere."""
+MAX_MESSAGE = 1000
+"""Largest length of a message: names and reasons in it may come from any file."""
 
 
 class UserError(Exception):
     """A mistake in the user's input: the message names the file, the field and the remedy, in one line.
 
-    What it quotes may come from a stranger's file: line breaks become spaces, and what a terminal might obey
-    (escape sequences, marks that turn the direction of writing) is shown as Python would write it.
+    Quoted text may come from a stranger's file: line breaks become spaces, and characters that a terminal might obey
+    (escape sequences, marks of writing direction) are shown as Python escapes.
     """
 
     def __init__(self, message: str) -> None:
@@ -18,24 +18,24 @@ class UserError(Exception):
 
 
 def printable(text: object) -> str:
-    """In one line of a bearable length, without what a terminal might obey."""
+    """Return the text as one line of bounded length, without characters that a terminal might obey."""
     line = " ".join(str(text).split())
     if not line.isprintable():
         line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+    return line if len(line) <= MAX_MESSAGE else f"{line[: MAX_MESSAGE // 2]} ... {line[-MAX_MESSAGE // 2 :]}"
 
 
 def one_line(error: Exception) -> str:
-    """What went wrong; of the system's errors the file and the reason."""
+    """Describe an error in one line; for an error of the system, name the file and the reason."""
     if isinstance(error, OSError):
         return printable(f"{error.filename or 'input or output'}: {error.strerror or error}")
     return printable(error)
 
 
 class FrameError(UserError):
-    """The pixels of a frame cannot be read any more. The step that asked for them has changed nothing."""
+    """The pixels of a frame can no longer be read. The step that asked for them has changed nothing."""
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Whether it says that there is no more memory: Python and NumPy have an error for it, PyTorch has a text."""
+    """Return whether an error means that memory ran out: Python and NumPy have a type for it, PyTorch has a text."""
     return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)

@@ -1,4 +1,4 @@
-"""The trained Gaussians: raw parameters, their activations, and how they start."""
+"""The trained Gaussians: raw parameters, activations, and initial values."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ SH_C0 = 0.28209479177387814
 
 
 def fixed_exp(values: Tensor) -> Tensor:
-    """exp, to the same bits on any number of threads."""
+    """Return exp of the values, to the same bits on any number of threads."""
     with one_piece():
         return values.exp()
 
 
 class GaussianParameters(nn.Module):
-    """Raw parameters of N Gaussians in the normalised scene; :meth:`activate` gives what renders.
+    """Raw parameters of N Gaussians in the normalised scene; :meth:`activate` makes renderable ones.
 
     Attributes: ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``log_scales`` [N, 3], ``opacity_logits`` [N],
     ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0), ``shading`` [N, 10] or [N, 0].
@@ -50,7 +50,7 @@ class GaussianParameters(nn.Module):
         self.opacity_logits = nn.Parameter(torch.full((count,), opacity, device=device).logit())
         self.sh_dc = nn.Parameter(sh_dc.clone())
         self.sh_rest = nn.Parameter(torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device=device))
-        # Apart from the control points' initial +1e-2, as in the official code, so that the distance has a gradient.
+        # Unlike the control points' initial +1e-2, as in the official code, so that the distance has a gradient.
         self.hyper = nn.Parameter(torch.full((count, hyper_dim), -1e-2, device=device))
         self.shading = nn.Parameter(torch.zeros(count, SHADING_COLUMNS if shaded else 0, device=device))
 
@@ -58,7 +58,7 @@ class GaussianParameters(nn.Module):
     def empty(
         count: int, sh_count: int, hyper_dim: int, shaded: bool, device: torch.device | str
     ) -> GaussianParameters:
-        """Room for ``count`` Gaussians, to be filled from a checkpoint."""
+        """Allocate ``count`` Gaussians, to be filled from a checkpoint."""
         zeros = torch.zeros(count, 3, device=device)
         made = GaussianParameters(zeros, zeros, zeros, sh_degree=0, hyper_dim=hyper_dim, shaded=shaded)
         made.sh_rest = nn.Parameter(torch.zeros(count, sh_count, 3, device=device))
@@ -69,29 +69,32 @@ class GaussianParameters(nn.Module):
 
     @property
     def sh_degree(self) -> int:
-        """Highest degree there is room for."""
+        """Highest degree of spherical harmonics that ``sh_rest`` can hold."""
         return round((self.sh_rest.shape[1] + 1) ** 0.5) - 1
 
     def scales(self) -> Tensor:
-        """[N, 3] standard deviations."""
+        """Return the standard deviations, [N, 3]."""
         return fixed_exp(self.log_scales)
 
     def opacities(self) -> Tensor:
-        """[N] in (0, 1)."""
+        """Return the opacities, [N] in (0, 1)."""
         with one_piece():
             return self.opacity_logits.sigmoid()
 
     def activate(self) -> Gaussians:
-        """The Gaussians at rest: activation happens here and nowhere else."""
+        """Return the Gaussians at rest. Activation happens here and nowhere else."""
         return Gaussians(self.means, self.quats, self.scales(), self.opacities(), self.sh_dc, self.sh_rest)
 
 
-def neighbor_distance(points: Tensor, count: int = 3) -> Tensor:
-    """[N] root mean squared distance to the ``count`` nearest other points; 1e-3 at least, 1e-2 for a lone point."""
+def neighbor_distance(points: Tensor) -> Tensor:
+    """Return the root mean squared distance of each point to its three nearest neighbours, [N].
+
+    Distances are at least 1e-3; that of a lone point is 1e-2.
+    """
     total = points.shape[0]
     if total <= 1:
         return torch.full((total,), 1e-2, device=points.device)
-    count = min(count, total - 1)
+    count = min(3, total - 1)
     array = points.detach().cpu().double().numpy()
     distances, _ = KDTree(array).query(array, k=count + 1)
     mean = torch.from_numpy((distances[:, 1:] ** 2).mean(axis=1) ** 0.5)
@@ -107,8 +110,14 @@ def gaussians_from_points(
     scale: float = 1.0,
     shaded: bool = False,
 ) -> GaussianParameters:
-    """Round Gaussians at ``points`` [N, 3], as large as the distance to their neighbours times ``scale``; ``colors``
-    [N, 3] in [0, 1], grey where there are none."""
+    """Make isotropic Gaussians at points.
+
+    Args:
+        points: [N, 3] centres.
+        colors: [N, 3] in [0, 1]. None: grey.
+        scale: standard deviation in units of the distance to the neighbours (:func:`neighbor_distance`).
+        shaded: whether the Gaussians have shading parameters.
+    """
     with one_piece():
         log_scales = (neighbor_distance(points) * scale).log()[:, None].repeat(1, 3)
     sh_dc = torch.zeros_like(points) if colors is None else (colors - 0.5) / SH_C0

@@ -1,4 +1,4 @@
-"""Adam groups, schedules, and keeping the optimiser's rows aligned while Gaussians come and go."""
+"""Adam with named parameters, learning-rate schedules, and row bookkeeping while Gaussians are added and pruned."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ ADAM_EPS = 1e-15
 
 
 def log_linear(start: float, end: float, step: int, until: int) -> float:
-    """From ``start`` at step 0 to ``end`` at step ``until``, straight in the logarithm, constant afterwards."""
+    """Interpolate log-linearly from ``start`` at step 0 to ``end`` at step ``until``, constant afterwards."""
     if step >= until:
         return end
-    if start <= 0.0 or end <= 0.0:  # no logarithm: straight
+    if start <= 0.0 or end <= 0.0:  # no logarithm exists: interpolate linearly
         return start + (end - start) * step / until
     return math.exp(math.log(start) + (math.log(end) - math.log(start)) * step / until)
 
 
 @dataclass
 class Group:
-    """One parameter and what Adam keeps beside it."""
+    """One parameter and its Adam state."""
 
     parameter: nn.Parameter
     rate: float
@@ -37,10 +37,10 @@ class Group:
 
 
 class Adam:
-    """Adam with bias correction, as ``torch.optim.Adam`` has it, on named parameters: all of them in one launch.
+    """Adam with bias correction as in ``torch.optim.Adam``, on named parameters, in one kernel launch.
 
-    Attributes: ``groups``, name to :class:`Group`. Rates are read at every step. A parameter without a gradient is
-    left alone; one whose gradient is zero still has its moments decay.
+    Attributes: ``groups``, name to :class:`Group`. Rates are read at every step. A parameter without a gradient does
+    not change; the moments of one whose gradient is zero still decay.
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], rates: Mapping[str, float]) -> None:
@@ -49,12 +49,12 @@ class Adam:
             parameter.data = parameter.data.contiguous()
 
     def gradients(self) -> list[tuple[str, Tensor]]:
-        """The gradients there are, with the names of their parameters."""
-        found = ((name, group.parameter.grad) for name, group in self.groups.items())
-        return [(name, gradient) for name, gradient in found if gradient is not None]
+        """Return the existing gradients, with the names of their parameters."""
+        gradients = ((name, group.parameter.grad) for name, group in self.groups.items())
+        return [(name, gradient) for name, gradient in gradients if gradient is not None]
 
     def step(self) -> None:
-        """Change every parameter that has a gradient."""
+        """Update every parameter that has a gradient."""
         updates = []
         for group in self.groups.values():
             gradient = group.parameter.grad
@@ -73,13 +73,13 @@ class Adam:
             group.parameter.grad = None
 
     def regather(self, owner: nn.Module, names: tuple[str, ...], index: Tensor, fresh: Tensor) -> None:
-        """New rows from old ones: row i of every named parameter becomes old row ``index[i]``.
+        """Rebuild rows: row i of every named parameter becomes its old row ``index[i]``.
 
         Args:
             owner: module that holds the parameters as attributes.
-            names: parameters whose first dimension is to be re-gathered.
-            index: [N'] int64 source rows; repeated to clone, left out to prune.
-            fresh: [N'] bool, rows that start with zero moments.
+            names: parameters whose first dimension is gathered anew.
+            index: [N'] int64 source rows; repeated to clone, omitted to prune.
+            fresh: [N'] bool, True for rows that start with zero moments.
         """
         for name in names:
             group = self.groups.get(name)
@@ -93,27 +93,27 @@ class Adam:
                 group.exp_avg, group.exp_avg_sq = group.exp_avg[index] * keep, group.exp_avg_sq[index] * keep
 
     def reset_moments(self, name: str) -> None:
-        """Forget the moments of one parameter after its values were overwritten; its steps go on counting."""
+        """Zero the moments of a parameter whose values were overwritten; its step count continues."""
         for moment in (self.groups[name].exp_avg, self.groups[name].exp_avg_sq):
             if moment is not None:
                 moment.zero_()
 
     def tensors(self, prefix: str) -> dict[str, Tensor]:
-        """Moments and step counts as ``prefix.name.exp_avg``, ``.exp_avg_sq`` and ``.step`` (a float32 scalar), for a
-        checkpoint; nothing for a parameter that never had a gradient."""
-        found = {}
+        """Return moments and step counts for a checkpoint, as ``prefix.name.exp_avg``, ``.exp_avg_sq`` and ``.step`` (a
+        float32 scalar). A parameter that never had a gradient is left out."""
+        tensors = {}
         for name, group in self.groups.items():
             if group.exp_avg is not None and group.exp_avg_sq is not None:
-                found[f"{prefix}.{name}.step"] = torch.tensor(float(group.steps))
-                found[f"{prefix}.{name}.exp_avg"] = group.exp_avg
-                found[f"{prefix}.{name}.exp_avg_sq"] = group.exp_avg_sq
-        return found
+                tensors[f"{prefix}.{name}.step"] = torch.tensor(float(group.steps))
+                tensors[f"{prefix}.{name}.exp_avg"] = group.exp_avg
+                tensors[f"{prefix}.{name}.exp_avg_sq"] = group.exp_avg_sq
+        return tensors
 
     def load_tensors(self, prefix: str, tensors: Mapping[str, Tensor]) -> None:
-        """Inverse of :meth:`tensors`; a parameter that had no state yet stays without.
+        """Restore what :meth:`tensors` returned; a parameter that had no state stays without.
 
         Raises:
-            KeyError: a parameter has part of its state.
+            KeyError: a part of a parameter's state is missing.
             ValueError: a moment does not have the shape of its parameter.
         """
         for name, group in self.groups.items():

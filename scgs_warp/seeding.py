@@ -7,6 +7,6 @@ import torch
 
 
 def generator(seed: int, *keys: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """A random generator that depends on (seed, keys) alone: nothing has to be saved for a run to be resumed."""
+    """Return a random generator that depends on (seed, keys) alone, so that a resumed run needs no saved state."""
     state = np.random.SeedSequence([seed, len(keys), *keys]).generate_state(1, np.uint64)[0]
     return torch.Generator(device=device).manual_seed(int(state) & (2**63 - 1))

@@ -1,4 +1,4 @@
-"""The values that walk through the pipeline. Frozen; shapes stand beside the fields.
+"""Values passed along the pipeline: frozen, with the shape beside each field.
 
 ``Frame -> motion -> Pose [M] -> skin -> Gaussians at t [N] -> project -> Splats [N] -> bin -> Tiles -> composite ->
 Image``
@@ -14,9 +14,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in OpenCV convention: x right, y down, z forward; pixel centres at +0.5. Nothing is checked.
+    """A pinhole camera in OpenCV convention: x right, y down, z forward; pixel centres at +0.5. Nothing is validated.
 
-    OpenGL's and Blender's camera-to-world ``c2w`` becomes a viewmat by ``inv(c2w @ diag(1, -1, -1, 1))``.
+    A camera-to-world matrix ``c2w`` of OpenGL or Blender becomes ``viewmat = inv(c2w @ diag(1, -1, -1, 1))``.
     """
 
     viewmat: Tensor
@@ -24,56 +24,55 @@ class Camera:
     K: Tensor
     """[3, 3] intrinsics in pixels, float32."""
     width: int
-    """Of the image, pixels."""
+    """Image width, pixels."""
     height: int
-    """Of the image, pixels."""
+    """Image height, pixels."""
 
     def to(self, device: torch.device | str) -> Camera:
-        """The same camera with its tensors on a device."""
+        """Return the camera with its tensors on a device."""
         return Camera(self.viewmat.to(device), self.K.to(device), self.width, self.height)
 
     @property
     def position(self) -> Tensor:
-        """[3] centre of projection, world."""
+        """Centre of projection, [3], world."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One observation: a camera, a time in [0, 1] and what it saw. Images are stored planar; [H, W, 3] is a view."""
+    """One observation: a camera, a time in [0, 1] and an image. Images are stored planar; [H, W, 3] is a view."""
 
     camera: Camera
-    """Where it was taken, world."""
+    """Camera of the image, world."""
     time: float
-    """When it was taken, in [0, 1]."""
+    """Time of the image, in [0, 1]."""
     image: Tensor
     """[H, W, 3] float32 in [0, 1], on the data set's background; ``image.permute(2, 0, 1)`` is contiguous."""
     alpha: Tensor | None = None
-    """[H, W] float32 coverage, where the data has it."""
+    """[H, W] float32 coverage. None: the data has none."""
     mask: Tensor | None = None
-    """[H, W] bool, True where the pixel is valid; None: all are."""
+    """[H, W] bool, True for valid pixels. None: all are valid."""
     name: str = ""
-    """Stem of the file it came from."""
+    """Stem of the image file's name."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the control points are at one instant, and how they are turned."""
+    """Positions and rotations of the control points at one instant."""
 
     translations: Tensor
     """[M, 3] displacement from the control points' rest positions."""
     rotations: Tensor
     """[M, 4] wxyz, unit."""
     shape_rotations: Tensor | None = None
-    """[M, 4] wxyz, unit; a rotation for the Gaussians' shape alone. None: ``rotations`` turn both."""
+    """[M, 4] wxyz, unit; rotations of the Gaussians' shapes alone. None: ``rotations`` turn shapes, too."""
     log_scales: Tensor | None = None
-    """[M, 3] change of the Gaussians' log scales. None: none."""
+    """[M, 3] change of the Gaussians' log scales. None: no change."""
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Activated Gaussians at one instant: nothing here knows time. float32, one device, world units unless said
-    otherwise."""
+    """Activated Gaussians at one instant: float32, on one device, in world units unless stated otherwise."""
 
     means: Tensor
     """[N, 3] centres."""
@@ -84,9 +83,9 @@ class Gaussians:
     opacities: Tensor
     """[N] in [0, 1]"""
     sh_dc: Tensor
-    """[N, 3] spherical harmonics coefficients of degree 0: colour is ``0.5 + 0.2821 * sh_dc``, and what follows."""
+    """[N, 3] spherical harmonics of degree 0: colour is ``0.5 + 0.2821 * sh_dc`` plus the higher degrees."""
     sh_rest: Tensor
-    """[N, K - 1, 3] the higher ones; K = (degree + 1)^2."""
+    """[N, K - 1, 3] spherical harmonics of the higher degrees; K = (degree + 1)^2."""
 
 
 @dataclass(frozen=True)
@@ -109,24 +108,24 @@ class Splats:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Which splats touch which tile, nearest first."""
+    """Lists of the splats that touch each tile, nearest first."""
 
     ranges: Tensor
-    """[T, 2] int32, begin and end of each tile (row major) in the two lists below."""
+    """[T, 2] int32, begin and end of each tile (row major) in ``splats`` and ``slots``."""
     splats: Tensor
     """[P] int32, splat index of each (tile, splat) pair, sorted by tile, then depth."""
     slots: Tensor
-    """[P] int32, emission index of each pair: where its gradient is written."""
+    """[P] int32, emission index of each pair: the slot that its gradient is written to."""
     offsets: Tensor
-    """[N + 1] int64, a splat's pairs were emitted at ``offsets[i] .. offsets[i + 1]``."""
+    """[N + 1] int64, the pairs of splat i have the slots ``offsets[i] .. offsets[i + 1]``."""
     width: int
     height: int
     columns: int
     rows: int
     tile_size: int = 16
     windows: tuple[tuple[int, int], ...] = ()
-    """Where the lists would not fit into memory together they are empty, and these are the tiles, each time from begin
-    to end, that compositing lists and draws at once, in this order."""
+    """Windows of tiles, from begin to end, that compositing lists and draws one after the other when the lists do not
+    fit into memory together; the lists above are then empty."""
 
 
 @dataclass(frozen=True)
@@ -143,21 +142,21 @@ class Image:
 
 @dataclass
 class Stats:
-    """What densification needs, filled by the backward pass of compositing; a buffer handed in, not a hook."""
+    """Statistics for densification: a buffer that the backward pass of compositing adds to."""
 
     grad_norm: Tensor
     """[N] sum over images of the norm of the loss gradient to the 2D mean, in normalised device coordinates."""
     count: Tensor
-    """[N] images in which the Gaussian was visible (float32)."""
+    """[N] number of images in which the Gaussian was visible (float32)."""
     max_radii: Tensor
     """[N] largest screen radius seen, as a fraction of the longer image side."""
     absolute: bool = False
-    """Sum the absolute per-pixel gradients instead of their (cancelling) sum."""
+    """Whether absolute gradients are summed over pixels, which do not cancel."""
 
     @staticmethod
     def zeros(count: int, device: torch.device | str, absolute: bool = False) -> Stats:
         return Stats(*(torch.zeros(count, device=device) for _ in range(3)), absolute=absolute)
 
     def rows(self, index: Tensor) -> Stats:
-        """Of these Gaussians."""
+        """Return the statistics of the Gaussians in ``index``."""
         return Stats(self.grad_norm[index], self.count[index], self.max_radii[index], absolute=self.absolute)

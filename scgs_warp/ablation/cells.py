@@ -20,7 +20,7 @@ from ..config.validation import check
 from ..errors import UserError, printable
 from ..storage.checkpoint import FILE as CHECKPOINT
 from ..storage.checkpoint import PREVIOUS
-from ..storage.files import as_number, parse_json
+from ..storage.json_files import as_number, parse_json
 
 AblationName = Literal["nodes", "motion", "arap"]
 ABLATIONS: tuple[str, ...] = get_args(AblationName)

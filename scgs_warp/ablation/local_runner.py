@@ -105,7 +105,7 @@ def _start(place: str, cell: Cell, threads: int, jobs: int, report: Report) -> _
         stdout=log,
         stderr=log,
         start_new_session=True,
-        env={**os.environ, memory.SIBLINGS: str(jobs)},
+        env={**os.environ, memory.SIBLINGS_VARIABLE: str(jobs)},
     )
     assert process.stdin is not None
     process.stdin.write(cell_to_json(cell).encode())

@@ -20,7 +20,7 @@ from ..runtime.environment import available_threads
 from ..runtime.progress import Progress, progress
 from ..runtime.stop_signals import stop_signals
 from ..storage.checkpoint import FILE as CHECKPOINT
-from ..storage.files import parse_json
+from ..storage.json_files import parse_json
 from . import ray_cluster
 from .cells import LOG, Cell, cell_to_json
 from .local_runner import End, Report, Runner

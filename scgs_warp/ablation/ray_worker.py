@@ -19,7 +19,7 @@ from typing import Any
 from .. import __version__
 from ..errors import UserError
 from ..runtime import environment, memory
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from ..training.run_folder import LOCK
 from .cells import LOG, attempt, cell_from_json
 
@@ -180,7 +180,7 @@ def work(order: dict[str, Any]) -> dict[str, Any]:
         ``failure``, one line, or None; and ``stopped``: whether a signal ended it, the checkpoint being saved.
     """
     environment.configure(order["threads"])
-    os.environ[memory.SIBLINGS] = str(order["siblings"])
+    os.environ[memory.SIBLINGS_VARIABLE] = str(order["siblings"])
     if order["memory"] is not None:
         memory.set_limit(order["memory"] / memory.GIB)
     cell = cell_from_json(order["cell"])

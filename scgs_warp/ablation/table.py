@@ -10,7 +10,7 @@ from typing import Any
 
 from ..config.presets import FREE_TO_CHANGE
 from ..errors import UserError
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from .cells import VARIED, Cell, cell_folder, difference, discover, read_metrics, recorded, sort_values
 from .published import PUBLISHED_PSNR, TABLE_S1
 

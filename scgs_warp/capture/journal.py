@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
-from ..storage.files import parse_json
+from ..storage.json_files import parse_json
 from .writing import FILE, write_text
 
 WORK = "work"

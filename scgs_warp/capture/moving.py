@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..data.images import size_text
 from ..errors import UserError
-from ..storage.files import size_text
 from .source import Folder, Source, open_source, read_rgb, shrunk
 
 FLOW_SIDE = 480

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..runtime.progress import progress
-from ..storage.files import as_number
+from ..storage.json_files import as_number
 from ..visualization.video import write_png
 from . import features, mapping, moving, picking, pictures, writing
 from .diagnosis import Outcome, notes, too_few

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol
 import cv2
 import numpy as np
 
-from ..data.images import is_complete, oversized_claim
+from ..data.images import is_complete, oversized_claim, size_text
+from ..data.natural_order import natural
 from ..errors import UserError
-from ..storage.files import natural, size_text
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from ..data.held_out import held_out
 from ..data.readers.transforms import OPENGL_TO_OPENCV
-from ..storage.files import held_out
 from ..visualization.video import write_png
 from .features import FrameFiles, quiet
 from .mapping import CameraSolution

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from ..errors import UserError
-from ..storage.files import parse_json
+from ..storage.json_files import parse_json
 from .fields import (
     DataConfig,
     DensifyConfig,

@@ -14,12 +14,11 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
-from ..storage.files import size_text
 from ..types import Camera
 from .borders import border_mask, reduce_mask
 from .cache import ImageCache, Pixels
 from .dataset import Dataset, StoredFrame, spread
-from .images import Decoded, ReadOptions, decode, is_transparent, parallel_map, read_image
+from .images import Decoded, ReadOptions, decode, is_transparent, parallel_map, read_image, size_text
 from .lens import Lens
 from .points import finite_points
 

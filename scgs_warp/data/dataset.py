@@ -14,9 +14,9 @@ from torch import Tensor
 
 from ..config.fields import BACKGROUND_COLORS
 from ..errors import UserError
-from ..storage.files import size_text
 from ..types import Camera, Frame
 from .cache import ImageCache, Pixels
+from .images import size_text
 
 
 def spread(count: int, most: int) -> list[int]:

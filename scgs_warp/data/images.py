@@ -18,7 +18,6 @@ import torch
 from ..config.fields import BACKGROUND_COLORS
 from ..errors import UserError
 from ..runtime import environment
-from ..storage.files import size_text
 from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
@@ -37,6 +36,11 @@ warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+def size_text(size: Sequence[int]) -> str:
+    """Return ``800 x 600 pixels`` for (width, height)."""
+    return f"{size[0]} x {size[1]} pixels"
 
 
 class Decoded(NamedTuple):

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..errors import UserError
 from ..formats.gaussian_files import gaussian_points
+from ..formats.ply_header import check_ply_counts
 from ..gaussians import SH_C0
-from ..storage.files import check_ply_counts
 from ..storage.safe_paths import is_regular
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
-from ..storage.files import parse_json
+from ..storage.json_files import parse_json
 
 MAX_BYTES = 64 << 20
 """Size of the largest edit file."""

@@ -18,7 +18,7 @@ from ..errors import UserError
 from ..formats.gaussian_ply import write_gaussian_ply
 from ..rendering.render import render
 from ..scene.scene import Scene
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from ..types import Camera, Gaussians, Image
 from . import edit_file
 from .document import Edit

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
-from ..storage.files import read_npy
+from ..storage.numpy_files import read_npy
 
 FILE = "ground_truth.npz"
 OPAQUE = 0.5

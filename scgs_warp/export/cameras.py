@@ -11,7 +11,7 @@ import numpy as np
 
 from ..data.dataset import Dataset
 from ..data.readers.transforms import OPENGL_TO_OPENCV
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from ..types import Camera
 
 

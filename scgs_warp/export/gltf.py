@@ -12,7 +12,7 @@ import numpy as np
 from .. import __version__
 from ..edit.rotations import unit
 from ..errors import UserError
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from .skeleton import Skeleton
 
 COMPONENTS = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}

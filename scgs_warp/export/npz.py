@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from ..types import Gaussians
 from .skeleton import Skeleton
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..errors import UserError
 from ..scene.scene import Scene
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from .page_data import pack
 from .page_scene import page_scene
 

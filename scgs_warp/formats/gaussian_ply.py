@@ -9,10 +9,10 @@ import torch
 
 from ..errors import UserError
 from ..gaussians import GaussianParameters
-from ..storage.checkpoint import write_atomically
-from ..storage.files import check_ply_counts
+from ..storage.files import write_atomically
 from ..types import Gaussians
 from .gaussian_parameters import to_parameters
+from .ply_header import check_ply_counts
 
 REST_COLUMNS = (0, 9, 24, 45)
 """``f_rest_*`` columns of degrees 0 to 3."""

@@ -19,8 +19,7 @@ import torch
 
 from ..errors import UserError
 from ..gaussians import GaussianParameters
-from ..storage.checkpoint import write_atomically
-from ..storage.files import read_bytes
+from ..storage.files import read_bytes, write_atomically
 from ..types import Gaussians
 from .gaussian_parameters import to_parameters
 

@@ -1,4 +1,4 @@
-"""Cameras for films: what the training cameras look at, and paths around it. All angles are in degrees."""
+"""Cameras for films: an overview of the training cameras, and paths around the scene. All angles are in degrees."""
 
 from __future__ import annotations
 
@@ -14,24 +14,23 @@ from torch import Tensor
 from ..types import Camera
 
 FULL_ORBIT_GAP = 100.0
-"""Cameras whose azimuths leave no larger gap than this surround the scene."""
+"""Largest gap between azimuths of cameras that surround the scene."""
 SWING_SHARE = 0.8
-"""Of an observed arc, a turntable uses this much: the scene's sides were seen at a slant at its ends."""
+"""Share of an observed arc that a turntable uses: from the arc's ends the scene is seen at a slant."""
 STEEPEST = 80.0
-"""A turntable's largest elevation: above a pole, azimuth means nothing."""
-
+"""Largest elevation of a turntable: above a pole, azimuth is undefined."""
 ROUNDING = 2e-6
-"""Positions closer together than this share of their distance from the origin are one: viewmats are float32."""
+"""Relative error of positions taken from float32 viewmats, as a share of their distance from the origin."""
 
 Vector = Sequence[float] | np.ndarray | Tensor
 
 
 @dataclass(frozen=True)
 class Overview:
-    """How the training cameras, taken together, see the scene. Plain numbers, world units, kept with the scene."""
+    """Summary of the training cameras: plain numbers in world units, stored with the scene."""
 
     centre: tuple[float, float, float]
-    """The point that the optical axes pass closest to."""
+    """Point closest to all optical axes."""
     up: tuple[float, float, float]
     """Unit vector."""
     radius: float
@@ -41,22 +40,22 @@ class Overview:
     elevation: float
     """Median elevation of the cameras, seen from the centre."""
     azimuth: float = 0.0
-    """Where a film starts: the middle of the observed arc, or the first camera if they go all the way round."""
+    """Azimuth at which a film starts: the middle of the observed arc, or the first camera of a full orbit."""
     sweep: float = 360.0
-    """The arc of azimuths the cameras cover; 360 if they go all the way round."""
+    """Arc of azimuths that the cameras cover; 360 for a full orbit."""
     aspect: float = 1.0
-    """Width of the images divided by their height."""
+    """Width of the images over their height."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Values that JSON holds exactly."""
+        """Return values that JSON holds exactly."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Overview:
-        """The inverse of ``to_dict``.
+        """Restore what ``to_dict`` returned.
 
         Raises:
-            KeyError, TypeError, ValueError: the values are not those of an overview.
+            KeyError, TypeError, ValueError: the values do not describe an overview.
         """
         rest = {key: float(value) for key, value in values.items() if key not in ("centre", "up")}
         return Overview(_triple(values["centre"]), _triple(values["up"]), **rest)
@@ -72,14 +71,17 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def agreed_up(rotations: np.ndarray) -> np.ndarray:
-    """[3] the direction that the cameras agree to call up.
+    """Return the common up direction of cameras, [3].
 
-    Cameras held level have x axes perpendicular to it, whatever their pitch, so it is the direction in which the x
-    axes vary least. If they hardly turn, that leaves a plane to choose from; the mean of the -y axes decides.
+    The x axes of level cameras are perpendicular to it, whatever their pitch, so it is the direction in which the x
+    axes vary least. If the cameras hardly turn, that leaves a plane, and the mean of their -y axes decides.
+
+    Args:
+        rotations: [V, 3, 3] world to camera.
     """
     mean = -rotations[:, 1].mean(0)
     values, vectors = np.linalg.eigh(rotations[:, 0].T @ rotations[:, 0] / len(rotations))
-    if values[1] > 0.01 and values[1] > 10 * values[0]:  # they turn by some degrees, and roll by far less
+    if values[1] > 0.01 and values[1] > 10 * values[0]:  # cameras turn by some degrees and roll by far less
         level = vectors[:, 0]
         agreement = float(level @ mean)
         if abs(agreement) > 0.05:
@@ -90,10 +92,10 @@ def agreed_up(rotations: np.ndarray) -> np.ndarray:
 
 
 def _centre(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """[3] the point with the least squared distance to all optical axes.
+    """Return the point with the least squared distance to all optical axes, [3].
 
-    Where the axes are parallel, or meet behind the cameras, there is none worth the name; then a point in front of
-    the mean camera, three times as far away as the cameras lie apart.
+    If the axes are parallel or meet behind the cameras, return a point in front of the mean camera instead, three times
+    as far away as the cameras are spread.
     """
     least = rounding(positions)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -106,25 +108,25 @@ def _centre(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
     middle = positions.mean(0)
     spread = float(np.linalg.norm(positions - middle, axis=1).max())
     forward = axes.mean(0)
-    if np.linalg.norm(forward) < 1e-3:  # a panorama: everything around the cameras is the scene
+    if np.linalg.norm(forward) < 1e-3:  # a panorama: the scene surrounds the cameras
         return middle
     return middle + _unit(forward) * (3 * spread if spread > least else 1.0)
 
 
 def rounding(positions: np.ndarray) -> float:
-    """The least distance, among camera centres [V, 3] taken from viewmats, that is one."""
+    """Return the distance up to which camera centres [V, 3] taken from viewmats coincide."""
     return ROUNDING * float(np.linalg.norm(positions, axis=1).max())
 
 
 def _horizon(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors of azimuth 0 and 90, perpendicular to ``up``; x and y where up is z."""
+    """Return the unit vectors of azimuth 0 and 90, perpendicular to ``up``; x and y if up is z."""
     helper = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     zero = _unit(helper - (helper @ up) * up)
     return zero, np.cross(up, zero)
 
 
 def _arc(azimuths: np.ndarray) -> tuple[float, float]:
-    """(start, sweep) of the shortest arc that holds all azimuths."""
+    """Return start and sweep of the shortest arc that holds all azimuths."""
     ordered = np.sort(azimuths % 360.0)
     gaps = np.diff(np.append(ordered, ordered[0] + 360.0))
     widest = int(gaps.argmax())
@@ -132,13 +134,13 @@ def _arc(azimuths: np.ndarray) -> tuple[float, float]:
 
 
 def overview(cameras: Sequence[Camera]) -> Overview:
-    """Deduce from training cameras what they look at and from where; a full orbit and a small arc both work.
+    """Summarise training cameras, from a small arc to a full orbit.
 
     Args:
         cameras: at least one, world units.
 
     Raises:
-        ValueError: there is no camera.
+        ValueError: ``cameras`` is empty.
     """
     if not cameras:
         raise ValueError("cameras is empty; an overview needs at least one")
@@ -152,7 +154,7 @@ def overview(cameras: Sequence[Camera]) -> Overview:
     heights = offsets @ up
     zero, ninety = _horizon(up)
     flat = np.stack([offsets @ zero, offsets @ ninety], axis=1)
-    aside = np.linalg.norm(flat, axis=1) > 0.1 * distances  # cameras near a pole have no azimuth
+    aside = np.linalg.norm(flat, axis=1) > 0.1 * distances  # cameras near a pole have no usable azimuth
     azimuths = np.degrees(np.arctan2(flat[:, 1], flat[:, 0]))
     start, sweep = _arc(azimuths[aside]) if aside.any() else (float(azimuths[0]), 0.0)
     if 360.0 - sweep <= FULL_ORBIT_GAP:
@@ -173,12 +175,12 @@ def overview(cameras: Sequence[Camera]) -> Overview:
 
 
 def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
-    """The viewmat of a camera at ``eye`` that sees ``target`` at its image's centre and ``up`` upwards.
+    """Return the viewmat of a camera at ``eye`` that sees ``target`` at the image's centre and ``up`` upwards.
 
     Args:
         eye: [3] world.
         target: [3] world.
-        up: [3] any length; if it points along the view, some other direction is taken.
+        up: [3] any length; replaced by another direction if it points along the view.
 
     Returns:
         [4, 4] world-to-camera, OpenCV (x right, y down, z forward), float32.
@@ -201,23 +203,23 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
 
 
 def image_size(overview: Overview, size: int) -> tuple[int, int]:
-    """(width, height) with the training images' proportions, the longer side ``size``, both even (video wants that)."""
+    """Return (width, height) in the training images' proportions: longer side ``size``, both even as video requires."""
     width = size if overview.aspect >= 1 else size * overview.aspect
     height = size / overview.aspect if overview.aspect >= 1 else size
     return max(2, 2 * round(width / 2)), max(2, 2 * round(height / 2))
 
 
 def orbit_camera(overview: Overview, azimuth: float, size: int, elevation: float | None = None) -> Camera:
-    """A camera on the sphere around the scene's centre, looking at it.
+    """Return a camera on the sphere around the scene's centre that looks at the centre.
 
     Args:
-        overview: of the scene.
+        overview: overview of the scene.
         azimuth: degrees, as ``Overview.azimuth``.
         size: longer side of the image in pixels.
-        elevation: degrees; the training cameras' by default, at most ``STEEPEST``.
+        elevation: degrees, clamped to ``STEEPEST``. None: that of the training cameras.
 
     Returns:
-        A camera on the CPU, square pixels, the training cameras' field of view.
+        A camera on the CPU with square pixels and the training cameras' field of view.
     """
     width, height = image_size(overview, size)
     elevation = overview.elevation if elevation is None else elevation
@@ -233,24 +235,24 @@ def orbit_camera(overview: Overview, azimuth: float, size: int, elevation: float
 
 
 def azimuth_of(overview: Overview, eye: Vector) -> float:
-    """The azimuth, 0 to 360 degrees, from which ``orbit_camera`` looks the way that a camera at ``eye`` [3] does."""
+    """Return the azimuth, 0 to 360 degrees, at which ``orbit_camera`` looks from the side of ``eye`` [3]."""
     zero, ninety = _horizon(np.array(overview.up))
     offset = np.asarray(eye, np.float64) - np.array(overview.centre)
     return math.degrees(math.atan2(float(offset @ ninety), float(offset @ zero))) % 360.0
 
 
 def turntable(overview: Overview, frames: int, size: int, azimuths: tuple[float, float] | None = None) -> list[Camera]:
-    """Cameras of a film that goes round the scene and loops.
+    """Return the cameras of a film that goes round the scene and loops.
 
-    If the training cameras surround the scene: one turn of equal steps, starting where the first camera stood. If
-    they cover an arc only (a forward-facing capture), nothing is known of the scene's back: the camera swings like a
-    pendulum, from the middle of the arc to one side, to the other, and back, within ``SWING_SHARE`` of the arc.
+    If the training cameras surround the scene, the film is one turn of equal steps that starts at the first camera. If
+    they cover only an arc (a forward-facing capture), the scene's back is unknown: the camera swings like a pendulum,
+    from the middle of the arc to one side, to the other, and back, within ``SWING_SHARE`` of the arc.
 
     Args:
-        overview: of the scene.
+        overview: overview of the scene.
         frames: number of cameras.
         size: longer side of the images in pixels; the shorter follows the training images' proportions.
-        azimuths: (first, last) in degrees instead: equal steps from the first, the last left out.
+        azimuths: (first, last) in degrees, to be used instead: equal steps from the first, without the last.
 
     Raises:
         ValueError: ``frames`` is less than 1.

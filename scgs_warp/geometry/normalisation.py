@@ -13,14 +13,14 @@ from ..types import Camera
 from .cameras import rounding
 
 COMMON_RADIUS = 1.3654
-"""Radius, after normalisation, of what all cameras see (or of the initial points' bulk). It is that of D-NeRF's rig
-(cameras at 4.031, field of view 0.6911), whose frame therefore stays as it is, its figures within [-1.3, 1.3]^3."""
+"""Radius, after normalisation, of the region that all cameras see, or of the bulk of the initial points. D-NeRF's rig
+(cameras at 4.031, field of view 0.6911) has this radius, so its frame does not change: figures in [-1.3, 1.3]^3."""
 BULK = 0.95
-"""Fraction of the initial points that shall lie within COMMON_RADIUS; the rest may be far background."""
+"""Fraction of the initial points placed within COMMON_RADIUS; the rest may be far background."""
 FEWEST_POINTS = 10
-"""Fewer say nothing of where the scene is."""
+"""Smallest number of initial points that tells where the scene is."""
 PARALLEL = 1e-4
-"""Smallest eigenvalue of the mean of (I - d d^T) at which optical axes still define a nearest point: some 1 degree."""
+"""Smallest eigenvalue of the mean of (I - d d^T) at which optical axes define a nearest point: about 1 degree."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,17 @@ class Normalisation:
 
     @staticmethod
     def fit(cameras: Sequence[Camera], points: Tensor | None = None) -> Normalisation:
-        """From initial points where there are at least ten (median; 95 % within the radius), else from the cameras:
-        the point nearest to all optical axes, and the sphere about it that the median camera sees whole.
+        """Fit centre and scale to ten or more initial points (median; 95 % within the radius), else to the cameras.
+
+        From cameras, the centre is the point nearest to all optical axes, and the radius is that of the sphere around
+        it that the median camera sees whole.
 
         Args:
             cameras: at least one.
             points: [P, 3] world.
+
+        Raises:
+            ValueError: ``cameras`` is empty.
         """
         if not cameras:
             raise ValueError("cameras: at least one is needed")
@@ -61,21 +66,21 @@ class Normalisation:
         return Normalisation(centre, COMMON_RADIUS / radius if radius > 0 else 1.0)
 
     def apply(self, points: Tensor) -> Tensor:
-        """[..., 3] world to normalised, in the points' dtype (the arithmetic is float64)."""
+        """Convert points [..., 3] from world to normalised units, in float64; the result has the points' dtype."""
         centre = torch.as_tensor(self.centre, device=points.device)
         return ((points.double() - centre) * self.scale).to(points.dtype)
 
     def undo(self, points: Tensor) -> Tensor:
-        """[..., 3] normalised to world."""
+        """Convert points [..., 3] from normalised to world units."""
         centre = torch.as_tensor(self.centre, device=points.device)
         return (points.double() / self.scale + centre).to(points.dtype)
 
     def undo_scale(self, lengths: Tensor) -> Tensor:
-        """Lengths (depths, standard deviations) from normalised to world units."""
+        """Convert lengths (depths, standard deviations) from normalised to world units."""
         return (lengths.double() / self.scale).to(lengths.dtype)
 
     def apply_camera(self, camera: Camera) -> Camera:
-        """The camera that sees the normalised scene at the same pixels, depths times ``scale``."""
+        """Return the camera that sees the normalised scene at the same pixels, with depths times ``scale``."""
         viewmat = camera.viewmat.double()
         centre = torch.as_tensor(self.centre, device=viewmat.device)
         moved = viewmat.clone()
@@ -83,7 +88,7 @@ class Normalisation:
         return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
 
     def undo_camera(self, camera: Camera) -> Camera:
-        """Inverse of :meth:`apply_camera`."""
+        """Return the camera that :meth:`apply_camera` was given."""
         viewmat = camera.viewmat.double()
         centre = torch.as_tensor(self.centre, device=viewmat.device)
         moved = viewmat.clone()
@@ -92,7 +97,7 @@ class Normalisation:
 
 
 def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Camera centres [V, 3], viewing directions [V, 3], and sines [V] of half the narrower field of view."""
+    """Return camera centres [V, 3], viewing directions [V, 3], and sines [V] of half the narrower field of view."""
     viewmats = torch.stack([camera.viewmat for camera in cameras]).double().cpu().numpy()
     Ks = torch.stack([camera.K for camera in cameras]).double().cpu().numpy()
     sizes = np.array([(camera.width, camera.height) for camera in cameras], np.float64)
@@ -103,8 +108,10 @@ def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _nearest_to_axes(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Least squares: sum over cameras of (I - d d^T)(x - p) = 0. Near-parallel axes leave x open along them; then
-    it is put ahead of the cameras by twice the rig's size."""
+    """Solve sum over cameras of (I - d d^T)(x - p) = 0 for the point x nearest to all optical axes.
+
+    Near-parallel axes leave x undetermined along them; it then lies ahead of the cameras by twice the rig's size.
+    """
     projectors = np.eye(3) - np.einsum("vi,vj->vij", axes, axes)
     A, least = projectors.mean(axis=0), rounding(positions)
     if np.linalg.eigvalsh(A)[0] > PARALLEL:

@@ -1,4 +1,4 @@
-"""One step of Adam over many tensors at once, and the first of many that is not finite. No gradients."""
+"""Adam steps over many tensors at once, and the search for a non-finite tensor. No gradients."""
 
 from __future__ import annotations
 
@@ -37,17 +37,18 @@ class Update(NamedTuple):
 def adam_step(
     updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15, form: Form = "auto"
 ) -> None:
-    """Adam (Kingma and Ba 2015, algorithm 1) with bias correction as in ``torch.optim.Adam``, in one launch. Finite
-    gradients beyond 1e19, whose squares would overflow, count as 1e19.
+    """Take one step of Adam (Kingma and Ba 2015, algorithm 1), bias-corrected as ``torch.optim.Adam``, in one launch.
+
+    Finite gradients beyond 1e19, whose squares would overflow, are clamped to 1e19.
 
     Args:
-        updates: tensors on one device; those without elements, and no updates at all, are fine.
+        updates: tensors on one device; empty tensors and an empty list are allowed.
         betas: decay of the first and second moment.
         eps: added to the root of the second moment after its bias correction.
-        form: ``plain`` (any device), ``cpu`` (SIMD), or what suits the device.
+        form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Raises:
-        ValueError: a tensor is no contiguous float32 of its value's shape, on one device; or the form does not fit.
+        ValueError: a tensor is not contiguous float32 of its value's shape on the common device, or the form is wrong.
     """
     if not updates:
         return
@@ -67,12 +68,12 @@ def adam_step(
         launch(cpu_kernels.adam_step, len(chunks), *tables, *numbers, grain=4)
     else:
         launch(kernels.adam_step, len(chunks) * ADAM_CHUNK, *tables, *numbers)
-    # As torch's own in-place operations do: what was computed from the old values can tell that they are gone.
+    # As after torch's own in-place operations, a backward pass that needs the old values raises.
     torch.autograd.graph.increment_version([tensor for update in updates for tensor in (update.value, *update[2:4])])
 
 
 def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
-    """Index of the first tensor with an infinity or a NaN, or None. Exact: nothing is summed that could overflow.
+    """Return the index of the first tensor with an infinity or a NaN, or None. Exact: no sum can overflow.
 
     Args:
         tensors: float32, on one device.
@@ -115,7 +116,7 @@ def _simd(form: str, device: torch.device) -> bool:
 
 
 def _fits(update: Update, device: torch.device) -> bool:
-    """What :func:`_refuse` names, asked once a tensor and step, hence without a loop."""
+    """Return whether an update is valid; runs for each tensor in each step, hence without a loop."""
     value, gradient, exp_avg, exp_avg_sq = update[:4]
     return (
         value.shape == gradient.shape == exp_avg.shape == exp_avg_sq.shape
@@ -129,7 +130,7 @@ def _fits(update: Update, device: torch.device) -> bool:
 
 
 def _table(rows: list, dtype: type, device: torch.device) -> Tensor:
-    """NumPy reads lists several times faster than torch does."""
+    """Make a tensor of a list through NumPy, which reads lists several times faster than torch does."""
     return torch.from_numpy(np.array(rows, dtype)).to(device)
 
 
@@ -147,7 +148,7 @@ def _refuse(update: Update, device: torch.device) -> None:
 
 @lru_cache(maxsize=16)
 def _layout(sizes: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Sizes [T] and chunks [C, 2] (tensor, first element) of tensors with ``sizes`` elements."""
+    """Return sizes [T] and chunks [C, 2] (tensor, first element) of tensors with ``sizes`` elements."""
     chunks = [(i, begin) for i, size in enumerate(sizes) for begin in range(0, size, ADAM_CHUNK)]
     table = torch.tensor(chunks, dtype=torch.int64).view(-1, 2)
     return torch.tensor(sizes, dtype=torch.int64).to(device), table.to(device)

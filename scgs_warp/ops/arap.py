@@ -32,16 +32,16 @@ def _rotations(rest: Tensor, posed: Tensor, neighbors: Tensor, weights: Tensor) 
 
 
 def local_rotations(rest: Tensor, posed: Tensor, neighbors: Tensor, weights: Tensor) -> Tensor:
-    """The rotation of every node that best explains its edges: argmin sum_j w_ij |e'_ij - R e_ij|^2 (SC-GS, Eq. 8).
+    """Return the best rotation of every node's edges: argmin sum_j w_ij |e'_ij - R e_ij|^2 (SC-GS, Eq. 8).
 
     Args:
-        rest: [M, 3] positions before.
-        posed: [M, 3] positions after.
-        neighbors: [M, J] int32, -1 where there is none.
+        rest: [M, 3] positions at rest.
+        posed: [M, 3] positions after the deformation.
+        neighbors: [M, J] int32, -1 for a missing neighbour.
         weights: [M, J] >= 0.
 
     Returns:
-        [M, 3, 3] rotations (determinant +1 always; the identity for a node without edges). No gradient.
+        [M, 3, 3] rotations, always with determinant +1; the identity for a node without edges. No gradient.
 
     Raises:
         ValueError: shapes do not fit.
@@ -52,7 +52,7 @@ def local_rotations(rest: Tensor, posed: Tensor, neighbors: Tensor, weights: Ten
 
 
 def reverse_edges(neighbors: Tensor) -> NodeLists:
-    """The edges that lead to each node, for ``arap_energy`` to be given again and again with the same neighbours."""
+    """Return the edges that lead to each node, to be computed once for many calls of ``arap_energy``."""
     return node_lists(neighbors, neighbors.shape[0])
 
 
@@ -85,19 +85,19 @@ class _ArapEnergy(torch.autograd.Function):
 def arap_energy(
     rest: Tensor, posed: Tensor, neighbors: Tensor, weights: Tensor, *, reverse: NodeLists | None = None
 ) -> Tensor:
-    """Energy of every node, sum_j w_ij |e'_ij - R_i e_ij|^2 with the best rotation R_i (SC-GS, Eq. 9).
+    """Return the energy of every node, sum_j w_ij |e'_ij - R_i e_ij|^2 with the best rotation R_i (SC-GS, Eq. 9).
 
     Args:
-        rest: [M, 3] positions before.
-        posed: [M, 3] positions after.
-        neighbors: [M, J] int32 in [0, M), -1 where there is none.
+        rest: [M, 3] positions at rest.
+        posed: [M, 3] positions after the deformation.
+        neighbors: [M, J] int32 in [0, M), -1 for a missing neighbour.
         weights: [M, J] >= 0.
-        reverse: ``reverse_edges(neighbors)``, to build it once for many calls.
+        reverse: ``reverse_edges(neighbors)``, if computed before.
 
     Returns:
-        [M] energies, in squared units of the positions; one is not finite where an edge's end is not. Gradients flow to
-        rest and posed, but not along such edges; the rotations are held constant (at the minimum their own gradient
-        vanishes).
+        [M] energies, in squared units of the positions; non-finite for a node with an edge to a non-finite position.
+        Gradients flow to rest and posed, except along such edges; the rotations are held constant, since their own
+        gradient vanishes at the minimum.
 
     Raises:
         ValueError: shapes do not fit.
@@ -109,18 +109,17 @@ def arap_energy(
 
 
 def trajectory_graph(trajectories: Tensor, count: int = 8) -> tuple[Tensor, Tensor]:
-    """Neighbours of the control points by how far apart they stay over time, and their weights (SC-GS, Eq. 10).
+    """Return the neighbours of the control points by their distance over time, and weights (SC-GS, Eq. 10).
 
-    The squared distance of two nodes is its mean over the sampled times; weights are ``exp(-d^2 / (2 h^2))`` with h the
+    The squared distance of two nodes is averaged over the sampled times. Weights are ``exp(-d^2 / (2 h^2))`` with h the
     mean neighbour distance, normalised for every node.
 
     Args:
         trajectories: [T, M, 3] positions of the M nodes at T times.
-        count: neighbours a node, 1 .. 15.
+        count: neighbours per node, 1 .. 15.
 
     Returns:
-        Neighbours [M, count] int32, nearest first, -1 where there are fewer nodes, and weights [M, count] (0 there).
-        No gradient.
+        Neighbours [M, count] int32, nearest first, padded with -1, and weights [M, count], padded with 0. No gradient.
 
     Raises:
         ValueError: shapes do not fit or ``count`` is out of range.
@@ -137,19 +136,19 @@ def trajectory_graph(trajectories: Tensor, count: int = 8) -> tuple[Tensor, Tens
     if available <= 0:
         return neighbors, weights
     tracks = trajectories.detach().permute(1, 0, 2).reshape(nodes, 3 * times) / times**0.5
-    found, distances = nearest(tracks, tracks, available + 1)
-    # A node among its duplicates need not come first in its own list; if it does not appear at all, the last goes. One
-    # that is not finite may appear twice: lists then end with placeholders.
-    own = found == torch.arange(nodes, device=device, dtype=torch.int32)[:, None]
+    indices, distances = nearest(tracks, tracks, available + 1)
+    # Every node is removed from its own list. Among duplicates it need not come first; if it does not appear at all,
+    # the last entry goes. A non-finite node may appear twice: its list then ends with placeholders.
+    own = indices == torch.arange(nodes, device=device, dtype=torch.int32)[:, None]
     own &= own.cumsum(dim=1) == 1
     own[:, -1] |= ~own.any(dim=1)
-    found, distances = found[~own].reshape(nodes, -1), distances[~own].reshape(nodes, -1).double()
+    indices, distances = indices[~own].reshape(nodes, -1), distances[~own].reshape(nodes, -1).double()
     finite = distances.isfinite()
     lengths = distances.sqrt().where(finite, 0.0).sum(dim=1)
     total = torch.ones_like(lengths) @ lengths
     bandwidth = total / (torch.ones_like(lengths) @ finite.sum(dim=1).double()).clamp_min(1)
     logits = (-distances / (2 * bandwidth**2).clamp_min(1e-60)).where(finite, -torch.inf)
     raw = torch.softmax(logits, dim=1).where(finite, 0.0)
-    found = found.where(finite, -1)
-    neighbors[:, :available], weights[:, :available] = found, raw.float()
+    indices = indices.where(finite, -1)
+    neighbors[:, :available], weights[:, :available] = indices, raw.float()
     return neighbors, weights

@@ -1,4 +1,4 @@
-"""Splats to tiles: which splats touch which tile, nearest first."""
+"""Binning: lists of the splats that touch each tile, nearest first."""
 
 from __future__ import annotations
 
@@ -11,35 +11,36 @@ from ..runtime import debug
 from ..runtime.launch import launch
 from ..types import Splats, Tiles
 from . import checks, memory_windows
-from .binning_cuda import MAX_PAIRS, RadixCount, geometry_of
+from .binning_cuda import MAX_PAIRS, RadixBinning, geometry_of
 from .memory_windows import Demand, Window
 
 CHUNK_SIZE = 1024
-"""Fewest splats worth a chunk on a CPU."""
+"""Smallest number of splats in a chunk on a CPU."""
 MAX_CHUNKS = 128
-"""A chunk counts what it has in each row of tiles: with many chunks the counts outweigh the splats."""
+"""Largest number of chunks: each counts its splats per row of tiles, and many counts would outweigh the splats."""
 
 
 def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | None = None) -> Tiles:
     """List, for every tile of the image, the splats that reach one of its pixels, sorted by depth.
 
-    A splat reaches the pixels where its alpha is at least 1/255. Splats with a radius of 0, non-finite or not positive
-    definite values, or an opacity under 1/255 are left out. Equal depths are ordered by index. No gradient.
+    A splat reaches the pixels where its alpha is at least 1/255. A splat is left out if its radius is 0, a value is
+    non-finite, its conic is not positive definite, or its opacity is under 1/255. Equal depths are ordered by index. No
+    gradient.
 
     Args:
         splats: N projected Gaussians, on any device.
         tile_size: side of a tile in pixels.
-        demand: what compositing takes beside the lists. Given, an image whose lists do not fit into memory is cut into
-            windows, which ``composite`` draws one after the other. None: the lists have to fit.
+        demand: memory that compositing takes beside the lists. If given, an image whose lists do not fit into memory is
+            cut into windows, which ``composite`` draws one after the other. None: the lists have to fit.
 
     Returns:
         Tiles on the same device; ``ranges`` row major, ``slots`` such that splat ``i`` owns ``offsets[i]`` up to
         ``offsets[i + 1]``, in the order rows first, then columns.
 
     Raises:
-        ValueError: a field's shape does not fit, an image side or tile size is not positive, there are more than
+        ValueError: a field has a wrong shape, an image side or tile size is not positive, or there are more than
             2^31 - 1 tiles or (without ``demand``) pairs of splat and tile.
-        NotEnoughMemory: the lists, or with ``demand`` the image or one single tile, take more memory than there is.
+        NotEnoughMemory: the lists, or with ``demand`` the image or a single tile, take more memory than is free.
     """
     _validate(splats, tile_size)
     columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
@@ -54,39 +55,39 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | N
         memory_windows.require_lists(count, device)
     elif not memory_windows.fits(count, demand, device):
         windows = memory_windows.cut(lambda window: _count(splats, size, window), columns, rows, demand, splats)
-        none = torch.empty(0, dtype=torch.int32, device=device)
-        return Tiles(none.view(0, 2), none, none, none.long(), *size, windows=tuple(windows))
+        empty = torch.empty(0, dtype=torch.int32, device=device)
+        return Tiles(empty.view(0, 2), empty, empty, empty.long(), *size, windows=tuple(windows))
     return _listed(splats, size, count)
 
 
 def bin_window(splats: Splats, tiles: Tiles, window: Window) -> Tiles:
-    """The lists of some tiles of an image; those of all others are empty.
+    """List the splats of some tiles of an image; the lists of all other tiles are empty.
 
     Args:
-        tiles: what ``bin_splats`` returned for the same splats.
-        window: begin and end of the tiles that are wanted.
+        tiles: result of ``bin_splats`` for the same splats.
+        window: begin and end of the tiles to list.
     """
     size = (tiles.width, tiles.height, tiles.columns, tiles.rows, tiles.tile_size)
     return _listed(splats, size, _count(splats, size, window))
 
 
-def _count(splats: Splats, size: tuple[int, ...], window: Window) -> BandCount | RadixCount:
-    counted = BandCount if splats.means2d.device.type == "cpu" else RadixCount
+def _count(splats: Splats, size: tuple[int, ...], window: Window) -> BandBinning | RadixBinning:
+    counted = BandBinning if splats.means2d.device.type == "cpu" else RadixBinning
     return counted(geometry_of(splats), size, window)
 
 
-def _listed(splats: Splats, size: tuple[int, int, int, int, int], count: BandCount | RadixCount) -> Tiles:
+def _listed(splats: Splats, size: tuple[int, int, int, int, int], count: BandBinning | RadixBinning) -> Tiles:
     tiles = Tiles(*count.lists(), *size)
     if debug.enabled():
         checks.check_tiles(splats, tiles)
     return tiles
 
 
-class BandCount:
-    """On a CPU, a ``bands.Count``: what each splat touches, to be dealt to the rows of tiles, each of which is sorted
-    by itself; see ``kernels.binning_cpu``."""
+class BandBinning:
+    """Binning on a CPU (a ``ListSize``): splats are dealt to rows of tiles, and each row is sorted by itself; see
+    ``kernels.cpu.binning``."""
 
-    most = MAX_PAIRS
+    max_entries = MAX_PAIRS
 
     def __init__(self, geometry: list[Tensor], size: tuple[int, ...], window: Window) -> None:
         count, (_, _, columns, rows, _) = len(geometry[0]), size
@@ -95,36 +96,36 @@ class BandCount:
         self._chunks = chunks = max(-(-count // self._chunk_size), 1)
         windows = torch.empty(count, dtype=torch.int64)
         corners = torch.empty(count, 2, dtype=torch.int32)
-        self._found = (windows, corners)
+        self._touched = (windows, corners)
         self._begins = torch.empty(chunks, rows + 1, dtype=torch.int32)
         self._band_begins = torch.empty(rows + 1, dtype=torch.int32)
         self._first_slots = torch.empty(chunks + 2, dtype=torch.int64)
-        counts = (*self._found, self._begins, self._first_slots)
+        counts = (*self._touched, self._begins, self._first_slots)
         launch(kernels.count_chunks, chunks, *geometry, self._chunk_size, *self._size, *counts, grain=1)
         launch(kernels.place_chunks, 1, self._begins, self._first_slots, self._band_begins)
         self.pairs, self._stretches = self._first_slots[chunks:].tolist()
         self.entries = max(self.pairs, self._stretches)
 
     @property
-    def kept(self) -> int:
+    def list_bytes(self) -> int:
         rows, columns = self._tiles
         return 8 * self.pairs + 8 * len(self._geometry[0]) + 8 * rows * columns
 
     @property
-    def scratch(self) -> int:
+    def scratch_bytes(self) -> int:
         rows, columns = self._tiles
         return 32 * self._stretches + 4 * self._begins.numel() + 4 * rows * columns
 
     def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Ranges, splats, slots, offsets."""
+        """Return ranges, splats, slots and offsets."""
         count, (rows, columns) = len(self._geometry[0]), self._tiles
         offsets = torch.empty(count + 1, dtype=torch.int64)
         keys, spare = (torch.empty(self._stretches, dtype=torch.int64) for _ in range(2))
         dealt = torch.empty(self._stretches, 4, dtype=torch.int32)
         before = torch.empty_like(self._begins)
         begun = self._begins.clone() if debug.enabled() else None
-        found = (*self._found, self._first_slots, self._begins, offsets, dealt, keys, before)
-        launch(kernels.deal_chunks, self._chunks, *self._geometry[:4], self._chunk_size, *self._size, *found, grain=1)
+        chunks = (*self._touched, self._first_slots, self._begins, offsets, dealt, keys, before)
+        launch(kernels.deal_chunks, self._chunks, *self._geometry[:4], self._chunk_size, *self._size, *chunks, grain=1)
         if begun is not None:
             checks.check_dealt(begun, self._begins)
         ranges = torch.empty(rows * columns, 2, dtype=torch.int32)

@@ -1,8 +1,7 @@
-"""Splats to tiles on CUDA: a radix sort of the splats by depth, then one of all pairs by tile.
+"""Binning on CUDA: a radix sort of the splats by depth, then one of all pairs by tile.
 
-Two ways in. ``RadixCount`` asks the device for the number of pairs, once, in the middle. ``bin_within`` never asks:
-it has room for so many pairs and says afterwards, on the device, how many there were. Both run on a CPU as well, where
-they are tested.
+``RadixBinning`` asks the device once for the number of pairs. ``bin_within`` never asks: it has room for a given number
+of pairs and leaves the true number on the device. Both also run on a CPU, where they are tested.
 """
 
 from __future__ import annotations
@@ -23,32 +22,29 @@ from . import checks
 
 MAX_PAIRS = 2**31 - 1
 MAX_ROOM = MAX_PAIRS // 2
-"""Pairs that a radix sort can hold: its lists are twice as long."""
+"""Largest number of pairs that a radix sort can hold: its lists are twice as long."""
 
 
-def bin_within(
-    splats: Splats, capacity: int, *, slots: bool = True, tile_size: int = TILE_SIZE
-) -> tuple[Tiles, Tensor]:
-    """``bin_splats`` without waiting for the device: every buffer's size follows from the arguments' shapes.
+def bin_within(splats: Splats, capacity: int, *, slots: bool = True) -> tuple[Tiles, Tensor]:
+    """Bin splats without waiting for the device: the size of every buffer follows from the arguments.
 
     Args:
         splats: N projected Gaussians, on any device; shapes are not checked.
-        capacity: pairs of splat and tile that there is room for, at least 1.
-        slots: whether ``Tiles.slots`` is wanted; compositing needs it for gradients only. Else it is empty.
-        tile_size: side of a tile in pixels.
+        capacity: number of pairs of splat and tile that the lists hold, at least 1.
+        slots: whether to make ``Tiles.slots``, which compositing needs for gradients only; otherwise it is empty.
 
     Returns:
-        Tiles whose lists have ``capacity`` entries, and the number of pairs there really were, int64 [1] on the
-        device. Where it is more than ``capacity``, pairs are missing from the lists (nothing is out of bounds) and what
-        was drawn with them must be thrown away.
+        Tiles whose lists have ``capacity`` entries, and the true number of pairs, int64 [1] on the device. If it is
+        larger than ``capacity``, pairs are missing from the lists (nothing is out of bounds) and an image drawn with
+        them must be discarded.
 
     Raises:
         ValueError: the capacity is less than 1 or more than ``MAX_ROOM``.
     """
     if not 1 <= capacity <= MAX_ROOM:
         raise ValueError(f"capacity must be in 1 .. {MAX_ROOM}, got {capacity}")
-    columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
-    size = (splats.width, splats.height, columns, rows, tile_size)
+    columns, rows = -(-splats.width // TILE_SIZE), -(-splats.height // TILE_SIZE)
+    size = (splats.width, splats.height, columns, rows, TILE_SIZE)
     geometry = geometry_of(splats)
     whole = (*size, 0, columns * rows)
     counts, order = _count(geometry, whole)
@@ -61,10 +57,10 @@ def bin_within(
     return tiles, total
 
 
-class RadixCount:
-    """On a GPU, a ``bands.Count``: as many pairs as there are, which takes one wait."""
+class RadixBinning:
+    """Binning on a GPU (a ``ListSize``), with lists of exactly the number of pairs, at the price of one wait."""
 
-    most = MAX_ROOM
+    max_entries = MAX_ROOM
 
     def __init__(self, geometry: list[Tensor], size: tuple[int, ...], window: tuple[int, int]) -> None:
         self._geometry, self._size = geometry, (*size, *window)
@@ -73,32 +69,32 @@ class RadixCount:
         self.pairs = self.entries = int(self._offsets[-1])
 
     @property
-    def kept(self) -> int:
+    def list_bytes(self) -> int:
         return 12 * self.pairs + 8 * len(self._counts) + 8 * self._size[2] * self._size[3]
 
     @property
-    def scratch(self) -> int:
+    def scratch_bytes(self) -> int:
         return 16 * self.pairs + 12 * len(self._counts)
 
     def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Ranges, splats, slots, offsets."""
-        found = _list(self._geometry, self._size, self._counts, self._order, self._offsets, self.pairs, True)
-        return *found, self._offsets
+        """Return ranges, splats, slots and offsets."""
+        lists = _list(self._geometry, self._size, self._counts, self._order, self._offsets, self.pairs, True)
+        return *lists, self._offsets
 
 
 def bytes_within(capacity: int, count: int, tiles: int) -> int:
-    """What ``bin_within`` takes without slots, of ``count`` splats."""
+    """Return the bytes that ``bin_within`` takes without slots, for ``count`` splats."""
     return 16 * capacity + 52 * count + 8 * tiles
 
 
 def geometry_of(splats: Splats) -> list[Tensor]:
-    """The tensors that decide which tiles a splat touches, in the kernels' order."""
+    """Return the tensors that decide which tiles a splat touches, in the kernels' order."""
     names = ("means2d", "conics", "opacities", "depths", "radii")
     return [getattr(splats, name).detach().contiguous() for name in names]
 
 
 def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """[N] tiles that each splat touches; [2 N] in whose first half the splats are in order of depth."""
+    """Return the number of tiles that each splat touches, [N], and [2 N] whose first half is the order by depth."""
     count, device = len(geometry[0]), geometry[0].device
     counts = torch.empty(count, dtype=torch.int32, device=device)
     depth_keys = torch.empty(2 * count, device=device)
@@ -109,7 +105,7 @@ def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tenso
 
 
 def _running_sums(counts: Tensor) -> Tensor:
-    """[N + 1] int64 sum of the counts before each."""
+    """Return the sums of the counts before each, [N + 1] int64."""
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, dtype=torch.int64, out=offsets[1:])
     return offsets
@@ -117,14 +113,14 @@ def _running_sums(counts: Tensor) -> Tensor:
 
 def _list(
     geometry: list[Tensor],
-    size: tuple[int, ...],  # width, height, columns, rows, tile size, begin and end of the tiles wanted
+    size: tuple[int, ...],  # width, height, columns, rows, tile size, begin and end of the window
     counts: Tensor,
     order: Tensor,
     offsets: Tensor,
     room: int,
     with_slots: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Ranges [T, 2], splats [room], slots [room] (or [0])."""
+    """Return ranges [T, 2], splats [room] and slots [room] (or [0])."""
     count, tile_count, device = len(counts), size[2] * size[3], counts.device
     ranked = torch.empty_like(counts)
     launch(kernels.counts_by_depth, count, order, counts, ranked)
@@ -145,7 +141,7 @@ def _list(
 
 
 def radix_sort(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
-    """Stable radix sort of the first halves; the second halves are scratch."""
+    """Sort the first halves by key, stably; the second halves are scratch."""
     if count == 0:
         return
     with on_torch_stream(keys.device) if keys.is_cuda else contextlib.nullcontext():

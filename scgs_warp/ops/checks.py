@@ -1,4 +1,4 @@
-"""Checks of what binning and compositing promise each other, for debug mode (``scgs_warp.runtime.debug``)."""
+"""Checks of the invariants between binning and compositing, for debug mode (``scgs_warp.runtime.debug``)."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from ..runtime import debug
 from ..types import Splats, Tiles
 
 UNWRITTEN = -1
-"""In debug mode, what lists hold before they are written."""
+"""Initial entry of lists in debug mode."""
 UNWRITTEN_BITS = 0x7FABCDEF
-"""The same of gradient slots: a NaN that no arithmetic makes."""
-LARGEST = 1e30
-"""Beyond this, sums of finite values need not be finite."""
+"""Initial bits of gradient slots in debug mode: a NaN that no arithmetic makes."""
+SAFE_MAGNITUDE = 1e30
+"""Largest magnitude of values whose sums are surely finite."""
 
 
 def unwritten(size: int, device: torch.device | str = "cpu") -> Tensor:
-    """[size] int32 for a kernel to fill; in debug mode, what it leaves out can be told."""
+    """Allocate [size] int32 for a kernel to fill; debug mode can tell entries that the kernel leaves out."""
     if debug.enabled():
         return torch.full((size,), UNWRITTEN, dtype=torch.int32, device=device)
     return torch.empty(size, dtype=torch.int32, device=device)
 
 
 def unwritten_slots(pairs: int, width: int, device: torch.device) -> Tensor:
-    """[pairs, width] float32, likewise."""
+    """Allocate [pairs, width] float32 for a kernel to fill, as :func:`unwritten` does."""
     slots = torch.empty(pairs, width, device=device)
     if debug.enabled():
         slots.view(torch.int32).fill_(UNWRITTEN_BITS)
@@ -32,9 +32,10 @@ def unwritten_slots(pairs: int, width: int, device: torch.device) -> Tensor:
 
 
 def expect(holds: bool | Tensor, what: str) -> None:
-    """
+    """Check an invariant, described by ``what``.
+
     Raises:
-        BrokenInvariant: ``what`` does not hold everywhere.
+        BrokenInvariant: it does not hold everywhere.
     """
     if isinstance(holds, Tensor):
         holds = bool(holds.all())
@@ -43,10 +44,10 @@ def expect(holds: bool | Tensor, what: str) -> None:
 
 
 def check_tiles(splats: Splats, tiles: Tiles) -> None:
-    """Complete lists: every pair counted is listed once, in its tile, in order, with a slot of its own.
+    """Check complete lists: every counted pair is listed once, in its tile, in order, with a slot of its own.
 
     Raises:
-        BrokenInvariant: naming what is not so.
+        BrokenInvariant: naming the violated invariant.
     """
     count, pairs = len(splats.means2d), len(tiles.splats)
     check_room(tiles, pairs, count)
@@ -73,10 +74,10 @@ def check_tiles(splats: Splats, tiles: Tiles) -> None:
 
 
 def check_dealt(begun: Tensor, ended: Tensor) -> None:
-    """On a CPU, between dealing and sorting, which would follow what was never written.
+    """Check on a CPU that dealing wrote every stretch that sorting will read.
 
     Args:
-        begun, ended: [chunks, rows + 1] where each chunk's first stretch of each row goes, and behind its last one.
+        begun, ended: [chunks, rows + 1] position of each chunk's first stretch of each row, and behind its last one.
 
     Raises:
         BrokenInvariant: a chunk dealt more or fewer than it counted.
@@ -85,10 +86,10 @@ def check_dealt(begun: Tensor, ended: Tensor) -> None:
 
 
 def check_room(tiles: Tiles, capacity: int, count: int) -> None:
-    """Lists with room for ``capacity`` pairs of ``count`` splats, whether or not all found room.
+    """Check lists with room for ``capacity`` pairs of ``count`` splats, whether or not all pairs found room.
 
     Raises:
-        BrokenInvariant: something points out of them.
+        BrokenInvariant: an entry points outside the lists.
     """
     ranges, offsets = tiles.ranges, tiles.offsets
     expect(len(tiles.splats) == capacity, "the list has the room that was planned")
@@ -101,13 +102,13 @@ def check_room(tiles: Tiles, capacity: int, count: int) -> None:
 
 
 def check_pixels(tiles: Tiles, window: tuple[int, int], alpha: Tensor, transmittance: Tensor, last: Tensor) -> None:
-    """What the forward pass says of the pixels of some tiles.
+    """Check the results of the forward pass for the pixels of some tiles.
 
     Args:
         alpha, transmittance, last: [H, W] of the whole image.
 
     Raises:
-        BrokenInvariant: naming what is not so.
+        BrokenInvariant: naming the violated invariant.
     """
     side, device = tiles.tile_size, alpha.device
     rows = torch.arange(tiles.height, device=device) // side
@@ -123,19 +124,21 @@ def check_pixels(tiles: Tiles, window: tuple[int, int], alpha: Tensor, transmitt
 
 
 def check_image(image: Tensor, channels: Tensor, background: Tensor) -> None:
-    """
+    """Check that an image of finite colours is finite.
+
     Raises:
-        BrokenInvariant: the image is not finite, although what it is made of is.
+        BrokenInvariant: it is not.
     """
     finite = channels[channels.isfinite()]
-    if _tame(finite, background):
+    if _safe(finite, background):
         expect(image.isfinite(), "an image of finite colours is finite")
 
 
 def check_slots(tiles: Tiles, v_slots: Tensor) -> None:
-    """
+    """Check the gradient slots.
+
     Raises:
-        BrokenInvariant: a gradient slot is missing, or would be read without having been written.
+        BrokenInvariant: a slot is missing, or would be read without having been written.
     """
     expect(len(v_slots) == len(tiles.splats), "there is a gradient slot for each pair")
     left = (v_slots.view(torch.int32) == UNWRITTEN_BITS).any(dim=1)
@@ -143,15 +146,16 @@ def check_slots(tiles: Tiles, v_slots: Tensor) -> None:
 
 
 def check_gradients(gradients: tuple[Tensor | None, ...], v_image: Tensor, v_alpha: Tensor) -> None:
-    """
+    """Check that finite incoming gradients give finite gradients.
+
     Raises:
-        BrokenInvariant: a gradient is not finite, although what came in is.
+        BrokenInvariant: they do not.
     """
-    if _tame(v_image, v_alpha):
+    if _safe(v_image, v_alpha):
         for gradient in gradients:
             expect(gradient is None or gradient.isfinite(), "gradients of finite gradients are finite")
 
 
-def _tame(*tensors: Tensor) -> bool:
-    """Finite, and far from the largest numbers."""
-    return all(bool((tensor.abs() <= LARGEST).all()) for tensor in tensors)
+def _safe(*tensors: Tensor) -> bool:
+    """Return whether all values are finite and small enough for finite sums."""
+    return all(bool((tensor.abs() <= SAFE_MAGNITUDE).all()) for tensor in tensors)

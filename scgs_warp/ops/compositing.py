@@ -1,4 +1,4 @@
-"""Tiles to pixels: alpha compositing of sorted splats, and its adjoint."""
+"""Compositing: alpha blending of each tile's sorted splats into pixels, and its adjoint."""
 
 from __future__ import annotations
 
@@ -20,15 +20,13 @@ from .binning import bin_window
 from .memory_windows import Demand, Window, slot_bytes
 
 Form = Literal["auto", "pixel", "cpu", "cuda", "blocks"]
-
-
 EMPTY_TILE = 8
-"""What reading and writing a tile's pixels costs on a CPU, in pairs of splat and tile."""
+"""Cost of reading and writing a tile's pixels on a CPU, in pairs of splat and tile."""
 
 
 @dataclass(frozen=True)
 class _Job:
-    """What one call of ``composite`` holds beside its differentiable tensors."""
+    """Arguments of one call of ``composite`` beside its differentiable tensors."""
 
     splats: Splats
     tiles: Tiles
@@ -38,7 +36,7 @@ class _Job:
 
 
 def demand(splats: Splats, channels: Tensor, background: Tensor | None = None) -> Demand:
-    """What :func:`composite` of these arguments takes beside the lists of splats, with what is made of its image."""
+    """Estimate the memory that :func:`composite` takes beside the lists of splats, its image's further use included."""
     count, width = channels.shape
     packed = 4 * (PACKED_GEOMETRY + _padded(width)) if channels.device.type == "cpu" else 4
     tensors = (splats.means2d, splats.conics, splats.opacities, channels)
@@ -49,7 +47,7 @@ def demand(splats: Splats, channels: Tensor, background: Tensor | None = None) -
 
 
 def image_demand(width: int, height: int, channels: int, gradients: bool = False) -> int:
-    """Bytes of an image and its alpha, with depth and colours made of them; of their gradients and a loss' images."""
+    """Estimate the bytes of an image and its alpha, with depth, colours, gradients and a loss' images made of them."""
     planes = 3 * (channels + 1) + 2 if gradients else channels + 3
     return 4 * planes * width * height
 
@@ -68,28 +66,28 @@ def composite(
 
     3D Gaussian Splatting (Kerbl et al. 2023), equation 3, with gsplat 1.5.3's thresholds: alpha is at most 0.999 (and
     passes no gradient there), is skipped under 1/255, and a pixel ends for good before the splat that would leave a
-    transmittance of 1e-4 or less. A splat with a channel that is not finite, or beyond 1e18, is left out.
+    transmittance of 1e-4 or less. A splat with a channel that is non-finite or beyond 1e18 is left out.
 
-    Gradients go to ``splats.means2d``, ``conics`` and ``opacities``, to ``channels`` and to ``background``. One to the
-    geometry that overflows counts as none.
+    Gradients go to ``splats.means2d``, ``conics`` and ``opacities``, to ``channels`` and to ``background``. A gradient
+    to the geometry that overflows becomes 0.
 
     Args:
         splats: N projected Gaussians; ``depths`` is not read.
-        channels: [N, C] what is blended: colours, depths, anything.
-        tiles: of ``bin_splats(splats)``. Where they are cut into windows, these are listed and drawn one after the
-            other, in the backward pass as well: the same bits, with the lists of one window in memory.
-        background: [C] what shines through. None: zeros, as what is not finite.
-        stats: if given, the backward pass adds to it what ``Stats`` says.
+        channels: [N, C] values to blend: colours, depths, anything.
+        tiles: result of ``bin_splats(splats)``. If cut into windows, these are listed and drawn one after the other, in
+            the backward pass as well: the same bits, with the lists of one window in memory.
+        background: [C] values behind all splats. None: zeros, which also replace non-finite values.
+        stats: if given, the backward pass adds its statistics.
         absgrad: [N, 2] buffer that the backward pass overwrites with the sum over pixels of the absolute gradients of
             ``means2d``.
-        form: which of the kernels runs; ``auto`` takes the fastest for the device. ``pixel`` is the readable
-            reference on any device, ``blocks`` the portable sibling of ``cuda``.
+        form: kernels to run; ``auto`` takes the fastest for the device. ``pixel`` is the readable reference on any
+            device, ``blocks`` the portable sibling of ``cuda``.
 
     Returns:
         image [C, H, W] on the background, alpha [H, W] in [0, 1).
 
     Raises:
-        ValueError: a shape or the form does not fit.
+        ValueError: a shape or the form is wrong.
     """
     _validate(splats, channels, tiles, background, stats, absgrad)
     if background is None:
@@ -133,7 +131,7 @@ class _Composite(torch.autograd.Function):
         for number, (tiles, window) in enumerate(_pieces(job)):
             v_slots = _adjoint(job, tiles, window, tensors, source, lists, absolute)
             compositing_cuda.sum_slots(job.form, tiles.offsets, v_slots, outputs, more=number > 0)
-            del tiles, v_slots  # before the next ones are made
+            del tiles, v_slots  # frees their memory before the next window
         if debug.enabled():
             checks.check_gradients(outputs, v_image, v_alpha)
         if job.stats is not None:
@@ -159,8 +157,7 @@ def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
 
 
 def _pieces(job: _Job) -> Iterator[tuple[Tiles, Window]]:
-    """The lists and the tiles they are of: all at once, or window by window. Whoever asks for the next must have let go
-    of the last."""
+    """Yield lists and window: all at once, or window by window. The caller must drop each before the next."""
     if not job.tiles.windows:
         yield job.tiles, (0, len(job.tiles.ranges))
         return
@@ -170,8 +167,8 @@ def _pieces(job: _Job) -> Iterator[tuple[Tiles, Window]]:
 
 
 def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, ...]:
-    """Image, alpha, and for the adjoint (None unless ``keep``): the form's view of the splats, final transmittance
-    and last contributor."""
+    """Return image and alpha, and for the adjoint (None unless ``keep``) the form's representation of the splats, final
+    transmittance and last contributor."""
     means2d, conics, opacities, channels, background = tensors
     device, count = channels.device, channels.shape[1]
     image = torch.empty(count, job.tiles.height, job.tiles.width, device=device)
@@ -183,13 +180,13 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
     if job.form == "cpu":
         source = _pack(means2d, conics, opacities, channels)
     else:
-        source = torch.empty_like(opacities)  # opacities of the splats that may be added
+        source = torch.empty_like(opacities)  # opacities, with 0 for splats that are left out
         launch(kernels.finite_opacities, len(opacities), opacities, channels, source)
     for tiles, window in _pieces(job):
         _draw(job.form, tiles, window, tensors, source, outputs)
         if transmittance is not None and last is not None and checked:
             checks.check_pixels(tiles, window, alpha, transmittance, last)
-        del tiles  # before the next ones are made
+        del tiles  # frees its memory before the next window
     if checked:
         checks.check_image(image, channels, background)
     return image, alpha, *((source, transmittance, last) if keep else (None, None, None))
@@ -203,7 +200,7 @@ def _draw(
     source: Tensor,
     outputs: tuple[Tensor | None, ...],
 ) -> None:
-    """The pixels of some tiles."""
+    """Draw the pixels of some tiles."""
     means2d, conics, _, channels, background = tensors
     size, begin, count = (tiles.width, tiles.height, tiles.columns), window[0], window[1] - window[0]
     if form == "cpu":
@@ -220,7 +217,7 @@ def _draw(
 
 
 def _pixels(tiles: Tiles, window: Window) -> list[tuple[int, int]]:
-    """First pixel and number of pixels of the stretches of the image, row major, that a window consists of."""
+    """Return first pixel and number of pixels of each row-major stretch of the image that a window covers."""
     (top, left), (bottom, right) = divmod(window[0], tiles.columns), divmod(window[1], tiles.columns)
     side, width = tiles.tile_size, tiles.width
     y_begin = top * side
@@ -232,18 +229,18 @@ def _pixels(tiles: Tiles, window: Window) -> list[tuple[int, int]]:
 
 
 def _load(tiles: Tiles, window: Window) -> Tensor:
-    """[T] what the window's tiles up to each cost on a CPU, in pairs."""
+    """Return the cost on a CPU of the window's tiles up to each, [T], in pairs."""
     ends = tiles.ranges[window[0] : window[1], 1]
     return ends + torch.arange(EMPTY_TILE, (len(ends) + 1) * EMPTY_TILE, EMPTY_TILE)
 
 
 def _padded(channels: int) -> int:
-    """Columns that a packed splat's channels take."""
+    """Return the number of columns of a packed splat's channels."""
     return -(-channels // CHANNEL_GROUP) * CHANNEL_GROUP
 
 
 def _slot_width(channels: int) -> int:
-    """Columns of a gradient slot: of up to 8 channels it is one cache line."""
+    """Return the number of columns of a gradient slot, which is one cache line for up to 8 channels."""
     return max(kernels.SLOT_WIDTH, SLOT_GEOMETRY + channels)
 
 
@@ -262,8 +259,8 @@ def _adjoint(
     pixels: tuple[Tensor, ...],
     absolute: bool,
 ) -> Tensor:
-    """[P, S] gradient of every pair listed, in its slot. ``pixels``: final transmittance, last contributor, and the
-    gradients to image and alpha."""
+    """Return the gradient of every listed pair in its slot, [P, S]. ``pixels``: final transmittance, last contributor,
+    and the gradients to image and alpha."""
     means2d, conics, _, channels, background = tensors
     v_slots = checks.unwritten_slots(len(tiles.splats), _slot_width(channels.shape[1]), channels.device)
     lists = (background, tiles.ranges, tiles.splats, tiles.slots, *pixels)
@@ -284,7 +281,7 @@ def _adjoint(
 
 
 def _background_gradient(v_image: Tensor, transmittance: Tensor) -> Tensor:
-    """[C] sum over pixels of v_image times transmittance, in a fixed order."""
+    """Return the sum over pixels of v_image times transmittance, [C], in a fixed order."""
     channels, height, _ = v_image.shape
     rows = torch.empty(height, channels, device=v_image.device)
     launch(kernels.background_rows, height, v_image, transmittance, rows, grain=16)

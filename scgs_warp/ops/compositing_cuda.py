@@ -1,4 +1,4 @@
-"""Launches of the forms of compositing that take a block of threads a tile: ``cuda``, and the portable ``blocks``."""
+"""Launches of the forms of compositing with a block of threads per tile: ``cuda``, and the portable ``blocks``."""
 
 from __future__ import annotations
 
@@ -21,8 +21,14 @@ def forward(
     outputs: tuple[Tensor | None, ...],
     window: tuple[int, int],
 ) -> None:
-    """``lists``: the kernels' tensors up to the sorted list; ``size``: width, height, columns; ``window``: begin and
-    end of the tiles to draw."""
+    """Draw some tiles.
+
+    Args:
+        lists: the kernels' tensors up to the sorted list.
+        size: width, height, columns.
+        outputs: image, alpha, final transmittance and last contributor.
+        window: begin and end of the tiles to draw.
+    """
     begin, blocks = window[0], window[1] - window[0]
     if form == "cuda":
         launch_native(native.composite_tiles, blocks, *lists, *size, *outputs, begin=begin)
@@ -44,8 +50,14 @@ def adjoint(
     v_slots: Tensor,
     window: tuple[int, int],
 ) -> None:
-    """``lists``: the kernels' tensors up to ``v_alpha``; else as ``forward``. More channels than the native form's slot
-    holds go to the portable one."""
+    """Write the gradients of some tiles' pairs into their slots.
+
+    The portable form takes over where there are more channels than a slot of the native form holds.
+
+    Args:
+        lists: the kernels' tensors up to ``v_alpha``.
+        size, window: as in :func:`forward`.
+    """
     begin, blocks = window[0], window[1] - window[0]
     if form == "cuda" and lists[3].shape[1] <= native.MAX_CHANNELS:
         launch_native(native.composite_tiles_adjoint, blocks, *lists, *size, v_slots, begin=begin)
@@ -62,8 +74,12 @@ def adjoint(
 def sum_slots(
     form: str, offsets: Tensor, v_slots: Tensor, outputs: tuple[Tensor | None, ...], more: bool = False
 ) -> None:
-    """Sum each splat's slots into the gradients of mean, conic, opacity, channels and the absolute one of the mean;
-    ``more``: onto what they hold."""
+    """Sum each splat's slots into its gradients.
+
+    Args:
+        outputs: gradients to mean, conic, opacity and channels, and the absolute gradient to the mean.
+        more: whether to add to the outputs instead of overwriting them.
+    """
     count, slots = len(offsets) - 1, (offsets, v_slots, int(more))
     if v_slots.shape[1] != slots_cuda.SLOT_WIDTH:
         launch(compositing.sum_slots, count, *slots, *outputs)
@@ -74,10 +90,10 @@ def sum_slots(
 
 
 def launch_native(kernel: Any, blocks: int, *args: Any, begin: int = 0) -> None:
-    """Launch a kernel whose body is empty on a CPU.
+    """Launch a kernel that exists on CUDA alone.
 
     Raises:
-        RuntimeError: the tensors are on a CPU.
+        RuntimeError: the tensors are on a CPU, where the kernel's body is empty.
     """
     device: torch.device = args[0].device
     if device.type != "cuda":

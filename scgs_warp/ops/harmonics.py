@@ -1,4 +1,4 @@
-"""Colour from spherical harmonics and the direction of view, with gradients."""
+"""View-dependent colour from spherical harmonics, with gradients."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class _SphericalHarmonics(torch.autograd.Function):
             launch(cpu_kernels.spherical_harmonics_adjoint, blocks, *arguments, grain=32)
         else:
             launch(kernels.spherical_harmonics_adjoint, count, *arguments)
-        # Only mean minus camera enters, so the camera's gradient is minus the sum of the means'.
+        # The colour depends on mean minus camera alone, so the camera's gradient is minus the sum of the means'.
         v_camera = -sum_rows(v_means) if wants_camera and v_means is not None else None
         return v_dc, v_rest, v_means, v_camera, None, None
 
@@ -61,20 +61,21 @@ class _SphericalHarmonics(torch.autograd.Function):
 def spherical_harmonics(
     sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_position: Tensor, degree: int, *, form: Form = "auto"
 ) -> Tensor:
-    """Colours of Gaussians seen from one point: harmonics + 0.5, clamped at 0 (3D-GS; signs as there).
+    """Return the colours of Gaussians seen from one point: harmonics + 0.5, clamped at 0 (signs as in 3D-GS).
 
     Args:
         sh_dc: [N, 3] float32, coefficients of degree 0.
-        sh_rest: [N, R, 3] float32, the higher ones, R >= (degree + 1)^2 - 1; those beyond get a zero gradient.
+        sh_rest: [N, R, 3] float32, coefficients of the higher degrees, R >= (degree + 1)^2 - 1; those beyond ``degree``
+            get a zero gradient.
         means: [N, 3] float32, world.
         camera_position: [3] float32, world.
         degree: 0 to 3.
-        form: which of the kernels runs: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the device's own.
+        form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
-        [N, 3] colours >= 0; where a coefficient that counts is not finite the colour is not either, and ``composite``
-        leaves such a Gaussian out. Gradients reach all four tensors; a channel that is clamped or not finite passes
-        none, nor does one to the mean that would overflow.
+        [N, 3] colours >= 0; non-finite where a used coefficient is, and ``composite`` leaves such a Gaussian out.
+        Gradients reach all four tensors; a clamped or non-finite channel passes no gradient, nor does one to the mean
+        that would overflow.
 
     Raises:
         ValueError: a shape is wrong, or the degree is not 0 to 3 or more than ``sh_rest`` has.

@@ -1,4 +1,4 @@
-"""Colours that turn with what they are painted on: rotation of spherical harmonics coefficients. No gradient."""
+"""Rotation of spherical harmonics coefficients, so that colours turn with their surface. No gradient."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..kernels import harmonics_rotation as kernels
 from ..runtime.launch import launch
 
 SIZES = (0, 3, 8, 15)
-"""Coefficients above degree 0, for degrees 0 to 3."""
+"""Numbers of coefficients above degree 0, for degrees 0 to 3."""
 
 
 def _basis(degree: int, d: np.ndarray) -> np.ndarray:
-    """[V, 2 l + 1] one band at unit directions [V, 3], with the signs of 3D-GS (``kernels/harmonics.py``)."""
+    """Evaluate one band at unit directions [V, 3] as [V, 2 l + 1]; signs of 3D-GS (``kernels/harmonics.py``)."""
     x, y, z = d.T
     xx, yy, zz = x * x, y * y, z * z
     pi = math.pi
@@ -43,9 +43,9 @@ def _basis(degree: int, d: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _tables() -> tuple[Tensor, Tensor]:
-    """Directions [15, 3] and the inverses [83] of the bands' values there.
+    """Return directions [15, 3] and the inverses [83] of the bands' values there.
 
-    The directions are those of a seeded search for well-conditioned matrices: values are as exact as coefficients.
+    A seeded search finds directions whose matrices are well conditioned, so that values are as exact as coefficients.
     """
     random = np.random.default_rng(1)
     directions, inverses = [], []
@@ -60,17 +60,17 @@ def _tables() -> tuple[Tensor, Tensor]:
 
 
 def rotate_harmonics(sh_rest: Tensor, quats: Tensor) -> Tensor:
-    """Coefficients of the functions turned by ``quats``: seen along R d they show what they showed along d.
+    """Rotate spherical harmonics: along R d the result has the colour that the input has along d.
 
     Args:
-        sh_rest: [N, R, 3] coefficients of degree 1 and up; R is 0, 3, 8 or 15.
-        quats: [N, 4] wxyz, any norm. Where x, y and z are 0 the coefficients stay as they are, to the bit.
+        sh_rest: [N, R, 3] coefficients of degree 1 and higher; R is 0, 3, 8 or 15.
+        quats: [N, 4] wxyz, any norm. The identity (x, y and z are 0) keeps the coefficients' bits.
 
     Returns:
-        [N, R, 3]; degree 0 does not turn. No gradient.
+        [N, R, 3]; degree 0 needs no rotation. No gradient.
 
     Raises:
-        ValueError: shapes do not fit.
+        ValueError: a shape is wrong.
     """
     if sh_rest.ndim != 3 or sh_rest.shape[2] != 3 or sh_rest.shape[1] not in SIZES:
         raise ValueError(f"sh_rest must be [N, R, 3] with R in {SIZES}, got {tuple(sh_rest.shape)}")

@@ -1,8 +1,8 @@
-"""Images whose lists of splats do not fit into memory, in windows of tiles, each of which does.
+"""Windows of tiles, for images whose lists of splats do not fit into memory together.
 
 A tile's list does not depend on what else is listed, so a window's pixels have the bits of the whole image's. Windows
-are rows of tiles as long as one row fits, then parts of a row, in the end one tile. Their order is that of the tiles:
-sums over a splat's slots go on from window to window in the order they have in one piece.
+are rows of tiles as long as one row fits, then parts of a row, in the end one tile. They follow the order of the tiles,
+so that sums over a splat's slots continue from window to window in the order they have in one piece.
 """
 
 from __future__ import annotations
@@ -20,58 +20,58 @@ from ..types import Splats
 Window = tuple[int, int]
 """Tiles from begin to end; either whole rows or within one row."""
 
-CROWDED = 0.5
-"""Part of the memory that a window is cut to, while it can be cut: what one leaves behind is not at once free."""
+WINDOW_SHARE = 0.5
+"""Share of the free memory that a window may fill, while it can be cut further: memory is not free again at once."""
 REMEDY = "make the image smaller or use fewer Gaussians"
 
 
-class Count(Protocol):
-    """What counting found, before anything of the size of the lists is allocated."""
+class ListSize(Protocol):
+    """Size of the lists of a window, counted before they are allocated."""
 
     pairs: int
-    """Of splat and tile."""
+    """Number of pairs of splat and tile."""
     entries: int
-    """Of the longest list."""
-    most: int
-    """What a list can index."""
+    """Length of the longest list."""
+    max_entries: int
+    """Largest length that a list can index."""
 
     @property
-    def kept(self) -> int:
+    def list_bytes(self) -> int:
         """Bytes of the lists."""
         ...
 
     @property
-    def scratch(self) -> int:
-        """Bytes that making them takes besides, and leaves free."""
+    def scratch_bytes(self) -> int:
+        """Bytes used only while the lists are made."""
         ...
 
 
 @dataclass(frozen=True)
 class Demand:
-    """What compositing takes beside the lists, in bytes."""
+    """Memory that compositing takes beside the lists, in bytes."""
 
     fixed: int
-    """Whatever the number of pairs: images, packed splats, gradients."""
+    """Independent of the number of pairs: images, packed splats, gradients."""
     per_pair: int = 0
-    """In the backward pass: a gradient slot."""
+    """Per pair in the backward pass: a gradient slot."""
 
-    def total(self, count: Count) -> int:
-        """With the lists and their scratch."""
-        return self.fixed + count.kept + max(count.scratch, self.per_pair * count.pairs)
+    def total(self, size: ListSize) -> int:
+        """Bytes with the lists and their scratch memory."""
+        return self.fixed + size.list_bytes + max(size.scratch_bytes, self.per_pair * size.pairs)
 
 
-def fits(count: Count, demand: Demand, device: torch.device) -> bool:
-    """Whether everything can be listed and drawn at once."""
-    return count.entries <= count.most and memory.fits(demand.total(count), device)
+def fits(size: ListSize, demand: Demand, device: torch.device) -> bool:
+    """Return whether everything can be listed and drawn at once."""
+    return size.entries <= size.max_entries and memory.fits(demand.total(size), device)
 
 
 def require_image(need: int, size: tuple[int, int], count: int, device: torch.device) -> None:
-    """Refuse an image that itself does not fit, before its tiles are counted.
+    """Refuse an image that does not fit whatever its lists, before its tiles are counted.
 
     Args:
-        need: bytes whatever the number of pairs.
+        need: bytes that do not depend on the number of pairs.
         size: width and height.
-        count: of splats.
+        count: number of splats.
 
     Raises:
         NotEnoughMemory: with the figures.
@@ -83,25 +83,27 @@ def _named(size: tuple[int, int], count: int) -> str:
     return f"an image of {size[0]} x {size[1]} with {count:,} Gaussians"
 
 
-def require_lists(count: Count, device: torch.device) -> None:
-    """Refuse lists that cannot be: there is nobody who would draw them in windows.
+def require_lists(size: ListSize, device: torch.device) -> None:
+    """Refuse lists that cannot be made in one piece, for callers that do not draw in windows.
 
     Raises:
-        ValueError: they cannot be indexed.
+        ValueError: the lists cannot be indexed.
         NotEnoughMemory: they do not fit.
     """
-    if count.entries > count.most:
+    if size.entries > size.max_entries:
         raise ValueError(
-            f"splats: {count.pairs} pairs of splat and tile, more than {count.most}; reduce the image or the splats"
+            f"splats: {size.pairs} pairs of splat and tile, more than {size.max_entries}; "
+            "reduce the image or the splats"
         )
-    memory.require(count.kept + count.scratch, device, f"splats: {count.pairs:,} pairs of splat and tile", REMEDY)
+    need = size.list_bytes + size.scratch_bytes
+    memory.require(need, device, f"splats: {size.pairs:,} pairs of splat and tile", REMEDY)
 
 
-def cut(count: Callable[[Window], Count], columns: int, rows: int, demand: Demand, splats: Splats) -> list[Window]:
-    """Windows of an image that does not fit in one piece, in the order of the tiles, all of which fit.
+def cut(measure: Callable[[Window], ListSize], columns: int, rows: int, demand: Demand, splats: Splats) -> list[Window]:
+    """Cut an image into windows that all fit, in the order of the tiles.
 
     Args:
-        count: of a window.
+        measure: counts the lists of a window.
         columns, rows: tiles of the image.
 
     Raises:
@@ -111,27 +113,27 @@ def cut(count: Callable[[Window], Count], columns: int, rows: int, demand: Deman
     room = memory.room(device)
     if demand.fixed > room:
         raise memory.refusal(demand.fixed, device, name, REMEDY, room)
-    found: list[Window] = []
+    done: list[Window] = []
     waiting: list[Window] = [(0, columns * rows)]
     while waiting:
         window = begin, end = waiting.pop()
-        counted = count(window)
-        total = demand.total(counted)
+        size = measure(window)
+        total = demand.total(size)
         single = end - begin == 1
-        if counted.entries <= counted.most and total <= demand.fixed + CROWDED * (room - demand.fixed):
-            found.append(window)
-        elif single and counted.entries <= counted.most and total <= room:
-            found.append(window)
+        if size.entries <= size.max_entries and total <= demand.fixed + WINDOW_SHARE * (room - demand.fixed):
+            done.append(window)
+        elif single and size.entries <= size.max_entries and total <= room:
+            done.append(window)
         elif single:
-            tile = f"{name}: one tile of it, with {counted.pairs:,} splats,"
+            tile = f"{name}: one tile of it, with {size.pairs:,} splats,"
             raise memory.refusal(total, device, tile, REMEDY, room)
         else:
             waiting += reversed(halves(window, columns))
-    return found
+    return done
 
 
 def halves(window: Window, columns: int) -> tuple[Window, Window]:
-    """Rows apart, or the columns of one row; the window has two tiles at least."""
+    """Halve a window of two tiles or more, between rows or within its only row."""
     begin, end = window
     rows = (end - begin) // columns
     middle = begin + (rows // 2 * columns if rows > 1 else (end - begin) // 2)
@@ -139,6 +141,6 @@ def halves(window: Window, columns: int) -> tuple[Window, Window]:
 
 
 def slot_bytes(tensors: tuple[Tensor, ...], width: int) -> int:
-    """Of a gradient slot of ``width`` columns, if there will be a backward pass."""
+    """Bytes of a gradient slot of ``width`` columns; 0 if there will be no backward pass."""
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     return 4 * width if wanted else 0

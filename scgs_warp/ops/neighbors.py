@@ -1,4 +1,4 @@
-"""Which control points move a Gaussian, and how much: exact nearest neighbours and RBF weights (SC-GS, Eq. 5)."""
+"""Control points of every Gaussian: exact nearest neighbours and RBF weights (SC-GS, Eq. 5)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .node_sums import rbf_node_sums
 
 
 class NodeLists(NamedTuple):
-    """The (Gaussian, neighbour) pairs of every node, ascending: the order in which its gradients are summed."""
+    """The (Gaussian, neighbour) pairs of every node, ascending: its gradients are summed in this order."""
 
     order: Tensor
     """[N * K] int32, pairs ``i * K + k`` sorted by node."""
@@ -23,20 +23,22 @@ class NodeLists(NamedTuple):
 
 
 def node_lists(indices: Tensor, count: int) -> NodeLists:
-    """Lists of the pairs of each of ``count`` nodes; ``indices`` [N, K] int32, entries in [0, count)."""
+    """List the pairs of each of ``count`` nodes; ``indices`` [N, K] int32 has entries in [0, count)."""
     nodes, order = torch.sort(indices.reshape(-1), stable=True)
     bounds = torch.arange(count + 1, device=indices.device, dtype=nodes.dtype)
     return NodeLists(order.int(), torch.searchsorted(nodes, bounds, out_int32=True))
 
 
 def chunk_size(nodes: int) -> int:
-    """Gaussians whose node gradients are summed into one buffer on a CPU: a function of the node count alone, and a
-    multiple of the 16 that the kernels take at a time."""
+    """Return the number of Gaussians whose node gradients are summed into one buffer on a CPU.
+
+    It depends on the node count alone, and is a multiple of the 16 lanes of the kernels.
+    """
     return max(2048, -(-4 * nodes // 16) * 16)
 
 
 def _check_nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Points and nodes without gradient, contiguous; whether the search fits a CPU's lanes is for ``_in_lanes``."""
+    """Validate points and nodes, and return them contiguous and detached."""
     if points.ndim != 2:
         raise ValueError(f"points must be [N, D], got {tuple(points.shape)}")
     if nodes.ndim != 2 or nodes.shape[1] != points.shape[1] or points.shape[1] == 0:
@@ -51,19 +53,19 @@ def _in_lanes(points: Tensor) -> bool:
 
 
 def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The exact ``k`` nearest nodes of every point, nearest first; ties go to the lower index. No gradient.
+    """Find the exact ``k`` nearest nodes of every point, nearest first; ties go to the lower index. No gradient.
 
     Args:
         points: [N, D] float32.
         nodes: [M, D] float32.
-        k: neighbours a point, 1 .. min(M, 16).
+        k: neighbours per point, 1 .. min(M, 16).
 
     Returns:
-        Indices [N, k] int32, always in [0, M), and squared distances [N, k]. A row whose distances are NaN or infinite
-        gets distances of infinity.
+        Indices [N, k] int32, always in [0, M), and squared distances [N, k]; NaN and infinite distances become
+        infinity.
 
     Raises:
-        ValueError: shapes do not fit, or ``k`` is out of range.
+        ValueError: a shape is wrong, or ``k`` is out of range.
     """
     points, nodes = _check_nearest(points, nodes, k)
     indices = torch.empty(points.shape[0], k, dtype=torch.int32, device=points.device)
@@ -80,8 +82,8 @@ def _blocks(points: Tensor) -> int:
     return -(-points.shape[0] // neighbors.LANES)
 
 
-class _Lists(NamedTuple):
-    """Which nodes every block of sixteen points has to look at, and the nodes' positions when that was found."""
+class CandidateLists(NamedTuple):
+    """Candidate nodes of every block of sixteen points, with the nodes' positions at the time of the search."""
 
     k: int
     order: Tensor
@@ -103,17 +105,19 @@ class _Lists(NamedTuple):
 class NeighborSearch:
     """:func:`nearest` for points and nodes that move a little between calls.
 
-    On a CPU it remembers, for blocks of points that are close together, which nodes were within reach; later calls look
-    at those alone wherever a bound on all movements since then proves that this is enough, and at every node elsewhere.
-    Nothing has to be invalidated, and what is remembered never changes a result: it need not be saved.
+    On a CPU it remembers candidate nodes for blocks of points that are close together. Later calls search the
+    candidates alone wherever a bound on all movements since then proves that this is enough, and every node elsewhere.
+    The memory never changes a result, so it need be neither invalidated nor saved.
     """
 
     def __init__(self) -> None:
-        self._lists: _Lists | None = None
-        self._searched = 0
+        self.lists: CandidateLists | None = None
+        """Candidates in use."""
+        self.full_searches = 0
+        """Number of blocks searched in full since the lists were made."""
 
     def __call__(self, points: Tensor, nodes: Tensor, k: int) -> Tensor:
-        """Exactly the indices of ``nearest(points, nodes, k)``: [N, k] int32.
+        """Return exactly the indices of ``nearest(points, nodes, k)``, [N, k] int32.
 
         Raises:
             ValueError: as :func:`nearest`.
@@ -122,22 +126,22 @@ class NeighborSearch:
         if not _in_lanes(points):
             return nearest(points, nodes, k)[0]
         blocks = _blocks(points)
-        # New lists cost about as much as searching every block in full: they are due once that much was searched.
-        own = self._lists  # once: another thread may put others there
-        if own is None or self._searched > blocks or not own.fit(points, nodes, k):
+        # New lists cost about as much as a full search of every block: they are due after as many full searches.
+        own = self.lists  # read once: another thread may replace them
+        if own is None or self.full_searches > blocks or not own.fit(points, nodes, k):
             indices, distances = nearest(points, nodes, k)
-            self._lists, self._searched = _make_lists(points, nodes, distances), 0
+            self.lists, self.full_searches = _make_lists(points, nodes, distances), 0
             return indices
         shift, failed = torch.empty(1), torch.empty(blocks, dtype=torch.int32)
         launch(neighbor_lists.largest_shift, 1, own.nodes, nodes, shift)
         indices = torch.empty(points.shape[0], k, dtype=torch.int32)
         lists = own.order, own.centres, own.counts, own.lists, shift
         launch(neighbors.nearest_listed, blocks, points, nodes, k, *lists, indices, failed, grain=16)
-        self._searched += int(failed.sum())
+        self.full_searches += int(failed.sum())
         return indices
 
 
-def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> _Lists:
+def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> CandidateLists:
     codes = torch.empty(points.shape[0], dtype=torch.int32)
     corners = torch.zeros(2, 3)
     if points.shape[0]:
@@ -151,13 +155,13 @@ def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> _Lists:
     lists = torch.empty(blocks, int(neighbor_lists.LIST_SIZE), dtype=torch.int32)
     columns = nodes.T.contiguous()
     launch(neighbor_lists.list_blocks, blocks, points, columns, order, distances, centres, counts, lists, grain=16)
-    return _Lists(distances.shape[1], order, centres, counts, lists, nodes.clone())
+    return CandidateLists(distances.shape[1], order, centres, counts, lists, nodes.clone())
 
 
 def _node_sums(
     indices: Tensor, points: Tensor, nodes: Tensor, v_logits: Tensor, lists: NodeLists | None
 ) -> tuple[int, Tensor]:
-    """Number of partial sums and their buffer [parts * M, 2 + D]."""
+    """Return the number of partial sums and their buffer [parts * M, 2 + D]."""
     count, width = nodes.shape[0], 2 + nodes.shape[1]
     if lists is None and points.device.type == "cpu":
         size = chunk_size(count)
@@ -208,25 +212,25 @@ def rbf_weights(
     *,
     lists: NodeLists | None = None,
 ) -> Tensor:
-    """Weights of a Gaussian's control points: ``s_k exp(-d_k^2 / (2 r_k^2))``, normalised over its neighbours.
+    """Return the weights of a Gaussian's control points: ``s_k exp(-d_k^2 / (2 r_k^2))``, normalised.
 
-    SC-GS, Eq. 5; the strengths are the official code's learned node weights. Computed as a softmax of exponents, so a
-    Gaussian far from every node keeps sensible weights. A row without one finite exponent gives all to its first
+    SC-GS, Eq. 5; the strengths are the official code's learned node weights. The weights are a softmax of exponents, so
+    a Gaussian far from every node keeps sensible ones. A row without a finite exponent gives weight 1 to its first
     neighbour and passes no gradient.
 
     Args:
-        points: [N, D] rest positions, hyper-coordinates appended where used.
-        nodes: [M, D].
+        points: [N, D] rest positions, with hyper-coordinates appended if used.
+        nodes: [M, D] likewise.
         radii: [M] > 0, in the units of the points.
         indices: [N, K] int32 in [0, M), as ``nearest`` gives them.
-        strengths: [M] > 0, or None for 1.
-        lists: ``node_lists(indices, M)`` where there is one already; used on CUDA.
+        strengths: [M] > 0. None: 1.
+        lists: ``node_lists(indices, M)``, if computed before; used on CUDA.
 
     Returns:
         [N, K], rows sum to 1. Gradients flow to points, nodes, radii and strengths.
 
     Raises:
-        ValueError: shapes do not fit.
+        ValueError: a shape is wrong.
     """
     if points.ndim != 2:
         raise ValueError(f"points must be [N, D], got {tuple(points.shape)}")

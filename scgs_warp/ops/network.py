@@ -1,4 +1,4 @@
-"""The deformation network on a CPU: a multilayer perceptron as three kernels instead of forty torch operations."""
+"""The deformation network on a CPU: a multilayer perceptron in three kernels instead of forty torch operations."""
 
 from __future__ import annotations
 
@@ -13,26 +13,23 @@ from ..kernels.cpu import network_adjoint as kernels_adjoint
 from ..kernels.types import NETWORK_BLOCK, NETWORK_PANEL
 from ..runtime.launch import launch
 
-ROWS = 8
-"""Matrices have a multiple of this many rows."""
-
-LARGEST = 8192
-"""Rows evaluated at once where no gradient is wanted: what they pass from layer to layer stays in the cache."""
-
-
-LARGEST_ADJOINT = 2048
-"""The same for the adjoint; the bits do not depend on it."""
+ROW_MULTIPLE = 8
+"""The number of rows of a matrix is a multiple of this."""
+ROWS_AT_ONCE = 8192
+"""Rows evaluated at once without gradients: hidden values stay in the cache from layer to layer."""
+ADJOINT_ROWS_AT_ONCE = 2048
+"""Rows of the adjoint evaluated at once; the bits do not depend on it."""
 
 
 class Layers:
-    """Weights of all layers in the form that the kernels read, made anew when a parameter has changed.
+    """Weights of all layers, packed as the kernels read them; packed anew after a parameter has changed.
 
     Args:
         weights: [out, in] of every layer, float32, contiguous, on the CPU; the first reads the inputs alone.
         biases: [out] of every layer.
-        inputs: columns of the inputs. A layer whose weights are that much wider than its predecessor's output reads
-            them again, before that output (a skip connection).
-        inputs_adjoint: whether :meth:`gradients` will be asked for that of the inputs.
+        inputs: number of input columns. A layer with that many more columns than its predecessor has outputs reads the
+            inputs again, in front of those outputs (a skip connection).
+        inputs_adjoint: whether :meth:`gradients` will compute the gradient of the inputs.
     """
 
     def __init__(self, weights: list[Tensor], biases: list[Tensor], inputs: int, inputs_adjoint: bool = False) -> None:
@@ -62,9 +59,9 @@ class Layers:
         launch(kernels.pack_weights, len(rows) * widest, widest, self.table, self.packed, grain=1)
 
     def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Inputs and hidden values in panels, and the outputs [T M, out]."""
+        """Return inputs and hidden values in panels, and the outputs [T M, out]."""
         count = where.shape[0] * when.shape[0]
-        rows = -(-count // ROWS) * ROWS
+        rows = -(-count // ROW_MULTIPLE) * ROW_MULTIPLE
         inputs = torch.empty(-(-self.inputs // NETWORK_PANEL), rows, NETWORK_PANEL)
         launch(kernels.pack_inputs, rows, where, when, inputs)
         hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * NETWORK_PANEL)
@@ -76,17 +73,20 @@ class Layers:
     def gradients(
         self, inputs: Tensor, hidden: Tensor, v_out: Tensor, sizes: tuple[int, int, int] | None
     ) -> tuple[Tensor | None, list[Tensor]]:
-        """Of the inputs' first columns, summed over the times ([M, A]; ``sizes`` are M, T, A, None where nobody wants
-        it), and of every layer's weights, then of every layer's bias."""
+        """Return the gradient of ``where`` and those of all weights, then of all biases.
+
+        Args:
+            sizes: M, T and A of ``where`` [M, A] at T times. None: its gradient is not needed.
+        """
         layers, rows, count = len(self.weights), hidden.shape[1], v_out.shape[0]
         flat = torch.zeros(self.gradient_size) if count == 0 else torch.empty(self.gradient_size)
         table = self.table.clone()
         table[:, 8] = torch.tensor(self.gradient_begin) * flat.element_size() + flat.data_ptr()
         v_inputs = None if sizes is None else torch.empty(count, sizes[2])
-        v_hidden = torch.empty(layers, min(rows, LARGEST_ADJOINT), hidden.shape[2])
+        v_hidden = torch.empty(layers, min(rows, ADJOINT_ROWS_AT_ONCE), hidden.shape[2])
         parts = 2
-        for begin in range(0, rows, LARGEST_ADJOINT):
-            own = min(LARGEST_ADJOINT, rows - begin)
+        for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
+            own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
             grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, self.packed)
             launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
             if v_inputs is not None:
@@ -103,7 +103,7 @@ class Layers:
 
 
 def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> Tensor:
-    """[T M, A] to [M, A], in order."""
+    """Sum [T M, A] over the times to [M, A], in order."""
     if times == 0:
         return torch.zeros(positions, columns)
     instants = v_inputs.view(times, positions, columns)
@@ -114,8 +114,11 @@ def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> T
 
 
 class PackedLayers:
-    """Weights packed for one frame are kept for the next, for as long as no parameter is replaced or changed in place.
-    What torch does not count (edits through ``.data``, other libraries' writes) is not seen: :meth:`forget` them."""
+    """Cache of packed weights, valid until a parameter is replaced or changed in place.
+
+    It misses changes that torch does not count (edits through ``.data``, writes of other libraries): call
+    :meth:`forget` after them.
+    """
 
     def __init__(self) -> None:
         self._kept: tuple[list[tuple[int, int]], Layers] | None = None
@@ -124,9 +127,9 @@ class PackedLayers:
         self._kept = None
 
     def __call__(self, parameters: Iterable[Tensor], make: Callable[[], Layers]) -> Layers:
-        """The layers that ``make`` packs from ``parameters``."""
+        """Return the layers that ``make`` packs from ``parameters``."""
         parameters = list(parameters)
-        if any(p.is_inference() for p in parameters):  # torch does not count changes of these
+        if any(p.is_inference() for p in parameters):  # torch does not count changes of inference tensors
             return make()
         key, kept = [(p.data_ptr(), p._version) for p in parameters], self._kept
         if kept is None or kept[0] != key:
@@ -154,28 +157,28 @@ class _Network(torch.autograd.Function):
 
 
 def supported(weights: list[Tensor], biases: list[Tensor]) -> bool:
-    """Whether :func:`network` takes them: float32 on a CPU, hidden widths multiples of 32."""
+    """Return whether :func:`network` accepts the parameters: float32 on a CPU, hidden widths multiples of 32."""
     return all(
         p.device.type == "cpu" and p.dtype == torch.float32 and p.is_contiguous() for p in (*weights, *biases)
     ) and all(w.shape[0] % NETWORK_PANEL == 0 for w in weights[:-1])
 
 
 def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
-    """Hidden layers with ReLU and a last one without, for every position at every time.
+    """Evaluate hidden layers with ReLU and a last layer without, for every position at every time.
 
     Args:
         where: [M, A] inputs that depend on the position.
         when: [T, B] inputs that depend on the time. No gradient.
-        weights: [out, in] of every layer; ``in`` is A + B for the first, and for the others the width of the layer
-            before, or that and A + B more: then the inputs are read again, in front (a skip connection).
+        weights: [out, in] of every layer; ``in`` is A + B for the first layer, and for the others the width of the
+            layer before, or A + B more for a skip connection, which reads the inputs again, in front.
         biases: [out] of every layer.
 
     Returns:
-        [T M, out of the last layer], rows ``t M + m``. Gradients go to weights, biases and ``where``; their sums
-        are taken in a fixed order.
+        [T M, out of the last layer], rows ``t M + m``. Gradients go to weights, biases and ``where``, summed in a fixed
+        order.
 
     Raises:
-        ValueError: shapes do not fit, or the parameters are not :func:`supported`.
+        ValueError: a shape is wrong, or the parameters are not :func:`supported`.
     """
     _validate(where, when, weights, biases)
     where, when = where.contiguous(), when.detach().contiguous()
@@ -185,13 +188,13 @@ def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Ten
 
 
 def evaluate(layers: Layers, where: Tensor, when: Tensor) -> Tensor:
-    """:func:`network` without gradients, of weights that are packed already."""
-    if where.shape[0] * when.shape[0] <= LARGEST:
+    """Evaluate :func:`network` without gradients, with packed weights."""
+    if where.shape[0] * when.shape[0] <= ROWS_AT_ONCE:
         return layers.values(where, when, keep=False)[2]
     parts = [
         layers.values(rows, when[t : t + 1], keep=False)[2]
         for t in range(when.shape[0])
-        for rows in where.split(LARGEST)
+        for rows in where.split(ROWS_AT_ONCE)
     ]
     return torch.cat(parts)
 

@@ -11,8 +11,8 @@ from ..runtime.launch import launch
 
 
 def skin_node_sums(order: Tensor, begin: Tensor, pairs: tuple, scaled: int) -> Tensor:
-    """[M, SUMS (+ 3)] for ``skin_finish``; ``pairs``: arguments of ``skin_segments`` from ``means_in`` on, in which
-    ``nodes`` are the third."""
+    """Return the sums [M, SUMS (+ 3)] for ``skin_finish``; ``pairs`` are the arguments of ``skin_segments`` from
+    ``means_in`` on, of which ``nodes`` is the third."""
     rows = _rows(order, pairs[2], SUMS + 3 * scaled)
     launch(kernels.skin_segments, _segments(order), order, *pairs, rows, grain=8)
     return _sum(begin, rows)
@@ -21,7 +21,7 @@ def skin_node_sums(order: Tensor, begin: Tensor, pairs: tuple, scaled: int) -> T
 def rbf_node_sums(
     order: Tensor, begin: Tensor, points: Tensor, nodes: Tensor, indices: Tensor, v_logits: Tensor
 ) -> Tensor:
-    """[M, 2 + D] for ``rbf_finish``."""
+    """Return the sums [M, 2 + D] for ``rbf_finish``."""
     parts = -(-nodes.shape[1] // kernels.LANES)
     rows = _rows(order, nodes, 2 + nodes.shape[1])
     launch(

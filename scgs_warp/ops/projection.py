@@ -1,4 +1,4 @@
-"""Projection of 3D Gaussians to an image, with gradients."""
+"""Projection of 3D Gaussians to splats in an image, with gradients."""
 
 from __future__ import annotations
 
@@ -111,9 +111,9 @@ def project(
 ) -> Splats:
     """Project Gaussians to a pinhole camera's image (EWA splatting, conventions of gsplat 1.5.3).
 
-    A splat ends where its alpha falls under 1/255: ``radii = ceil(sqrt(2 ln(255 opacity) covariance2d))`` per axis. All
-    its fields are 0, and it gets no gradient, where the Gaussian is culled: not between the planes, off the image, both
-    radii at most ``radius_clip``, opacity under 1/255, quaternion zero, or anything not finite.
+    A splat ends where its alpha falls under 1/255: ``radii = ceil(sqrt(2 ln(255 opacity) covariance2d))`` per axis. A
+    Gaussian is culled, with all fields 0 and no gradient, if it is not between the planes or off the image, both radii
+    are at most ``radius_clip``, the opacity is under 1/255, the quaternion is zero, or a value is non-finite.
 
     Args:
         means: [N, 3] float32, world.
@@ -121,19 +121,19 @@ def project(
         scales: [N, 3] float32 > 0, standard deviations, world units.
         opacities: [N] float32 in [0, 1].
         viewmat: [4, 4] float32, world to camera (OpenCV).
-        K: [3, 3] float32, pixels; its skew is not used and it gets no gradient.
-        width: of the image, pixels.
-        height: of the image, pixels.
+        K: [3, 3] float32, pixels; its skew is ignored, and it gets no gradient.
+        width: image width, pixels.
+        height: image height, pixels.
         near_plane: smallest camera z kept.
         far_plane: largest camera z kept.
-        radius_clip: splats no larger than this are dropped, pixels.
+        radius_clip: splats of this radius or a smaller one are dropped, pixels.
         eps2d: added to both variances of the 2D covariance, px^2.
         antialiased: multiply the opacity by sqrt(det / det with eps2d) (Mip-Splatting, section 5.2), before the extent.
-        form: which of the kernels runs: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the device's own.
+        form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
-        Splats of this image. Gradients reach means, quats, scales, opacities and viewmat; the clamp of the Jacobian to
-        the frustum widened by 0.3 tan(fov / 2) passes none, nor does a Gaussian one of whose gradients overflows.
+        Splats of this image. Gradients reach means, quats, scales, opacities and viewmat. The clamp of the Jacobian to
+        the frustum widened by 0.3 tan(fov / 2) passes no gradient, nor does a Gaussian with an overflowing gradient.
 
     Raises:
         ValueError: a shape or a size is wrong.

@@ -1,4 +1,4 @@
-"""Column sums in an order fixed by the shape alone, whatever the thread count: ``tensor.sum(0)`` promises no order."""
+"""Column sums in an order that depends on the shape alone; ``tensor.sum(0)`` promises no order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..runtime.launch import launch
 
 
 def sum_rows(values: Tensor) -> Tensor:
-    """Sum of the rows of ``values`` [N, C], float32, as [C]; a tree of 64 children a node. No gradient."""
+    """Sum the rows of ``values`` [N, C], float32, to [C], in a tree with 64 children per node. No gradient."""
     if values.ndim != 2:
         raise ValueError(f"values must be [N, C], got {tuple(values.shape)}")
     if values.shape[0] == 0:

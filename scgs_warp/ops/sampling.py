@@ -9,22 +9,22 @@ from ..kernels import sampling as kernels
 from ..runtime.launch import launch
 
 CHUNK = {"cpu": 4096, "cuda": 128}
-"""Points one grid index handles. The result does not depend on it."""
+"""Points that one grid index handles; the result does not depend on it."""
 
 
 def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
     """Choose ``count`` points, each the farthest from those chosen before it; ties go to the lower index.
 
     Args:
-        points: [N, D] float32. Points that are not finite are chosen last.
-        count: how many, 0 .. N.
-        start: index of the first one.
+        points: [N, D] float32. Non-finite points are chosen last.
+        count: number of points to choose, 0 .. N.
+        start: index of the first point.
 
     Returns:
         [count] int64, distinct indices in the order of choice, on the device of the points.
 
     Raises:
-        ValueError: ``points`` is not [N, D], more points are asked for than there are, or ``start`` is none of them.
+        ValueError: ``points`` is not [N, D], or ``count`` or ``start`` is out of range.
     """
     if points.ndim != 2 or points.shape[1] == 0:
         raise ValueError(f"points must be [N, D] with D > 0, got {tuple(points.shape)}")

@@ -1,4 +1,4 @@
-"""Colours that follow the turn of the surface they lie on, with gradients."""
+"""Diffuse shading: colours that change as their surface turns, with gradients."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from ..kernels import shading as kernels
 from ..runtime.launch import launch
 
 COLUMNS = 10
+"""Shading parameters per Gaussian: a 3 x 3 matrix and a coefficient."""
 
 
 class _Shade(torch.autograd.Function):
@@ -32,21 +33,22 @@ class _Shade(torch.autograd.Function):
 
 
 def shade(sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor) -> Tensor:
-    """Base colours times ``1 + x + 5 b x^2`` within [0, 4]; ``x = <G, R - I>``, R turning ``quats`` to ``quats_t``.
+    """Multiply base colours by ``1 + x + 5 b x^2`` within [0, 4], where ``x = <G, R - I>`` and R turns ``quats`` to
+    ``quats_t``.
 
-    What a diffuse surface sends back is, to first order, linear in its normal, and G holds the light and the normal
-    there are; b is for lamps, whose light is cut off at grazing angles. Both are learnt for each Gaussian. At rest
-    nothing changes.
+    The light that a diffuse surface reflects is, to first order, linear in its normal: G holds the light and the
+    normal, and b describes lamps, whose light is cut off at grazing angles. Both are learnt for each Gaussian. At rest
+    the factor is 1.
 
     Args:
         sh_dc: [N, 3] spherical harmonics coefficients of degree 0 (colour less one half, over C0).
-        shading: [N, 10] the matrices G, by rows, and b.
+        shading: [N, 10] the matrices G, row by row, and b.
         quats: [N, 4] wxyz at rest, any norm.
-        quats_t: [N, 4] wxyz at the instant, any norm.
+        quats_t: [N, 4] wxyz at the rendered instant, any norm.
 
     Returns:
-        [N, 3] coefficients of degree 0. Gradients reach ``sh_dc`` and ``shading`` alone: a surface must not turn for
-        the sake of its brightness.
+        [N, 3] coefficients of degree 0. Gradients reach ``sh_dc`` and ``shading`` alone, so that no surface turns to
+        match a brightness.
 
     Raises:
         ValueError: a shape is wrong.

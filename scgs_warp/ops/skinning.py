@@ -1,4 +1,4 @@
-"""Gaussians follow their control points: linear blend skinning (SC-GS, Eq. 6 and 7)."""
+"""Linear blend skinning: Gaussians follow their control points (SC-GS, Eq. 6 and 7)."""
 
 from __future__ import annotations
 
@@ -56,16 +56,16 @@ class _Skin(torch.autograd.Function):
 
 
 def _skin_lanes(means, quats, nodes, translations, rotations, shapes, log_scales, weights, indices) -> tuple:
-    """``skin`` without gradients, on a CPU."""
+    """Run ``skin`` on a CPU, without gradients."""
     scaled = int(log_scales is not None)
     outputs = _like(means, quats, means if scaled else None)
-    palette = _palette(nodes, (translations, rotations, shapes, log_scales))
+    palette = pack_palette(nodes, (translations, rotations, shapes, log_scales))
     launch(skinning.skin_lanes, _lanes(means), means, quats, *palette, scaled, indices, weights, *outputs, grain=32)
     return tuple(outputs)
 
 
 def _node_sums(pairs: tuple, scaled: int, lists: NodeLists | None) -> tuple[int, Tensor]:
-    """Number of partial sums and their buffer [parts * M, columns]."""
+    """Return the number of partial sums and their buffer [parts * M, columns]."""
     means, nodes, indices = pairs[0], pairs[2], pairs[4]
     count, width = nodes.shape[0], kernels.SUMS + 3 * scaled
     if lists is None and means.device.type == "cpu":
@@ -126,18 +126,18 @@ def skin(
         means: [N, 3] at rest, world.
         quats: [N, 4] wxyz at rest, need not be unit.
         nodes: [M, 3] control points at rest, world.
-        pose: of the M control points. Its rotations need not be unit; ``shape_rotations``, where given, turn the
-            Gaussians' shape in place of ``rotations``.
+        pose: pose of the M control points. Its rotations need not be unit; ``shape_rotations``, if given, turn the
+            Gaussians' shapes instead of ``rotations``.
         indices: [N, K] int32 in [0, M), nearest first, as ``nearest`` gives them. Not checked against M.
         weights: [N, K], rows sum to 1, as ``rbf_weights`` gives them.
-        lists: ``node_lists(indices, M)`` where there is one already; used on CUDA.
+        lists: ``node_lists(indices, M)``, if computed before; used on CUDA.
 
     Returns:
         Means [N, 3], quaternions [N, 4] (wxyz, unit), and the change of log scales [N, 3] (None if the pose has none).
-        Gradients flow to all tensors except the indices; a Gaussian whose mean or quaternion is not finite passes none.
+        Gradients flow to all tensors except the indices; a Gaussian with a non-finite mean or quaternion passes none.
 
     Raises:
-        ValueError: shapes do not fit.
+        ValueError: a shape is wrong.
     """
     _validate(means, quats, nodes, pose, indices, weights)
     floats = means, quats, nodes, *_pose_tensors(pose), weights
@@ -148,22 +148,22 @@ def skin(
     return _Skin.apply(*values, indices, lists)  # type: ignore[return-value]
 
 
-NEAR = 0.7072
-"""Unit quaternions whose first component is at least this are less than 45 degrees from the identity (as directions in
-four dimensions), and so on the same side as each other."""
+SAME_SIDE = 0.7072
+"""Unit quaternions with a larger first component are less than 45 degrees from the identity (as directions in four
+dimensions), hence less than 90 degrees from each other."""
 
 
-class _Palette(NamedTuple):
-    """The control points as rows for the SIMD kernels."""
+class Palette(NamedTuple):
+    """The control points as rows, for the SIMD kernels."""
 
     motion: Tensor
     reach: Tensor
     aligned: int
-    """1: no two shape rotations lie on different sides, so none has to be turned. Saves time, changes nothing."""
+    """1 if all shape rotations are less than 90 degrees apart: no sign has to be flipped. Saves time, same result."""
 
 
-def _palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None) -> _Palette:
-    """Of contiguous tensors; ``pose``: translations, rotations, shape rotations, log scales."""
+def pack_palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None) -> Palette:
+    """Pack contiguous tensors; ``pose`` is translations, rotations, shape rotations and log scales."""
     translations, rotations, shapes, log_scales = pose
     count = nodes.shape[0]
     motion, reach = (torch.empty(count, skinning_palette.ROW) for _ in range(2))
@@ -175,7 +175,7 @@ def _palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None)
         *(log_scales, int(log_scales is not None), motion, reach),
         grain=128,
     )
-    return _Palette(motion, reach, int(bool((motion[:, 12] > NEAR).all())))
+    return Palette(motion, reach, int(bool((motion[:, 12] > SAME_SIDE).all())))
 
 
 class _SkinRbf(torch.autograd.Function):
@@ -183,7 +183,7 @@ class _SkinRbf(torch.autograd.Function):
     def forward(ctx: Any, means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose_and_indices):
         *pose, indices = pose_and_indices
         has_hyper, has_strengths, has_log_scales = (int(value is not None) for value in (hyper, strengths, pose[3]))
-        palette = _palette(nodes, tuple(pose), radii, strengths, hyper_nodes)
+        palette = pack_palette(nodes, tuple(pose), radii, strengths, hyper_nodes)
         weights = torch.empty(indices.shape)
         outputs = _like(means, quats, means if has_log_scales else None)
         launch(
@@ -250,19 +250,19 @@ def skin_rbf(
     hyper_points: Tensor | None = None,
     hyper_nodes: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """``skin`` with the weights of ``rbf_weights``, in one pass and one adjoint pass where the device is a CPU.
+    """Skin with the weights of ``rbf_weights``; on a CPU in one pass and one adjoint pass.
 
     Args:
         means, quats, nodes, pose, indices: as in ``skin``.
         radii, strengths: as in ``rbf_weights``.
-        hyper_points: [N, H] further coordinates of the Gaussians, for the weights alone. None: none.
-        hyper_nodes: [M, H] of the control points; given exactly where ``hyper_points`` is.
+        hyper_points: [N, H] further coordinates of the Gaussians, for the weights alone. None: no such coordinates.
+        hyper_nodes: [M, H] further coordinates of the control points; required exactly with ``hyper_points``.
 
     Returns:
-        As ``skin``. Gradients flow to all tensors except the indices.
+        The results of ``skin``. Gradients flow to all tensors except the indices.
 
     Raises:
-        ValueError: shapes do not fit.
+        ValueError: a shape is wrong.
     """
     if (hyper_points is None) != (hyper_nodes is None):
         raise ValueError("hyper_points and hyper_nodes must be given together")

@@ -1,4 +1,4 @@
-"""SSIM and the photometric loss as one autograd op: L1 and SSIM share their passes over the images, and one adjoint."""
+"""Photometric loss as one autograd op: L1 and SSIM share their passes over the images, and one adjoint."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ Form = Literal["auto", "pixel", "cpu"]
 
 
 def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form = "auto") -> Tensor:
-    """Structural similarity (Wang et al. 2004): 11 x 11 Gaussian, sigma 1.5, zero padding, data range 1.
+    """Return the structural similarity (Wang et al. 2004): 11 x 11 Gaussian, sigma 1.5, zero padding, data range 1.
 
     Args:
         image: [C, H, W] float32.
         truth: [C, H, W] float32, a constant: no gradient reaches it.
-        mask: [H, W] bool, True where a pixel is valid; None: all are. Invalid pixels of ``image`` are replaced by
-            those of ``truth``, so that no window sees them, and the mean leaves them out.
-        form: ``pixel`` (plain kernels, any device), ``cpu`` (SIMD), or what suits the device.
+        mask: [H, W] bool, True for valid pixels. None: all are valid. Invalid pixels of ``image`` are replaced by those
+            of ``truth``, so that no window sees them, and the mean leaves them out.
+        form: kernels to run: ``pixel`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
-        The mean over valid pixels and channels, a scalar; 1 where no pixel is valid. Differentiable in ``image``.
+        The mean over valid pixels and channels, a scalar; 1 if no pixel is valid. Differentiable in ``image``.
 
     Raises:
-        ValueError: a shape, dtype or device does not fit; the message names the argument.
+        ValueError: a shape, dtype or device is wrong; the message names the argument.
     """
     return photometric_loss(image, truth, mask, 0.0, form=form)[2]
 
@@ -38,15 +38,15 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form
 def photometric_loss(
     image: Tensor, truth: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.2, *, form: Form = "auto"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, equation 7), with arguments as in ``ssim``.
+    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, equation 7); arguments as in ``ssim``.
 
     Returns:
         loss, l1 and ssim, scalars, each differentiable in ``image``. L1 is the mean absolute difference over valid
-        pixels and channels. Where no pixel is valid they are 0, 0 and 1, and the gradient is zero. Values that are
-        not finite make the loss not finite.
+        pixels and channels. If no pixel is valid they are 0, 0 and 1, and the gradient is zero. Non-finite values
+        make the loss non-finite.
 
     Raises:
-        ValueError: a shape, dtype or device does not fit; the message names the argument.
+        ValueError: a shape, dtype or device is wrong; the message names the argument.
     """
     if image.ndim != 3 or image.dtype != torch.float32:
         raise ValueError(f"image must be [C, H, W] float32, got {list(image.shape)} {image.dtype}")
@@ -120,7 +120,7 @@ class _Photometric(torch.autograd.Function):
         else:
             sums = (_forward_bands if simd else _forward_pixels)(image, truth, mask, partials)
         totals = sums.flatten(1).double().sum(1)  # a few thousand values: one thread, one order
-        # Pixels times channels that count: a number, or a tensor, as asking for its value would wait for the device.
+        # Valid pixels times channels: a number, or a tensor, because reading its value would wait for the device.
         count: float | Tensor = float(max(image.numel(), 1))
         if mask is not None:
             count = mask.sum().double() * image.shape[0]

@@ -1,1 +1,1 @@
-"""Gaussians to images."""
+"""Rendering: Gaussians to images."""

@@ -1,4 +1,4 @@
-"""gsplat's main entry point, name by name, on this project's kernels: its users switch by changing one import."""
+"""gsplat's main entry point on this project's kernels: same names, so that users switch by changing one import."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def rasterization(
     rolling_shutter: Any = "GLOBAL",
     viewmats_rs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render N Gaussians from C cameras; arguments, order and defaults of gsplat 1.5.3's ``rasterization``.
+    """Render N Gaussians from C cameras, with the arguments, order and defaults of gsplat 1.5.3's ``rasterization``.
 
     Args:
         means: [N, 3] float32, world.
@@ -67,15 +67,15 @@ def rasterization(
         height: pixels.
         near_plane: smallest camera z kept.
         far_plane: largest camera z kept.
-        radius_clip: splats of no larger radius are dropped, pixels.
+        radius_clip: splats of this radius or a smaller one are dropped, pixels.
         eps2d: added to both variances of the 2D covariance, px^2.
-        sh_degree: 0 to 3: ``colors`` are harmonics. None: they are colours.
-        backgrounds: [C, D] behind everything. None: zeros. Depth has zero behind it.
-        render_mode: what the last dimension holds: colour, accumulated depth (D), expected depth (ED), or both.
+        sh_degree: 0 to 3 if ``colors`` are harmonics. None: they are colours.
+        backgrounds: [C, D] behind everything. None: zeros. The depth behind everything is zero.
+        render_mode: content of the last dimension: colour, accumulated depth (D), expected depth (ED), or both.
         absgrad: after ``backward``, ``meta["means2d"].absgrad`` [C, N, 2] is the sum over pixels of the absolute
             gradients of the 2D means (AbsGS).
         rasterize_mode: ``antialiased``: Mip-Splatting's opacity compensation.
-        packed: no effect, as ``tile_size``, ``sparse_grad``, ``channel_chunk`` and ``segmented``: there is one layout.
+        packed: no effect, like ``tile_size``, ``sparse_grad``, ``channel_chunk`` and ``segmented``: one layout exists.
 
     Returns:
         renders [C, H, W, D], alphas [C, H, W, 1], and meta: ``means2d`` [C, N, 2] (may ``retain_grad``), ``radii``
@@ -84,7 +84,7 @@ def rasterization(
 
     Raises:
         ValueError: a shape, dtype or choice is wrong; the message names the argument.
-        NotImplementedError: an argument asks for what this project does not do; the message names it.
+        NotImplementedError: an argument asks for a feature that does not exist here; the message names it.
     """
     _refuse(
         distributed=distributed,
@@ -121,7 +121,7 @@ def rasterization(
 
     renders, alphas = [], []
     for index, (camera, splat) in enumerate(zip(cameras, splats)):
-        # Through the stacked tensor, so that its retained gradient is that of every camera.
+        # The 2D means come from the stacked tensor, so that its retained gradient covers every camera.
         splat = Splats(meta["means2d"][index], *_without_means2d(splat))
         own = colors[index] if colors.ndim == (3 if sh_degree is None else 4) else colors
         background = None if backgrounds is None else backgrounds[index]
@@ -145,7 +145,7 @@ def _channels(
     render_mode: str,
     background: Tensor | None,
 ) -> tuple[Tensor, Tensor | None]:
-    """What one camera blends, [N, D], and what lies behind it, [D]: depth is the last channel."""
+    """Return the channels that one camera blends, [N, D], depth last, and the background, [D]."""
     depths = splats.depths[:, None]
     if not render_mode.startswith("RGB"):
         return depths, None
@@ -188,7 +188,7 @@ def _check_dtypes(**tensors: Tensor | None) -> None:
 def _check_shapes(
     means: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None, sh_degree: int | None
 ) -> None:
-    """Shapes that ``project`` does not see; it checks the others."""
+    """Check the shapes that ``project`` does not check."""
     count = len(means) if means.ndim else 0
     if viewmats.ndim != 3 or tuple(viewmats.shape[1:]) != (4, 4) or len(viewmats) == 0:
         raise ValueError(f"viewmats must be [C, 4, 4] with C > 0, got {tuple(viewmats.shape)}")

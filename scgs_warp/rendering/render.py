@@ -29,15 +29,15 @@ def render(
 
     Args:
         gaussians: N activated Gaussians in world units; N may be 0.
-        camera: where from; on the device of the Gaussians.
+        camera: viewpoint, on the device of the Gaussians.
         background: [3] colour behind everything. None: black.
-        sh_degree: degree of the harmonics used. None: all there is.
-        stats: if given, the backward pass adds to it what ``Stats`` says.
+        sh_degree: degree of the harmonics used. None: the highest one present.
+        stats: if given, the backward pass adds its statistics.
         antialiased: Mip-Splatting's opacity compensation.
 
     Returns:
         Image: ``rgb`` [H, W, 3] (its planar permutation is contiguous), ``alpha`` [H, W], ``depth`` [H, W] in world
-        units along the camera's z. Gradients reach all of ``gaussians``, ``camera.viewmat`` and ``background``.
+        units along the camera's z. Gradients reach ``gaussians``, ``camera.viewmat`` and ``background``.
 
     Raises:
         ValueError: a shape, a size or the degree is wrong.
@@ -59,11 +59,11 @@ def draw(
     depth: bool = False,
     binned: Callable[[Splats], Tiles] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`render`, planar, and depth only on demand: it costs a training step that has no use for it.
+    """Render as :func:`render` does, to planar images, with depth only on demand: training does without its cost.
 
     Args:
         depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
-        binned: lists which splats touch which tile. None: ``bin_splats``.
+        binned: function that lists the splats of each tile. None: ``bin_splats``.
 
     Returns:
         image [3 or 4, H, W] and alpha [H, W].
@@ -86,7 +86,7 @@ def draw(
 
 
 class _FiniteGradient(torch.autograd.Function):
-    """The value as it is; of its gradient what is finite, elsewhere 0."""
+    """Identity whose gradient is 0 wherever it would be non-finite."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ class _FiniteGradient(torch.autograd.Function):
 
 
 def centre_of(camera: Camera) -> Tensor:
-    """[3] ``camera.position``, whose gradient is 0 where a broken viewmat (zero times NaN) would make it NaN."""
+    """Return ``camera.position``, [3], with gradient 0 where a broken viewmat (zero times NaN) would make it NaN."""
     if not camera.viewmat.requires_grad:
         return camera.position
     viewmat: Tensor = _FiniteGradient.apply(camera.viewmat)  # type: ignore[assignment]
@@ -106,5 +106,5 @@ def centre_of(camera: Camera) -> Tensor:
 
 
 def expected_depth(accumulated: Tensor, alpha: Tensor) -> Tensor:
-    """Accumulated depth over alpha, and 0 where alpha is 0 (nothing was accumulated there); same shape as both."""
+    """Return accumulated depth over alpha, and 0 where alpha is 0; the shapes of all three are equal."""
     return accumulated / alpha.clamp_min(1e-10)

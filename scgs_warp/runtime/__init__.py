@@ -1,1 +1,1 @@
-"""The process and its devices: environment, threads, launches, memory, progress, stop signals."""
+"""The process and its devices: environment, threads, kernel launches, memory, progress, stop signals."""

@@ -1,7 +1,7 @@
-"""How a grid is shared among CPU threads: where it is cut, and who takes which chunk.
+"""Sharing of a grid among CPU threads: cutting it into chunks, and running them.
 
 Chunks get smaller towards the end (guided self-scheduling, Polychronopoulos and Kuck 1987): a few large ones cost
-little, and small last ones let all threads end at about the same time. Where the cost of each grid index is known
+little, and small last ones let all threads end at about the same time. If the cost of each grid index is known
 beforehand, chunks are cut by cost and the heaviest come first.
 """
 
@@ -23,35 +23,36 @@ from . import environment
 Chunk = tuple[int, int]
 """First grid index and number of indices."""
 
-PARTS = 3
-"""A chunk is this part of a thread's fair share of what is left: costs are estimates, the first must not end last."""
-SMALLEST = 32
-"""No chunk is a smaller part of a thread's fair share of the whole."""
+CHUNKS_PER_SHARE = 3
+"""A chunk is one of so many parts of a thread's fair share of the remaining grid. Costs are estimates: the first chunk
+must not end last."""
+MAX_CHUNKS_PER_SHARE = 32
+"""No chunk is smaller than one of so many parts of a thread's fair share of the whole grid."""
 
 
 @functools.cache
 def _shares(threads: int) -> np.ndarray:
-    """Where chunks end, as parts of the whole, ascending to 1."""
+    """Ends of the chunks as fractions of the whole, ascending to 1."""
     ends, left = [], 1.0
     while left > 0.0:
-        left -= max(left / (PARTS * threads), 1.0 / (SMALLEST * threads))
+        left -= max(left / (CHUNKS_PER_SHARE * threads), 1.0 / (MAX_CHUNKS_PER_SHARE * threads))
         ends.append(1.0 - max(left, 0.0))
     return np.array(ends)
 
 
 @functools.lru_cache(maxsize=1024)
 def cut_evenly(count: int, threads: int, grain: int) -> list[Chunk]:
-    """Chunks of ``grain`` indices and multiples of it (the last may be smaller), every index in one of them."""
+    """Cut a grid into chunks of multiples of ``grain`` indices; the last may be smaller."""
     ends = np.minimum(np.ceil(_shares(threads) * (count / grain)).astype(np.int64) * grain, count)
     return _chunks(np.unique(ends))
 
 
 def cut_by_load(load: Tensor, threads: int) -> list[Chunk]:
-    """Chunks by cost, heaviest first, every index in one of them.
+    """Cut a grid into chunks of similar cost, heaviest first.
 
     Args:
-        load: [count] integers, on the CPU: the cost of all indices up to each, itself included.
-        threads: how many share the work.
+        load: [count] integers, on the CPU: cost of all indices up to each, itself included.
+        threads: number of threads that share the work.
     """
     running = load.numpy()
     last = np.searchsorted(running, _shares(threads) * float(running[-1]))
@@ -66,11 +67,11 @@ def _chunks(ends: np.ndarray) -> list[Chunk]:
     return [(begin, end - begin) for begin, end in zip(begins, ends.tolist())]
 
 
-class _Helpers:
-    """Threads that wait for work for as long as the process lives."""
+class HelperThreads:
+    """Threads that wait for jobs for as long as the process lives."""
 
     def __init__(self, flush_denormals: bool) -> None:
-        # Denormals are flushed in every thread or in none: results must not depend on who computes them.
+        # All threads flush denormals or no thread does: results must not depend on which thread computes them.
         self.flush_denormals = flush_denormals
         self.jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self.count = 0
@@ -92,13 +93,13 @@ class _Helpers:
             job()
 
 
-_helpers = _Helpers(False)
+helpers = HelperThreads(False)
 
 
 def _forked() -> None:
-    """A child process has none of its parent's threads."""
-    global _helpers
-    _helpers = _Helpers(_helpers.flush_denormals)
+    """Start afresh in a child process, which inherits no threads."""
+    global helpers
+    helpers = HelperThreads(helpers.flush_denormals)
 
 
 if hasattr(os, "register_at_fork"):
@@ -106,16 +107,16 @@ if hasattr(os, "register_at_fork"):
 
 
 def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: int) -> None:
-    """``call(first, size)`` once for each chunk, by this thread and up to ``threads - 1`` others.
+    """Run ``call(first, size)`` once for each chunk, in this thread and up to ``threads - 1`` others.
 
-    Returns when all are done. It waits for chunks, not for threads: a helper that wakes up late finds nothing left and
-    holds up nobody, nor does it hold on to ``call`` and its tensors: their memory is wanted by what comes next.
+    Returns when all chunks are done, whether or not all helpers have woken up. A late helper finds nothing to do, and
+    does not keep ``call`` and its tensors alive: the next step needs their memory.
     """
-    global _helpers
+    global helpers
     flush = environment.configured()
-    if _helpers.flush_denormals != flush:
-        _helpers.dismiss()
-        _helpers = _Helpers(flush)
+    if helpers.flush_denormals != flush:
+        helpers.dismiss()
+        helpers = HelperThreads(flush)
     ticket, finished, all_done = itertools.count(), itertools.count(1), threading.Lock()
     all_done.acquire()
     errors: list[BaseException] = []
@@ -125,7 +126,7 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
         while (turn := next(ticket)) < len(chunks):
             try:
                 calls[0](*chunks[turn])
-            except BaseException as error:  # raised again below, in the thread that asked
+            except BaseException as error:  # raised again below, in the calling thread
                 errors.append(error)
             if next(finished) == len(chunks):
                 all_done.release()
@@ -136,11 +137,11 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
         work()
         left.release()
 
-    _helpers.submit(help_out, copies)
+    helpers.submit(help_out, copies)
     try:
         work()
         all_done.acquire()
-    except BaseException:  # interrupted: helpers still write to memory that would be freed on the way out
+    except BaseException:  # after an interrupt, helpers may still write to memory that would be freed
         _acquire_all(left, copies)
         raise
     finally:

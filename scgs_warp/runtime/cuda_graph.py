@@ -1,4 +1,4 @@
-"""Warp on torch's streams, and both in one CUDA graph."""
+"""CUDA streams and graphs shared by torch and Warp."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _streams: dict[int, dict[int, wp.Stream]] = {}
 
 
 def on_torch_stream(device: torch.device) -> contextlib.AbstractContextManager:
-    """Warp's launches go to torch's current stream of ``device``; nobody waits for anybody."""
+    """Send Warp's launches to torch's current stream of ``device``, without synchronising."""
     return wp.ScopedStream(warp_stream(device), sync_enter=False)
 
 
 def warp_stream(device: torch.device) -> wp.Stream:
-    """Torch's current stream as Warp's, the same object every time.
+    """Return Warp's object for torch's current stream, the same object every time.
 
     Warp keeps what belongs to a stream (an event, the radix sort's memory, a capture in progress) only as long as the
-    object lives: a new one a launch would throw all that away each time. Torch's streams live as long as the process.
+    object lives, so a new object for each launch would discard it. Torch's streams live as long as the process.
     """
     stream = torch.cuda.current_stream(device)
     of_device = _streams.setdefault(stream.device_index, {})
@@ -31,20 +31,20 @@ def warp_stream(device: torch.device) -> wp.Stream:
 
 
 class CudaGraph:
-    """What ``body`` launches, through torch and Warp alike, as one CUDA graph.
+    """A CUDA graph of everything that ``body`` launches through torch and Warp.
 
-    ``body`` may not wait for the device nor copy to or from the host; tensors it makes live in the graph's own memory
-    and are overwritten by every replay.
+    ``body`` must not wait for the device, nor copy to or from the host. The tensors it makes live in the graph's own
+    memory and are overwritten by every replay.
     """
 
     overwrites = True
-    """Whether the next replay changes the result of the last."""
+    """True: a replay overwrites the result of the one before."""
 
     def __init__(self, body: Callable[[], Any], device: torch.device) -> None:
-        """Run ``body`` twice to load and compile everything it needs, then capture it.
+        """Run ``body`` twice to load and compile its kernels, then capture it.
 
         Raises:
-            RuntimeError: something in ``body`` cannot be captured.
+            RuntimeError: ``body`` cannot be captured.
         """
         warming, capturing = torch.cuda.Stream(device), torch.cuda.Stream(device)
         warming.wait_stream(torch.cuda.current_stream(device))
@@ -53,20 +53,20 @@ class CudaGraph:
                 body()
         torch.cuda.current_stream(device).wait_stream(warming)
         with torch.cuda.stream(capturing):
-            warp_stream(device)  # Warp makes an event for a stream it does not know, better not during the capture
+            warp_stream(device)  # Warp makes an event for a new stream, which a capture does not allow
         self.graph = torch.cuda.CUDAGraph()
         with (
             torch.cuda.device(device),
             torch.cuda.graph(self.graph, stream=capturing, capture_error_mode="thread_local"),
         ):
-            # Warp must know of the capture: its radix sort then takes its memory from the graph.
+            # Warp is told of the capture, so that its radix sort takes its memory from the graph.
             capture = wp.ScopedCapture(stream=warp_stream(device), external=True)
             with capture:
                 self.result = body()
         self._modules = capture.graph
-        """Keeps the captured kernels' modules loaded."""
+        """Keeps the modules of the captured kernels loaded."""
 
     def replay(self) -> Any:
-        """Launch the graph on torch's current stream; its result's tensors are the same ones every time."""
+        """Launch the graph on torch's current stream and return its result, the same tensors every time."""
         self.graph.replay()
         return self.result

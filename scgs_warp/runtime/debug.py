@@ -1,7 +1,7 @@
-"""Debug mode: what the kernels promise each other is checked at every call, at a multiple of the time.
+"""Debug mode: checks the kernels' invariants at every call, at a multiple of the time.
 
-``SCGS_DEBUG=1`` turns it on for a process, ``debug.enable()`` from here on. The mode changes no result; it raises
-``BrokenInvariant`` where one is wrong.
+``SCGS_DEBUG=1`` turns it on for a process, ``debug.enable()`` from the call on. The mode changes no result; it raises
+``BrokenInvariant`` for a wrong one.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ _enabled = os.environ.get("SCGS_DEBUG", "") not in ("", "0")
 
 
 class BrokenInvariant(RuntimeError):
-    """A defect of this project (or of the machine), not of its input: the message says what is violated."""
+    """A defect of this project or of the machine, not of the input; the message names the violated invariant."""
 
 
 def enable(on: bool = True) -> None:
-    """Check from now on, or no more."""
+    """Turn debug mode on or off."""
     global _enabled
     _enabled = on
 
 
 def enabled() -> bool:
-    """Whether to check."""
+    """Return whether debug mode is on."""
     return _enabled

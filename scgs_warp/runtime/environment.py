@@ -1,4 +1,4 @@
-"""Process-wide settings: waiting policy, thread counts, denormals. Everything of that kind is set here, once."""
+"""Process-wide settings, all made here: OpenMP's waiting policy, thread counts, denormals, Warp's start."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _configured = False
 
 
 def prepare_environment() -> None:
-    """Set what must be known before torch is imported. Called when ``scgs_warp`` is imported; the user's values win.
+    """Set environment variables that torch reads when it is imported; values the user has set win.
 
-    OpenMP threads sleep instead of spinning between torch calls: our own kernels use those cores meanwhile.
-    cuBLAS gets the fixed workspace that makes its sums reproducible; MKL is told to give the same bits for any number
-    of threads (without it the gradient of a narrow layer differs; it cost no measurable time).
+    OpenMP threads sleep instead of spinning between torch calls, because kernels use those cores meanwhile. cuBLAS gets
+    the fixed workspace that makes its sums reproducible. MKL gives the same bits for any number of threads; otherwise
+    the gradient of a narrow layer differs.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("KMP_BLOCKTIME", "0")
@@ -27,15 +27,33 @@ def prepare_environment() -> None:
     os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
 
 
+def init_warp() -> None:
+    """Initialise Warp without its banner, and without the CUDA driver's message on a machine that has no GPU."""
+    import warp as wp
+
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    if os.path.exists("/dev/nvidiactl") or os.name != "posix":
+        wp.init()
+        return
+    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)  # the driver's message comes from C
+    try:
+        os.dup2(sink, 2)
+        wp.init()
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)
+
+
 def available_threads() -> int:
-    """Cores this process may use: those it may run on, and no more than a container's share of processor time."""
+    """Count the cores this process may use, limited by its affinity and by a container's share of processor time."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.ceil(min(cores, _quota())))
+    return max(1, math.ceil(min(cores, container_quota())))
 
 
 @functools.cache
-def _quota(folder: str = "/sys/fs/cgroup") -> float:
-    """Processors' worth of time that the control group grants (Linux); infinite where nothing is said."""
+def container_quota(folder: str = "/sys/fs/cgroup") -> float:
+    """Return the processor time that the control group grants, in processors (Linux); infinite without a limit."""
     for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):  # version 2, version 1
         try:
             words = " ".join(Path(folder, name).read_text() for name in names).split()
@@ -48,24 +66,24 @@ def _quota(folder: str = "/sys/fs/cgroup") -> float:
 
 
 def thread_count() -> int:
-    """Threads that Warp launches and torch use on the CPU."""
+    """Return the number of threads that kernel launches and torch use on the CPU."""
     return _threads or available_threads()
 
 
 def configured() -> bool:
-    """Whether :func:`configure` was called: threads of our own then flush denormals as the main thread does."""
+    """Return whether :func:`configure` was called; helper threads then flush denormals as the main thread does."""
     return _configured
 
 
 def ensure_configured() -> None:
-    """:func:`configure` with its defaults, unless it was called before."""
+    """Call :func:`configure` with its defaults, unless it was called before."""
     if not _configured:
         configure()
 
 
 def _keep_freed_memory() -> None:
-    """Ask glibc to keep freed buffers instead of handing them back: every step allocates the same ones again, and
-    faulting their pages in took a quarter of the compositing time."""
+    """Ask glibc to keep freed buffers instead of returning them to the system: every step allocates the same ones
+    again, and faulting their pages in takes a quarter of the compositing time."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):  # not glibc
@@ -76,32 +94,37 @@ def _keep_freed_memory() -> None:
     mallopt(trim_threshold, 1 << 30)
 
 
-def configure(threads: int | None = None, deterministic: bool = True) -> None:
-    """Set the number of CPU threads for Warp and torch alike, denormals to zero, and torch's deterministic algorithms.
+def configure(threads: int | None = None) -> None:
+    """Set the number of CPU threads for Warp and torch, flush denormals to zero, choose deterministic algorithms.
 
     Call it before the first tensor operation: OpenMP's workers inherit the flush-to-zero mode from the thread that
-    starts them. Denormals made one stretch of 250 training steps 20 times slower.
+    starts them. Denormals can make training steps 20 times slower.
+
+    Args:
+        threads: number of CPU threads. None: all available ones.
     """
     global _threads, _configured
     import numpy as np
     import torch
 
     for dtype in (np.float32, np.float64):
-        np.finfo(dtype)  # numpy looks once, and older ones warn of the missing denormals if they are flushed by then
+        np.finfo(dtype)  # asked before flushing: older versions of NumPy warn of missing denormals
     _threads, _configured = threads, True
     _keep_freed_memory()
     torch.set_flush_denormal(True)
     torch.set_num_threads(thread_count())
-    torch.use_deterministic_algorithms(deterministic, warn_only=True)
-    # With this switch on, torch.empty writes NaN into every buffer; our kernels fill what they allocate.
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    # This switch would make torch.empty fill every buffer with NaN; the kernels write all they allocate.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 
 
 @contextlib.contextmanager
 def one_piece() -> Iterator[None]:
-    """For torch's exp, sigmoid, sine and their like over large tensors. Torch cuts such work where its threads meet,
-    and computes the last elements of each piece with other instructions, which round differently: the bits would depend
-    on the number of threads. Not a matter of speed at these sizes."""
+    """Run torch's exp, sigmoid, sine and the like in one thread, so that the bits do not depend on the thread count.
+
+    Torch cuts large tensors into one piece per thread and computes the last elements of each piece with other
+    instructions, which round differently. One thread is fast enough at the sizes in use.
+    """
     import torch
 
     before = torch.get_num_threads()

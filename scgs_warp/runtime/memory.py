@@ -1,7 +1,7 @@
-"""How much memory may still be taken: asked before it is, so that what does not fit is cut up or refused.
+"""Memory that may still be taken: asked before an allocation, so that what does not fit is cut up or refused.
 
 The limit is the user's (``set_limit``, ``--memory-gib``, ``SCGS_MEMORY_GIB``), or else what the machine, its control
-group and the process' own limits leave. On a GPU it is of the GPU's memory.
+group and the process' own limits leave. On a GPU it concerns the GPU's memory.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ import torch
 
 from ..errors import UserError
 
-VARIABLE = "SCGS_MEMORY_GIB"
+LIMIT_VARIABLE = "SCGS_MEMORY_GIB"
+"""Environment variable: the user's limit."""
+SIBLINGS_VARIABLE = "SCGS_SIBLINGS"
+"""Environment variable: how many processes of one job share the machine. ``torchrun`` has a variable of its own."""
 GIB = 2**30
-SHARE = 0.9
-"""Of what is free: beside what is planned, threads, libraries and small tensors grow too."""
-SECONDS = 1.0
-"""How long a reading serves for what is small beside it."""
-UNKNOWN = 2.0**60
-"""Bytes, where the system says nothing (outside Linux)."""
-SIBLINGS = "SCGS_SIBLINGS"
-"""Variable: how many processes of one job share the machine; torchrun says it in one of its own."""
-SMALL = 0.25
-"""Part of a reading that may be taken without another one."""
+USABLE_SHARE = 0.9
+"""Share of the free memory that may be planned for: threads, libraries and small tensors grow too."""
+READING_SECONDS = 1.0
+"""Seconds for which a reading answers requests that are small beside it."""
+SMALL_PART = 0.25
+"""Share of a reading up to which a request counts as small."""
+UNKNOWN_FREE = 2.0**60
+"""Bytes assumed free where the system says nothing (outside Linux)."""
 
 
 class NotEnoughMemory(UserError, MemoryError):
-    """What was asked for takes more than may be taken: the message gives both figures and the remedy. Nothing was
-    allocated."""
+    """A request takes more than may be taken: the message gives both figures and the remedy. Nothing was allocated."""
 
 
 _limit: int | None = None
@@ -45,49 +45,63 @@ _lock = threading.Lock()
 
 
 def set_limit(gib: float | None) -> None:
-    """Never plan for more memory than this: of the process on a CPU, of what torch allocates on a GPU.
+    """Limit the memory of the process on a CPU, and what torch allocates on a GPU.
 
     Args:
-        gib: in GiB, more than 0. None: what the machine has.
+        gib: GiB, more than 0. None: no limit beside the machine's.
 
     Raises:
-        UserError: it is not a positive number.
+        UserError: ``gib`` is not a positive number.
     """
     global _limit, _limit_known
     if gib is not None and not 0.0 < gib < math.inf:
         raise UserError(f"memory limit of {gib} GiB: give a number greater than 0")
     _limit, _limit_known = None if gib is None else int(gib * GIB), True
-    with _lock:
-        _readings.clear()
+    forget_readings()
+
+
+def set_limit_from_environment() -> None:
+    """Set the limit that ``SCGS_MEMORY_GIB`` gives, or none.
+
+    Raises:
+        UserError: the variable is not a positive number.
+    """
+    text = os.environ.get(LIMIT_VARIABLE, "").strip()
+    try:
+        set_limit(float(text) if text else None)
+    except (UserError, ValueError):
+        raise UserError(f"{LIMIT_VARIABLE}={text}: give a number of GiB greater than 0, or leave it out") from None
 
 
 def limit() -> int | None:
-    """The user's limit in bytes: ``set_limit``'s, or else that of ``SCGS_MEMORY_GIB``; None: there is none.
+    """Return the user's limit in bytes: that of ``set_limit``, or else of ``SCGS_MEMORY_GIB``; None without either.
 
     Raises:
         UserError: the variable is not a positive number.
     """
     if not _limit_known:
-        text = os.environ.get(VARIABLE, "").strip()
-        try:
-            set_limit(float(text) if text else None)
-        except (UserError, ValueError):
-            raise UserError(f"{VARIABLE}={text}: give a number of GiB greater than 0, or leave it out") from None
+        set_limit_from_environment()
     return _limit
 
 
+def forget_readings() -> None:
+    """Ask the system again at the next request."""
+    with _lock:
+        _readings.clear()
+
+
 def in_gib(size: float) -> str:
-    """Bytes as people read them."""
+    """Format bytes as MiB or GiB."""
     if size < GIB / 8:
         return f"{size / 2**20:,.1f} MiB"
     return f"{size / GIB:,.2f} GiB" if size < 100 * GIB else f"{size / GIB:,.0f} GiB"
 
 
 def fits(need: int, device: torch.device | str = "cpu") -> bool:
-    """Whether ``need`` bytes may be taken. Costs nothing where that is a small part of a recent reading."""
+    """Return whether ``need`` bytes may be taken; without asking the system if a recent reading is far larger."""
     name = str(device)
     taken, room = _readings.get(name, (-math.inf, 0))
-    if need <= SMALL * room and time.monotonic() - taken < SECONDS:
+    if need <= SMALL_PART * room and time.monotonic() - taken < READING_SECONDS:
         return True
     if need <= measure(name):
         return True
@@ -96,27 +110,27 @@ def fits(need: int, device: torch.device | str = "cpu") -> bool:
 
 
 def room(device: torch.device | str = "cpu") -> int:
-    """Bytes that may be taken now, memory that was freed but kept handed back first."""
+    """Return the bytes that may be taken now, after handing freed memory back to the system."""
     hand_back(str(device))
     return measure(str(device))
 
 
 def measure(name: str) -> int:
-    """Bytes that may be taken, as the system counts; remembered for ``fits``."""
-    bounds = _free_on_gpu(name) if name.startswith("cuda") else _free_on_host()
-    found = int(SHARE * max(0.0, min(*bounds, UNKNOWN)))
+    """Return the bytes that may be taken by the system's count, and remember them for ``fits``."""
+    bounds = _free_on_gpu(name) if name.startswith("cuda") else free_on_host()
+    free = int(USABLE_SHARE * max(0.0, min(*bounds, UNKNOWN_FREE)))
     with _lock:
-        _readings[name] = time.monotonic(), found
-    return found
+        _readings[name] = time.monotonic(), free
+    return free
 
 
 def require(need: int, device: torch.device | str, what: str, remedy: str) -> None:
-    """Refuse what does not fit.
+    """Refuse a request that does not fit.
 
     Args:
         need: bytes.
         what: begins the message: "``what`` needs".
-        remedy: ends it.
+        remedy: ends the message.
 
     Raises:
         NotEnoughMemory: with both figures.
@@ -126,7 +140,7 @@ def require(need: int, device: torch.device | str, what: str, remedy: str) -> No
 
 
 def refusal(need: int, device: torch.device | str, what: str, remedy: str, room: int | None = None) -> NotEnoughMemory:
-    """What ``require`` raises. ``room``: bytes that may be taken, where they are known."""
+    """Make the error that ``require`` raises. ``room``: bytes that may be taken, if already known."""
     own = limit()
     of = "" if own is None else f" of the {in_gib(own)} allowed"
     allowed = f"{in_gib(measure(str(device)) if room is None else room)}{of} may be taken"
@@ -134,15 +148,15 @@ def refusal(need: int, device: torch.device | str, what: str, remedy: str, room:
 
 
 def hand_back(name: str = "cpu") -> None:
-    """Freed memory goes back to the system (glibc keeps it otherwise), so that what is resident is what is used."""
+    """Return freed memory to the system (glibc keeps it otherwise), so that resident memory is memory in use."""
     if name.startswith("cuda"):
-        return  # what torch keeps is counted as free
+        return  # torch's cache is counted as free
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def status(key: str) -> int | None:
-    """A line of /proc/self/status in bytes; None where there is none (outside Linux)."""
+    """Read a line of /proc/self/status, in bytes; None if it is missing (outside Linux)."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith(f"{key}:"):
@@ -151,9 +165,9 @@ def status(key: str) -> int | None:
 
 
 def siblings() -> int:
-    """Processes of this job on this machine, itself included."""
-    found = [os.environ.get(name, "") for name in (SIBLINGS, "LOCAL_WORLD_SIZE")]
-    return max([1, *(int(text) for text in found if text.isascii() and text.isdigit() and len(text) < 6)])
+    """Count the processes of this job on this machine, itself included."""
+    counts = [os.environ.get(name, "") for name in (SIBLINGS_VARIABLE, "LOCAL_WORLD_SIZE")]
+    return max([1, *(int(text) for text in counts if text.isascii() and text.isdigit() and len(text) < 6)])
 
 
 def _free_on_gpu(name: str) -> Iterator[float]:
@@ -165,9 +179,9 @@ def _free_on_gpu(name: str) -> Iterator[float]:
         yield own - allocated
 
 
-def _free_on_host() -> Iterator[float]:
-    """Every bound there is; infinite where nothing is said. What is the machine's is shared with processes of the same
-    job, which plan at the same moment."""
+def free_on_host() -> Iterator[float]:
+    """Yield every bound that applies, and infinity. Processes of the same job, which plan at the same moment, share
+    the machine's memory evenly."""
     yield math.inf
     own = limit()
     if own is not None:
@@ -176,7 +190,7 @@ def _free_on_host() -> Iterator[float]:
     with contextlib.suppress(OSError, ValueError, IndexError):
         text = Path("/proc/meminfo").read_text(encoding="ascii")
         yield 1024 * int(text.split("MemAvailable:")[1].split(maxsplit=1)[0]) / shares
-    yield from (free / shares for free in _free_in_groups())
+    yield from (free / shares for free in free_in_groups())
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -186,8 +200,8 @@ def _free_on_host() -> Iterator[float]:
                 yield most - (status(used) or 0)
 
 
-def _free_in_groups(root: str = "/sys/fs/cgroup", own: str = "/proc/self/cgroup") -> Iterator[float]:
-    """What the process' control group and those above it leave (Linux), pages that the kernel may drop included."""
+def free_in_groups(root: str = "/sys/fs/cgroup", own: str = "/proc/self/cgroup") -> Iterator[float]:
+    """Yield what the process' control group and its parents leave (Linux), including pages the kernel may drop."""
     try:
         lines = Path(own).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):

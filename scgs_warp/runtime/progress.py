@@ -1,6 +1,6 @@
-"""A progress bar with rate and time left on a terminal; plain lines, few enough to read later, in a log file.
+"""Progress with rate and time left: a bar on a terminal, a few plain lines in a log file.
 
-``advance`` costs well under a microsecond unless it is time to draw, so that it may be called at every training step.
+``advance`` costs well under a microsecond unless it is time to draw, so that every training step may call it.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from contextlib import contextmanager, suppress
 from typing import Any, TextIO, TypeVar
 
 REDRAW_SECONDS = 0.2
-"""A terminal is redrawn this often."""
+"""Seconds between two drawings on a terminal."""
 LINE_FRACTION = 0.05
-"""A log gets a line after this fraction of the work ..."""
+"""A log file gets a line after this fraction of the work ..."""
 LINE_SHORTEST = 2.0
 """... but no sooner than after these seconds ..."""
 LINE_LONGEST = 30.0
 """... and after these in any case."""
 RATE_SECONDS = 15.0
-"""The rate is that of the last seconds: training steps become slower as Gaussians are added."""
+"""The rate is measured over these last seconds: training steps become slower as Gaussians are added."""
 
 
 Result = TypeVar("Result")
 
 
 def mute(stream: TextIO) -> None:
-    """Let what is written to ``stream`` go nowhere from now on: its terminal was closed, or nobody reads its pipe."""
+    """Discard all further output to ``stream``, whose terminal was closed or whose pipe nobody reads."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
@@ -37,7 +37,7 @@ def mute(stream: TextIO) -> None:
 
 
 def say(text: str) -> None:
-    """A line on standard output; work does not end because nobody can see it any more."""
+    """Print a line on standard output; a closed terminal or pipe does not end the work."""
     try:
         print(text, flush=True)
     except OSError:
@@ -45,7 +45,7 @@ def say(text: str) -> None:
 
 
 def clock(seconds: float) -> str:
-    """``1:02:03`` or ``2:03``."""
+    """Format seconds as ``1:02:03`` or ``2:03``."""
     minutes, second = divmod(int(seconds + 0.5), 60)
     hours, minute = divmod(minutes, 60)
     return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
@@ -58,7 +58,7 @@ def _text(value: Any) -> str:
 
 
 class Progress:
-    """What ``progress`` yields: counts steps, keeps the newest value of each field, draws now and then."""
+    """Count of finished steps, with the newest value of each field, drawn from time to time."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int = 0) -> None:
         self.total = total
@@ -72,7 +72,7 @@ class Progress:
         self._next = self._began
 
     def advance(self, n: int = 1, **fields: Any) -> None:
-        """``n`` more steps are done; ``fields`` (numbers, text) replace those of the same name. None removes one."""
+        """Count ``n`` more steps; ``fields`` (numbers, text) replace those of the same name, and None removes one."""
         self.done += n
         if fields:
             self.fields.update(fields)
@@ -81,7 +81,7 @@ class Progress:
             self._next = self._safely(lambda: self._draw(now), now)
 
     def print(self, text: str) -> None:
-        """A line that stays, above the bar."""
+        """Print a line that stays, above the bar."""
         self._safely(lambda: self._print(text), None)
 
     def finish(self, completed: bool = True) -> None:
@@ -89,7 +89,7 @@ class Progress:
         self._safely(lambda: self._finish(completed), None)
 
     def _safely(self, draw: Callable[[], Result], otherwise: Result) -> Result:
-        """A terminal that was closed, or a pipe that nobody reads, ends the drawing and not the work."""
+        """Stop drawing, not the work, when the terminal was closed or nobody reads the pipe."""
         try:
             return draw()
         except OSError:
@@ -103,7 +103,7 @@ class Progress:
         raise NotImplementedError
 
     def _draw(self, now: float) -> float:
-        """Show the state; returns when to look again."""
+        """Show the state and return the time of the next drawing."""
         raise NotImplementedError
 
     def _mark(self, now: float) -> None:
@@ -118,27 +118,27 @@ class Progress:
 
     @property
     def rate(self) -> float:
-        """Steps a second, of late; 0 while unknown."""
+        """Steps per second over the last seconds; 0 while unknown."""
         (then, before), (now, after) = self._marks[0], self._marks[-1]
         return (after - before) / (now - then) if now > then else 0.0
 
     def describe_rate(self) -> str:
-        """``12.3 it/s``, or ``4.5 s/it`` where one step takes longer than a second."""
+        """Format the rate as ``12.3 it/s``, or as ``4.5 s/it`` if a step takes longer than a second."""
         rate = self.rate
         if rate <= 0:
             return "- it/s"
         return f"{rate:.1f} it/s" if rate >= 1 else f"{1 / rate:.1f} s/it"
 
     def describe_left(self) -> str:
-        """Time left as ``2:03``, ``-`` while unknown."""
+        """Format the time left as ``2:03``, or ``-`` while it is unknown."""
         return clock(max(self.total - self.done, 0) / self.rate) if self.rate > 0 else "-"
 
     def describe_fields(self) -> str:
         return "  ".join(f"{name} {_text(value)}" for name, value in self.fields.items() if value is not None)
 
 
-class _Lines(Progress):
-    """For log files: one plain line from time to time."""
+class _LogLines(Progress):
+    """A plain line from time to time, for log files, of which rich would write the last alone."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
         super().__init__(total, description, stream, start)
@@ -165,8 +165,8 @@ class _Lines(Progress):
         self._line(f"{rate:.1f} it/s  {'done' if completed else 'stopped'} after {clock(elapsed)}")
 
 
-class _Bar(Progress):
-    """For terminals, drawn by rich. Refreshed from ``advance``: no thread of its own that would compete for a core."""
+class _TerminalBar(Progress):
+    """A bar drawn by rich, for terminals. ``advance`` refreshes it: a thread of its own would compete for a core."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
         super().__init__(total, description, stream, start)
@@ -189,7 +189,7 @@ class _Bar(Progress):
     def _draw(self, now: float) -> float:
         self._mark(now)
         timing = f"{self.describe_rate()}  {clock(self.elapsed)} < {self.describe_left()}"
-        # rich reads [words] in square brackets as markup
+        # rich would read [words] in square brackets as markup.
         text = self.describe_fields().replace("[", "(").replace("]", ")")
         self._rich.update(self._task, completed=self.done, timing=timing, text=text, refresh=True)
         return now + REDRAW_SECONDS
@@ -204,19 +204,19 @@ class _Bar(Progress):
 
 @contextmanager
 def progress(total: int, description: str, *, start: int = 0, stream: TextIO | None = None) -> Iterator[Progress]:
-    """Show how far a loop of ``total`` steps has come.
+    """Show the progress of a loop of ``total`` steps.
 
     Args:
-        total: steps.
-        description: what is being done, in a word or two.
-        start: steps done before (a resumed run); they do not count for the rate.
-        stream: where to show it; standard output by default. A bar on a terminal, plain lines elsewhere.
+        total: number of steps.
+        description: name of the work, in a word or two.
+        start: steps done before (in a resumed run); they do not count for the rate.
+        stream: output, by default standard output. A terminal gets a bar, anything else plain lines.
 
     Yields:
-        An object whose ``advance(n=1, **fields)`` is to be called as the work proceeds.
+        An object whose ``advance(n=1, **fields)`` the loop calls.
     """
     shown_on: TextIO = stream or sys.stdout or open(os.devnull, "w")  # a daemon may have no standard output
-    shown = (_Bar if shown_on.isatty() else _Lines)(total, description, shown_on, start)
+    shown = (_TerminalBar if shown_on.isatty() else _LogLines)(total, description, shown_on, start)
     try:
         yield shown
     except BaseException:

@@ -1,4 +1,4 @@
-"""How a user, a system or a terminal asks a run to stop."""
+"""Signals by which a user, the system or a terminal asks a run to stop."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from typing import Any
 
 @contextmanager
 def stop_signals() -> Iterator[threading.Event]:
-    """Ctrl-C, SIGTERM and the end of the terminal (SIGHUP) ask for a stop instead of ending the process; a second
-    Ctrl-C ends it. The others come twice of themselves: from the shell and from the system."""
+    """Turn Ctrl-C, SIGTERM and SIGHUP (a closed terminal) into a request to stop; a second Ctrl-C ends the process.
+
+    A second SIGTERM or SIGHUP changes nothing: the shell and the system may each send one.
+
+    Yields:
+        An event that is set once a stop was requested. Outside the main thread signals are left alone.
+    """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked
@@ -25,7 +30,7 @@ def stop_signals() -> Iterator[threading.Event]:
 
     numbers = [signal.SIGINT, signal.SIGTERM]
     hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
-    if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:  # nohup: it is to go on
+    if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:  # under nohup the run continues
         numbers.append(hang_up)
     before = {number: signal.signal(number, ask) for number in numbers}
     try:

@@ -1,5 +1,4 @@
-"""Which of several processes this one is. ``torchrun`` starts them and says so in the environment; torch is not needed
-to read it."""
+"""Rank of this process among those that ``torchrun`` started, read from the environment without importing torch."""
 
 from __future__ import annotations
 
@@ -12,13 +11,13 @@ from .environment import available_threads
 
 
 @dataclass(frozen=True)
-class Place:
+class ProcessRank:
     """This process among those of a job."""
 
     rank: int
     size: int
     local_rank: int = 0
-    """Among those on this machine."""
+    """Rank among the processes on this machine."""
     local_size: int = 1
 
     @property
@@ -27,28 +26,28 @@ class Place:
         return max(1, available_threads() // self.local_size)
 
 
-def place() -> Place | None:
-    """What ``torchrun`` says; None for a process on its own.
+def process_rank() -> ProcessRank | None:
+    """Read the rank that ``torchrun`` gave this process; None for a process on its own.
 
     Raises:
-        UserError: the environment is not what ``torchrun`` makes.
+        UserError: the environment is not one that ``torchrun`` makes.
     """
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     if "RANK" not in os.environ or "MASTER_ADDR" not in os.environ or os.environ.get("WORLD_SIZE", "1") == "1":
         return None
     try:
-        found = Place(*(int(os.environ[name]) for name in names))
+        own = ProcessRank(*(int(os.environ[name]) for name in names))
     except (KeyError, ValueError) as error:
         raise UserError(f"environment: {', '.join(names)} must be whole numbers ({error}); use torchrun") from error
-    if not (0 <= found.rank < found.size and 0 <= found.local_rank < found.local_size <= found.size):
-        raise UserError(f"environment: {found} cannot be; start the job with torchrun")
-    return found
+    if not (0 <= own.rank < own.size and 0 <= own.local_rank < own.local_size <= own.size):
+        raise UserError(f"environment: {own} cannot be; start the job with torchrun")
+    return own
 
 
-def label() -> str:
-    """``" (process 1 of 2)"`` for messages of a process that is not the first; else nothing."""
+def process_label() -> str:
+    """Return ``" (process 1 of 2)"`` for messages of every process but the first, which gets an empty text."""
     with contextlib.suppress(UserError):
-        where = place()
-        if where is not None and where.rank > 0:
-            return f" (process {where.rank} of {where.size})"
+        own = process_rank()
+        if own is not None and own.rank > 0:
+            return f" (process {own.rank} of {own.size})"
     return ""

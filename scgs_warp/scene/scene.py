@@ -21,7 +21,7 @@ from ..motion import build_motion
 from ..motion.base import Motion
 from ..rendering.render import render
 from ..storage import checkpoint
-from ..storage.files import parse_json
+from ..storage.json_files import parse_json
 from ..types import Camera, Gaussians, Image
 from .frame_graph import FrameGraph
 from .validation import check_metadata, check_motion, check_settings, check_tensors, reason

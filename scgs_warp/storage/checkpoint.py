@@ -1,4 +1,7 @@
-"""Checkpoints: one safetensors file, written atomically, the previous one kept. No pickle; no path, date or host."""
+"""Checkpoints: one safetensors file, written atomically; the previous one is kept.
+
+A checkpoint holds no pickle, path, date or host name.
+"""
 
 from __future__ import annotations
 
@@ -19,79 +22,29 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ..errors import UserError
-from .files import parse_json
+from . import files
+from .json_files import parse_json
 
 FILE = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
 DAMAGED = "checkpoint.damaged.safetensors"
-"""What a damaged checkpoint is called once training goes on from the previous one."""
+"""Name of a damaged checkpoint after training has fallen back on the previous one."""
 METADATA_KEY = "scgs_warp"
-"""All metadata is one key of sorted JSON: safetensors writes several keys in random order."""
+"""The only metadata key, of sorted JSON: safetensors writes several keys in random order."""
 FORMAT = 1
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
-NOT_NOW = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ESTALE)
-"""A file that cannot be read for these reasons may be sound."""
-WORDS = ""
-"""What the check sum of the metadata is called, among those of the tensors."""
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+TEMPORARY_ERRORS = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ESTALE)
+"""Read errors that say nothing of the content: the file may be sound."""
+METADATA_SUM = ""
+"""Name of the metadata's check sum among those of the tensors."""
 
 
 class DamagedCheckpoint(UserError):
-    """The newest checkpoint cannot be used; the one before may be sound (:func:`fall_back`)."""
-
-
-def temporary_of(path: Path) -> Path:
-    """What ``path`` is called while it is written: one name, so that those who are killed leave one file, not many."""
-    return path.with_name(f".{path.name}.tmp")
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames in ``folder`` outlast a loss of power, where the system can do that."""
-    with suppress(OSError):  # not on Windows, nor on every network share
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
-
-
-def _write_through(path: Path, content: bytes) -> None:
-    """All of it, on the disk when this returns; on any exception there is no such file.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    try:
-        path.unlink(missing_ok=True)  # in a stranger's folder it may be a link to somewhere else
-        with open(path, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-    except BaseException:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
-        raise
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write beside, flush to disk, rename: a reader sees the old file or the new one, never half of it, also after a
-    loss of power.
-
-    Raises:
-        UserError: the disk is full or the folder cannot be written; the old file is intact.
-    """
-    temporary = temporary_of(path)
-    try:
-        _write_through(temporary, content)
-        os.replace(temporary, path)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise UserError(f"{path}: cannot be written ({error.strerror}); the previous file is intact") from error
-    sync_folder(path.parent)
+    """The newest checkpoint cannot be used; the previous one may be sound (:func:`fall_back`)."""
 
 
 def _sum_of_words(metadata: Mapping[str, Any]) -> int:
-    """Of all that the metadata says beside the sums themselves."""
+    """Check sum of the metadata without its check sums."""
     rest = {name: value for name, value in metadata.items() if name != "crc32"}
     return zlib.crc32(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode())
 
@@ -101,31 +54,31 @@ def _sum(tensor: Tensor) -> int:
 
 
 def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Write ``checkpoint.safetensors``; the one before becomes ``checkpoint.previous.safetensors``.
+    """Write ``checkpoint.safetensors`` and keep the one before as ``checkpoint.previous.safetensors``.
 
     Whenever the process ends, the folder holds a sound checkpoint under one of the two names. The metadata holds a
-    check sum of each tensor and one of itself.
+    check sum of each tensor and of itself.
 
     Raises:
-        UserError: it cannot be written; the checkpoint before it is intact.
+        UserError: the checkpoint cannot be written; the one before it is intact.
     """
-    # A clone, since safetensors refuses tensors that share memory.
+    # Cloned, since safetensors refuses tensors that share memory.
     saved = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
     sums = {name: _sum(tensor) for name, tensor in saved.items()}
     words = parse_json(json.dumps({**metadata, "format": FORMAT}))
-    sums[WORDS] = _sum_of_words(words)
+    sums[METADATA_SUM] = _sum_of_words(words)
     text = json.dumps({**words, "crc32": sums}, sort_keys=True, separators=(",", ":"))
     content = save(saved, {METADATA_KEY: text})
     path = folder / FILE
-    temporary = temporary_of(path)
+    temporary = files.temporary_of(path)
     try:
         try:
-            _write_through(temporary, content)
+            files.write_and_flush(temporary, content)
         except OSError as error:
-            if error.errno not in NO_ROOM or not os.path.exists(path):
+            if error.errno not in DISK_FULL or not os.path.exists(path):
                 raise
-            (folder / PREVIOUS).unlink(missing_ok=True)  # room for two, not for three
-            _write_through(temporary, content)
+            (folder / PREVIOUS).unlink(missing_ok=True)  # there is room for two checkpoints, not for three
+            files.write_and_flush(temporary, content)
         if os.path.exists(path):
             _name_also(path, folder / PREVIOUS)
         os.replace(temporary, path)
@@ -134,35 +87,35 @@ def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, An
             temporary.unlink(missing_ok=True)
         remedy = (
             "the one before it is intact: when there is room and leave to write, --resume continues from there"
-            if os.path.exists(path)  # pathlib's raises where the folder may not be looked into
+            if os.path.exists(path)  # Path.exists raises where the folder may not be searched
             else "nothing is saved yet: make room or choose another --output"
         )
         raise UserError(f"{path}: cannot be written ({error.strerror}); {remedy}") from error
-    sync_folder(folder)
+    files.sync_folder(folder)
 
 
 def _name_also(path: Path, name: Path) -> None:
-    """Let ``name`` be what ``path`` is; where there can be no hard links, a copy of it."""
-    temporary = temporary_of(name)
-    with suppress(OSError):  # then there is no previous checkpoint; the newest is written all the same
+    """Make ``name`` a hard link to ``path``, or a copy where the file system has no hard links."""
+    temporary = files.temporary_of(name)
+    with suppress(OSError):  # without a previous checkpoint the newest is written all the same
         temporary.unlink(missing_ok=True)
         try:
             os.link(path, temporary)
         except OSError:
             shutil.copyfile(path, temporary)
         os.replace(temporary, name)
-    with suppress(OSError):  # a rename between two names of one file does nothing
+    with suppress(OSError):  # renaming one name of a file to another does nothing
         temporary.unlink(missing_ok=True)
 
 
 def read(
     folder: Path, prefixes: tuple[str, ...] = ("",), *, name: str = FILE
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors whose names start with one of ``prefixes``, and the metadata. ``name``: of the file.
+    """Read the tensors whose names start with one of ``prefixes``, and the metadata, from the file ``name``.
 
     Raises:
-        DamagedCheckpoint: it is damaged, or missing while there is a previous one (with the remedy).
-        UserError: there is no checkpoint, or it is of another format.
+        DamagedCheckpoint: the file is damaged, or missing beside a previous one (with the remedy).
+        UserError: there is no checkpoint, or its format is another.
     """
     path = folder / name
     spare = name == FILE and (folder / PREVIOUS).is_file()
@@ -177,14 +130,14 @@ def read(
             tensors = {key: file.get_tensor(key) for key in file.keys() if key.startswith(prefixes)}
         if not isinstance(metadata, dict):
             raise ValueError("no metadata")
-        sums = metadata.get("crc32", {})  # runs from before there were any have none
-        if WORDS in sums and sums[WORDS] != _sum_of_words(metadata):
+        sums = metadata.get("crc32", {})  # early runs have no check sums
+        if METADATA_SUM in sums and sums[METADATA_SUM] != _sum_of_words(metadata):
             raise ValueError("its metadata is not what was written")
         for key, tensor in tensors.items():
             if key in sums and sums[key] != _sum(tensor):
                 raise ValueError(f"{key} is not what was written")
     except (SafetensorError, KeyError, ValueError, TypeError, AttributeError, OSError) as error:
-        if isinstance(error, OSError) and error.errno in NOT_NOW:
+        if isinstance(error, OSError) and error.errno in TEMPORARY_ERRORS:
             raise UserError(f"{path}: cannot be read ({error.strerror}); try again, or make it readable") from error
         raise DamagedCheckpoint(f"{path}: damaged or not ours ({error}); {remedy}") from error
     if metadata.get("format") != FORMAT:
@@ -195,13 +148,13 @@ def read(
 
 
 def fall_back(folder: Path, error: DamagedCheckpoint) -> str:
-    """Put the previous checkpoint in the place of one that is damaged or missing. Whoever calls holds the lock.
+    """Replace a damaged or missing checkpoint by the previous one. The caller holds the run folder's lock.
 
     Returns:
-        what to tell the user.
+        A message for the user.
 
     Raises:
-        DamagedCheckpoint: ``error``, where the previous one is no better.
+        DamagedCheckpoint: ``error``, if the previous checkpoint is no better.
         UserError: the folder cannot be written.
     """
     path = folder / FILE
@@ -219,14 +172,15 @@ def fall_back(folder: Path, error: DamagedCheckpoint) -> str:
         path.stat()
     except OSError as failure:
         raise UserError(f"{path}: cannot be replaced ({failure.strerror}); make the folder writable") from error
-    sync_folder(folder)
+    files.sync_folder(folder)
     return f"{path}: damaged (kept as {DAMAGED}); training goes on from {PREVIOUS}, step {step}"
 
 
 def strip(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors under ``prefix``, without it."""
+    """Return the tensors under ``prefix``, with the prefix removed from their names."""
     return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def to_device(tensors: Mapping[str, Tensor], device: torch.device | str) -> dict[str, Tensor]:
+    """Return the tensors on ``device``."""
     return {name: value.to(device) for name, value in tensors.items()}

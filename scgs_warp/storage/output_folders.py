@@ -1,4 +1,4 @@
-"""Folders that results go to: found writable before the work, and replaced as a whole after it."""
+"""Output folders: checked before the work, replaced as a whole after it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from ..errors import UserError
 
 
 def make_parent(path: Path) -> None:
-    """Make the folder that ``path`` is to stand in.
+    """Make the parent folder of ``path``.
 
     Raises:
-        UserError: it cannot be made, or nothing can be written there.
+        UserError: it cannot be made, or is not writable.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -25,15 +25,15 @@ def make_parent(path: Path) -> None:
 
 
 def holds_only(folder: Path, pattern: str) -> bool:
-    """Whether all names in it match a regular expression: such a folder may be replaced."""
+    """Return whether all names in a folder match a regular expression, so that it may be replaced."""
     return all(re.fullmatch(pattern, entry.name) for entry in folder.iterdir())
 
 
 def replace_folder(path: Path, new: Path) -> None:
-    """Put the folder ``new`` in the place of ``path``, which is removed once the new one stands there.
+    """Replace the folder ``path`` by the folder ``new``, and remove the earlier one afterwards.
 
     Raises:
-        OSError: that cannot be; the earlier folder stands where it stood.
+        OSError: replacing failed; the earlier folder is back in its place.
     """
     if not path.is_dir():
         os.replace(new, path)

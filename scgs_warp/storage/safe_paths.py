@@ -1,8 +1,8 @@
-"""Names that stand in files of others: they say where in the file's own folder something lies, and nowhere else.
+"""Paths named in other people's files: accepted only inside the file's own folder.
 
-A data set or a model may come from a stranger. What leads out of its folder (``..``, another root, a drive) is refused,
-as is what is no file at all, such as ``/dev/zero``, which never ends. Links that lie in the folder are followed: its
-owner put them there.
+A data set or a model may come from a stranger. A name that leads out of its folder (``..``, another root, a drive) is
+refused, as is anything but a regular file: ``/dev/zero`` never ends. Links in the folder are followed: its owner put
+them there.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from pathlib import Path
 from ..errors import UserError
 
 LONGEST_NAME, LONGEST_PATH = 240, 2000
-"""Bytes; file systems have 255 and 4096, and something may be added."""
+"""Bytes; file systems allow 255 and 4096, and suffixes may be added."""
 
 
 def inside(folder: Path, name: str, where: str, what: str = "file") -> Path:
-    """The path of ``name`` in ``folder``; slashes of either kind.
+    """Return the path of ``name`` in ``folder``; slashes and backslashes both separate.
 
     Args:
-        where: what names it, for the message: file and field.
-        what: kind of thing that is named.
+        where: file and field that hold the name; begins the message.
+        what: kind of file that is named, for the message.
 
     Raises:
-        UserError: it is empty, can be no path, or leads out of the folder.
+        UserError: the name is empty, is no valid path, or leads out of the folder.
     """
     text = name.replace("\\", "/")
     if not text.strip() or "\0" in text or not _fits(text):
@@ -43,15 +43,15 @@ def inside(folder: Path, name: str, where: str, what: str = "file") -> Path:
 def _fits(text: str) -> bool:
     try:
         size = len(os.fsencode(text))
-    except UnicodeEncodeError:  # half a letter
+    except UnicodeEncodeError:  # half of a surrogate pair
         return False
     return size <= LONGEST_PATH and all(len(os.fsencode(part)) <= LONGEST_NAME for part in text.split("/"))
 
 
 def is_regular(path: Path) -> bool:
-    """Whether it can be read as a file, to its end: no pipe, no device.
+    """Return whether ``path`` is a regular file, not a folder, pipe or device.
 
     Raises:
-        OSError: there is no such thing, or it cannot be looked at.
+        OSError: it does not exist or cannot be examined.
     """
     return stat.S_ISREG(path.stat().st_mode)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..config.presets import DensifyConfig
 from ..gaussians import GaussianParameters
-from ..geometry.quaternion import rotate
+from ..geometry.rotation import rotate
 from ..optim import Adam
 from ..runtime import memory
 from ..types import Stats

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
-from ..runtime.torchrun import Place
+from ..runtime.torchrun import ProcessRank
 
 PATIENCE = timedelta(minutes=10)
 """A process that is silent for so long counts as lost. Ended ones are noticed at once; this is for those that hang, and
@@ -37,13 +37,13 @@ class Lost(UserError):
 
 
 @contextlib.contextmanager
-def team_of(where: Place | None, device: str) -> Iterator[Team | None]:
+def team_of(where: ProcessRank | None, device: str) -> Iterator[Team | None]:
     """Join the processes that ``torchrun`` started, for the time of the context; None without it.
 
     Processes other than the first print nothing to standard output meanwhile.
 
     Args:
-        where: of ``job.place()``.
+        where: of ``process_rank()``.
         device: ``cpu`` or ``cuda``; of the latter each process takes the GPU of its place on the machine.
 
     Raises:
@@ -77,7 +77,7 @@ def team_of(where: Place | None, device: str) -> Iterator[Team | None]:
             dist.destroy_process_group()
 
 
-def _choose_network(where: Place) -> None:
+def _choose_network(where: ProcessRank) -> None:
     """Processes on one machine talk through its loopback interface: nothing listens on a network, and the machine's
     name need not be known to anybody. The user's choice wins."""
     if where.local_size == where.size and hasattr(socket, "if_nameindex"):
@@ -86,7 +86,7 @@ def _choose_network(where: Place) -> None:
             os.environ.setdefault("GLOO_SOCKET_IFNAME", loopback[0])
 
 
-def _choose_gpu(where: Place) -> None:
+def _choose_gpu(where: ProcessRank) -> None:
     import torch.distributed as dist
 
     present = torch.cuda.device_count()
@@ -111,7 +111,7 @@ class Team:
         Lost: (all methods) another process ended, or was silent for ``PATIENCE``.
     """
 
-    def __init__(self, where: Place) -> None:
+    def __init__(self, where: ProcessRank) -> None:
         self.rank, self.size = where.rank, where.size
         self.waited = self.moved = 0.0
         self.bytes = 0

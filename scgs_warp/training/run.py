@@ -18,7 +18,7 @@ from ..evaluation.evaluate import Lpips, metrics_of, write_metrics
 from ..geometry import cameras
 from ..runtime.progress import progress
 from ..scene.scene import Scene
-from ..storage.checkpoint import write_atomically
+from ..storage.files import write_atomically
 from ..visualization import video
 from ..visualization.figures import curves
 from ..visualization.overlay import Painter

@@ -20,7 +20,8 @@ from ..errors import UserError, one_line
 from ..evaluation.image_metrics import psnr
 from ..runtime.progress import Progress, say
 from ..scene.scene import Scene
-from ..storage.checkpoint import FILE, PREVIOUS, write_atomically
+from ..storage.checkpoint import FILE, PREVIOUS
+from ..storage.files import write_atomically
 from ..visualization.figures import read_log
 from .tensorboard import TensorBoard, check_installed
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
-from ..storage.checkpoint import write_atomically
-from ..storage.files import as_number, parse_json
+from ..storage.files import write_atomically
+from ..storage.json_files import as_number, parse_json
 
 AXIS_FIELDS, MAX_AXIS_VALUE = ("step", "seconds"), 1e9
 """Fields that place a log line on the axes, and their largest valid value."""

@@ -15,7 +15,8 @@ from fuzz.poison import Draw
 from helpers.cuda_emulation import COMPILER, build, launcher
 from scgs_warp.kernels import compositing
 from scgs_warp.ops import compositing_cuda
-from scgs_warp.runtime.launch import _parameters_of, launch
+from scgs_warp.runtime.kernel_arguments import parameters_of
+from scgs_warp.runtime.launch import launch
 
 from . import fence
 
@@ -35,8 +36,7 @@ def emulated(seed: int) -> Iterator[None]:
         if fence.current is None:
             run(kernel, blocks, *args, begin=begin)
         else:
-            parameters = _parameters_of(kernel, args)
-            fence.current.run(kernel, parameters, args, lambda own: run(kernel, blocks, *own, begin=begin))
+            fence.current.run(kernel, parameters_of(kernel), args, lambda own: run(kernel, blocks, *own, begin=begin))
 
     def portable(kernel: Any, blocks: int, *args: Any, block_dim: int, begin: int = 0) -> None:
         launch(compositing.composite_pixels_adjoint, blocks, *args, begin=begin)

@@ -10,8 +10,8 @@ from torch import Tensor
 import scgs_warp
 from fuzz.poison import Draw, finite_rows
 from helpers.splats import random_splats
-from scgs_warp.ops.binning import BandCount, bin_splats
-from scgs_warp.ops.binning_cuda import RadixCount, bin_within, geometry_of
+from scgs_warp.ops.binning import BandBinning, bin_splats
+from scgs_warp.ops.binning_cuda import RadixBinning, bin_within, geometry_of
 from scgs_warp.ops.compositing import composite
 from scgs_warp.ops.covariance import covariance
 from scgs_warp.ops.harmonics import spherical_harmonics
@@ -162,7 +162,7 @@ def case_binning(d: Draw, device: str) -> None:
     assert not bool(broken[tiles.splats.cpu().long()].any()), "a broken splat is in a tile"
     size = (splats.width, splats.height, tiles.columns, tiles.rows, tile_size)
     ours_of = (tiles.ranges, tiles.splats, tiles.slots, tiles.offsets)
-    for counted in (BandCount, RadixCount) if device == "cpu" else (RadixCount,):
+    for counted in (BandBinning, RadixBinning) if device == "cpu" else (RadixBinning,):
         for ours, other in zip(ours_of, counted(geometry_of(splats), size, (0, tiles.columns * tiles.rows)).lists()):
             assert torch.equal(ours, other), f"{counted.__name__} differs"
     if tile_size == 16:

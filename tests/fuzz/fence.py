@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from scgs_warp.runtime import launch
+from scgs_warp.runtime.kernel_arguments import parameters_of
 
 PAGE = mmap.PAGESIZE
 ROOM = 1 << 23
@@ -124,15 +125,15 @@ def walled(tensor: Tensor) -> Tensor:
 def fenced() -> Iterator[Fence]:
     """Fence launches on the CPU; the thread count must be 1."""
     global current
-    fence, kernels = Fence(), launch._CpuKernel
-    bind, pack = kernels.bind, kernels.pack
+    fence, kernels = Fence(), launch.CpuKernel
+    bind = kernels.bind
 
     def bound(self: Any, arguments: bytes, tensors: tuple, begin: int) -> Callable[[int, int], None]:
         def call(first: int, size: int) -> None:
             def go(args: tuple) -> None:
-                bind(self, pack(self, args), args, begin)(first, size)
+                bind(self, self.pack(args), args, begin)(first, size)
 
-            fence.run(self.kernel, self.parameters, tensors, go)
+            fence.run(self.kernel, parameters_of(self.kernel), tensors, go)
 
         return call
 

@@ -1,4 +1,4 @@
-"""Normalisation of a scene: fitted to cameras or points, undone without loss, finite for any cameras."""
+"""Scene normalisation: fitted to cameras and points, applied and undone."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def ring(count: int, centre: np.ndarray, radius: float) -> list[Camera]:
     return cameras
 
 
-def test_normalisation_of_cameras():
+def test_cameras_on_a_ring():
     centre, radius = np.array([10.0, -20.0, 5.0]), 40.0
     transform = Normalisation.fit(ring(7, centre, radius))
     assert np.abs(transform.centre - centre).max() < 1e-3
@@ -36,7 +36,7 @@ def test_normalisation_of_cameras():
     assert transform.centre.dtype == np.float64
 
 
-def test_normalisation_of_points_and_round_trip():
+def test_points_and_round_trip():
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * 30 + torch.tensor([5.0, 6.0, 7.0])
     cameras = ring(5, np.array([5.0, 6.0, 7.0]), 200.0)
     transform = Normalisation.fit(cameras, points)
@@ -52,7 +52,7 @@ def test_normalisation_of_points_and_round_trip():
     assert torch.allclose(transform.undo_camera(camera).viewmat, cameras[0].viewmat, atol=1e-4)
 
 
-def test_normalisation_of_parallel_cameras_is_finite():
+def test_parallel_cameras_are_finite():
     cameras = []
     for x in (-1.0, 0.0, 1.0):
         viewmat = torch.eye(4)

@@ -28,7 +28,7 @@ from helpers.tiny import tiny_config, tiny_dataset  # isort: skip
 
 from scgs_warp.config.presets import TrainConfig
 from scgs_warp.runtime import environment
-from scgs_warp.storage import checkpoint
+from scgs_warp.storage import checkpoint, files
 from scgs_warp.training import density_control, loop, visibility
 from scgs_warp.training.state import TrainState
 
@@ -89,11 +89,11 @@ def always(*_: Any) -> bool:
 MOMENTS: dict[str, Callable[[], None]] = {
     "before the first checkpoint": lambda: wrapped(loop, "training_step", nth(4, always)),
     "half a checkpoint": lambda: wrapped(
-        checkpoint, "_write_through", nth(7, lambda path, _: "checkpoint" in path.name, half_written)
+        files, "write_and_flush", nth(7, lambda path, _: "checkpoint" in path.name, half_written)
     ),
     "before the previous one is renamed": lambda: wrapped(os, "replace", nth(9, ends(checkpoint.PREVIOUS))),
     "between the two renames": lambda: wrapped(os, "replace", nth(11, ends(checkpoint.FILE))),
-    "before the folder is flushed": lambda: wrapped(checkpoint, "sync_folder", nth(13, always)),
+    "before the folder is flushed": lambda: wrapped(files, "sync_folder", nth(13, always)),
     "after the stage has changed": lambda: wrapped(TrainState, "begin_main", lambda *_: None, die),
     "while spheres are added": lambda: wrapped(density_control, "densify_spheres", lambda *_: None, nth(2, always)),
     "while Gaussians are added": lambda: wrapped(density_control, "densify", lambda *_: None, nth(3, always)),
@@ -112,7 +112,7 @@ def narrate(tell: Callable[[str], None]) -> None:
     wrapped(density_control, "densify", lambda *_: tell("main densification"))
     wrapped(density_control, "densify_spheres", lambda *_: tell("pretrain densification"))
     wrapped(checkpoint, "write", lambda *_: tell("checkpoint: gathering"))
-    wrapped(checkpoint, "_write_through", lambda *_: tell("checkpoint: writing"))
+    wrapped(files, "write_and_flush", lambda *_: tell("checkpoint: writing"))
     wrapped(os, "replace", lambda *_: tell("checkpoint: renaming"))
 
 

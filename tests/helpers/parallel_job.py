@@ -26,7 +26,7 @@ from scgs_warp.config.presets import TrainConfig
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import UserError
 from scgs_warp.runtime import environment
-from scgs_warp.runtime.torchrun import place
+from scgs_warp.runtime.torchrun import process_rank
 from scgs_warp.training import loop, process_group
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
@@ -120,7 +120,7 @@ def main(arguments: list[str] | None) -> None:
     while scenarios:
         process_group.PATIENCE = SHORT if scenarios[0] == "hung" else timedelta(minutes=2)
         os.environ["MASTER_PORT"] = ports.pop()
-        with team_of(place(), "cpu") as team:
+        with team_of(process_rank(), "cpu") as team:
             assert team is not None
             while scenarios:
                 name = scenarios.pop(0)

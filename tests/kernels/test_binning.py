@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from helpers.splats import random_splats
 from reference.binning import needed_pairs, usable
 from scgs_warp.ops import binning
-from scgs_warp.ops.binning import BandCount, bin_splats
-from scgs_warp.ops.binning_cuda import RadixCount
+from scgs_warp.ops.binning import BandBinning, bin_splats
+from scgs_warp.ops.binning_cuda import RadixBinning
 from scgs_warp.runtime import environment
 from scgs_warp.types import Splats, Tiles
 
@@ -131,8 +131,8 @@ def assert_both_sorts_agree(splats: Splats, device: str = "cpu", tile_size: int 
     columns, rows = -(-splats.width // tile_size), -(-splats.height // tile_size)
     size = (splats.width, splats.height, columns, rows, tile_size)
     whole = (0, columns * rows)
-    by_radix = RadixCount([t.to(device) for t in geometry], size, whole).lists()
-    for name, got, expected in zip(LISTS, BandCount(geometry, size, whole).lists(), by_radix, strict=True):
+    by_radix = RadixBinning([t.to(device) for t in geometry], size, whole).lists()
+    for name, got, expected in zip(LISTS, BandBinning(geometry, size, whole).lists(), by_radix, strict=True):
         assert torch.equal(got, expected.cpu()), name
     return len(by_radix[1])
 

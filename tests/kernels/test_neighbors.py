@@ -93,11 +93,6 @@ def test_sizes_that_cannot_be(device):
     assert indices.shape == (0, 2) and distances.shape == (0, 2)
 
 
-def full_searches(search: NeighborSearch) -> int:
-    """Blocks that the lists did not suffice for, since they were made."""
-    return search._searched
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
     ("n", "m", "d", "k"), [(3001, 300, 3, 4), (2000, 200, 5, 7), (1000, 100, 11, 3), (500, 3, 2, 3), (40, 20, 3, 16)]
@@ -117,22 +112,22 @@ def test_the_memory_is_used_and_renewed():
     points, nodes = cloud(7, 20_000, 300, 3)
     search = NeighborSearch()
     search(points, nodes, 4)
-    lists = search._lists
+    lists = search.lists
     assert lists is not None and int((lists.counts >= 0).sum()) > 0.9 * len(lists.counts)
     assert float(lists.counts.float().mean()) < 100
     search(points + 1e-3, nodes + 1e-3, 4)
-    assert search._lists is lists and full_searches(search) < 0.01 * len(lists.counts)
+    assert search.lists is lists and search.full_searches < 0.01 * len(lists.counts)
     moved = nodes.flip(0)
     for _ in range(2):
         assert torch.equal(search(points, moved, 4), nearest(points, moved, 4)[0])
-    assert full_searches(search) > len(lists.counts) and search._lists is lists
+    assert search.full_searches > len(lists.counts) and search.lists is lists
     search(points, moved, 4)
-    assert search._lists is not lists and full_searches(search) == 0
-    lists = search._lists
+    assert search.lists is not lists and search.full_searches == 0
+    lists = search.lists
     for other in ((points[1:], nodes, 4), (points, nodes[1:], 4), (points, nodes, 3), (points[:, :2], nodes[:, :2], 3)):
         assert torch.equal(search(*other), nearest(*other)[0])
-        assert search._lists is not lists
-        lists = search._lists
+        assert search.lists is not lists
+        lists = search.lists
 
 
 @pytest.mark.parametrize("afar", [50.0, 1e25, float("nan"), float("inf")])
@@ -142,12 +137,12 @@ def test_one_far_jump_is_noticed(afar):
     nodes[17] = afar
     search = NeighborSearch()
     search(points, nodes, 4)
-    assert torch.equal(search(points, nodes, 4), nearest(points, nodes, 4)[0]) and full_searches(search) == 0
+    assert torch.equal(search(points, nodes, 4), nearest(points, nodes, 4)[0]) and search.full_searches == 0
     nodes[17] = 0.0
     points[9], points[10] = points[2000], 30.0
     found = search(points, nodes, 4)
     assert torch.equal(found, nearest(points, nodes, 4)[0])
-    assert (found == 17).any() and full_searches(search) > 1
+    assert (found == 17).any() and search.full_searches > 1
 
 
 def test_memory_and_poison():

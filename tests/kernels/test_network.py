@@ -76,7 +76,7 @@ def test_the_adjoint_in_parts_gives_the_same_bits(largest, monkeypatch):
     where.requires_grad_()
     v = torch.randn(102, 40, generator=torch.Generator().manual_seed(13))
     whole = torch.autograd.grad(network(where, when, weights, biases), (where, *weights, *biases), v)
-    monkeypatch.setattr(ops, "LARGEST_ADJOINT", largest)
+    monkeypatch.setattr(ops, "ADJOINT_ROWS_AT_ONCE", largest)
     parts = torch.autograd.grad(network(where, when, weights, biases), (where, *weights, *biases), v)
     assert all(torch.equal(a, b) for a, b in zip(whole, parts))
 

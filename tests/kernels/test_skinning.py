@@ -287,11 +287,11 @@ def test_rotations_on_one_side_take_a_shorter_way_to_the_same_bits(monkeypatch):
     near, indices = fused_inputs(5, 3000, 64, 4, scales=True, near=True)
     far = fused_inputs(5, 3000, 64, 4)[0]
     results = []
-    for limit in (ops.NEAR, 2.0):
-        monkeypatch.setattr(ops, "NEAR", limit)
+    for limit in (ops.SAME_SIDE, 2.0):
+        monkeypatch.setattr(ops, "SAME_SIDE", limit)
         pose = tuple(near.get(name) for name in FIELDS)
-        assert ops._palette(near["nodes"], pose).aligned == (limit < 1.0)
-        assert not ops._palette(far["nodes"], tuple(far.get(name) for name in FIELDS)).aligned
+        assert ops.pack_palette(near["nodes"], pose).aligned == (limit < 1.0)
+        assert not ops.pack_palette(far["nodes"], tuple(far.get(name) for name in FIELDS)).aligned
         outputs, grads = run_fused(skin_rbf, near, indices)
         results.append([*outputs, *grads.values()])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))

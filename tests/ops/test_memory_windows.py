@@ -12,7 +12,7 @@ from helpers.splats import random_splats
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.errors import UserError
 from scgs_warp.ops import binning_cuda, compositing_cuda, memory_windows
-from scgs_warp.ops.binning import BandCount, bin_splats, bin_window
+from scgs_warp.ops.binning import BandBinning, bin_splats, bin_window
 from scgs_warp.ops.compositing import composite, demand
 from scgs_warp.ops.memory_windows import Demand
 from scgs_warp.rendering.rasterize import rasterization
@@ -37,7 +37,7 @@ def test_a_window_lists_what_the_whole_image_does(window: tuple[int, int], radix
     whole = bin_splats(splats)
     if radix:
         geometry, size = binning_cuda.geometry_of(splats), (*SIZE, 10, 6, 16)
-        ranges, listed, slots, offsets = binning_cuda.RadixCount(geometry, size, window).lists()
+        ranges, listed, slots, offsets = binning_cuda.RadixBinning(geometry, size, window).lists()
         part = replace(whole, ranges=ranges, splats=listed, slots=slots, offsets=offsets)
     else:
         part = bin_window(splats, whole, window)
@@ -53,10 +53,10 @@ def test_a_window_lists_what_the_whole_image_does(window: tuple[int, int], radix
 
 def test_windows_follow_each_other_and_are_rows_or_in_one():
     class Counted:
-        most, kept, entries = 10**9, 0, 1
+        max_entries, list_bytes, entries = 10**9, 0, 1
 
         def __init__(self, window: tuple[int, int]) -> None:
-            self.pairs = self.scratch = 100 * (window[1] - window[0])
+            self.pairs = self.scratch_bytes = 100 * (window[1] - window[0])
 
     for allowed in (401, 799, 2001, 11_000, 10**6):
         memory_room = allowed + 50
@@ -209,7 +209,7 @@ def test_more_pairs_than_a_list_can_index_are_cut():
     tiles = bin_splats(huge, demand=Demand(0))
     assert len(tiles.windows) > 1 and tiles.windows[-1][1] == 10**6
     last = tiles.windows[-1]
-    assert BandCount(binning_cuda.geometry_of(huge), (16000, 16000, 1000, 1000, 16), last).pairs == 3000 * (
+    assert BandBinning(binning_cuda.geometry_of(huge), (16000, 16000, 1000, 1000, 16), last).pairs == 3000 * (
         last[1] - last[0]
     )
 

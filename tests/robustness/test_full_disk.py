@@ -31,7 +31,7 @@ from helpers.tiny import tiny_dataset
 from scgs_warp.data import load
 from scgs_warp.errors import UserError
 from scgs_warp.scene.scene import Scene
-from scgs_warp.storage import checkpoint
+from scgs_warp.storage import checkpoint, files
 from scgs_warp.training import run as finish
 from scgs_warp.training import run_folder
 from scgs_warp.training.loop import fit
@@ -112,14 +112,14 @@ def test_deleted_run_folder(tmp_path, at_step):
 
 
 def test_disk_with_room_for_two_checkpoints(tmp_path, monkeypatch, whole):
-    plain = checkpoint._write_through
+    plain = files.write_and_flush
 
     def third(path: Path, content: bytes) -> None:
         if path.with_name(checkpoint.PREVIOUS).exists():
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         plain(path, content)
 
-    monkeypatch.setattr(checkpoint, "_write_through", third)
+    monkeypatch.setattr(files, "write_and_flush", third)
     fit(every_step(), tiny_dataset(FRAMES), output=tmp_path / "run")
     assert checkpoint_bytes(tmp_path / "run") == whole
 
@@ -155,7 +155,7 @@ def test_files_are_flushed_before_and_after_a_rename(tmp_path, monkeypatch):
     newest = f"rename {checkpoint.FILE}"
     assert done == ["file", newest, "folder", "file", f"rename {checkpoint.PREVIOUS}", newest, "folder"]
     done.clear()
-    checkpoint.write_atomically(tmp_path / "a.json", b"{}")
+    files.write_atomically(tmp_path / "a.json", b"{}")
     assert done == ["file", "rename a.json", "folder"]
 
 

@@ -33,6 +33,7 @@ from scgs_warp.errors import UserError
 from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
+from scgs_warp.storage.files import write_atomically
 
 
 class Payload:
@@ -316,7 +317,7 @@ def test_a_link_in_the_place_of_a_temporary_file_is_not_written_through(tmp_path
     victim = tmp_path / "victim"
     victim.write_text("mine")
     (tmp_path / ".a.json.tmp").symlink_to(victim)
-    checkpoint.write_atomically(tmp_path / "a.json", b"{}")
+    write_atomically(tmp_path / "a.json", b"{}")
     assert victim.read_text() == "mine" and (tmp_path / "a.json").read_bytes() == b"{}"
 
 

@@ -12,14 +12,13 @@ from scgs_warp.kernels import projection, reduction, skinning
 from scgs_warp.kernels.cuda.slots import sum_slot_columns
 from scgs_warp.runtime import launch
 from scgs_warp.runtime.cuda_launch import RecordedKernel
+from scgs_warp.runtime.kernel_arguments import parameters_of
 
 CPU = torch.device("cpu")
 
 
 def recorded(kernel: wp.Kernel, dim: int, args: tuple) -> RecordedKernel:
-    parameters = launch._parameters_of(kernel, args)
-    packed, _ = launch._pack(kernel, args)
-    return RecordedKernel(kernel, parameters, packed, launch._array, dim, CPU)
+    return RecordedKernel(kernel, args, dim, CPU)
 
 
 def slot_arguments(count: int, seed: int, absolute: bool) -> tuple[Any, ...]:
@@ -103,7 +102,4 @@ def test_every_kernel_can_be_settled():
     """Arguments of every kind that the kernels have find their place."""
     for module in (projection, reduction, skinning):
         for kernel in (value for value in vars(module).values() if isinstance(value, wp.Kernel)):
-            parameters = launch._describe_parameters(kernel)
-            packed = [None if p is not None else 0 for p in parameters]
-            ready = RecordedKernel(kernel, parameters, packed, launch._array, 1, CPU)
-            assert len(ready._types) == len(parameters)
+            RecordedKernel(kernel, [None if p is not None else 0 for p in parameters_of(kernel)], 1, CPU)

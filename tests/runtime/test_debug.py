@@ -73,7 +73,7 @@ def test_random_scenes_keep_every_promise(device: str, form: str, how: dict, deb
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler, or not Linux, whose fibres the shim uses")
 def test_so_do_the_native_form_and_the_radix_sort(tmp_path, monkeypatch: pytest.MonkeyPatch, debugging: None):
     monkeypatch.setattr(compositing_cuda, "launch_native", launcher(build(tmp_path)))
-    monkeypatch.setattr(binning, "BandCount", binning_cuda.RadixCount)
+    monkeypatch.setattr(binning, "BandBinning", binning_cuda.RadixBinning)
     for seed in range(2):
         draw(some_splats(seed), "cuda")
     spoil_launch(monkeypatch, compositing_cuda, "sum_slots", lambda _, outputs: outputs[-1][0].fill_(torch.inf))
@@ -223,19 +223,19 @@ def test_missing_slots_are_found():
         checks.check_slots(tiles, torch.zeros(len(tiles.splats) - 1, 16))
 
 
-@pytest.mark.parametrize("counted", ("BandCount", "RadixCount"))
+@pytest.mark.parametrize("counted", ("BandBinning", "RadixBinning"))
 def test_emitting_other_tiles_than_were_counted_is_found(counted: str, monkeypatch, debugging: None, all_threads: None):
     """The second pass sees smaller splats than the first: what it leaves out was never written, or is not owned."""
     environment.configure(1)
-    kind = getattr(binning, counted, None) or binning_cuda.RadixCount
-    monkeypatch.setattr(binning, "BandCount", kind)
+    kind = getattr(binning, counted, None) or binning_cuda.RadixBinning
+    monkeypatch.setattr(binning, "BandBinning", kind)
 
     def shrinking(geometry: list[torch.Tensor], *rest: Any) -> Any:
         count = kind(geometry, *rest)
         count._geometry = [geometry[0], 4.0 * geometry[1], *geometry[2:]]
         return count
 
-    monkeypatch.setattr(binning, "BandCount", shrinking)
+    monkeypatch.setattr(binning, "BandBinning", shrinking)
     large = random_splats(2, 60, 400, 300, log_scale=4.0, opacity=(0.5, 1.0))  # beyond the window of 8 x 8 tiles
     with pytest.raises(BrokenInvariant):
         bin_splats(large)

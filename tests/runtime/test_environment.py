@@ -1,3 +1,5 @@
+"""Processor shares of containers, and results that do not depend on the number of threads."""
+
 from __future__ import annotations
 
 import math
@@ -27,13 +29,13 @@ def test_share_of_a_container(tmp_path, files, expected):
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    assert environment._quota(str(tmp_path)) == expected
+    assert environment.container_quota(str(tmp_path)) == expected
 
 
 def test_threads_follow_affinity_and_share(monkeypatch):
     monkeypatch.setattr(environment.os, "sched_getaffinity", lambda process: set(range(64)), raising=False)
     for quota, threads in ((2.0, 2), (2.5, 3), (0.1, 1), (math.inf, 64), (1000.0, 64)):
-        monkeypatch.setattr(environment, "_quota", lambda quota=quota: quota)
+        monkeypatch.setattr(environment, "container_quota", lambda quota=quota: quota)
         assert environment.available_threads() == threads
 
 

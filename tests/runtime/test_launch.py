@@ -152,7 +152,7 @@ def test_an_error_in_a_chunk_comes_back_after_all_others_ran():
 
 def test_nobody_waits_for_a_helper_that_found_nothing(monkeypatch: pytest.MonkeyPatch):
     """The only helper is busy with another job: the asking thread does its own job alone."""
-    monkeypatch.setattr(cpu_threads, "_helpers", cpu_threads._Helpers(environment.configured()))
+    monkeypatch.setattr(cpu_threads, "helpers", cpu_threads.HelperThreads(environment.configured()))
     hold, started = threading.Event(), threading.Event()
 
     def slow(first: int, size: int) -> None:
@@ -177,7 +177,7 @@ def test_nobody_waits_for_a_helper_that_found_nothing(monkeypatch: pytest.Monkey
 
 
 def test_an_interrupt_waits_until_no_helper_writes_any_more(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cpu_threads, "_helpers", cpu_threads._Helpers(environment.configured()))
+    monkeypatch.setattr(cpu_threads, "helpers", cpu_threads.HelperThreads(environment.configured()))
     started, ended = threading.Event(), threading.Event()
 
     class Interrupted(list):

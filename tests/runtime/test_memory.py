@@ -29,7 +29,7 @@ linux = pytest.mark.skipif(memory.status("VmRSS") is None, reason="the system do
 
 @pytest.fixture(autouse=True)
 def unlimited(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delenv(memory.VARIABLE, raising=False)
+    monkeypatch.delenv(memory.LIMIT_VARIABLE, raising=False)
     memory.set_limit(None)
     yield
     memory.set_limit(None)
@@ -37,8 +37,8 @@ def unlimited(monkeypatch: pytest.MonkeyPatch):
 
 def allow(monkeypatch: pytest.MonkeyPatch, free: float) -> None:
     """As if this many bytes were free."""
-    monkeypatch.setattr(memory, "_free_on_host", lambda: iter([free / memory.SHARE]))
-    memory._readings.clear()
+    monkeypatch.setattr(memory, "free_on_host", lambda: iter([free / memory.USABLE_SHARE]))
+    memory.forget_readings()
 
 
 def test_the_variable_or_the_caller_sets_the_limit(monkeypatch: pytest.MonkeyPatch):
@@ -48,21 +48,20 @@ def test_the_variable_or_the_caller_sets_the_limit(monkeypatch: pytest.MonkeyPat
     for wrong in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(UserError, match="greater than 0"):
             memory.set_limit(wrong)
-    monkeypatch.setattr(memory, "_limit_known", False)
-    monkeypatch.setenv(memory.VARIABLE, "2")
+    monkeypatch.setenv(memory.LIMIT_VARIABLE, "2")
+    memory.set_limit_from_environment()
     assert memory.limit() == 2 * GIB
-    monkeypatch.setattr(memory, "_limit_known", False)
-    monkeypatch.setenv(memory.VARIABLE, "much")
+    monkeypatch.setenv(memory.LIMIT_VARIABLE, "much")
     with pytest.raises(UserError, match="SCGS_MEMORY_GIB=much"):
-        memory.limit()
+        memory.set_limit_from_environment()
 
 
 def test_the_app_option_sets_it_for_processes_of_its_own_too(monkeypatch: pytest.MonkeyPatch, all_threads: None):
     import os
 
-    monkeypatch.setenv(memory.VARIABLE, "7")
+    monkeypatch.setenv(memory.LIMIT_VARIABLE, "7")
     cli.prepare("cpu", None, 2.5)
-    assert memory.limit() == 5 * GIB // 2 and os.environ[memory.VARIABLE] == "2.5"
+    assert memory.limit() == 5 * GIB // 2 and os.environ[memory.LIMIT_VARIABLE] == "2.5"
     for wrong in (0.0, math.nan, -3.0):
         with pytest.raises(UserError, match="--memory-gib"):
             cli.prepare("cpu", None, wrong)
@@ -73,9 +72,9 @@ def test_what_is_resident_counts_against_the_limit():
     used = memory.status("VmRSS")
     assert used is not None
     memory.set_limit(used / GIB + 1.0)
-    assert 0.5 * GIB < memory.room() < memory.SHARE * 1.3 * GIB
+    assert 0.5 * GIB < memory.room() < memory.USABLE_SHARE * 1.3 * GIB
     block = torch.ones(GIB // 16)
-    assert memory.room() < 0.9 * memory.SHARE * GIB
+    assert memory.room() < 0.9 * memory.USABLE_SHARE * GIB
     del block
     assert memory.room() > 0.5 * GIB, "what was freed may be taken again"
     memory.set_limit(1e-3)
@@ -113,8 +112,8 @@ def test_what_control_groups_leave(tmp_path: Path, own: str, files: dict, expect
         for name, text in zip(names, texts, strict=True):
             (tmp_path / folder / name).write_text(text)
     (tmp_path / "own").write_text(own)
-    assert list(memory._free_in_groups(str(tmp_path), str(tmp_path / "own"))) == expected
-    assert list(memory._free_in_groups(str(tmp_path), str(tmp_path / "none"))) == []
+    assert list(memory.free_in_groups(str(tmp_path), str(tmp_path / "own"))) == expected
+    assert list(memory.free_in_groups(str(tmp_path), str(tmp_path / "none"))) == []
 
 
 def test_a_small_need_costs_no_reading(monkeypatch: pytest.MonkeyPatch):
@@ -122,14 +121,15 @@ def test_a_small_need_costs_no_reading(monkeypatch: pytest.MonkeyPatch):
 
     def free():
         readings.append(1)
-        yield 1000 / memory.SHARE
+        yield 1000 / memory.USABLE_SHARE
 
-    monkeypatch.setattr(memory, "_free_on_host", free)
-    memory._readings.clear()
+    monkeypatch.setattr(memory, "free_on_host", free)
+    memory.forget_readings()
     assert memory.fits(200) and memory.fits(200) and memory.fits(249) and len(readings) == 1
     assert memory.fits(300) and len(readings) == 2
     assert not memory.fits(1001) and len(readings) == 4, "once more after freed memory was handed back"
-    memory._readings["cpu"] = (-math.inf, 1000)  # long ago
+    later = memory.time.monotonic() + 10.0
+    monkeypatch.setattr(memory.time, "monotonic", lambda: later)
     assert memory.fits(200) and len(readings) == 5
 
 
@@ -225,19 +225,17 @@ def test_training_that_runs_out_of_memory_can_be_resumed(monkeypatch: pytest.Mon
 
 def test_a_system_that_says_nothing(monkeypatch):
     """As on macOS and Windows: what is asked for is granted."""
-    monkeypatch.setattr(memory, "_free_on_host", lambda: iter([math.inf]))
+    monkeypatch.setattr(memory, "free_on_host", lambda: iter([math.inf]))
     assert memory.measure("cpu") > 2**50 and memory.fits(2**40)
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").is_file(), reason="the system says nothing")
 def test_processes_of_a_job_share_the_machine(monkeypatch):
-    for name in (memory.SIBLINGS, "LOCAL_WORLD_SIZE"):
+    for name in (memory.SIBLINGS_VARIABLE, "LOCAL_WORLD_SIZE"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(memory, "_free_in_groups", lambda: iter([]))
-    monkeypatch.setattr(memory, "_limit", None)
-    monkeypatch.setattr(memory, "_limit_known", True)
-    alone = min(memory._free_on_host())
+    monkeypatch.setattr(memory, "free_in_groups", lambda: iter([]))
+    alone = min(memory.free_on_host())
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "8")
-    assert memory.siblings() == 8 and min(memory._free_on_host()) < alone / 6
-    monkeypatch.setenv(memory.SIBLINGS, "nonsense")
+    assert memory.siblings() == 8 and min(memory.free_on_host()) < alone / 6
+    monkeypatch.setenv(memory.SIBLINGS_VARIABLE, "nonsense")
     assert memory.siblings() == 8

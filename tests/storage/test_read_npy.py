@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scgs_warp.errors import UserError
-from scgs_warp.storage.files import read_npy
+from scgs_warp.storage.numpy_files import read_npy
 
 
 def test_arrays_that_claim_more_than_they_hold(tmp_path):

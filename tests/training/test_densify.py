@@ -9,7 +9,7 @@ import torch
 
 from helpers.tiny import tiny_config
 from scgs_warp.config.presets import DensifyConfig, preset, with_steps
-from scgs_warp.gaussians import GaussianParameters, gaussians_from_points, neighbor_distance
+from scgs_warp.gaussians import GaussianParameters, gaussians_from_points
 from scgs_warp.motion.control_points import ControlPoints, heads_of, make_network
 from scgs_warp.motion.node_density import adapt_control_points
 from scgs_warp.optim import Adam
@@ -103,22 +103,6 @@ def test_threshold_follows_the_resolution():
     config = DensifyConfig(grad_threshold=2e-4, resolution_exponent=0.66)
     assert threshold(config, 800, 800) == pytest.approx(2e-4)
     assert 4.8e-4 < threshold(config, 200, 200) < 5.2e-4
-
-
-def test_optimizer_round_trip(device):
-    gaussians, optimizer = make(3, device)
-    saved = {name: value.clone() for name, value in optimizer.tensors("a").items()}
-    fresh = Adam(dict(gaussians.named_parameters()), RATES)
-    fresh.load_tensors("a", saved)
-    again = fresh.tensors("a")
-    assert len(saved) == 3 * len(GaussianParameters.NAMES)
-    assert again.keys() == saved.keys() and all(torch.equal(again[k], saved[k]) for k in saved)
-
-
-def test_neighbor_distance_of_few():
-    assert neighbor_distance(torch.zeros(0, 3)).shape == (0,)
-    assert neighbor_distance(torch.zeros(1, 3)).shape == (1,)
-    assert float(neighbor_distance(torch.tensor([[0.0, 0, 0], [2.0, 0, 0]]))[0]) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("opaque", [0, 3, 32])

@@ -20,9 +20,7 @@ from helpers.parallel_job import DATA, LONG, PLAIN
 from helpers.paths import ROOT
 from helpers.tiny import tiny_config, tiny_dataset, write_dnerf
 from scgs_warp.apps.train import cli
-from scgs_warp.errors import UserError
 from scgs_warp.evaluation.evaluate import evaluate
-from scgs_warp.runtime import torchrun
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage.checkpoint import read
 from scgs_warp.training import loop
@@ -252,25 +250,6 @@ def test_every_view_once_an_epoch():
         assert sorted(seen) == list(range(6))
 
 
-def test_place(monkeypatch):
-    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR"):
-        monkeypatch.delenv(name, raising=False)
-    assert torchrun.place() is None and torchrun.label() == ""
-    with team_of(torchrun.place(), "cpu") as team:
+def test_no_group_without_torchrun():
+    with team_of(None, "cpu") as team:
         assert team is None
-    values = {"RANK": "3", "WORLD_SIZE": "8", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "localhost"}
-    for name, value in values.items():
-        monkeypatch.setenv(name, value)
-    found = torchrun.place()
-    assert found == torchrun.Place(3, 8, 1, 2) and torchrun.label() == " (process 3 of 8)"
-    monkeypatch.setattr(torchrun, "available_threads", lambda: 7)
-    assert found.threads == 3
-    monkeypatch.setattr(torchrun, "available_threads", lambda: 1)
-    assert found.threads == 1
-    for name, value in (("LOCAL_RANK", "2"), ("RANK", "8"), ("LOCAL_WORLD_SIZE", "two")):
-        with monkeypatch.context() as patch, pytest.raises(UserError, match="torchrun"):
-            patch.setenv(name, value)
-            torchrun.place()
-    monkeypatch.delenv("LOCAL_RANK")
-    with pytest.raises(UserError, match="LOCAL_RANK"):
-        torchrun.place()

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from scgs_warp.errors import UserError
-from scgs_warp.runtime.progress import progress
 from scgs_warp.visualization import figures
 
 
@@ -104,20 +103,3 @@ def test_curves_of_next_to_nothing(tmp_path: Path, lines: list) -> None:
 def test_missing_log_is_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"log\.jsonl"):
         figures.curves(tmp_path / "log.jsonl", tmp_path / "curves.png")
-
-
-def test_progress_in_a_log_file_is_few_lines(capsys: pytest.CaptureFixture) -> None:
-    with progress(1000, "train") as shown:
-        for _ in range(1000):
-            shown.advance(psnr=31.234, gaussians=12345, stage="main", gone=None)
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) <= 3
-    assert "train 1000/1000 (100 %)" in lines[-1] and "it/s" in lines[-1]
-    assert "psnr 31.23  gaussians 12,345  stage main" in lines[-1] and "gone" not in lines[-1]
-
-
-def test_progress_tells_where_it_was_stopped(capsys: pytest.CaptureFixture) -> None:
-    with pytest.raises(KeyboardInterrupt), progress(10, "train") as shown:
-        shown.advance(3)
-        raise KeyboardInterrupt
-    assert "train 3/10 (30 %)" in capsys.readouterr().out

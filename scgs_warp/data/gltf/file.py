@@ -20,7 +20,8 @@ import cv2
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import parse_json, read_bytes
+from ...storage.files import read_bytes
+from ...storage.json_files import parse_json
 from ...storage.safe_paths import inside, is_regular
 from ..images import is_complete, oversized_claim
 from .schema import find_problem

@@ -8,12 +8,13 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 
 from ...errors import UserError
-from ...storage.files import held_out, natural, size_text
 from ...storage.safe_paths import inside
 from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..dataset import Dataset
-from ..images import ReadOptions, header_size
+from ..held_out import held_out
+from ..images import ReadOptions, header_size, size_text
 from ..lens import Lens, make_lens
+from ..natural_order import natural
 from .colmap_model import ModelCamera, ModelImage, find_model, read_model
 
 

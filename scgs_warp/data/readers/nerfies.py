@@ -19,10 +19,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import as_array, as_number, held_out, is_rotation, read_json, read_npy, size_text
+from ...geometry.rotation import is_rotation
+from ...storage.json_files import as_array, as_number, read_json
+from ...storage.numpy_files import read_npy
 from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import ReadOptions
+from ..held_out import held_out
+from ..images import ReadOptions, size_text
 from ..lens import Lens, make_lens
 
 FILE = "dataset.json"

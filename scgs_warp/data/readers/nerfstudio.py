@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import by_name, held_out
 from ...storage.safe_paths import inside
 from ...types import Camera
 from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..dataset import Dataset
+from ..held_out import held_out
 from ..images import ReadOptions
+from ..natural_order import by_name
 from ..points import read_points
 from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
 

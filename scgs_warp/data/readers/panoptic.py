@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import as_array, as_number, is_rotation, read_json, read_npy, size_text
+from ...geometry.rotation import is_rotation
+from ...storage.json_files import as_array, as_number, read_json
+from ...storage.numpy_files import read_npy
 from ...storage.safe_paths import inside
 from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import ReadOptions
+from ..images import ReadOptions, size_text
 from ..lens import Lens
 
 TRAIN, TEST = "train_meta.json", "test_meta.json"

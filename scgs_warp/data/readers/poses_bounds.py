@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import is_rotation, natural, read_npy, size_text
+from ...geometry.rotation import is_rotation
+from ...storage.numpy_files import read_npy
 from ..assemble import FrameRecord, assemble, with_points
 from ..dataset import Dataset
-from ..images import ReadOptions
+from ..images import ReadOptions, size_text
 from ..lens import Lens
+from ..natural_order import natural
 from ..points import read_points
 from .transforms import SUFFIXES
 

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import as_number, is_rotation, read_json, size_text
+from ...geometry.rotation import is_rotation
+from ...storage.json_files import as_number, read_json
 from ...storage.safe_paths import inside
+from ..images import size_text
 from ..lens import Lens, make_lens
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import parse_json
+from ...storage.json_files import parse_json
 from .figure import Figure, build_figure
 from .orbit_cameras import PlannedPicture, instants, random_on_sphere
 from .raycast import Raycaster

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import parse_json
+from ...storage.json_files import parse_json
 from ..gltf.scene import GltfScene, read_scene
 from .builtin import FigureSubject
 from .contact_sheet import ContactSheet

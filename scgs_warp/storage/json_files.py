@@ -1,0 +1,73 @@
+"""JSON from files that others wrote, and the numbers in it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import UserError
+
+
+def parse_json(text: str | bytes, **hooks: Any) -> Any:
+    """Parse JSON as ``json.loads`` does; brackets nested too deeply are a ValueError here.
+
+    Raises:
+        ValueError: not valid JSON; a ``json.JSONDecodeError`` where the position is known.
+    """
+    try:
+        return json.loads(text, **hooks)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
+    """Read the JSON object in ``path``.
+
+    Args:
+        needed: why the file is needed, or the remedy; ends the message if the file is missing.
+
+    Raises:
+        UserError: the file is missing, is not JSON, or holds something else than an object.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; {needed}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read as UTF-8 text ({type(error).__name__}); restore the file") from None
+    try:
+        content = parse_json(text)
+    except json.JSONDecodeError as error:
+        raise UserError(
+            f"{path}: not valid JSON, line {error.lineno} column {error.colno}: {error.msg}; restore or correct it"
+        ) from None
+    except ValueError as error:  # nested too deeply, or Python's own limit of 4,300 digits
+        reason = "JSON nested too deeply" if "nested" in str(error) else "holds a number of more than 4,300 digits"
+        raise UserError(f"{path}: {reason}; restore or correct the file") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: holds no JSON object; restore the file")
+    return content
+
+
+def as_number(value: Any) -> float | None:
+    """Return a finite number as float, and None for anything else (bool and strings too)."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def as_array(value: Any, *shapes: tuple[int, ...]) -> np.ndarray | None:
+    """Return a finite float64 array of one of ``shapes``, and None for anything else."""
+    try:
+        array = np.array(value, np.float64)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    return array if array.shape in shapes and np.isfinite(array).all() else None

@@ -1,0 +1,58 @@
+"""Output folders: found writable before the work, replaced as a whole after it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from scgs_warp.errors import UserError
+from scgs_warp.storage.output_folders import holds_only, make_parent, replace_folder
+
+
+def filled(folder: Path, text: str) -> Path:
+    folder.mkdir()
+    (folder / "0001.png").write_text(text)
+    return folder
+
+
+def test_parent_is_made(tmp_path: Path):
+    make_parent(tmp_path / "a/b/film.mp4")
+    assert (tmp_path / "a/b").is_dir()
+
+
+def test_parent_that_cannot_be_made_is_refused(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"file: cannot be written .*; give another output folder"):
+        make_parent(tmp_path / "file/film.mp4")
+
+
+def test_holds_only_matches_whole_names(tmp_path: Path):
+    folder = filled(tmp_path / "frames", "old")
+    assert holds_only(folder, r"\d{4}\.png")
+    (folder / "0001.png.bak").touch()
+    assert not holds_only(folder, r"\d{4}\.png")
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_folder_is_replaced(tmp_path: Path, exists: bool):
+    if exists:
+        filled(tmp_path / "frames", "old")
+    replace_folder(tmp_path / "frames", filled(tmp_path / "new", "new"))
+    assert (tmp_path / "frames/0001.png").read_text() == "new"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["frames"]
+
+
+def test_earlier_folder_stays_where_replacing_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    old, new, replace = filled(tmp_path / "frames", "old"), filled(tmp_path / "new", "new"), os.replace
+
+    def fail_for_new(source: Path, target: Path) -> None:
+        if source == new:
+            raise OSError("no")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", fail_for_new)
+    with pytest.raises(OSError, match="no"):
+        replace_folder(old, new)
+    assert (old / "0001.png").read_text() == "old"
