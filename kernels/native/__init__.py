@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import types
+from .. import binning, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -30,6 +30,10 @@ CONSTANTS: dict[str, int | float] = {
     "CHANNEL_GROUP": types.CHANNEL_GROUP,
     "PACKED_GEOMETRY": types.PACKED_GEOMETRY,
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
+    # Binning.
+    "ALPHA_MIN": types.ALPHA_MIN,
+    "REACH_SLACK": binning.REACH_SLACK,
+    **{f"LOG2_{power}": value for power, value in enumerate(binning.LOG2_COEFFICIENTS)},
 }
 """Macros by name; a header sees those that its text names."""
 
