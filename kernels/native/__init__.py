@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import binning, types
+from .. import binning, projection, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -34,6 +34,11 @@ CONSTANTS: dict[str, int | float] = {
     "ALPHA_MIN": types.ALPHA_MIN,
     "REACH_SLACK": binning.REACH_SLACK,
     **{f"LOG2_{power}": value for power, value in enumerate(binning.LOG2_COEFFICIENTS)},
+    # Projection and skinning.
+    "FRUSTUM_MARGIN": projection.FRUSTUM_MARGIN,
+    "GRADIENT_MAX": types.GRADIENT_MAX,
+    "POSITION_MAX": types.POSITION_MAX,
+    "RADIUS_MAX": projection.RADIUS_MAX,
 }
 """Macros by name; a header sees those that its text names."""
 
