@@ -34,3 +34,9 @@ PACKED_GEOMETRY = 8
 
 CHANNEL_GROUP = 8
 """Channels of a splat packed for the CPU are padded with zeros to a multiple of this."""
+
+MAX_DIMENSIONS = 64
+"""Most dimensions of points that the SIMD search for neighbours takes: it keeps a block's coordinates on the stack."""
+
+MAX_HYPER = 8
+"""Most hyper-coordinates of a Gaussian that SIMD skinning takes: the room for them in a control point's row."""

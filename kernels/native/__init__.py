@@ -34,6 +34,8 @@ CONSTANTS: dict[str, int | float] = {
     "ALPHA_MIN": types.ALPHA_MIN,
     "REACH_SLACK": binning.REACH_SLACK,
     **{f"LOG2_{power}": value for power, value in enumerate(binning.LOG2_COEFFICIENTS)},
+    # Neighbours.
+    "MAX_DIMENSIONS": types.MAX_DIMENSIONS,
     # Projection and skinning.
     "FRUSTUM_MARGIN": projection.FRUSTUM_MARGIN,
     "GRADIENT_MAX": types.GRADIENT_MAX,
