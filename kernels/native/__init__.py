@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import binning, projection, types
+from .. import binning, neighbors, projection, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -36,6 +36,8 @@ CONSTANTS: dict[str, int | float] = {
     **{f"LOG2_{power}": value for power, value in enumerate(binning.LOG2_COEFFICIENTS)},
     # Neighbours.
     "MAX_DIMENSIONS": types.MAX_DIMENSIONS,
+    "MAX_HYPER": types.MAX_HYPER,
+    "MAX_NEIGHBORS": neighbors.MAX_NEIGHBORS,
     # Projection and skinning.
     "FRUSTUM_MARGIN": projection.FRUSTUM_MARGIN,
     "GRADIENT_MAX": types.GRADIENT_MAX,

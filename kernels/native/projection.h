@@ -3,14 +3,14 @@
 #include "simd.h"
 
 // Turn up to 16 rows of C floats into C vectors with a row in each lane; lanes from n on are 0.
-__attribute__((always_inline)) static inline void gather_rows(const float* from, int n, int C, vf* to) {
+ALWAYS_INLINE void gather_rows(const float* from, int n, int C, vf* to) {
     float lanes[4][16] = {};
     for (int l = 0; l < n; ++l)
         for (int c = 0; c < C; ++c) lanes[c][l] = from[C * l + c];
     __builtin_memcpy(to, lanes, 64 * C);
 }
 
-__attribute__((always_inline)) static inline void scatter_rows(float* to, int n, int C, const vf* from) {
+ALWAYS_INLINE void scatter_rows(float* to, int n, int C, const vf* from) {
     float lanes[4][16];
     __builtin_memcpy(lanes, from, 64 * C);
     for (int l = 0; l < n; ++l)

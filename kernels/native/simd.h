@@ -50,3 +50,7 @@ static inline vf exp2v(vf e) {
     r = r * f + 1.0f;
     return (vf)((vu)r + ((vu)t << 23));
 }
+
+// For functions that loop over one of their arguments, such as a number of columns: the loop is unrolled where the call
+// is inlined.
+#define ALWAYS_INLINE __attribute__((always_inline)) static inline
