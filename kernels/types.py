@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import warp as wp
 
+LOG2_E = 1.4426950408889634
+"""log2(e): exponentials are taken to base 2."""
+
 TILE_SIZE = 16
 """Side of a tile in pixels: one row of it is one 512-bit SIMD register, its 256 pixels are one CUDA block."""
 

@@ -16,14 +16,12 @@ from __future__ import annotations
 import warp as wp
 
 from ..native import native_function
-from ..types import CHANNEL_MAX, PACKED_GEOMETRY
+from ..types import CHANNEL_MAX, LOG2_E, PACKED_GEOMETRY
 
 wp.set_module_options({"enable_backward": False})
 
 TILE_SIDE = 16
 """The only tile size this form serves: a row is a register."""
-
-_LOG2_E = 1.4426950408889634
 
 
 @wp.kernel
@@ -40,7 +38,7 @@ def pack_splats(
     i = first + wp.tid()
     conic = conics_in[i]
     opacity = opacities_in[i]
-    factor = float(-0.5 * _LOG2_E)
+    factor = float(-0.5 * LOG2_E)
     count = channels_in.shape[1]
     for c in range(count):
         if not wp.abs(channels_in[i, c]) <= CHANNEL_MAX:

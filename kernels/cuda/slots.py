@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import warp as wp
 
+from ..compositing import SLOT_WIDTH as SLOT_WIDTH
 from ..gradient_limits import passed
 from ..types import SLOT_GEOMETRY
 
 wp.set_module_options({"enable_backward": False})
-
-SLOT_WIDTH = 16
-"""Columns of a gradient slot, the only width served here."""
 
 
 @wp.kernel

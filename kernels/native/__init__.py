@@ -30,6 +30,8 @@ CONSTANTS: dict[str, int | float] = {
     "CHANNEL_GROUP": types.CHANNEL_GROUP,
     "PACKED_GEOMETRY": types.PACKED_GEOMETRY,
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
+    "LN_2": 1.0 / types.LOG2_E,
+    "LOG2_E": types.LOG2_E,
     # Binning.
     "ALPHA_MIN": types.ALPHA_MIN,
     "REACH_SLACK": binning.REACH_SLACK,
