@@ -45,7 +45,7 @@ def finite_opacities(
 
 
 @wp.kernel
-def composite_pixels(
+def composite(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N] pixels
@@ -124,7 +124,7 @@ def add_pixel_adjoint(
 
 
 @wp.kernel
-def composite_pixels_adjoint(
+def composite_adjoint(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N]

@@ -79,7 +79,7 @@ def composite_tile_adjoint(
 
 
 @wp.kernel
-def composite_tiles(
+def composite(
     first: int,
     # In:
     packed_in: wp.array2d[float],  # [N, 8 + C padded]
@@ -112,7 +112,7 @@ def composite_tiles(
 
 
 @wp.kernel
-def composite_tiles_adjoint(
+def composite_adjoint(
     first: int,
     # In:
     packed_in: wp.array2d[float],  # [N, 8 + C padded]

@@ -1,6 +1,6 @@
 """The search for the K nearest control points on a CPU: sixteen points a thread, as lanes of SIMD registers.
 
-``nearest_lanes`` looks at every node. ``nearest_listed`` looks at those that a block of sixteen Gaussians, close
+``nearest`` looks at every node. ``nearest_listed`` looks at those that a block of sixteen Gaussians, close
 together in space, had within reach when ``list_blocks`` ran, and proves that nothing else matters: a node outside the
 list was at least ``reach`` from the block's centre c, and has come closer by no more than the largest shift of any node
 since. So if ``|x - c| + d_K + shift < reach``, the K nearest are in the list; a block with a lane for which this does
@@ -39,7 +39,7 @@ def _nearest_listed(
 
 
 @wp.kernel
-def nearest_lanes(
+def nearest(
     first: int,
     # In:
     points_in: wp.array2d[float],  # [N, D], D <= MAX_DIMENSIONS

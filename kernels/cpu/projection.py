@@ -34,7 +34,7 @@ def _project_adjoint(
 
 
 @wp.kernel
-def project_lanes(
+def project(
     first: int,
     # In:
     means_in: wp.array[wp.vec3],  # [N]
@@ -66,7 +66,7 @@ def project_lanes(
 
 
 @wp.kernel
-def project_lanes_adjoint(
+def project_adjoint(
     first: int,
     # In:
     means_in: wp.array[wp.vec3],  # [N]

@@ -1,7 +1,7 @@
 """RBF weights and skinning in one pass, for CPUs: sixteen Gaussians a step, SIMD in native bodies.
 
 The same mathematics as ``rbf_weights`` and ``skin``, which stay the readable truth, over the rows of
-``skinning_palette.py``: blending is one multiply-add of a whole row a neighbour. ``skin_lanes`` takes weights that are
+``skinning_palette.py``: blending is one multiply-add of a whole row a neighbour. ``skin`` takes weights that are
 known, as they are when a scene is rendered; ``skinning_cpu_adjoint.py`` has the gradients.
 """
 
@@ -34,7 +34,7 @@ def _skin_rbf(
 
 
 @wp.kernel
-def skin_lanes(
+def skin(
     first: int,
     # In:
     means_in: wp.array[wp.vec3],  # [N]
@@ -59,7 +59,7 @@ def skin_lanes(
 
 
 @wp.kernel
-def skin_rbf_lanes(
+def skin_rbf(
     first: int,
     # In:
     means_in: wp.array[wp.vec3],  # [N]

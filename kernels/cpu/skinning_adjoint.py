@@ -1,4 +1,4 @@
-"""Adjoint of ``skin_rbf_lanes``: a chunk of Gaussians a thread, sixteen a step.
+"""Adjoint of ``skin_rbf``: a chunk of Gaussians a thread, sixteen a step.
 
 Adding a Gaussian's gradient to its node is again one multiply-add of a row: the outer product ``v (x, 1)^T`` and the
 gradient of the blended rotation lie as the palette's motion row does.
@@ -22,7 +22,7 @@ def _skin_rbf_adjoint(
 
 
 @wp.kernel
-def skin_rbf_lanes_adjoint(
+def skin_rbf_adjoint(
     first: int,
     # In:
     size: int,  # Gaussians a chunk, a multiple of 16 that does not depend on the threads

@@ -52,7 +52,7 @@ def composite_tile_adjoint(
 
 
 @wp.kernel(launch_bounds=_BOUNDS)
-def composite_tiles(
+def composite(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N] pixels
@@ -80,7 +80,7 @@ def composite_tiles(
 
 
 @wp.kernel(launch_bounds=_BOUNDS)
-def composite_tiles_adjoint(
+def composite_adjoint(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N]

@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def sum_slot_columns(
+def sum_slots(
     first: int,
     # In:
     offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots

@@ -22,8 +22,8 @@ _TYPES = {wp.vec2: "wp::vec2", wp.vec3: "wp::vec3", wp.vec2i: "wp::vec2i", float
 _TYPES.update({wp.float32: "float", wp.int32: "int"})
 HEADER = "compositing_cuda.h"
 FUNCTIONS = {
-    "composite_tiles": compositing.composite_tile,
-    "composite_tiles_adjoint": compositing.composite_tile_adjoint,
+    "composite": compositing.composite_tile,
+    "composite_adjoint": compositing.composite_tile_adjoint,
 }
 
 

@@ -62,7 +62,7 @@ def pixel_group(image: wp.array3d[float], y: int, x: int, base: int) -> wp.vec4:
 
 
 @wp.kernel
-def composite_blocks(
+def composite(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N] pixels
@@ -158,7 +158,7 @@ def geometry_sums(own: Splat, d: wp.vec2, falloff: float, v_alpha: float) -> Sum
 
 
 @wp.kernel
-def composite_blocks_adjoint(
+def composite_adjoint(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N]
