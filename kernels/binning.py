@@ -1,4 +1,4 @@
-"""Which tiles a splat touches: the geometry that CPU (``binning_cpu``) and GPU (``binning_cuda``) share.
+"""Geometry of the tiles that a splat touches, shared by the sorts in ``cpu/binning.py`` and ``cuda/binning.py``.
 
 A splat reaches the pixels where its alpha is at least 1/255, the ellipse ``q <= 2 ln(255 o)``. A tile is touched where
 the rectangle of its pixel centres meets that ellipse. Of each row of tiles the touched ones are an interval: the
@@ -12,14 +12,14 @@ import warp as wp
 
 from .types import ALPHA_MIN
 
-# Counting and emitting must find the same tiles: no fusing of multiply and add, which may differ between two kernels.
+# Counting and emitting must find the same tiles, but fused multiplications and additions may differ between kernels.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 DEPTH_CULLED = wp.constant(3.0e38)
-"""Sort key of splats that touch nothing; finite, so that a float sort never sees a NaN or an infinity."""
+"""Sort key of splats that touch no tile; finite, so that no sort of floats has to order a NaN or an infinity."""
 
 REACH_SLACK = wp.constant(1.0e-3)
-"""Added to the ellipse: what float32 rounding may take from q, so that no pixel at the threshold loses its splat."""
+"""Slack added to the ellipse for the rounding of q in float32, so that no pixel at the threshold loses its splat."""
 
 LOG2_COEFFICIENTS = (1.4426933, -0.72116273, 0.47770593, -0.33924777, 0.21558853, -0.096066249, 0.020490346)
 """log2(1 + m) / m on [0, 1], lowest power first, from a fit at Chebyshev points; log2 is right to 2e-6."""
@@ -41,7 +41,7 @@ class Ellipse:
 
 @wp.func
 def reach_of(opacity: float) -> float:
-    """``2 ln(255 o)``, at least 0, and slack. Not the library's logarithm, which rounds differently on each device."""
+    """Compute ``2 ln(255 o)``, at least 0, plus slack. The library's logarithm rounds differently on each device."""
     bits = wp.cast(opacity / ALPHA_MIN, wp.uint32)
     m = wp.cast((bits & wp.uint32(0x7FFFFF)) | wp.uint32(0x3F800000), float) - 1.0
     log2 = float(LOG2_6)
@@ -81,7 +81,7 @@ def splat_ellipse(mean: wp.vec2, conic: wp.vec3, opacity: float, depth: float, r
 
 @wp.func
 def touched(low: float, high: float, tile_size: int, tiles: int, extent: int) -> wp.vec2i:
-    """Begin and end of the tiles, along one axis, whose pixel centres' span meets [low, high]."""
+    """Return begin and end of the tiles, along one axis, whose span of pixel centres meets [low, high]."""
     if not (high >= 0.5 and low <= float(extent) - 0.5):
         return wp.vec2i(0, 0)
     scale = 1.0 / float(tile_size)
@@ -112,12 +112,12 @@ def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: i
 
 @wp.func
 def rows_within(span: wp.vec2i, tile_begin: int, tile_end: int, columns: int) -> wp.vec2i:
-    """Of the rows of tiles, those that tiles ``tile_begin`` to ``tile_end`` lie in."""
+    """Cut the rows of tiles to those in which tiles ``tile_begin`` to ``tile_end`` lie."""
     return wp.vec2i(wp.max(span[0], tile_begin // columns), wp.min(span[1], (tile_end + columns - 1) // columns))
 
 
 @wp.func
 def columns_within(span: wp.vec2i, row: int, tile_begin: int, tile_end: int, columns: int) -> wp.vec2i:
-    """Of a row's tiles, those from ``tile_begin`` to ``tile_end``."""
+    """Cut a row's tiles to those from ``tile_begin`` to ``tile_end``."""
     begin = wp.max(span[0], tile_begin - row * columns)
     return wp.vec2i(begin, wp.max(begin, wp.min(span[1], tile_end - row * columns)))

@@ -10,6 +10,9 @@ LOG2_E = 1.4426950408889634
 TILE_SIZE = 16
 """Side of a tile in pixels: one row of it is one 512-bit SIMD register, its 256 pixels are one CUDA block."""
 
+LANES = 16
+"""Floats of a vector in the CPU's kernels, one AVX-512 register."""
+
 ALPHA_MIN = wp.constant(1.0 / 255.0)
 """A splat is skipped at a pixel where its alpha is smaller: it could not change an 8-bit image."""
 
@@ -24,7 +27,7 @@ CHANNEL_MAX = wp.constant(1.0e18)
 gradients of what lies behind it."""
 
 GRADIENT_MAX = wp.constant(1.0e30)
-"""A gradient of one Gaussian beyond this counts as none: sums over a hundred million Gaussians are still finite."""
+"""Larger gradients of one Gaussian are dropped: sums over a hundred million Gaussians are still finite."""
 
 POSITION_MAX = wp.constant(1.0e18)
 """Gaussians farther from the origin pass their control points no gradient: products with it would overflow."""

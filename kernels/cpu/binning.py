@@ -1,19 +1,18 @@
-"""Splats to tiles on a CPU: bands of tile rows, each sorted by itself.
+"""Binning on a CPU: splats are dealt to rows of tiles, and each row is sorted by itself.
 
-A *band* is a row of tiles, a *stretch* what one splat touches of one band: an interval of columns. In index order, so
-that memory is walked from front to back, splats are turned into stretches and dealt to the bands they lie in; a band's
-stretches are then few enough for a core's own cache, where they are sorted by depth and laid out tile by tile. Four
-launches, of which all but the second are shared among threads:
+A *band* is a row of tiles; a *stretch* is the interval of its columns that one splat touches. Splats are turned into
+stretches in index order, which walks memory from front to back, and dealt to their bands. The stretches of one band fit
+into a core's own cache, where they are sorted by depth and laid out tile by tile. There are four launches, of which all
+but the second are shared among threads:
 
-1. ``count_chunks``: which tiles each splat touches, 16 splats at a time, and how many stretches a chunk of splats has
-   in each band.
-2. ``place_chunks``: running sums of these counts: where each chunk writes.
-3. ``deal_chunks``: the stretches, band by band and there in the order of the splats' indices.
-4. ``sort_bands``: a stable radix sort of each band by depth, then its tiles' lists by counting.
+1. ``count_chunks`` finds the tiles that each splat touches, 16 splats at a time, and counts the stretches that a chunk
+   of splats has in each band.
+2. ``place_chunks`` turns these counts into running sums, the places where each chunk writes.
+3. ``deal_chunks`` writes the stretches by band, within a band in the order of the splats' indices.
+4. ``sort_bands`` sorts each band by depth with a stable radix sort, then fills its tiles' lists by counting.
 
-Lists sorted by tile, depth and index are unique: nothing depends on how many chunks or threads there are. The bodies
-are native snippets with Clang's vector types; their arithmetic is that of ``binning``, operation by operation, so that
-a CPU and a GPU find the same tiles.
+Lists sorted by tile, depth and index are unique, so nothing depends on the number of chunks or threads. The native code
+repeats the arithmetic of ``binning`` operation by operation, so that a CPU and a GPU find the same tiles.
 """
 
 from __future__ import annotations
@@ -91,7 +90,7 @@ def place_chunks(
     pairs_out: wp.array[wp.int64],  # [chunks + 2] counts, becomes: pairs before the chunk; all pairs; all stretches
     band_begins_out: wp.array[int],  # [bands + 1]
 ):
-    """In one grid index: there is little to add up."""
+    """Turn counts into running sums, in one grid index: there is little to add up."""
     chunks = stretches_out.shape[0]
     stretches = wp.int64(0)
     for band in range(band_begins_out.shape[0]):

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..native import native_function
-from .neighbors import LANES
+from ..types import LANES
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,22 +1,20 @@
-"""The search for the K nearest control points on a CPU: sixteen points a thread, as lanes of SIMD registers.
+"""Search for the K nearest control points on a CPU: a block of sixteen points per grid index, a point per SIMD lane.
 
-``nearest`` looks at every node. ``nearest_listed`` looks at those that a block of sixteen Gaussians, close
-together in space, had within reach when ``list_blocks`` ran, and proves that nothing else matters: a node outside the
-list was at least ``reach`` from the block's centre c, and has come closer by no more than the largest shift of any node
-since. So if ``|x - c| + d_K + shift < reach``, the K nearest are in the list; a block with a lane for which this does
-not hold is searched in full. Both visit nodes in ascending order, compute distances by the same expression and insert
-on a strict ``<``: they give the same indices, ties included, whatever the lists.
+``nearest`` searches every node. ``nearest_listed`` searches the nodes that a block of sixteen Gaussians close together
+had within reach when ``list_blocks`` ran, and proves that no other node matters: a node outside the list was at least
+``reach`` from the block's centre c, and has come closer by no more than the largest shift of any node since. If
+``|x - c| + d_K + shift < reach``, the K nearest are therefore in the list. A block with a lane for which this does not
+hold is searched in full. Both kernels visit nodes in ascending order, compute distances by the same expression and
+insert on a strict ``<``, so they give the same indices, ties included, whatever the lists.
 """
 
 import warp as wp
 
 from ..native import native_function
+from ..types import LANES
 from ..types import MAX_DIMENSIONS as MAX_DIMENSIONS
 
 wp.set_module_options({"enable_backward": False})
-
-LANES = wp.constant(16)
-"""Points a grid index handles: a block."""
 
 
 @native_function("neighbors.h")
@@ -49,7 +47,7 @@ def nearest(
     indices_out: wp.array2d[wp.int32],  # [N, K] nearest first
     distances_out: wp.array2d[float],  # [N, K] squared
 ):
-    """K nearest nodes of points ``16 i .. 16 i + 15``."""
+    """Find the K nearest nodes of points ``16 i .. 16 i + 15``."""
     block = first + wp.tid()
     _nearest(block * LANES, K, points_in, nodes_in, indices_out, distances_out)
 
@@ -70,7 +68,7 @@ def nearest_listed(
     indices_out: wp.array2d[wp.int32],  # [N, K] nearest first
     failed_out: wp.array[wp.int32],  # [blocks] 1 where the list did not suffice
 ):
-    """K nearest nodes of the points of block ``i``, exact."""
+    """Find the exact K nearest nodes of the points of block ``i``."""
     block = first + wp.tid()
     _nearest_listed(
         block, K, points_in, nodes_in, order_in, centres_in, counts_in, lists_in, shift_in, indices_out, failed_out

@@ -1,14 +1,13 @@
-"""``projection`` on a CPU: 16 Gaussians at a time in SIMD registers. Same formulas, same conventions, same culling."""
+"""Projection on a CPU: sixteen Gaussians at a time, a Gaussian in each SIMD lane, by the formulas of ``projection``."""
 
 from __future__ import annotations
 
 import warp as wp
 
 from ..native import native_function
+from ..types import LANES
 
 wp.set_module_options({"enable_backward": False})
-
-LANES = 16
 
 
 # fmt: off
@@ -57,7 +56,7 @@ def project(
     opacities_out: wp.array[float],  # [N]
     radii_out: wp.array[wp.vec2i],  # [N]
 ):
-    """Gaussians ``16 i .. 16 i + 15``."""
+    """Project Gaussians ``16 i .. 16 i + 15``."""
     _project(
         (first + wp.tid()) * LANES, means_in, quats_in, scales_in, opacities_in, viewmat_in, K_in, width, height,
         near_plane, far_plane, radius_clip, eps2d, antialiased, means2d_out, conics_out, depths_out, opacities_out,
@@ -90,7 +89,7 @@ def project_adjoint(
     v_scales_out: wp.array[wp.vec3],  # [N]
     v_opacities_out: wp.array[float],  # [N]
 ):
-    """Gaussians ``16 i .. 16 i + 15``. The camera's gradient is left to ``projection.project_adjoint``."""
+    """Compute the gradients of Gaussians ``16 i .. 16 i + 15``; ``projection.project_adjoint`` has the camera's."""
     _project_adjoint(
         (first + wp.tid()) * LANES, means_in, quats_in, scales_in, opacities_in, viewmat_in, K_in, width, height,
         eps2d, antialiased, radii_in, v_means2d_in, v_conics_in, v_depths_in, v_opacities_in, v_means_out, v_quats_out,

@@ -1,18 +1,18 @@
-"""RBF weights and skinning in one pass, for CPUs: sixteen Gaussians a step, SIMD in native bodies.
+"""Skinning on a CPU, with known weights (``skin``) or with RBF weights in the same pass (``skin_rbf``).
 
-The same mathematics as ``rbf_weights`` and ``skin``, which stay the readable truth, over the rows of
-``skinning_palette.py``: blending is one multiply-add of a whole row a neighbour. ``skin`` takes weights that are
-known, as they are when a scene is rendered; ``skinning_cpu_adjoint.py`` has the gradients.
+Sixteen Gaussians are moved at a time, a Gaussian in each SIMD lane. The formulas are those of ``neighbors.rbf_weights``
+and ``skinning.skin``. Control points are the rows of ``skinning_palette.py``, so blending takes one multiply-add of a
+whole row per neighbour. Known weights are used to render a scene; the adjoint of ``skin_rbf`` stands in
+``skinning_adjoint.py``.
 """
 
 import warp as wp
 
 from ..native import native_function
 from ..neighbors import MAX_NEIGHBORS as MAX_NEIGHBORS
+from ..types import LANES
 
 wp.set_module_options({"enable_backward": False})
-
-LANES = 16
 
 
 @native_function("skinning.h")
@@ -50,7 +50,7 @@ def skin(
     quats_out: wp.array[wp.vec4],  # [N]
     log_scales_out: wp.array[wp.vec3],  # [N], touched only with has_log_scales
 ):
-    """Gaussians ``16 i .. 16 i + 15``, with weights that are known."""
+    """Move Gaussians ``16 i .. 16 i + 15`` with known weights."""
     begin = (first + wp.tid()) * LANES
     _skin(
         begin, means_in, quats_in, motion_in, reach_in, aligned, has_log_scales, indices_in, weights_in,
@@ -78,7 +78,7 @@ def skin_rbf(
     quats_out: wp.array[wp.vec4],  # [N]
     log_scales_out: wp.array[wp.vec3],  # [N], touched only with has_log_scales
 ):
-    """Gaussians ``16 i .. 16 i + 15``."""
+    """Compute the weights of Gaussians ``16 i .. 16 i + 15`` and move them."""
     begin = (first + wp.tid()) * LANES
     _skin_rbf(
         begin, means_in, quats_in, hyper_in, has_hyper, motion_in, reach_in, aligned, has_strengths,

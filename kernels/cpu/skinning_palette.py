@@ -1,4 +1,4 @@
-"""The control points as a palette of rows for ``skinning_cpu.py``: two rows of sixteen floats a node, a register each.
+"""Palette of the control points for ``cpu/skinning.py``: two rows of sixteen floats per node, a register each.
 
 - ``motion``: the affine map ``[R | p + T - R p]`` (12, row by row), then the unit shape rotation (4);
 - ``reach``: position (3), ``-1 / (2 r^2)``, ``log s``, log scales (3), hyper-coordinates (MAX_HYPER, zero-padded).
@@ -37,7 +37,7 @@ def palette(
     motion_out: wp.array2d[float],  # [M, 16]
     reach_out: wp.array2d[float],  # [M, 16]
 ):
-    """The two rows of one node."""
+    """Write the two rows of one node."""
     m = first + wp.tid()
     p = nodes_in[m]
     R = quat_matrix(quat_normalise(rotations_in[m]))
@@ -98,7 +98,7 @@ def palette_adjoint(
     v_shape_rotations_out: wp.array[wp.vec4],  # [M], touched only with has_shape_rotations
     v_log_scales_out: wp.array[wp.vec3],  # [M], touched only with has_log_scales
 ):
-    """Gradients of one node from those of its two rows."""
+    """Compute the gradients of one node from those of its two rows."""
     m = first + wp.tid()
     motion = _sum_rows(m, v_motion_in)
     reach = _sum_rows(m, v_reach_in)

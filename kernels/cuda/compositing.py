@@ -1,15 +1,17 @@
-"""Alpha compositing on CUDA: one block of 256 threads a tile of 16 x 16, one thread a pixel, native bodies.
+"""Alpha compositing on CUDA, in native code: one block of 256 threads per tile of 16 x 16, one thread per pixel.
 
-Same meaning as ``compositing``, the readable truth. How the work is laid out:
+The meaning is that of ``compositing``; the work is laid out as follows:
 
-- A warp holds 8 x 4 pixels. Splats are staged through shared memory in batches; whoever stages one finds which of the
-  tile's eight such parts its ellipse may reach, and each warp walks only its own splats, by the bits of a ballot.
-- In base 2: ``alpha = o 2^power``, where ``power = -q / (2 ln 2)`` has its factor folded into the staged conic.
-- The adjoint adds a warp's 16 sums of a pair (the columns of a slot) up in 16 shuffles, each of which halves what a
-  lane is left with, instead of 5 a sum. The partial sums of the eight warps meet in shared memory, 32 pairs at a time,
-  and are added in the order of the warps into the pair's own slot: no atomics, the same bits every time.
+- A warp holds 8 x 4 pixels. Splats are staged through shared memory in batches. The thread that stages a splat finds
+  which of the tile's eight such parts its ellipse may reach, and each warp walks only its own splats, by the bits of a
+  ballot.
+- Exponentials are taken to base 2: ``alpha = o 2^power``, where the factor of ``power = -q / (2 ln 2)`` is folded into
+  the staged conic.
+- The adjoint adds up a warp's 16 sums of a pair (the columns of a slot) in 16 shuffles, each of which halves the sums
+  that a lane holds, instead of 5 per sum. The partial sums of the eight warps meet in shared memory, 32 pairs at a
+  time, and are added in the order of the warps into the pair's own slot: no atomics, the same bits every time.
 
-On a CPU the bodies are empty; tests compile them with a shim that runs a block's threads as fibres.
+On a CPU the native functions are empty; tests compile them with a shim that runs a block's threads as fibres.
 """
 
 from __future__ import annotations
@@ -24,10 +26,10 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK_DIM = TILE_SIZE * TILE_SIZE
 MAX_CHANNELS = SLOT_WIDTH - SLOT_GEOMETRY
-"""Channels that fit a slot; the forward pass has no such bound."""
+"""Largest number of channels that fit into a slot; the forward pass has no such bound."""
 
 _BOUNDS = (BLOCK_DIM, 4)
-"""Four blocks a multiprocessor: 64 registers a thread, of which next to nothing is spilled."""
+"""Four blocks per multiprocessor: 64 registers per thread, of which next to nothing is spilled."""
 
 
 # fmt: off

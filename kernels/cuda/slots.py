@@ -1,4 +1,4 @@
-"""The sums over each splat's gradient slots on CUDA."""
+"""Sums over each splat's gradient slots on CUDA."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def sum_slots(
     v_channels_out: wp.array2d[float],  # [N, C], C <= 8
     absgrad_out: wp.array2d[float],  # [N, 2]; empty: not wanted
 ):
-    """``compositing.sum_slots`` with a thread for every column, so that neighbours read neighbours. Grid: 16 N."""
+    """Sum as ``compositing.sum_slots`` does, with a thread per column, for coalesced reads. Grid: 16 N."""
     t = first + wp.tid()
     i = t // SLOT_WIDTH
     column = t - i * SLOT_WIDTH
