@@ -1,4 +1,4 @@
-"""Which tiles a splat touches: the geometry that CPU (``binning_cpu``) and GPU (``binning_cuda``) share.
+"""Geometry of the tiles that a splat touches, shared by the sorts in ``cpu/binning.py`` and ``cuda/binning.py``.
 
 A splat reaches the pixels where its alpha is at least 1/255, the ellipse ``q <= 2 ln(255 o)``. A tile is touched where
 the rectangle of its pixel centres meets that ellipse. Of each row of tiles the touched ones are an interval: the
@@ -12,14 +12,14 @@ import warp as wp
 
 from .types import ALPHA_MIN
 
-# Counting and emitting must find the same tiles: no fusing of multiply and add, which may differ between two kernels.
+# Counting and emitting must find the same tiles, but fused multiplications and additions may differ between kernels.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 DEPTH_CULLED = wp.constant(3.0e38)
-"""Sort key of splats that touch nothing; finite, so that a float sort never sees a NaN or an infinity."""
+"""Sort key of splats that touch no tile; finite, so that no sort of floats has to order a NaN or an infinity."""
 
 REACH_SLACK = wp.constant(1.0e-3)
-"""Added to the ellipse: what float32 rounding may take from q, so that no pixel at the threshold loses its splat."""
+"""Slack added to the ellipse for the rounding of q in float32, so that no pixel at the threshold loses its splat."""
 
 LOG2_COEFFICIENTS = (1.4426933, -0.72116273, 0.47770593, -0.33924777, 0.21558853, -0.096066249, 0.020490346)
 """log2(1 + m) / m on [0, 1], lowest power first, from a fit at Chebyshev points; log2 is right to 2e-6."""
@@ -41,7 +41,7 @@ class Ellipse:
 
 @wp.func
 def reach_of(opacity: float) -> float:
-    """``2 ln(255 o)``, at least 0, and slack. Not the library's logarithm, which rounds differently on each device."""
+    """Compute ``2 ln(255 o)``, at least 0, plus slack. The library's logarithm rounds differently on each device."""
     bits = wp.cast(opacity / ALPHA_MIN, wp.uint32)
     m = wp.cast((bits & wp.uint32(0x7FFFFF)) | wp.uint32(0x3F800000), float) - 1.0
     log2 = float(LOG2_6)
@@ -81,7 +81,7 @@ def splat_ellipse(mean: wp.vec2, conic: wp.vec3, opacity: float, depth: float, r
 
 @wp.func
 def touched(low: float, high: float, tile_size: int, tiles: int, extent: int) -> wp.vec2i:
-    """Begin and end of the tiles, along one axis, whose pixel centres' span meets [low, high]."""
+    """Return begin and end of the tiles, along one axis, whose span of pixel centres meets [low, high]."""
     if not (high >= 0.5 and low <= float(extent) - 0.5):
         return wp.vec2i(0, 0)
     scale = 1.0 / float(tile_size)
@@ -112,109 +112,12 @@ def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: i
 
 @wp.func
 def rows_within(span: wp.vec2i, tile_begin: int, tile_end: int, columns: int) -> wp.vec2i:
-    """Of the rows of tiles, those that tiles ``tile_begin`` to ``tile_end`` lie in."""
+    """Cut the rows of tiles to those in which tiles ``tile_begin`` to ``tile_end`` lie."""
     return wp.vec2i(wp.max(span[0], tile_begin // columns), wp.min(span[1], (tile_end + columns - 1) // columns))
 
 
 @wp.func
 def columns_within(span: wp.vec2i, row: int, tile_begin: int, tile_end: int, columns: int) -> wp.vec2i:
-    """Of a row's tiles, those from ``tile_begin`` to ``tile_end``."""
+    """Cut a row's tiles to those from ``tile_begin`` to ``tile_end``."""
     begin = wp.max(span[0], tile_begin - row * columns)
     return wp.vec2i(begin, wp.max(begin, wp.min(span[1], tile_end - row * columns)))
-
-
-ELLIPSE_SIMD = f"""
-    #pragma clang fp contract(off)
-    typedef float vf __attribute__((vector_size(64)));
-    typedef int vi __attribute__((vector_size(64)));
-    typedef unsigned vu __attribute__((vector_size(64)));
-    typedef double vd __attribute__((vector_size(128)));
-    const vi LANE = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
-    const vf ZERO = {{}};
-    const vi ZEROS = {{}};
-    const float ALPHA_MIN = {float(ALPHA_MIN)!r}f, REACH_SLACK = {float(REACH_SLACK)!r}f;
-    const float LOG2[] = {{{", ".join(f"{c!r}f" for c in LOG2_COEFFICIENTS)}}};
-    const int LOG2_COUNT = {len(LOG2_COEFFICIENTS)};
-    const bool part = tile_begin > 0 || tile_end < columns * rows;
-
-    auto least = [](vf a, vf b) -> vf {{ return b < a ? b : a; }};
-    auto most = [](vf a, vf b) -> vf {{ return b > a ? b : a; }};
-    auto floats = [](vi v) -> vf {{ return __builtin_convertvector(v, vf); }};
-
-    // splat_ellipse of 16 splats.
-    struct Ellipse {{
-        vf x, y, shear, half_width, half_height, tip, spread, steepness;
-        vi usable;
-    }};
-    auto ellipse_of = [&](vf x, vf y, vf a, vf b, vf c, vf opacity, vf depth, vi radius_x, vi radius_y) -> Ellipse {{
-        #pragma clang fp contract(off)
-        Ellipse e;
-        const vf sum = x + y + a + b + c + opacity + depth;
-        const vd da = __builtin_convertvector(a, vd), db = __builtin_convertvector(b, vd);
-        const vf determinant = __builtin_convertvector(da * __builtin_convertvector(c, vd) - db * db, vf);
-        e.usable = (radius_x > 0) & (radius_y > 0) & (opacity >= ALPHA_MIN) & (sum - sum == 0.0f) & (determinant > 0.0f)
-            & (a > 0.0f);
-        const vu bits = (vu)(opacity / ALPHA_MIN);
-        const vf m = (vf)((bits & 0x7fffffu) | 0x3f800000u) - 1.0f;
-        vf log2 = ZERO + LOG2[LOG2_COUNT - 1];
-        for (int k = LOG2_COUNT - 2; k >= 0; --k) log2 = log2 * m + LOG2[k];
-        log2 = log2 * m + floats((vi)(bits >> 23) - 127);
-        const vf reach = most(ZERO, 1.3862943611198906f * log2) + REACH_SLACK;
-        const vf scale = 1.0f / a;
-        e.x = x;
-        e.y = y;
-        e.shear = -b * scale;
-        e.spread = reach * scale;
-        e.steepness = determinant * scale * scale;
-        e.half_width = __builtin_elementwise_sqrt(reach * c / determinant);
-        e.half_height = __builtin_elementwise_sqrt(reach * a / determinant);
-        e.tip = -b * __builtin_elementwise_sqrt(reach / (c * determinant));
-        return e;
-    }};
-    struct Span {{
-        vi begin, end;
-    }};
-    auto touched = [&](vf low, vf high, int tiles, int extent) -> Span {{
-        #pragma clang fp contract(off)
-        const vi meets = (high >= 0.5f) & (low <= (float)extent - 0.5f);
-        const float scale = 1.0f / (float)tile_size;
-        low = meets ? low : ZERO;
-        high = meets ? high : ZERO;
-        vi begin = __builtin_convertvector((most(ZERO + 0.5f, low) - 0.5f) * scale, vi);
-        begin -= low > floats((begin + 1) * tile_size) - 0.5f;  // a true lane is -1
-        vi end = __builtin_convertvector((least(ZERO + (float)extent, high) - 0.5f) * scale, vi) + 1;
-        end = end < begin ? begin : end;
-        end = end > tiles ? ZEROS + tiles : end;
-        return {{meets ? begin : ZEROS, meets ? end : ZEROS}};
-    }};
-    auto touched_rows = [&](const Ellipse& e) -> Span {{
-        Span span = touched(e.y - e.half_height, e.y + e.half_height, rows, height);
-        if (part) {{  // of a whole image nothing lies outside, and the question costs time
-            const int top = tile_begin / columns, bottom = (tile_end + columns - 1) / columns;
-            span.begin = span.begin < top ? ZEROS + top : span.begin;
-            span.end = span.end > bottom ? ZEROS + bottom : span.end;
-        }}
-        return {{e.usable ? span.begin : ZEROS, e.usable ? span.end : ZEROS}};
-    }};
-    auto touched_columns = [&](const Ellipse& e, vi row) -> Span {{
-        #pragma clang fp contract(off)
-        const vi below = (row + 1) * tile_size;
-        const vf low = most(-e.half_height, floats(row * tile_size) + 0.5f - e.y);
-        const vf high = least(e.half_height, floats(below < height ? below : ZEROS + height) - 0.5f - e.y);
-        const vf right = least(high, most(low, e.tip)), left = least(high, most(low, -e.tip));
-        const vf x_right = e.shear * right
-            + __builtin_elementwise_sqrt(most(ZERO, e.spread - e.steepness * right * right));
-        const vf x_left = e.shear * left - __builtin_elementwise_sqrt(most(ZERO, e.spread - e.steepness * left * left));
-        Span span = touched(e.x + x_left, e.x + x_right, columns, width);
-        if (part) {{
-            const vi first = tile_begin - row * columns, last = tile_end - row * columns;
-            span.begin = span.begin < first ? first : span.begin;
-            span.end = span.end > last ? last : span.end;
-            span.end = span.end < span.begin ? span.begin : span.end;
-        }}
-        return span;
-    }};
-"""
-"""The same functions for native bodies on a CPU, of 16 splats, or of 16 rows of one splat, at a time: operation by
-operation, so that they find the same tiles. They see ``tile_size``, ``columns``, ``rows``, ``width``, ``height``, and
-``tile_begin`` and ``tile_end``, outside of which no tile is found."""

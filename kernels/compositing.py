@@ -1,4 +1,4 @@
-"""Alpha compositing, one thread a pixel: the readable truth, on any device.
+"""Alpha compositing on any device, one thread per pixel.
 
 Front to back over a tile's sorted splats (3D Gaussian Splatting, Kerbl et al. 2023, equation 3)::
 
@@ -6,8 +6,7 @@ Front to back over a tile's sorted splats (3D Gaussian Splatting, Kerbl et al. 2
     alpha_i = min(0.999, o_i exp(-q_i / 2)),    q = A dx^2 + 2 B dx dy + C dy^2,    d = pixel centre - mean
 
 A splat with alpha under 1/255 (or q < 0, which rounding makes of needles) is skipped; a pixel ends for good when the
-next transmittance would be <= 1e-4. The faster forms, ``compositing_cpu`` and ``compositing_cuda``, take the same
-arguments and are tested against this one.
+next transmittance would be <= 1e-4. The faster forms in ``cpu/`` and ``cuda/`` are tested against this one.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def finite_opacities(
 
 
 @wp.kernel
-def composite_pixels(
+def composite(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N] pixels
@@ -106,7 +105,7 @@ def add_pixel_adjoint(
     slot: int,
     v_slots: wp.array2d[float],
 ):
-    """Add to a slot what a gradient to one pixel's alpha says of the splat's mean, conic and opacity."""
+    """Add to a slot the gradients to the splat's mean, conic and opacity from that to one pixel's alpha."""
     d = centre - mean
     falloff = wp.exp(-0.5 * squared_distance(conic, d))
     if opacity * falloff > ALPHA_MAX:
@@ -124,7 +123,7 @@ def add_pixel_adjoint(
 
 
 @wp.kernel
-def composite_pixels_adjoint(
+def composite_adjoint(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N]
@@ -147,7 +146,7 @@ def composite_pixels_adjoint(
     # Out:
     v_slots_out: wp.array2d[float],  # [P, S], S >= 8 + C; row: mean 2, conic 3, opacity 1, |mean| 2, channels C, rest
 ):
-    """One thread a tile (a slot belongs to one tile): pixel by pixel, back to front from the last contributor."""
+    """Walk a tile pixel by pixel, back to front from the last contributor; one thread per tile and its slots."""
     tile = first + wp.tid()
     span = ranges_in[tile]
     for p in range(span[0], span[1]):
@@ -249,7 +248,7 @@ def sum_line_slots(
     v_channels_out: wp.array2d[float],  # [N, C], C <= 8
     absgrad_out: wp.array[wp.vec2],  # [N]; empty: not wanted
 ):
-    """``sum_slots`` of slots that are one vector: the same bits, in half the time on a CPU."""
+    """Sum as ``sum_slots`` does, of slots that are one vector: the same bits, in half the time on a CPU."""
     i = first + wp.tid()
     total = Slot()
     if more != 0:

@@ -1,8 +1,7 @@
 """The K nearest control points of every Gaussian, and the weights with which they pull it (SC-GS, Eq. 5).
 
-``nearest`` is exact: one point a thread, a sorted list of the K best, the nodes in ascending order, inserted on a
-strict ``<``. Ties go to the lower index, and a distance that is NaN is never inserted. ``neighbors_cpu.py`` does the
-same with SIMD.
+``nearest`` is exact: one point per thread, a sorted list of the K best, the nodes in ascending order, inserted on a
+strict ``<``. Ties go to the lower index, and a distance that is NaN is never inserted.
 """
 
 import warp as wp
@@ -25,7 +24,7 @@ def nearest(
     indices_out: wp.array2d[wp.int32],  # [N, K] nearest first
     distances_out: wp.array2d[float],  # [N, K] squared
 ):
-    """K nearest nodes of point ``i``; the sorted list lives in the outputs' own row."""
+    """Find the K nearest nodes of point ``i``; the sorted list lives in the outputs' own row."""
     i = first + wp.tid()
     for j in range(K):
         indices_out[i, j] = j
@@ -69,7 +68,10 @@ def rbf_weights(
     # Out:
     weights_out: wp.array2d[float],  # [N, K]
 ):
-    """Softmax over a Gaussian's neighbours of ``log s - d^2 / (2 r^2)``; all weight to the first if none is finite."""
+    """Take the softmax of ``log s - d^2 / (2 r^2)`` over a Gaussian's neighbours.
+
+    The first neighbour gets all the weight if no exponent is finite.
+    """
     i = first + wp.tid()
     K = indices_in.shape[1]
     top = float(-wp.inf)
@@ -113,7 +115,7 @@ def rbf_weights_adjoint(
     v_logits_out: wp.array2d[float],  # [N, K] gradient to log s - d^2 / (2 r^2)
     v_points_out: wp.array2d[float],  # [N, D]
 ):
-    """Gradients of one Gaussian's own values; the nodes' are summed from ``v_logits_out`` by ``rbf_reduce_*``."""
+    """Compute the gradients of one Gaussian's values; ``rbf_reduce_*`` sums the nodes' from ``v_logits_out``."""
     i = first + wp.tid()
     K = indices_in.shape[1]
     mean = float(0.0)
@@ -167,7 +169,7 @@ def rbf_reduce_chunks(
     # Out:
     sums_out: wp.array2d[float],  # [chunks * M, 2 + D] zero on entry
 ):
-    """Node sums of the Gaussians of one chunk, on a CPU: a chunk's size does not depend on the threads."""
+    """Sum one chunk of Gaussians for every node, on a CPU; its size does not depend on the number of threads."""
     chunk = first + wp.tid()
     M = nodes_in.shape[0]
     for i in range(chunk * size, wp.min((chunk + 1) * size, points_in.shape[0])):
@@ -190,7 +192,7 @@ def rbf_finish(
     v_radii_out: wp.array[float],  # [M]
     v_strengths_out: wp.array[float],  # [M], touched only with has_strengths
 ):
-    """Gradients of one node from its sums."""
+    """Compute the gradients of one node from its sums."""
     m = first + wp.tid()
     M = radii_in.shape[0]
     r = radii_in[m]

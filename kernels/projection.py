@@ -15,10 +15,10 @@ from .types import ALPHA_MIN
 wp.set_module_options({"enable_backward": False})
 
 FRUSTUM_MARGIN = wp.constant(0.3)
-"""The Jacobian, which explodes at grazing angles, is evaluated no farther outside the image than this tan(fov / 2)."""
+"""Bound of the Jacobian, in tan(fov / 2) outside the image: at grazing angles it would explode."""
 
 RADIUS_MAX = wp.constant(1.0e9)
-"""Larger radii cover every image all the same; a larger float would overflow int32."""
+"""Largest radius in pixels: it covers every image, and a larger float would overflow int32."""
 
 
 @wp.struct
@@ -156,7 +156,7 @@ def project(
 def covariance2d_adjoint(
     row_x: wp.vec3, row_y: wp.vec3, eps2d: float, antialiased: int, opacity: float, v_conic: wp.vec3, v_opacity: float
 ):
-    """(v_xx, v_xy, v_yy, v_opacity_in) of the 2D covariance (xy counted once) and the opacity before compensation."""
+    """Compute v_xx, v_xy, v_yy of the 2D covariance (xy counted once) and v_opacity_in before compensation."""
     raw_xx = wp.dot(row_x, row_x)
     raw_yy = wp.dot(row_y, row_y)
     xy = wp.dot(row_x, row_y)

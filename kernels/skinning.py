@@ -1,9 +1,9 @@
 """Linear blend skinning of Gaussians by their control points (SC-GS, Eq. 6 and 7).
 
-The adjoint runs in three launches: one thread a Gaussian for its own gradients, then the sums over each node's
-Gaussians (chunks of Gaussians on a CPU, segments of all pairs on CUDA: ``node_sums_cuda``), then one thread a node. The
-rotation's gradient is summed as the matrix ``G = sum w v (x - p)^T``, which turns into the quaternion's only once a
-node.
+The adjoint runs in three launches: one thread per Gaussian for its own gradients, then the sums over each node's
+Gaussians (by chunks of Gaussians on a CPU, by segments of all pairs in ``cuda/node_sums.py``), then one thread per
+node. The rotation's gradient is summed as the matrix ``G = sum w v (x - p)^T``, which is turned into the quaternion's
+once per node.
 """
 
 import warp as wp
@@ -21,12 +21,12 @@ from .quaternion import (
 wp.set_module_options({"enable_backward": False})
 
 SUMS = 16
-"""Columns of the node sums: G (9), w v (3), w s v_blend (4), then w v_log_scales (3) where there are any."""
+"""Columns of the node sums: G (9), w v (3), w s v_blend (4), then w v_log_scales (3) if there are log scales."""
 
 
 @wp.func
 def aligned(q: wp.vec4, reference: wp.vec4):
-    """q or -q, whichever lies on the side of the reference."""
+    """Return q or -q, whichever lies on the side of the reference."""
     if wp.dot(q, reference) < 0.0:
         return -q
     return q
@@ -108,8 +108,10 @@ def skin_adjoint(
     v_weights_out: wp.array2d[float],  # [N, K]
     v_blends_out: wp.array[wp.vec4],  # [N] gradient to the blended rotation before it is normalised; NaN: passes none
 ):
-    """Gradients of one Gaussian's own values. One that is not finite, or that a broken control point moves, passes
-    none."""
+    """Compute the gradients of one Gaussian's own values.
+
+    A Gaussian that is non-finite, or that a non-finite control point moves, passes no gradient.
+    """
     i = first + wp.tid()
     x = means_in[i]
     v = v_means_in[i]
@@ -217,7 +219,7 @@ def skin_reduce_chunks(
     # Out:
     sums_out: wp.array2d[float],  # [chunks * M, SUMS (+ 3)] zero on entry
 ):
-    """Node sums of the Gaussians of one chunk, on a CPU: a chunk's size does not depend on the threads."""
+    """Sum one chunk of Gaussians for every node, on a CPU; its size does not depend on the number of threads."""
     chunk = first + wp.tid()
     M = nodes_in.shape[0]
     for i in range(chunk * size, wp.min((chunk + 1) * size, means_in.shape[0])):
@@ -246,7 +248,7 @@ def skin_finish(
     v_shape_rotations_out: wp.array[wp.vec4],  # [M], touched only with has_shape_rotations
     v_log_scales_out: wp.array[wp.vec3],  # [M], touched only with has_log_scales
 ):
-    """Gradients of one node from its sums."""
+    """Compute the gradients of one node from its sums."""
     m = first + wp.tid()
     M = rotations_in.shape[0]
     G = wp.mat33(0.0)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import warp as wp
 
+LOG2_E = 1.4426950408889634
+"""log2(e): exponentials are taken to base 2."""
+
 TILE_SIZE = 16
 """Side of a tile in pixels: one row of it is one 512-bit SIMD register, its 256 pixels are one CUDA block."""
 
@@ -61,3 +64,9 @@ SSIM_BAND = 64
 
 SSIM_BLOCK = 128
 """Columns that it works on at once: 4 maps x 11 rows x 128 columns are 22 KiB."""
+
+MAX_DIMENSIONS = 64
+"""Most dimensions of points that the SIMD search for neighbours takes: it keeps a block's coordinates on the stack."""
+
+MAX_HYPER = 8
+"""Most hyper-coordinates of a Gaussian that SIMD skinning takes: the room for them in a control point's row."""

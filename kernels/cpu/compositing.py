@@ -1,14 +1,15 @@
-"""Alpha compositing on a CPU: one thread a tile, a row of 16 pixels in one SIMD register.
+"""Alpha compositing on a CPU: one tile per grid index, a row of 16 pixels in one SIMD register.
 
-The bodies are native snippets with Clang's vector types, which compile for every CPU (one AVX-512 register, two AVX2
-ones, four NEON ones). Semantics and arguments are those of ``compositing``; what differs is how the work is laid out:
+The meaning is that of ``compositing``; the work is laid out as follows:
 
 - Splats come packed (``pack_splats``): one gather of a cache line or two per pair, logarithm and divisions done once.
-- In base 2: ``alpha = 2^(power + log2 o)``, where ``power = -q / (2 ln 2)`` has its factor folded into the conic.
-- The rows of a tile that a splat reaches are found by one vector operation over all 16 rows; only those are visited.
-- A pixel that has ended is marked by the sign of its transmittance: its next transmittance is then never > 1e-4.
-- The adjoint contracts the channels with the incoming gradient first, so one running sum a pixel suffices. It keeps
-  the sums of a (tile, splat) pair in registers, a lane a column, and adds the lanes up at the end, 16 sums at a time.
+- Exponentials are taken to base 2: ``alpha = 2^(power + log2 o)``, where the factor of ``power = -q / (2 ln 2)`` is
+  folded into the conic.
+- One vector operation finds which of a tile's 16 rows a splat reaches; only those are visited.
+- The sign of its transmittance marks a pixel that has ended: the next transmittance is then never > 1e-4.
+- The adjoint contracts the channels with the incoming gradient first, so one running sum per pixel suffices. It keeps
+  the sums of a (tile, splat) pair in registers, a column of pixels per lane, and adds up the lanes at the end, 16 sums
+  at a time.
 """
 
 from __future__ import annotations
@@ -16,14 +17,12 @@ from __future__ import annotations
 import warp as wp
 
 from ..native import native_function
-from ..types import CHANNEL_MAX, PACKED_GEOMETRY
+from ..types import CHANNEL_MAX, LOG2_E, PACKED_GEOMETRY
 
 wp.set_module_options({"enable_backward": False})
 
 TILE_SIDE = 16
-"""The only tile size this form serves: a row is a register."""
-
-_LOG2_E = 1.4426950408889634
+"""Side of the tiles that this form serves, in pixels: a row is a register."""
 
 
 @wp.kernel
@@ -40,7 +39,7 @@ def pack_splats(
     i = first + wp.tid()
     conic = conics_in[i]
     opacity = opacities_in[i]
-    factor = float(-0.5 * _LOG2_E)
+    factor = float(-0.5 * LOG2_E)
     count = channels_in.shape[1]
     for c in range(count):
         if not wp.abs(channels_in[i, c]) <= CHANNEL_MAX:
@@ -81,7 +80,7 @@ def composite_tile_adjoint(
 
 
 @wp.kernel
-def composite_tiles(
+def composite(
     first: int,
     # In:
     packed_in: wp.array2d[float],  # [N, 8 + C padded]
@@ -114,7 +113,7 @@ def composite_tiles(
 
 
 @wp.kernel
-def composite_tiles_adjoint(
+def composite_adjoint(
     first: int,
     # In:
     packed_in: wp.array2d[float],  # [N, 8 + C padded]

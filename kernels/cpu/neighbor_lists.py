@@ -1,15 +1,17 @@
-"""Which nodes a block of sixteen points close together has within reach: what ``nearest_listed`` starts from."""
+"""Lists of the nodes that each block of sixteen points close together has within reach, for ``nearest_listed``."""
 
 import warp as wp
 
-from .neighbors import LANES
+from ..native import native_function
+from ..types import LANES
 
 wp.set_module_options({"enable_backward": False})
 
 LIST_SIZE = wp.constant(128)
-"""Most nodes in a block's list. A block that has more within reach is searched in full."""
+"""Largest number of nodes in a block's list. A block that has more within reach is searched in full."""
+
 MARGIN = wp.constant(0.35)
-"""How much farther than needed a list reaches, in units of the distance to the block's farthest neighbour."""
+"""Extra reach of a list, in units of the distance to the block's farthest neighbour."""
 
 
 @wp.kernel
@@ -21,8 +23,8 @@ def largest_shift(
     # Out:
     shift_out: wp.array[float],  # [1]
 ):
-    """How far the nodes have moved at most: one grid index. A node that is not finite now is nobody's neighbour and
-    does not count; one that was not is new: infinity."""
+    """Compute the largest distance that a node has moved, in one grid index. A node that is non-finite now is nobody's
+    neighbour and does not count; one that was non-finite before gives infinity."""
     most = float(0.0)
     for m in range(nodes_in.shape[0]):
         poison = float(0.0)
@@ -39,48 +41,16 @@ def largest_shift(
     shift_out[first + wp.tid()] = wp.sqrt(most)
 
 
-_WITHIN = """
-#if !defined(__CUDA_ARCH__)
-{
-    typedef float vf __attribute__((vector_size(64)));
-    typedef int vi __attribute__((vector_size(64)));
-    typedef bool vb __attribute__((ext_vector_type(16)));
-    const int D = columns.shape[0], M = columns.shape[1], room = lists.shape[1];
-    const float* centre = centres.data + (long long)block * (D + 1);
-    int* list = lists.data + (long long)block * room;
-    int count = 0;
-    for (int m = 0; m < M && count <= room; m += 16) {
-        const int lanes = M - m < 16 ? M - m : 16;
-        vf d2 = {};
-        for (int d = 0; d < D; ++d) {
-            vf e = {};
-            __builtin_memcpy(&e, columns.data + (long long)d * M + m, 4 * lanes);
-            e = e - centre[d];
-            d2 = d2 + e * e;
-        }
-        unsigned found = __builtin_bit_cast(unsigned short, __builtin_convertvector(d2 < reach * reach, vb));
-        for (found &= (1u << lanes) - 1; found; found &= found - 1, ++count)
-            if (count < room) list[count] = m + __builtin_ctz(found);
-    }
-    return count <= room ? count : -1;
-}
-#else
-    return -1;
-#endif
-"""
-
-
-@wp.func_native(_WITHIN)
-def _within(
-    block: int, reach: float, centres: wp.array2d[float], columns: wp.array2d[float], lists: wp.array2d[wp.int32]
-) -> int:
-    """Write the list of a block: the nodes within ``reach`` of its centre, ascending. How many, -1 if too many."""
-    ...
+@native_function("neighbor_lists.h")
+def _list_within(
+    block: int, reach: float, centres: wp.array2d[float], columns: wp.array2d[float], counts: wp.array[wp.int32],
+    lists: wp.array2d[wp.int32],
+): ...  # fmt: skip
 
 
 @wp.func
 def _spread(x: int):
-    """Bits 0 .. 9 to bits 0, 3, 6 ... 27."""
+    """Move bits 0 .. 9 to bits 0, 3, 6 ... 27."""
     x = (x | (x << 16)) & 0x030000FF
     x = (x | (x << 8)) & 0x0300F00F
     x = (x | (x << 4)) & 0x030C30C3
@@ -97,7 +67,7 @@ def morton_codes(
     # Out:
     codes_out: wp.array[wp.int32],  # [N]
 ):
-    """Place of point ``i`` on a curve through the first three dimensions; anywhere if it is not finite."""
+    """Compute the Morton code of point ``i`` in the first three dimensions; any code if the point is non-finite."""
     i = first + wp.tid()
     code = int(0)
     for d in range(wp.min(points_in.shape[1], 3)):
@@ -120,7 +90,7 @@ def list_blocks(
     counts_out: wp.array[wp.int32],  # [blocks]
     lists_out: wp.array2d[wp.int32],  # [blocks, LIST_SIZE]
 ):
-    """Centre, reach and list of block ``i``."""
+    """Compute centre, reach and list of block ``i``."""
     block = first + wp.tid()
     D = points_in.shape[1]
     last = distances_in.shape[1] - 1
@@ -149,4 +119,4 @@ def list_blocks(
             farthest = wp.max(farthest, own)
     reach = wp.min(reach + MARGIN * farthest, 1.0e18)  # its square must not overflow
     centres_out[block, D] = reach
-    counts_out[block] = _within(block, reach, centres_out, columns_in, lists_out)
+    _list_within(block, reach, centres_out, columns_in, counts_out, lists_out)

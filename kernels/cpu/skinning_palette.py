@@ -1,4 +1,4 @@
-"""The control points as a palette of rows for ``skinning_cpu.py``: two rows of sixteen floats a node, a register each.
+"""Palette of the control points for ``cpu/skinning.py``: two rows of sixteen floats per node, a register each.
 
 - ``motion``: the affine map ``[R | p + T - R p]`` (12, row by row), then the unit shape rotation (4);
 - ``reach``: position (3), ``-1 / (2 r^2)``, ``log s``, log scales (3), hyper-coordinates (MAX_HYPER, zero-padded).
@@ -9,12 +9,11 @@ import warp as wp
 from ..gradient_limits import passed
 from ..neighbors import MIN_STRENGTH
 from ..quaternion import quat_matrix, quat_matrix_adjoint, quat_normalise, quat_normalise_adjoint
+from ..types import MAX_HYPER as MAX_HYPER
 
 wp.set_module_options({"enable_backward": False})
 
 ROW = 16
-MAX_HYPER = 8
-"""Most hyper-coordinates of a point."""
 row = wp.types.vector(length=16, dtype=float)
 
 
@@ -38,7 +37,7 @@ def palette(
     motion_out: wp.array2d[float],  # [M, 16]
     reach_out: wp.array2d[float],  # [M, 16]
 ):
-    """The two rows of one node."""
+    """Write the two rows of one node."""
     m = first + wp.tid()
     p = nodes_in[m]
     R = quat_matrix(quat_normalise(rotations_in[m]))
@@ -65,20 +64,13 @@ def palette(
             reach_out[m, 8 + d] = hyper_in[m, d]
 
 
-_SUM_ROWS = """
-    wp::vec_t<16, float> total;
-    const long long stride = 16ll * parts.shape[1];
-    const float* at = parts.data + 16ll * m;
-    for (int chunk = 0; chunk < parts.shape[0]; ++chunk, at += stride)
-        for (int c = 0; c < 16; ++c) total.c[c] += at[c];
-    return total;
-"""
-
-
-@wp.func_native(_SUM_ROWS)
-def _sum_rows(m: int, parts: wp.array3d[float]) -> row:  # type: ignore[valid-type]
-    """Row m of every chunk, added in order."""
-    ...
+@wp.func
+def _sum_rows(m: int, parts: wp.array2d[row]):  # type: ignore[valid-type]
+    """Add row m of every chunk, in order."""
+    total = row()
+    for chunk in range(parts.shape[0]):
+        total += parts[chunk, m]
+    return total
 
 
 @wp.kernel
@@ -94,8 +86,8 @@ def palette_adjoint(
     shape_rotations_in: wp.array[wp.vec4],  # [M]
     has_shape_rotations: int,
     has_log_scales: int,
-    v_motion_in: wp.array3d[float],  # [chunks, M, 16]
-    v_reach_in: wp.array3d[float],  # [chunks, M, 16]
+    v_motion_in: wp.array2d[row],  # [chunks, M] rows
+    v_reach_in: wp.array2d[row],  # [chunks, M] rows
     # Out:
     v_nodes_out: wp.array[wp.vec3],  # [M]
     v_hyper_out: wp.array2d[float],  # [M, H], touched only with has_hyper
@@ -106,7 +98,7 @@ def palette_adjoint(
     v_shape_rotations_out: wp.array[wp.vec4],  # [M], touched only with has_shape_rotations
     v_log_scales_out: wp.array[wp.vec3],  # [M], touched only with has_log_scales
 ):
-    """Gradients of one node from those of its two rows."""
+    """Compute the gradients of one node from those of its two rows."""
     m = first + wp.tid()
     motion = _sum_rows(m, v_motion_in)
     reach = _sum_rows(m, v_reach_in)

@@ -1,12 +1,12 @@
-"""The pairs of tile and splat by two radix sorts, which a GPU can share among its threads.
+"""Binning on CUDA: the pairs of tile and splat by two radix sorts, which a GPU shares among its threads.
 
-Splats are sorted by depth first, N keys of 32 bits; their pairs, listed in that order, then only by tile, P keys of a
-dozen bits. The sort is stable, so both together are a sort by tile, then depth, then index, with a third of the
-traffic of sorting P keys of both.
+The first sort orders the N splats by depth, with keys of 32 bits. Their P pairs are listed in that order, and the
+second sort orders them by tile alone, with keys of a dozen bits. The sort is stable, so both together sort by tile,
+then depth, then index, with a third of the traffic of sorting P keys of both.
 
-Nothing here depends on a count that the host would have to know: lists have room for P pairs, the rest of the room is
-filled with a tile beyond the last, and where there is too little room the pairs that do not fit are left out. Whoever
-set the room compares it with the true total, afterwards.
+Nothing here depends on a count that the host would have to know. Lists have room for P pairs; spare room is filled with
+a tile beyond the last, and pairs that do not fit are left out. The caller compares the room with the true total
+afterwards. The kernels are plain Warp and run on a CPU too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import warp as wp
 
 from ..binning import DEPTH_CULLED, columns_within, rows_within, splat_ellipse, touched_columns, touched_rows
 
-# Counting and emitting must find the same tiles: no fusing of multiply and add, which may differ between two kernels.
+# Counting and emitting must find the same tiles, but fused multiplications and additions may differ between kernels.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
@@ -121,7 +121,7 @@ def emit_by_depth(
                 values_out[at] = value
             at += 1
             slot += 1
-    while at < end:  # never, as long as both passes find the same tiles; but no place may stay unwritten
+    while at < end:  # Both passes find the same tiles, so this never runs; but no place may stay unwritten.
         tiles_out[at] = 0
         values_out[at] = i
         if with_slots:
@@ -142,7 +142,7 @@ def fill_rest(
     values_out: wp.array[int],  # [2 P]
     owners_out: wp.array[int],  # [P] or empty
 ):
-    """Give the room that no pair took a key that sorts last."""
+    """Fill spare room with a key that sorts last."""
     p = first + wp.tid()
     if wp.int64(p) >= places_in[places_in.shape[0] - 1]:
         tiles_out[p] = beyond
@@ -167,7 +167,7 @@ def gather_owners(
 
 @wp.func
 def first_of_tile(tiles: wp.array[int], count: int, tile: int) -> int:
-    """Where the sorted pairs of a tile, or of a later one, begin."""
+    """Return where the sorted pairs of a tile, or of a later one, begin."""
     low = int(0)
     high = int(count)
     while low < high:

@@ -1,9 +1,9 @@
-"""Sums over the pairs of every control point, for CUDA: nodes have hundreds of pairs, some of them thousands.
+"""Sums over the pairs of every control point on CUDA, where a node may have hundreds or thousands of pairs.
 
-The list of pairs, sorted by node, is cut into segments of equal length, a thread each. Where the node changes within a
-segment the thread puts its sums away and begins anew. Segment s and node m share row ``s + m``: along the list one of
-the two grows at every change, so no row serves twice, and ``segments + nodes`` rows are enough for any list. A second
-pass adds each node's rows up in their order: the same bits every time.
+The list of pairs, sorted by node, is cut into segments of equal length, one per thread. Where the node changes within a
+segment, the thread stores its sums and starts new ones. Segment s and node m share row ``s + m``: along the list one of
+the two grows at every change, so no row is used twice, and ``segments + nodes`` rows suffice for any list. A second
+pass adds up each node's rows in order, which gives the same bits every time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..skinning import finite
 wp.set_module_options({"enable_backward": False})
 
 SEGMENT = 32
-"""Pairs a thread: enough threads for a GPU at 40,000 Gaussians, few enough rows for the second pass."""
+"""Pairs per thread: enough threads for a GPU at 40,000 Gaussians, few enough rows for the second pass."""
 LANES = 8
 """Coordinates of the points that one thread sums."""
 

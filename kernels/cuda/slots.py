@@ -1,20 +1,18 @@
-"""The sums over each splat's gradient slots on CUDA."""
+"""Sums over each splat's gradient slots on CUDA."""
 
 from __future__ import annotations
 
 import warp as wp
 
+from ..compositing import SLOT_WIDTH as SLOT_WIDTH
 from ..gradient_limits import passed
 from ..types import SLOT_GEOMETRY
 
 wp.set_module_options({"enable_backward": False})
 
-SLOT_WIDTH = 16
-"""Columns of a gradient slot, the only width served here."""
-
 
 @wp.kernel
-def sum_slot_columns(
+def sum_slots(
     first: int,
     # In:
     offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
@@ -27,7 +25,7 @@ def sum_slot_columns(
     v_channels_out: wp.array2d[float],  # [N, C], C <= 8
     absgrad_out: wp.array2d[float],  # [N, 2]; empty: not wanted
 ):
-    """``compositing.sum_slots`` with a thread for every column, so that neighbours read neighbours. Grid: 16 N."""
+    """Sum as ``compositing.sum_slots`` does, with a thread per column, for coalesced reads. Grid: 16 N."""
     t = first + wp.tid()
     i = t // SLOT_WIDTH
     column = t - i * SLOT_WIDTH

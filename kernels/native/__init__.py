@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import harmonics, ssim, types
+from .. import binning, harmonics, neighbors, projection, ssim, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -31,7 +31,6 @@ CONSTANTS: dict[str, int | float] = {
     "ADAM_GRADIENT_MAX": types.ADAM_GRADIENT_MAX,
     "ALPHA_MAX": types.ALPHA_MAX,
     "CHANNEL_GROUP": types.CHANNEL_GROUP,
-    "GRADIENT_MAX": types.GRADIENT_MAX,
     "NETWORK_PANEL": types.NETWORK_PANEL,
     "PACKED_GEOMETRY": types.PACKED_GEOMETRY,
     "ROOFLINE_BLOCK": types.ROOFLINE_BLOCK,
@@ -43,6 +42,21 @@ CONSTANTS: dict[str, int | float] = {
     "SSIM_C2": ssim.SSIM_C2,
     **{f"SSIM_TAP_{distance}": tap for distance, tap in enumerate(ssim.TAPS)},
     "TRANSMITTANCE_MIN": types.TRANSMITTANCE_MIN,
+    "LN_2": 1.0 / types.LOG2_E,
+    "LOG2_E": types.LOG2_E,
+    # Binning.
+    "ALPHA_MIN": types.ALPHA_MIN,
+    "REACH_SLACK": binning.REACH_SLACK,
+    **{f"LOG2_{power}": value for power, value in enumerate(binning.LOG2_COEFFICIENTS)},
+    # Neighbours.
+    "MAX_DIMENSIONS": types.MAX_DIMENSIONS,
+    "MAX_HYPER": types.MAX_HYPER,
+    "MAX_NEIGHBORS": neighbors.MAX_NEIGHBORS,
+    # Projection and skinning.
+    "FRUSTUM_MARGIN": projection.FRUSTUM_MARGIN,
+    "GRADIENT_MAX": types.GRADIENT_MAX,
+    "POSITION_MAX": types.POSITION_MAX,
+    "RADIUS_MAX": projection.RADIUS_MAX,
 }
 """Values of macros by name; a header gets those that its text names."""
 

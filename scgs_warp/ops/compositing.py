@@ -205,7 +205,7 @@ def _draw(
     size, begin, count = (tiles.width, tiles.height, tiles.columns), window[0], window[1] - window[0]
     if form == "cpu":
         lists, load = (source, background, tiles.ranges, tiles.splats), _load(tiles, window)
-        launch(cpu_kernels.composite_tiles, count, *lists, *size, *outputs, grain=1, load=load, begin=begin)
+        launch(cpu_kernels.composite, count, *lists, *size, *outputs, grain=1, load=load, begin=begin)
         return
     lists = (means2d, conics, source, channels, background, tiles.ranges, tiles.splats)
     if form != "pixel":
@@ -213,7 +213,7 @@ def _draw(
         return
     for first, pixels in _pixels(tiles, window):
         arguments = (*lists, *size, tiles.tile_size, *outputs)
-        launch(kernels.composite_pixels, pixels, *arguments, grain=256, begin=first)
+        launch(kernels.composite, pixels, *arguments, grain=256, begin=first)
 
 
 def _pixels(tiles: Tiles, window: Window) -> list[tuple[int, int]]:
@@ -267,11 +267,11 @@ def _adjoint(
     size, begin, count = (tiles.width, tiles.height, tiles.columns), window[0], window[1] - window[0]
     if job.form == "cpu":
         rest, load = (*size, int(absolute), v_slots), _load(tiles, window)
-        launch(cpu_kernels.composite_tiles_adjoint, count, source, *lists, *rest, grain=1, load=load, begin=begin)
+        launch(cpu_kernels.composite_adjoint, count, source, *lists, *rest, grain=1, load=load, begin=begin)
     elif job.form == "pixel":
         rest = (*size, tiles.tile_size, int(absolute), v_slots)
         lists = (means2d, conics, source, channels, *lists)
-        launch(kernels.composite_pixels_adjoint, count, *lists, *rest, grain=1, begin=begin)
+        launch(kernels.composite_adjoint, count, *lists, *rest, grain=1, begin=begin)
     else:
         lists = (means2d, conics, source, channels, *lists)
         compositing_cuda.adjoint(job.form, lists, size, absolute, v_slots, window)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..kernels import compositing
 from ..kernels.cuda import compositing as native
-from ..kernels.cuda import compositing_portable
+from ..kernels.cuda import compositing_blocks
 from ..kernels.cuda import slots as slots_cuda
 from ..runtime.launch import launch, launch_blocks
 
@@ -31,13 +31,13 @@ def forward(
     """
     begin, blocks = window[0], window[1] - window[0]
     if form == "cuda":
-        launch_native(native.composite_tiles, blocks, *lists, *size, *outputs, begin=begin)
+        launch_native(native.composite, blocks, *lists, *size, *outputs, begin=begin)
     else:
         launch_blocks(
-            compositing_portable.composite_blocks,
+            compositing_blocks.composite,
             blocks,
-            *(*lists, *size, compositing_portable.TILE_SIZE, *outputs),
-            block_dim=compositing_portable.BLOCK_DIM,
+            *(*lists, *size, compositing_blocks.TILE_SIZE, *outputs),
+            block_dim=compositing_blocks.BLOCK_DIM,
             begin=begin,
         )
 
@@ -60,13 +60,13 @@ def adjoint(
     """
     begin, blocks = window[0], window[1] - window[0]
     if form == "cuda" and lists[3].shape[1] <= native.MAX_CHANNELS:
-        launch_native(native.composite_tiles_adjoint, blocks, *lists, *size, v_slots, begin=begin)
+        launch_native(native.composite_adjoint, blocks, *lists, *size, v_slots, begin=begin)
     else:
         launch_blocks(
-            compositing_portable.composite_blocks_adjoint,
+            compositing_blocks.composite_adjoint,
             blocks,
-            *(*lists, *size, compositing_portable.TILE_SIZE, int(absolute), v_slots),
-            block_dim=compositing_portable.BLOCK_DIM,
+            *(*lists, *size, compositing_blocks.TILE_SIZE, int(absolute), v_slots),
+            block_dim=compositing_blocks.BLOCK_DIM,
             begin=begin,
         )
 
@@ -84,7 +84,7 @@ def sum_slots(
     if v_slots.shape[1] != slots_cuda.SLOT_WIDTH:
         launch(compositing.sum_slots, count, *slots, *outputs)
     elif form == "cuda":
-        launch(slots_cuda.sum_slot_columns, slots_cuda.SLOT_WIDTH * count, *slots, *outputs)
+        launch(slots_cuda.sum_slots, slots_cuda.SLOT_WIDTH * count, *slots, *outputs)
     else:
         launch(compositing.sum_line_slots, count, *slots, *outputs)
 

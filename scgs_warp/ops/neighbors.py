@@ -72,7 +72,7 @@ def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
     distances = torch.empty(points.shape[0], k, device=points.device)
     arguments = points, nodes, k, indices, distances
     if _in_lanes(points):
-        launch(neighbors.nearest_lanes, _blocks(points), *arguments, grain=16)
+        launch(neighbors.nearest, _blocks(points), *arguments, grain=16)
     else:
         launch(kernels.nearest, points.shape[0], *arguments)
     return indices, distances

@@ -39,7 +39,7 @@ class _Project(torch.autograd.Function):
         outputs = means2d, conics, depths, seen, radii
         if form == "cpu":
             blocks = -(-count // cpu_kernels.LANES)
-            launch(cpu_kernels.project_lanes, blocks, *inputs, *settings, *outputs, grain=32)
+            launch(cpu_kernels.project, blocks, *inputs, *settings, *outputs, grain=32)
         else:
             launch(kernels.project, count, *inputs, *settings, *outputs)
         ctx.save_for_backward(means, quats, scales, opacities, viewmat, K, radii)
@@ -66,7 +66,7 @@ class _Project(torch.autograd.Function):
         known = *inputs, *camera, radii, *incoming
         if ctx.form == "cpu" and not wants_view:
             blocks = -(-count // cpu_kernels.LANES)
-            launch(cpu_kernels.project_lanes_adjoint, blocks, *known, *v_inputs, grain=32)
+            launch(cpu_kernels.project_adjoint, blocks, *known, *v_inputs, grain=32)
         else:
             launch(kernels.project_adjoint, count, *known, int(wants_view), *v_inputs, v_views)
         v_viewmat = None

@@ -60,7 +60,7 @@ def _skin_lanes(means, quats, nodes, translations, rotations, shapes, log_scales
     scaled = int(log_scales is not None)
     outputs = _like(means, quats, means if scaled else None)
     palette = pack_palette(nodes, (translations, rotations, shapes, log_scales))
-    launch(skinning.skin_lanes, _lanes(means), means, quats, *palette, scaled, indices, weights, *outputs, grain=32)
+    launch(skinning.skin, _lanes(means), means, quats, *palette, scaled, indices, weights, *outputs, grain=32)
     return tuple(outputs)
 
 
@@ -187,7 +187,7 @@ class _SkinRbf(torch.autograd.Function):
         weights = torch.empty(indices.shape)
         outputs = _like(means, quats, means if has_log_scales else None)
         launch(
-            skinning.skin_rbf_lanes,
+            skinning.skin_rbf,
             _lanes(means),
             *(means, quats, hyper, has_hyper, *palette, has_strengths, has_log_scales, indices, weights, *outputs),
             grain=32,
@@ -211,7 +211,7 @@ class _SkinRbf(torch.autograd.Function):
         v_motion, v_reach = (torch.empty(chunks, count, skinning_palette.ROW) for _ in range(2))
         v_means, v_quats, v_hyper = _like(means, quats, hyper)
         launch(
-            skinning_adjoint.skin_rbf_lanes_adjoint,
+            skinning_adjoint.skin_rbf_adjoint,
             chunks,
             *(size, means, quats, hyper, has_hyper, motion, reach, aligned, has_strengths, has_log_scales),
             *(indices, weights, *v_outputs),

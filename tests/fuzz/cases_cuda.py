@@ -39,7 +39,7 @@ def emulated(seed: int) -> Iterator[None]:
             fence.current.run(kernel, parameters_of(kernel), args, lambda own: run(kernel, blocks, *own, begin=begin))
 
     def portable(kernel: Any, blocks: int, *args: Any, block_dim: int, begin: int = 0) -> None:
-        launch(compositing.composite_pixels_adjoint, blocks, *args, begin=begin)
+        launch(compositing.composite_adjoint, blocks, *args, begin=begin)
 
     compositing_cuda.launch_native, compositing_cuda.launch_blocks = fenced_native, portable  # type: ignore[assignment]
     try:

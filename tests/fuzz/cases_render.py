@@ -13,7 +13,6 @@ from helpers.splats import random_splats
 from scgs_warp.ops.binning import BandBinning, bin_splats
 from scgs_warp.ops.binning_cuda import RadixBinning, bin_within, geometry_of
 from scgs_warp.ops.compositing import composite
-from scgs_warp.ops.covariance import covariance
 from scgs_warp.ops.harmonics import spherical_harmonics
 from scgs_warp.ops.projection import project
 from scgs_warp.rendering.render import draw as draw_image
@@ -125,16 +124,6 @@ def case_harmonics(d: Draw, device: str) -> None:
     laws.zero("gradients of the marked channels", grads[0][~colors.isfinite()])
     alone = spherical_harmonics(*(x[whole] for x in inputs[:3]), inputs[3], degree, form=form)
     laws.equal("colours of the valid", colors[whole], alone)
-
-
-def case_covariance(d: Draw, device: str) -> None:
-    g = poisoned_gaussians(d, d.count(), 0)
-    inputs = [leaf(x) for x in on(device, g.quats, g.scales)]
-    found = covariance(*inputs)
-    laws.finite("covariances", found)
-    grads = torch.autograd.grad(found, inputs, d.normal(*found.shape).to(device))
-    laws.finite("gradients of quats, scales", *grads)
-    laws.all_zero_where("gradients of the broken", ~finite_rows(*inputs).to(device), grads)
 
 
 def splats_of(d: Draw, device: str) -> Splats:
@@ -274,7 +263,6 @@ def case_rasterization(d: Draw, device: str) -> None:
 CASES = {
     "projection": (case_projection, 3),
     "harmonics": (case_harmonics, 2),
-    "covariance": (case_covariance, 1),
     "binning": (case_binning, 3),
     "compositing": (case_compositing, 4),
     "draw": (case_draw, 4),

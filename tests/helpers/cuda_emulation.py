@@ -1,4 +1,4 @@
-"""Native CUDA bodies of ``kernels.compositing_cuda``, compiled for the CPU with ``cuda_shim.h``."""
+"""The native functions of ``kernels.cuda.compositing``, compiled for the CPU with ``cuda_shim.h``."""
 
 from __future__ import annotations
 
@@ -13,22 +13,29 @@ from typing import Any
 import torch
 import warp as wp
 
+from scgs_warp.kernels import native
 from scgs_warp.kernels.cuda import compositing
 
 SHIM = Path(__file__).resolve().parent / "cuda_shim.h"
 COMPILER = shutil.which("g++") if sys.platform == "linux" else None
 _TYPES = {wp.vec2: "wp::vec2", wp.vec3: "wp::vec3", wp.vec2i: "wp::vec2i", float: "float", int: "int"}
 _TYPES.update({wp.float32: "float", wp.int32: "int"})
-BODIES = {
-    "composite_tiles": (compositing.FORWARD, compositing.composite_tile),
-    "composite_tiles_adjoint": (compositing.ADJOINT, compositing.composite_tile_adjoint),
+HEADER = "compositing_cuda.h"
+FUNCTIONS = {
+    "composite": compositing.composite_tile,
+    "composite_adjoint": compositing.composite_tile_adjoint,
 }
 
 
 def source() -> str:
-    """One C function a body: pointers and shapes of its arrays, its integers, the number of blocks and a seed."""
-    parts = [f'#include "{SHIM}"\n']
-    for name, (body, function) in BODIES.items():
+    """Return the header and, for each kernel, a C function of its name that runs blocks of threads.
+
+    Its arguments: first block, number of blocks, seed, pointers and shapes of the arrays, integers.
+    """
+    text = native.header_text(HEADER)
+    macros = [f"#define {name} {value}\n" for name, value in native.constant_macros(text).items()]
+    parts = [f'#include "{SHIM}"\n', *macros, text]
+    for name, function in FUNCTIONS.items():
         parameters, values, arrays, integers = ["int tile"], ["tile"], 0, 0
         for label, kind in list(function.input_types.items())[1:]:
             if wp.types.is_array(kind):
@@ -40,7 +47,10 @@ def source() -> str:
                 parameters.append(f"int {label}")
                 values.append(f"numbers[{integers}]")
                 integers += 1
-        parts.append(f"static void {name}_body({', '.join(parameters)}) {{{body}}}\n")
+        parts.append(
+            f"static void {name}_body({', '.join(parameters)}) {{\n"
+            f"    {function.key}({', '.join(function.input_types)});\n}}\n"
+        )
         parts.append(
             f'extern "C" int {name}(int begin, int blocks, unsigned seed,\n'
             f"    void** data, wp::Shape* shapes, int* numbers) {{\n"
@@ -65,7 +75,7 @@ def build(folder: Path) -> ctypes.CDLL:
 
 
 def launcher(library: ctypes.CDLL, seed: int = 0) -> Callable[..., None]:
-    """Return a function that replaces ``ops.compositing_cuda.launch_native``."""
+    """Return a function that takes the place of ``ops.compositing_cuda.launch_native``."""
 
     def launch_native(kernel: wp.Kernel, blocks: int, *args: Any, begin: int = 0) -> None:
         declared = [argument.type for argument in kernel.adj.args[1:]]

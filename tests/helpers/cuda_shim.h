@@ -118,6 +118,7 @@ struct Index {
 }  // namespace shim
 
 #define __CUDA_ARCH__ 900
+#define __device__
 #define __shared__ static
 #define threadIdx (shim::Index{shim::block->current})
 

@@ -30,7 +30,7 @@ def _own_kernels(module: ModuleType) -> list[wp.Kernel]:
 
 def test_kernels_are_discovered():
     found = [kernel.key for name in MODULES for kernel in _own_kernels(_import(name))]
-    assert {"photometric", "composite_pixels", "composite_blocks"} <= set(found)
+    assert {"photometric", "composite"} <= set(found)
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -15,6 +15,8 @@ import warp as wp
 from scgs_warp.kernels import native
 from scgs_warp.runtime.launch import launch
 
+from helpers.cuda_emulation import SHIM  # isort: skip
+
 HEADERS = sorted(path.name for path in native.FOLDER.glob("*.h"))
 COMPILERS = ("clang++", *(f"clang++-{version}" for version in range(25, 15, -1)))
 WARNINGS = ["-Wall", "-Wextra", "-Werror", "-Wno-psabi", "-Wno-unused-function"]
@@ -34,13 +36,16 @@ def compiler() -> str:
 
 @pytest.mark.parametrize("name", HEADERS)
 def test_compiles_by_itself(name, tmp_path):
-    """As C++17 beside Warp's own headers, which count as system headers."""
+    """As C++17 beside Warp's own headers, or for CUDA the emulation of a block; these count as system headers."""
     constants = native.constant_macros(native.header_text(name))
     unit = tmp_path / "unit.cpp"
-    lines = ["#define WP_NO_CRT", '#include "builtin.h"', *(f"#define {k} {v}" for k, v in constants.items())]
+    if name.endswith("_cuda.h"):
+        folder, prologue = SHIM.parent, [f"#include <{SHIM.name}>"]
+    else:
+        folder, prologue = Path(wp.__file__).parent / "native", ["#define WP_NO_CRT", '#include "builtin.h"']
+    lines = [*prologue, *(f"#define {k} {v}" for k, v in constants.items())]
     unit.write_text("\n".join([*lines, f'#include "{native.FOLDER / name}"', ""]), encoding="utf-8")
-    warp_headers = Path(wp.__file__).parent / "native"
-    command = [compiler(), "-std=c++17", "-fsyntax-only", *WARNINGS, "-isystem", str(warp_headers), str(unit)]
+    command = [compiler(), "-std=c++17", "-fsyntax-only", *WARNINGS, "-isystem", str(folder), str(unit)]
     result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert result.returncode == 0, result.stderr[-4000:]
 

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from scgs_warp.kernels import projection, reduction, skinning
-from scgs_warp.kernels.cuda.slots import sum_slot_columns
+from scgs_warp.kernels.cuda.slots import sum_slots
 from scgs_warp.runtime import launch
 from scgs_warp.runtime.cuda_launch import RecordedKernel
 from scgs_warp.runtime.kernel_arguments import parameters_of
@@ -32,11 +32,11 @@ def slot_arguments(count: int, seed: int, absolute: bool) -> tuple[Any, ...]:
 
 
 def test_other_shapes_and_missing_arrays():
-    ready = recorded(sum_slot_columns, 1, slot_arguments(1, 0, True))
+    ready = recorded(sum_slots, 1, slot_arguments(1, 0, True))
     for count, seed, absolute in ((5, 1, True), (70, 2, False), (70, 3, True), (5, 4, False), (1, 5, True)):
         got, expected = (slot_arguments(count, seed, absolute) for _ in range(2))
         ready.launch(16 * count, got, None)
-        launch.launch(sum_slot_columns, 16 * count, *expected)
+        launch.launch(sum_slots, 16 * count, *expected)
         for a, b in zip(got[3:], expected[3:]):
             if a is not None:
                 assert torch.equal(a, b) and b.any()
@@ -45,9 +45,9 @@ def test_other_shapes_and_missing_arrays():
 def test_a_grid_may_begin_later():
     """As windows of tiles do: what lies before stays as it was."""
     got, expected = (slot_arguments(10, 3, True) for _ in range(2))
-    ready = recorded(sum_slot_columns, 1, slot_arguments(1, 0, True))
+    ready = recorded(sum_slots, 1, slot_arguments(1, 0, True))
     ready.launch(16 * 4, got, None, 16 * 6)
-    launch.launch(sum_slot_columns, 16 * 4, *expected, begin=16 * 6)
+    launch.launch(sum_slots, 16 * 4, *expected, begin=16 * 6)
     for a, b in zip(got[3:], expected[3:]):
         assert torch.equal(a, b) and b[6:].any() and not b[:6].any()
 
@@ -77,7 +77,7 @@ def test_numbers_between_arrays():
 
 def test_mistakes_name_the_argument():
     arguments = slot_arguments(4, 0, True)
-    ready = recorded(sum_slot_columns, 64, arguments)
+    ready = recorded(sum_slots, 64, arguments)
     for place, wrong, error in (
         (0, arguments[0].int(), ValueError),
         (1, arguments[1].T, ValueError),
@@ -86,7 +86,7 @@ def test_mistakes_name_the_argument():
     ):
         changed = [*arguments]
         changed[place] = wrong
-        with pytest.raises(error, match="sum_slot_columns"):
+        with pytest.raises(error, match="sum_slots"):
             ready.launch(64, tuple(changed), None)
     with pytest.raises(TypeError, match="arguments"):
         ready.launch(64, arguments[:-1], None)

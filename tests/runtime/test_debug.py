@@ -196,7 +196,7 @@ def spoil_launch(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, spoil:
 )
 def test_broken_pixels_are_found(promise: str, place: int, value: float, monkeypatch, debugging: None):
     def spoil(kernel: str, args: tuple) -> None:
-        if kernel == "composite_tiles":
+        if kernel == "composite":
             args[place].view(-1)[40] = value
 
     spoil_launch(monkeypatch, compositing, "launch", spoil)
@@ -208,7 +208,7 @@ def test_broken_slots_are_found(monkeypatch: pytest.MonkeyPatch, debugging: None
     original = compositing.launch
 
     def forgetful(kernel: Any, count: int, *args: Any, **options: Any) -> None:
-        if kernel.key == "composite_tiles_adjoint":  # the last tile's adjoint is not run
+        if kernel.key == "composite_adjoint":  # the last tile's adjoint is not run
             count, options["load"] = count - 1, options["load"][:-1]
         original(kernel, count, *args, **options)
 

@@ -28,8 +28,8 @@ def emulate(monkeypatch: pytest.MonkeyPatch, library: ctypes.CDLL, seed: int = 0
     pixel form."""
 
     def portable(kernel: Any, blocks: int, *args: Any, block_dim: int, begin: int = 0) -> None:
-        assert kernel.key == "composite_blocks_adjoint"
-        launch(compositing.composite_pixels_adjoint, blocks, *args, begin=begin)
+        assert kernel.key == "composite_adjoint"
+        launch(compositing.composite_adjoint, blocks, *args, begin=begin)
 
     monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library, seed))
     monkeypatch.setattr(compositing_cuda, "launch_blocks", portable)

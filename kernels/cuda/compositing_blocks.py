@@ -1,13 +1,13 @@
-"""Alpha compositing, one block a tile, one thread a pixel, through Warp's tile API.
+"""Alpha compositing by blocks of threads through Warp's tile API: one block per tile, one thread per pixel.
 
-The portable sibling of ``compositing_cuda``, for any number of channels: same meaning and arguments as ``compositing``;
-``tile_size`` is 16. The block fetches a tile's splats in batches of 256, one a thread, into shared memory, and every
-thread walks the batch for its own pixel. Nothing here is CUDA only: with ``wp.config.enable_cpu_blocks`` the same
-kernels run (slowly) on a CPU, where they are tested.
+It serves any number of channels, with the meaning and arguments of ``compositing``; ``tile_size`` is 16. The block
+fetches a tile's splats into shared memory in batches of 256, one per thread, and every thread walks the batch for its
+own pixel. Nothing here is CUDA only: with ``wp.config.enable_cpu_blocks`` the same kernels run (slowly) on a CPU, where
+they are tested.
 
-The calls that the whole block must reach together are ``tile_max``, ``tile_sum``, ``tile_scatter_masked`` and reading
-their results; loops around them therefore have bounds that all threads share. Reading a shared tile is no such call.
-``tile_max`` at the head of a batch is also the barrier that keeps the next batch from overwriting the last one early.
+The whole block must reach ``tile_max``, ``tile_sum``, ``tile_scatter_masked`` and reads of their results together, so
+loops around them have bounds that all threads share. Reading a shared tile is no such call. ``tile_max`` at the head of
+a batch is also the barrier that keeps the next batch from overwriting the last one early.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False})
 BLOCK_DIM = TILE_SIZE * TILE_SIZE
 _LANES = wp.constant(BLOCK_DIM)
 GROUP = wp.constant(4)
-"""Channels composited in one walk (colour and depth). More channels walk again, four at a time."""
+"""Channels composited in one walk (colour and depth). More channels take further walks, four at a time."""
 _SUMS = wp.constant(SLOT_GEOMETRY + 4)
 
 Splat = wp.types.vector(length=6, dtype=wp.float32)
@@ -62,7 +62,7 @@ def pixel_group(image: wp.array3d[float], y: int, x: int, base: int) -> wp.vec4:
 
 
 @wp.kernel
-def composite_blocks(
+def composite(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N] pixels
@@ -142,7 +142,7 @@ def composite_blocks(
 
 @wp.func
 def geometry_sums(own: Splat, d: wp.vec2, falloff: float, v_alpha: float) -> Sums:
-    """What a gradient to one pixel's alpha says of the splat's mean, conic and opacity; nothing where clamped."""
+    """Turn a gradient to one pixel's alpha into those to the splat's mean, conic and opacity; zero where clamped."""
     sums = Sums()
     if own[5] * falloff <= ALPHA_MAX:
         g = v_alpha * own[5] * falloff  # gradient to -q / 2
@@ -158,7 +158,7 @@ def geometry_sums(own: Splat, d: wp.vec2, falloff: float, v_alpha: float) -> Sum
 
 
 @wp.kernel
-def composite_blocks_adjoint(
+def composite_adjoint(
     first: int,
     # In:
     means2d_in: wp.array[wp.vec2],  # [N]

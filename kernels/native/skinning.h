@@ -1,0 +1,148 @@
+// Skinning of 16 Gaussians, a lane each: the formulas of kernels/skinning.py.
+#pragma once
+#include "skinning_block.h"
+
+// e^x of x <= 0; 0 below -87.
+ALWAYS_INLINE vf exponential(vf x) {
+    FUSE_WITHIN_EXPRESSIONS
+    vf y = x < -87.0f ? vf{} - 87.0f : x;
+    vf shifted = y * 1.44269504f + 12582912.0f;
+    vf n = shifted - 12582912.0f;
+    vf f = y - n * 0.693359375f + n * 2.12194440e-4f;
+    vf p = 1.0f +
+           f * (1.0f + f * (0.5f + f * (0.16666667f + f * (4.16666667e-2f + f * (8.3333333e-3f + f * 1.3888889e-3f)))));
+    vi exponent = (__builtin_convertvector(n, vi) + 127) << 23;
+    return x < -87.0f ? vf{} : p * (vf)exponent;
+}
+
+// Move the Gaussians at x and q by their blended motion, and write them.
+ALWAYS_INLINE void move(
+    int begin, int rows, const vf* x, const vf* q, const wp::array_t<float>& motion, const wp::array_t<float>& reach,
+    const int* pick, int K, const float* weight, const vf* weights_of, int aligned, int has_log_scales,
+    wp::array_t<wp::vec3>& means_t, wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& log_scales
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    vf B[16], side[MAX_NEIGHBORS];
+    blend(motion.data, pick, weight, weights_of, K, aligned, side, B);
+    vf moved[3], b[4], u[4];
+    for (int c = 0; c < 3; ++c) moved[c] = B[4 * c] * x[0] + B[4 * c + 1] * x[1] + B[4 * c + 2] * x[2] + B[4 * c + 3];
+    vf nb = inverse_norm(B[12], B[13], B[14], B[15]), nq = inverse_norm(q[0], q[1], q[2], q[3]);
+    normalise(B + 12, nb, b);
+    normalise(q, nq, u);
+    vf turned[4] = {
+        b[0] * u[0] - b[1] * u[1] - b[2] * u[2] - b[3] * u[3], b[0] * u[1] + b[1] * u[0] + b[2] * u[3] - b[3] * u[2],
+        b[0] * u[2] - b[1] * u[3] + b[2] * u[0] + b[3] * u[1], b[0] * u[3] + b[1] * u[2] - b[2] * u[1] + b[3] * u[0]
+    };
+    write_vectors(means_t.data, begin, rows, 3, moved);
+    write_vectors(quats_t.data, begin, rows, 4, turned);
+    if (has_log_scales) {
+        float sums[16][4];
+        for (int l = 0; l < 16; ++l) {
+            v4 row = {};
+            for (int k = 0; k < K; ++k)
+                row = row + weight[l * K + k] * *(const v4*)(reach.data + 16ll * pick[l * K + k] + 4);
+            *(v4*)sums[l] = row;
+        }
+        for (int l = 0; l < rows; ++l)
+            for (int c = 0; c < 3; ++c) log_scales.data[begin + l].c[c] = sums[l][1 + c];
+    }
+}
+
+// With weights that are known.
+static inline void skin(
+    int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<wp::vec4>& quats, const wp::array_t<float>& motion,
+    const wp::array_t<float>& reach, int aligned, int has_log_scales, const wp::array_t<int>& indices,
+    const wp::array_t<float>& weights, wp::array_t<wp::vec3>& means_t, wp::array_t<wp::vec4>& quats_t,
+    wp::array_t<wp::vec3>& log_scales
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    struct Any {
+        enum { value = 0 };
+    };
+    struct Four {
+        enum { value = 4 };
+    };
+    auto run = [&](auto kc) __attribute__((always_inline)) {
+        const int K = decltype(kc)::value ? decltype(kc)::value : indices.shape[1];
+        const int rows = means.shape[0] - begin < 16 ? means.shape[0] - begin : 16;
+        vf x[3], q[4];
+        int spare_picks[16 * MAX_NEIGHBORS];
+        float spare_weights[16 * MAX_NEIGHBORS];
+        read_vectors(means.data, begin, rows, 3, x);
+        read_vectors(quats.data, begin, rows, 4, q);
+        const int* pick = (const int*)read_rows(indices.data + (long long)begin * K, rows, 4 * K, spare_picks);
+        const float* weight = (const float*)read_rows(weights.data + (long long)begin * K, rows, 4 * K, spare_weights);
+        vf columns[16];
+        if (!aligned) weight_columns(weight, K, columns);
+        move(
+            begin, rows, x, q, motion, reach, pick, K, weight, columns, aligned, has_log_scales, means_t, quats_t,
+            log_scales
+        );
+    };
+    if (indices.shape[1] == 4)
+        run(Four{});
+    else
+        run(Any{});
+}
+
+// With RBF weights, which are written too.
+static inline void skin_rbf(
+    int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<wp::vec4>& quats, const wp::array_t<float>& hyper,
+    int has_hyper, const wp::array_t<float>& motion, const wp::array_t<float>& reach, int aligned, int has_strengths,
+    int has_log_scales, const wp::array_t<int>& indices, wp::array_t<float>& weights, wp::array_t<wp::vec3>& means_t,
+    wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& log_scales
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    struct Any {
+        enum { value = 0 };
+    };
+    struct Four {
+        enum { value = 4 };
+    };
+    const int H = has_hyper ? hyper.shape[1] : 0;
+    const float infinity = __builtin_inff();
+    auto run = [&](auto kc) __attribute__((always_inline)) {
+        const int K = decltype(kc)::value ? decltype(kc)::value : indices.shape[1];
+        const int rows = means.shape[0] - begin < 16 ? means.shape[0] - begin : 16;
+        vf x[3], q[4];
+        int spare_picks[16 * MAX_NEIGHBORS];
+        float spare_weights[16 * MAX_NEIGHBORS];
+        read_vectors(means.data, begin, rows, 3, x);
+        read_vectors(quats.data, begin, rows, 4, q);
+        const int* pick = (const int*)read_rows(indices.data + (long long)begin * K, rows, 4 * K, spare_picks);
+        vf hyper_point[MAX_HYPER];
+        read_hyper(hyper, H, begin, rows, hyper_point);
+        vf w[MAX_NEIGHBORS], top = vf{} - infinity, total = vf{};
+        for (int k = 0; k < K; ++k) {
+            vf e[4 + MAX_HYPER];
+            vf logit = offset(reach.data, pick, K, k, x, hyper_point, H, e);
+            logit = logit * e[3];
+            if (has_strengths) {
+                float strength[16];
+#pragma clang loop vectorize(disable)
+                for (int l = 0; l < 16; ++l) strength[l] = reach.data[16ll * pick[l * K + k] + 4];
+                logit = logit + load16(strength);
+            }
+            w[k] = ((logit > -infinity) & (logit < infinity)) ? logit : vf{} - infinity;
+            top = w[k] > top ? w[k] : top;
+        }
+        const vi nothing_near = top == -infinity;
+        for (int k = 0; k < K; ++k) {
+            w[k] = w[k] > -infinity ? exponential(w[k] - (nothing_near ? vf{} : top)) : vf{};
+            if (k == 0) w[k] = nothing_near ? vf{} + 1.0f : w[k];
+            total = total + w[k];
+        }
+        const vf inverse = 1.0f / total;
+        for (int k = 0; k < K; ++k) w[k] = w[k] * inverse;
+        weight_rows(w, K, spare_weights);
+        __builtin_memcpy(weights.data + (long long)begin * K, spare_weights, 4 * K * rows);
+        move(
+            begin, rows, x, q, motion, reach, pick, K, spare_weights, w, aligned, has_log_scales, means_t, quats_t,
+            log_scales
+        );
+    };
+    if (indices.shape[1] == 4)
+        run(Four{});
+    else
+        run(Any{});
+}
