@@ -23,7 +23,7 @@ from ..visualization import video
 from ..visualization.figures import curves
 from ..visualization.overlay import Painter
 from .loop import fit
-from .process_group import Team
+from .process_group import ProcessGroup
 from .run_folder import read_seconds
 
 FILM_FRAMES = 120
@@ -70,7 +70,7 @@ def train_and_finish(
     lpips: Lpips | None = None,
     look: Callable[[Dataset], None] | None = None,
     tensorboard: bool = False,
-    team: Team | None = None,
+    group: ProcessGroup | None = None,
 ) -> dict[str, Any]:
     """Load, train, evaluate: what ``apps/train.py`` does.
 
@@ -82,7 +82,7 @@ def train_and_finish(
         lpips: the perceptual distance, if it is to be measured.
         look: called with the training frames before training begins.
         tensorboard: also write event files for TensorBoard to ``output``.
-        team: the processes that share the work of training; the first does the rest.
+        group: the processes that share the work of training; the first does the rest.
 
     Returns:
         what ``metrics.json`` holds; nothing in other processes than the first.
@@ -104,9 +104,9 @@ def train_and_finish(
         resume=resume,
         settings=settings_of(config, data),
         tensorboard=tensorboard,
-        team=team,
+        group=group,
     )
-    if team is not None and not team.first:
+    if group is not None and not group.first:
         return {}
     try:
         return finish(scene, test, output, frames=frames, lpips=lpips)

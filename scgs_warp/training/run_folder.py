@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -22,10 +22,8 @@ from ..runtime.progress import Progress, say
 from ..scene.scene import Scene
 from ..storage.checkpoint import FILE, PREVIOUS, write_atomically
 from ..visualization.figures import read_log
+from .state import StepResult, TrainState
 from .tensorboard import TensorBoard, check_installed
-
-if TYPE_CHECKING:
-    from .state import StepResult, TrainState
 
 LOG_EVERY = 50
 PREVIEW_SECONDS = 15.0
@@ -149,12 +147,12 @@ class RunFolder:
             pass  # a file system without locks: there a second trainer is the user's own care, too
 
     @property
-    def has_begun(self) -> bool:
+    def has_no_checkpoint(self) -> bool:
         """Whether a run has begun here that no checkpoint was written of."""
         names = (FILE, PREVIOUS)
         return (self.path / "config.json").is_file() and not any((self.path / name).exists() for name in names)
 
-    def begin(self, step: int) -> None:
+    def start(self, step: int) -> None:
         """Write the configuration; drop log lines after ``step``, which a resumed run will write again, and what was
         half written when the process was killed."""
         for left in self.path.glob(".*.tmp"):
@@ -245,14 +243,14 @@ class RunFolder:
         if done:
             write_atomically(self.path / "previews" / "latest.png", content.tobytes())
 
-    def look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+    def log_test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
         """PSNR of a few test images after ``step`` steps, for the curve."""
         scene.motion.eval()
         with self._optional("the look at held-out frames"):
-            self._look_at_test(scene, test, step)
+            self._test_psnr(scene, test, step)
         scene.motion.train()
 
-    def _look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+    def _test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
         wanted = range(0, len(test), max(1, len(test) // TEST_IMAGES))
         values = []
         for i in wanted:
@@ -267,10 +265,10 @@ class RunFolder:
             self.log({"step": step, "test_psnr": sum(values) / len(values)})
 
 
-class Onlooker(RunFolder):
+class ReadOnlyRunFolder(RunFolder):
     """The run directory as processes see it that leave it to another one: nothing is written."""
 
-    def __enter__(self) -> Onlooker:
+    def __enter__(self) -> ReadOnlyRunFolder:
         return self
 
     def __exit__(
@@ -278,7 +276,7 @@ class Onlooker(RunFolder):
     ) -> None:
         pass
 
-    def begin(self, step: int) -> None:
+    def start(self, step: int) -> None:
         pass
 
     def log(self, entry: dict[str, Any]) -> None:
@@ -287,5 +285,5 @@ class Onlooker(RunFolder):
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
         pass
 
-    def look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+    def log_test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
         pass

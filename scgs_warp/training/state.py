@@ -28,7 +28,7 @@ from .camera_refinement import CameraRefinement
 from .frames import first_frames
 from .initial_points import likely_points
 from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, sphere_base, thin_spheres
-from .process_group import Team
+from .process_group import ProcessGroup
 
 Stage = Literal["pretrain", "main"]
 
@@ -74,9 +74,9 @@ class TrainState:
         self.stage: Stage = stage
         self.step, self.fingerprint = step, fingerprint
         self.failures = 0
-        self.team: Team | None = None
+        self.group: ProcessGroup | None = None
         """The processes that share each step's views, if this is one of several; no part of a checkpoint."""
-        self.whole = True
+        self.consistent = True
         """Whether ``step`` counts all that has been done to the parameters."""
         self.cameras = CameraRefinement(frames if config.optim.cameras > 0 else 0).to(gaussians.means.device)
         self.camera_optimizer = self.cameras.optimizer()
@@ -155,7 +155,7 @@ class TrainState:
 
     def save(self, folder: Path) -> None:
         """Write the checkpoint; of several processes the first does."""
-        if self.team is not None and not self.team.first:
+        if self.group is not None and not self.group.first:
             return
         tensors = dict(self.scene().tensors())
         tensors.update(self.gaussian_optimizer.tensors("adam.gaussians"))

@@ -14,8 +14,9 @@ from scgs_warp.errors import UserError
 from scgs_warp.motion.control_points import make_network
 from scgs_warp.motion.per_gaussian import PER_GAUSSIAN_HEADS
 from scgs_warp.runtime import environment
+from scgs_warp.training.density_control import control_density
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.loop import adapt, fit
+from scgs_warp.training.loop import fit
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step
 
@@ -84,7 +85,7 @@ def test_the_motion_rests_through_the_coarse_steps(model):
     before = [parameter.detach().clone() for parameter in state.motion.parameters()]
     for step in range(config.coarse + 2):
         training_step(state, frames)
-        adapt(state, (48, 48))
+        control_density(state, (48, 48))
         state.step += 1
         same = [torch.equal(old, new) for old, new in zip(before, state.motion.parameters())]
         assert all(same) if step < config.coarse else not all(same), step

@@ -52,7 +52,7 @@ def test_the_curve_does_not_show_opacity_resets(tmp_path, monkeypatch):
     looks = []
     monkeypatch.setattr(
         RunFolder,
-        "look_at_test",
+        "log_test_psnr",
         lambda _, scene, test, step: looks.append((step, float(scene.gaussians.opacities().detach().max()))),
     )
     schedule = {"until": 45, "opacity_reset_every": 20, "every": 10}

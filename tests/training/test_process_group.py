@@ -29,7 +29,7 @@ from scgs_warp.training import loop
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
 from scgs_warp.training.multi_view import all_views
-from scgs_warp.training.process_group import team_of
+from scgs_warp.training.process_group import join_processes
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import one_view
 from scgs_warp.types import Stats
@@ -256,8 +256,8 @@ def test_place(monkeypatch):
     for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR"):
         monkeypatch.delenv(name, raising=False)
     assert torchrun.place() is None and torchrun.label() == ""
-    with team_of(torchrun.place(), "cpu") as team:
-        assert team is None
+    with join_processes(torchrun.place(), "cpu") as group:
+        assert group is None
     values = {"RANK": "3", "WORLD_SIZE": "8", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "localhost"}
     for name, value in values.items():
         monkeypatch.setenv(name, value)
