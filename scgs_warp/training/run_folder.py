@@ -88,6 +88,8 @@ class RunFolder:
         self._began = time.perf_counter()
         self._shown_at = 0.0
         self._psnr: float | None = None
+        self._regularisers: list[float] = []
+        """Weighted regulariser of each step since the last log line: only some steps carry ARAP."""
         self._told: set[str] = set()
         self._torn = False
         """Whether the log may end in the middle of a line."""
@@ -203,6 +205,8 @@ class RunFolder:
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
         """Progress, a log line every 50 steps, a preview every 15 seconds. ``state.step`` counts the step as done."""
         due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
+        if result.failed is None:
+            self._regularisers.append(result.regulariser)
         if due and result.failed is None:
             seen = slice(None) if result.mask is None else result.mask  # as the loss and the test's score do
             now = float(psnr(result.render[:, seen], result.truth[:, seen]))
@@ -215,12 +219,13 @@ class RunFolder:
                     "loss": float(result.loss),
                     "l1": float(result.l1),
                     "ssim": float(result.ssim),
-                    "regulariser": result.regulariser,
+                    "regulariser": sum(self._regularisers) / len(self._regularisers),
                     "psnr": None if self._psnr is None else round(self._psnr, 3),
                     "gaussians": len(state.gaussians),
                     "control_points": len(getattr(state.motion, "positions", ())),
                 }
             )
+            self._regularisers.clear()
         if due or result.failed:
             bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
         else:

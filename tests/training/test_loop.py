@@ -20,6 +20,7 @@ from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.evaluation.image_metrics import psnr
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
+from scgs_warp.training import loop
 from scgs_warp.training.densify import RESET_OPACITY
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
@@ -45,6 +46,26 @@ def test_every_motion_model_learns(model, tmp_path, device):
     steps = [entry["step"] for entry in log if "loss" in entry]
     assert steps == [50, 100, 150, 200]
     assert any("test_psnr" in entry for entry in log)
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_the_log_shows_the_regulariser(batch, tmp_path, monkeypatch):
+    """Each line has the mean over the steps since the line before, of which one in five carries ARAP."""
+    values = []
+    step = loop.training_step
+
+    def recorded(state, frames):
+        result = step(state, frames)
+        values.append(result.regulariser)
+        return result
+
+    monkeypatch.setattr(loop, "training_step", recorded)
+    fit(tiny_config(100, batch=batch), tiny_dataset(4), output=tmp_path / "run")
+    log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    rows = {entry["step"]: entry["regulariser"] for entry in log if "loss" in entry}
+    assert rows.keys() == {50, 100} and all(value > 0.0 for value in rows.values())
+    assert rows[50] == pytest.approx(sum(values[:50]) / 50) and rows[100] == pytest.approx(sum(values[50:]) / 50)
+    assert sum(value > 0.0 for value in values) <= 20
 
 
 def test_the_curve_does_not_show_opacity_resets(tmp_path, monkeypatch):
@@ -76,8 +97,6 @@ def test_checkpoint_round_trip(tmp_path, device):
 
 
 def test_interrupt_saves(tmp_path, monkeypatch):
-    from scgs_warp.training import loop
-
     data = tiny_dataset(6)
     step = loop.training_step
 
