@@ -9,8 +9,6 @@ import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config.presets import TrainConfig, preset, with_steps
-from scgs_warp.config.validation import check
-from scgs_warp.errors import UserError
 from scgs_warp.motion.control_points import make_network
 from scgs_warp.motion.per_gaussian import PER_GAUSSIAN_HEADS
 from scgs_warp.runtime import environment
@@ -96,10 +94,3 @@ def test_presets_begin_at_rest_for_as_long_as_the_published_ones():
     for config in (preset("paper"), preset("cpu"), preset("quick"), with_steps(preset("cpu"), 900)):
         assert 0.07 <= config.coarse / config.steps <= 0.13
         assert config.rest_steps == config.freeze
-
-
-def test_refuses_plane_settings_that_cannot_run():
-    with pytest.raises(UserError, match="plane_times"):
-        check(tiny_config(30, motion={"plane_times": 1}))
-    with pytest.raises(UserError, match="hexplane_smooth"):
-        check(tiny_config(30, loss={"hexplane_smooth": -1.0}))
