@@ -65,7 +65,7 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.runtime.progress import say
     from scgs_warp.training.dataset_advice import advise, survey
     from scgs_warp.training.process_group import join_processes
-    from scgs_warp.training.run import summary, train_and_finish
+    from scgs_warp.training.run import summary, train_and_evaluate
     from scgs_warp.training.run_folder import refuse_existing
     from scgs_warp.training.tensorboard import check_installed
 
@@ -73,7 +73,7 @@ def main(args: list[str] | None) -> None:
         check_installed()
     refuse_existing(output, options.resume)
 
-    def look(data: Dataset) -> None:
+    def show_advice(data: Dataset) -> None:
         say("\n".join(advise(survey(data), config, device)))
 
     with join_processes(where, device) as group:
@@ -81,7 +81,7 @@ def main(args: list[str] | None) -> None:
         if folder is None:  # of several processes one makes it
             folder = group.in_turn(lambda: builtin_scene(device)) if group else builtin_scene(device)
         rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "group": group}
-        metrics = train_and_finish(config, folder, output, look=look, **rest)
+        metrics = train_and_evaluate(config, folder, output, before_training=show_advice, **rest)
         say(summary(metrics))
         if group:
             say(group.summary())

@@ -1,4 +1,4 @@
-"""A run directory: config.json, log.jsonl, previews/, and who may write to it."""
+"""A run directory: config.json, log.jsonl, previews/, and the lock that admits one trainer."""
 
 from __future__ import annotations
 
@@ -26,18 +26,20 @@ from .state import StepResult, TrainState
 from .tensorboard import TensorBoard, check_installed
 
 LOG_EVERY = 50
+"""Steps between two log lines."""
 PREVIEW_SECONDS = 15.0
 LOCK = ".lock"
 TEST_IMAGES = 4
+"""Held-out images that the curve is measured on, about."""
 BOARD_IMAGES = 20
-"""Training pictures that a run shows in TensorBoard."""
+"""Number of training pictures per run in TensorBoard."""
 
 
 def read_seconds(folder: Path) -> float | None:
-    """Seconds of training according to the log; None without one."""
+    """Read the seconds of training from the log; None without a log."""
     newest: float | None = None
     for entry in _entries(folder):
-        with suppress(ValueError, KeyError, TypeError):  # not ours
+        with suppress(ValueError, KeyError, TypeError):  # a damaged line
             newest = float(entry["seconds"])
     return newest
 
@@ -48,24 +50,24 @@ def _entries(folder: Path) -> list[dict[str, Any]]:
 
 
 def refuse_existing(path: Path, resume: bool) -> None:
-    """Nothing is ever overwritten.
+    """Refuse to overwrite a run.
 
     Raises:
-        UserError: there is a run in ``path`` and ``resume`` was not asked for.
+        UserError: ``path`` holds a run, and ``resume`` is False.
     """
     if not resume and ((path / FILE).exists() or (path / PREVIOUS).exists()):
         raise UserError(f"{path}: holds a run already; continue it with --resume or choose another --output")
 
 
 class RunFolder:
-    """Use as a context manager: holds a lock, so that two trainers cannot share one directory.
+    """The run directory of a trainer; a context manager that holds a lock, so that two trainers cannot share it.
 
     With ``tensorboard`` the log's entries, and a picture now and then, also go to event files. Log, previews, event
-    files and the look at held-out frames are for the eye: where they fail, training says so once and goes on.
+    files and the scores of held-out frames are optional: where they fail, training warns once and goes on.
 
     Raises:
-        UserError: not writable, in use, or there is a run already and ``resume`` was not asked for; ``tensorboard``
-            without the package.
+        UserError: the directory is not writable, in use, or holds a run while ``resume`` is False; ``tensorboard`` is
+            asked for without its package.
     """
 
     def __init__(
@@ -92,9 +94,9 @@ class RunFolder:
         """Weighted regulariser of each step since the last log line: only some steps carry ARAP."""
         self._told: set[str] = set()
         self._torn = False
-        """Whether the log may end in the middle of a line."""
+        """True while the log may end in the middle of a line."""
         self.tell: Callable[[str], None] = say
-        """Shows a line that is no error."""
+        """Prints a line that is no error."""
 
     def __enter__(self) -> RunFolder:
         if self.resume and not self.path.is_dir():
@@ -124,7 +126,7 @@ class RunFolder:
 
     @contextmanager
     def _optional(self, what: str) -> Iterator[None]:
-        """Around what a run can do without."""
+        """Turn a failure of an optional output into one warning."""
         try:
             yield
         except (OSError, UserError) as error:
@@ -136,7 +138,7 @@ class RunFolder:
         self._lock_file = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             import fcntl
-        except ImportError:  # not on Windows: there a second trainer is the user's own care
+        except ImportError:  # Windows has no fcntl: there the user must not start a second trainer
             return
         try:
             fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -146,24 +148,24 @@ class RunFolder:
                 f"{self.path}: another trainer is running here; wait for it or choose another --output"
             ) from error
         except OSError:
-            pass  # a file system without locks: there a second trainer is the user's own care, too
+            pass  # a file system without locks: the same
 
     @property
     def has_no_checkpoint(self) -> bool:
-        """Whether a run has begun here that no checkpoint was written of."""
+        """True where a run has begun but has not written a checkpoint."""
         names = (FILE, PREVIOUS)
         return (self.path / "config.json").is_file() and not any((self.path / name).exists() for name in names)
 
     def start(self, step: int) -> None:
-        """Write the configuration; drop log lines after ``step``, which a resumed run will write again, and what was
-        half written when the process was killed."""
+        """Write the configuration, drop log lines after ``step``, which a resumed run writes again, and remove files
+        that a killed process left half written."""
         for left in self.path.glob(".*.tmp"):
             with suppress(OSError):
                 left.unlink()
         self._write_settings()
         entries: list[dict[str, Any]] = []
         for entry in _entries(self.path) if self.resume else []:
-            with suppress(ValueError, TypeError):  # not ours
+            with suppress(ValueError, TypeError):  # a damaged line
                 if int(entry.get("step", 0)) <= step:
                     self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
                     entries.append(entry)
@@ -179,10 +181,11 @@ class RunFolder:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of training, those before a resume counted in."""
+        """Seconds of training, including those before a resume."""
         return self.seconds + time.perf_counter() - self._began
 
     def log(self, entry: dict[str, Any]) -> None:
+        """Append an entry to ``log.jsonl`` and to the event files."""
         line = json.dumps({**entry, "seconds": round(self.elapsed, 2)}) + "\n"
         with self._optional("log lines"):
             torn, self._torn = self._torn, True
@@ -192,8 +195,8 @@ class RunFolder:
         self._on_board(lambda board: board.record(entry))
 
     def _on_board(self, action: Callable[[TensorBoard], None]) -> None:
-        """For those who watch in TensorBoard, if somebody does."""
-        board, self._board = self._board, None  # one that has failed once fails for good, or waits for ever
+        """Write to the event files, if there are any."""
+        board, self._board = self._board, None  # a board that failed once fails always, or waits for ever
         if board is not None:
             with self._optional("the event files for TensorBoard"):
                 action(board)
@@ -203,14 +206,15 @@ class RunFolder:
         self._on_board(lambda board: board.show(name, truth, render, step))
 
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
-        """Progress, a log line every 50 steps, a preview every 15 seconds. ``state.step`` counts the step as done."""
+        """Advance the progress bar; log every 50 steps, write a preview every 15 seconds. ``state.step`` counts this
+        step."""
         due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
         if result.failed is None:
             self._regularisers.append(result.regulariser)
         if due and result.failed is None:
-            seen = slice(None) if result.mask is None else result.mask  # as the loss and the test's score do
-            now = float(psnr(result.render[:, seen], result.truth[:, seen]))
-            if math.isfinite(now):  # equal images, both empty, have none
+            valid = slice(None) if result.mask is None else result.mask  # as in the loss and the score of the test
+            now = float(psnr(result.render[:, valid], result.truth[:, valid]))
+            if math.isfinite(now):  # the PSNR of equal images is infinite
                 self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
             self.log(
                 {
@@ -239,7 +243,7 @@ class RunFolder:
                 self.show(result)
 
     def show(self, result: StepResult) -> None:
-        """``previews/latest.png``: truth beside render."""
+        """Write ``previews/latest.png``: truth beside render."""
         import cv2
 
         pair = torch.cat([result.truth, result.render], dim=2).clamp(0.0, 1.0)
@@ -249,9 +253,9 @@ class RunFolder:
             write_atomically(self.path / "previews" / "latest.png", content.tobytes())
 
     def log_test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
-        """PSNR of a few test images after ``step`` steps, for the curve."""
+        """Log the PSNR of a few test images after ``step`` steps."""
         scene.motion.eval()
-        with self._optional("the look at held-out frames"):
+        with self._optional("scores of held-out frames"):
             self._test_psnr(scene, test, step)
         scene.motion.train()
 
@@ -271,7 +275,7 @@ class RunFolder:
 
 
 class ReadOnlyRunFolder(RunFolder):
-    """The run directory as processes see it that leave it to another one: nothing is written."""
+    """The run directory in processes other than the first: nothing is written."""
 
     def __enter__(self) -> ReadOnlyRunFolder:
         return self

@@ -60,10 +60,10 @@ def test_pictures_and_scores_that_cannot_be_written(name, done, tmp_path, monkey
     if name.endswith(".mp4"):
         monkeypatch.setattr(video._Mp4, "_write", full)
     with pytest.raises(UserError, match=r"No space left on device.*--resume makes the missing") as caught:
-        finish.train_and_finish(config(), data, run, frames=2, resume=True)
+        finish.train_and_evaluate(config(), data, run, frames=2, resume=True)
     assert name in str(caught.value) and not (run / "metrics.json").exists() and bits(run) == before
     monkeypatch.undo()
-    finish.train_and_finish(config(), data, run, frames=2, resume=True)
+    finish.train_and_evaluate(config(), data, run, frames=2, resume=True)
     assert (run / "metrics.json").exists() and bits(run) == before
 
 
@@ -74,10 +74,10 @@ def test_a_real_disk_that_is_full_after_training(done, tmp_path):
         scene, test = Scene.load(run), load(done[0], "test")
         disk.fill()
         with pytest.raises(UserError, match="No space left on device"):
-            finish.finish(scene, test, run, frames=2)
+            finish.write_results(scene, test, run, frames=2)
         assert not (run / "metrics.json").exists()
         disk.free()
-        finish.finish(scene, test, run, frames=2)
+        finish.write_results(scene, test, run, frames=2)
         assert (run / "metrics.json").stat().st_size > 100
 
 

@@ -1,13 +1,16 @@
-"""Schedules of a step: learning rates, degree of spherical harmonics and frozen motion as functions of the step."""
+"""Functions of the step: learning rates, degree of spherical harmonics, frozen motion, noise on times."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
+import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config import presets as C
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.step import SETTLED, motion_frozen, set_rates, settling, sh_degree
+from scgs_warp.training.step import SETTLED, motion_frozen, noisy_time, set_rates, settling, sh_degree
 
 
 def test_constant_rates_settle_in_the_last_share_of_the_run():
@@ -74,3 +77,18 @@ def test_spherical_harmonics_grow_and_motion_thaws():
     assert degrees == [0] * 15 + [1] * 15 + [2] * 10
     assert frozen == [True] * 5 + [False] * 35
     assert not motion_frozen(state_at(3)), "stage 1 trains the network"
+
+
+def test_noisy_times_fade_and_repeat():
+    config = tiny_config(1000, motion={"time_noise": 0.5}, optim={"network_until": 500})
+
+    def spread(stage_step: int) -> float:
+        times = [
+            noisy_time(0.5, SimpleNamespace(config=config, stage_step=stage_step, step=step), 11) for step in range(200)
+        ]
+        return float(torch.tensor(times).std())
+
+    assert spread(0) == pytest.approx(0.05, rel=0.2) and spread(250) == pytest.approx(0.025, rel=0.2)
+    assert spread(500) == 0.0 and spread(0) == spread(0)
+    state = SimpleNamespace(config=tiny_config(1000), stage_step=0, step=0)
+    assert noisy_time(0.3, state, 11) == 0.3

@@ -1,0 +1,28 @@
+"""Data sets: frames are read when they are asked for, indices are spread evenly."""
+
+from __future__ import annotations
+
+import pytest
+
+from helpers.nerfstudio_files import write
+from scgs_warp.data import load
+from scgs_warp.data.dataset import spread
+from scgs_warp.errors import UserError
+
+
+def test_a_file_that_goes_away_is_told_when_it_is_needed(tmp_path):
+    write(tmp_path)
+    data = load(tmp_path, cache_mib=0)
+    (tmp_path / "f_3.png").unlink()
+    assert data[0].image is not None
+    with pytest.raises(UserError, match=r"f_3\.png: no such image"):
+        _ = data[3].image
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 24), (1, 24), (24, 24), (25, 24), (47, 24), (1000, 24), (5, 1)])
+def test_spread_takes_no_more_than_it_may(count, most):
+    chosen = spread(count, most)
+    assert len(chosen) == len(set(chosen)) == min(count, most)
+    assert chosen == sorted(chosen) and all(0 <= index < count for index in chosen)
+    if count and most > 1:
+        assert chosen[0] == 0 and chosen[-1] == count - 1
