@@ -90,8 +90,8 @@ class RunFolder:
         self._began = time.perf_counter()
         self._shown_at = 0.0
         self._psnr: float | None = None
-        self._regularisers: list[float] = []
-        """Weighted regulariser of each step since the last log line: only some steps carry ARAP."""
+        self._regulariser = 0.0
+        """Weighted term of the last step that carried it since the last log line: one step in a few carries ARAP."""
         self._told: set[str] = set()
         self._torn = False
         """True while the log may end in the middle of a line."""
@@ -209,8 +209,8 @@ class RunFolder:
         """Advance the progress bar; log every 50 steps, write a preview every 15 seconds. ``state.step`` counts this
         step."""
         due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
-        if result.failed is None:
-            self._regularisers.append(result.regulariser)
+        if result.failed is None and result.regulariser:
+            self._regulariser = result.regulariser
         if due and result.failed is None:
             valid = slice(None) if result.mask is None else result.mask  # as in the loss and the score of the test
             now = float(psnr(result.render[:, valid], result.truth[:, valid]))
@@ -223,13 +223,13 @@ class RunFolder:
                     "loss": float(result.loss),
                     "l1": float(result.l1),
                     "ssim": float(result.ssim),
-                    "regulariser": sum(self._regularisers) / len(self._regularisers),
+                    "regulariser": self._regulariser,
                     "psnr": None if self._psnr is None else round(self._psnr, 3),
                     "gaussians": len(state.gaussians),
                     "control_points": len(getattr(state.motion, "positions", ())),
                 }
             )
-            self._regularisers.clear()
+            self._regulariser = 0.0
         if due or result.failed:
             bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
         else:

@@ -69,3 +69,10 @@ def test_unreadable_files(tmp_path):
 def test_too_few_steps():
     with pytest.raises(UserError, match="--steps 3"):
         C.with_steps(C.preset("cpu"), 3)
+
+
+def test_presets_begin_at_rest_for_as_long_as_the_published_ones():
+    """3,000 of 40,000 steps (Deformable-3D-GS) to 3,000 of 23,000 (4D-GS)."""
+    for config in (C.preset("paper"), C.preset("cpu"), C.preset("quick"), C.with_steps(C.preset("cpu"), 900)):
+        assert 0.07 <= config.coarse / config.steps <= 0.13
+        assert config.rest_steps == config.freeze

@@ -9,8 +9,10 @@ import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config import presets as C
+from scgs_warp.training.density_control import control_density
+from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.step import SETTLED, motion_frozen, noisy_time, set_rates, settling, sh_degree
+from scgs_warp.training.step import SETTLED, motion_frozen, noisy_time, set_rates, settling, sh_degree, training_step
 
 
 def test_constant_rates_settle_in_the_last_share_of_the_run():
@@ -92,3 +94,17 @@ def test_noisy_times_fade_and_repeat():
     assert spread(500) == 0.0 and spread(0) == spread(0)
     state = SimpleNamespace(config=tiny_config(1000), stage_step=0, step=0)
     assert noisy_time(0.3, state, 11) == 0.3
+
+
+@pytest.mark.parametrize("model", ["hexplane", "per-gaussian"])
+def test_the_motion_rests_through_the_coarse_steps(model):
+    data, config = tiny_dataset(6), tiny_config(30, motion={"model": model}, coarse=6)
+    state = TrainState.begin(config, data, "cpu")
+    frames = Frames(data, state.normalisation, config, "cpu")
+    before = [parameter.detach().clone() for parameter in state.motion.parameters()]
+    for step in range(config.coarse + 2):
+        training_step(state, frames)
+        control_density(state, (48, 48))
+        state.step += 1
+        same = [torch.equal(old, new) for old, new in zip(before, state.motion.parameters())]
+        assert all(same) if step < config.coarse else not all(same), step
