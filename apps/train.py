@@ -64,8 +64,8 @@ def main(args: list[str] | None) -> None:
 
     from scgs_warp.runtime.progress import say
     from scgs_warp.training.dataset_advice import advise, survey
-    from scgs_warp.training.process_group import team_of
-    from scgs_warp.training.run import summary, train_and_finish
+    from scgs_warp.training.process_group import join_processes
+    from scgs_warp.training.run import summary, train_and_evaluate
     from scgs_warp.training.run_folder import refuse_existing
     from scgs_warp.training.tensorboard import check_installed
 
@@ -73,18 +73,18 @@ def main(args: list[str] | None) -> None:
         check_installed()
     refuse_existing(output, options.resume)
 
-    def look(data: Dataset) -> None:
+    def show_advice(data: Dataset) -> None:
         say("\n".join(advise(survey(data), config, device)))
 
-    with team_of(where, device) as team:
+    with join_processes(where, device) as group:
         folder = options.data or (Path(named) if named else None)
         if folder is None:  # of several processes one makes it
-            folder = team.in_turn(lambda: builtin_scene(device)) if team else builtin_scene(device)
-        rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "team": team}
-        metrics = train_and_finish(config, folder, output, look=look, **rest)
+            folder = group.in_turn(lambda: builtin_scene(device)) if group else builtin_scene(device)
+        rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "group": group}
+        metrics = train_and_evaluate(config, folder, output, before_training=show_advice, **rest)
         say(summary(metrics))
-        if team:
-            say(team.summary())
+        if group:
+            say(group.summary())
         say(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
 
 

@@ -35,14 +35,14 @@ from scgs_warp.runtime import environment
 from scgs_warp.runtime.torchrun import process_rank
 from scgs_warp.training import step as training
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.process_group import Team, team_of
+from scgs_warp.training.process_group import ProcessGroup, join_processes
 
 assert scgs_warp.__version__
 PARTS = [
     ("view", training, "one_view"),
-    ("wait", Team, "rows"),
-    ("exchange", Team, "exchange"),
-    ("join", Team, "join"),
+    ("wait", ProcessGroup, "gather_rows"),
+    ("exchange", ProcessGroup, "all_to_all"),
+    ("join", ProcessGroup, "all_gather"),
     ("adam", Adam, "step"),
 ]
 """What rows call them: a view forward and backward, waiting for the others at its end, two ways of moving gradients."""
@@ -98,12 +98,12 @@ def main(arguments: list[str] | None) -> None:
     options = parser.parse_args(arguments)
     where = process_rank()
     device = prepare(options.device, where.threads if where and options.threads is None else options.threads)
-    with team_of(where, device) as team:
+    with join_processes(where, device) as group:
         scene = synthetic_scene("control-points", options.gaussians, options.nodes, device)
         data = training_data(scene, options.size)
         scene.motion.cache_binding(None)  # type: ignore[operator]
         state = training_state(scene, arap=False)
-        state.team, processes = team, 1 if team is None else team.size
+        state.group, processes = group, 1 if group is None else group.size
         state.config = replace(state.config, batch=processes)
         frames, clock = Frames(data, scene.normalisation, state.config, device), Clock(device)
 
@@ -120,13 +120,13 @@ def main(arguments: list[str] | None) -> None:
             "threads": environment.thread_count(),
             "model_mib": round(model_mib(scene), 1),
             "peak_mib": round(peak_mib(device) or 0.0),
-            "mib_per_step": round((team.bytes / options.steps if team else 0) / 2**20, 2),
+            "mib_per_step": round((group.bytes / options.steps if group else 0) / 2**20, 2),
             "rows": clock.rows(),
             "machine": machine(device),
             "date": now(),
         }
         print(json.dumps(result, indent=1))
-        if options.json and (team is None or team.first):
+        if options.json and (group is None or group.first):
             options.json.write_text(json.dumps(result, indent=1) + "\n")
 
 

@@ -37,7 +37,7 @@ from scgs_warp.data.synthetic.builtin import make_synthetic
 from scgs_warp.edit import EditSession
 from scgs_warp.runtime import environment
 from scgs_warp.scene.scene import Scene
-from scgs_warp.training.run import train_and_finish
+from scgs_warp.training.run import train_and_evaluate
 
 STEEPEST = 30.0
 """MiB an hour. An editor that is open for a working day may have a quarter of a gibibyte more at its end."""
@@ -134,7 +134,7 @@ def small(motion: str) -> TrainConfig:
 def train_once(place: Path, motion: str, resume: bool = False) -> Path:
     data = make_synthetic(place / "data", size=96, train=16, test=2)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        train_and_finish(small(motion), data, place / "run", frames=4, resume=resume)
+        train_and_evaluate(small(motion), data, place / "run", frames=4, resume=resume)
     return place / "run"
 
 

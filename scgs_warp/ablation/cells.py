@@ -234,7 +234,7 @@ def run_cell(cell: Cell) -> Path:
     Raises:
         UserError: the cell cannot be trained; KeyboardInterrupt: stopped, with the checkpoint saved.
     """
-    from ..training.run import train_and_finish
+    from ..training.run import train_and_evaluate
 
     folder = Path(cell.folder)
     check_cell(cell)
@@ -251,7 +251,7 @@ def run_cell(cell: Cell) -> Path:
             data = Path(settings["data"].pop("folder"))
             config = from_dict(settings, cell.name)
             resume = any((folder / name).is_file() for name in (CHECKPOINT, PREVIOUS))
-            train_and_finish(config, data, folder, device=cell.device, resume=resume, frames=0, lpips=lpips)
+            train_and_evaluate(config, data, folder, device=cell.device, resume=resume, frames=0, lpips=lpips)
     return folder / "metrics.json"
 
 

@@ -1,7 +1,7 @@
-"""Every setting of a training run (``config/fields.py``): the three presets, reading and writing.
+"""The three presets, and reading and writing of configurations.
 
-``with_steps`` scales the milestones when ``--steps`` changes the total. ``config.json`` of a run directory is
-``to_dict`` of the whole and can be read back.
+``with_steps`` scales the milestones when ``--steps`` changes the total. ``config.json`` of a run directory holds
+``to_dict`` of the configuration and can be read back.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PRESETS: tuple[str, ...] = get_args(PresetName)
 
 
 def preset(name: PresetName) -> TrainConfig:
-    """A complete configuration. ``quick``: the built-in scene; ``cpu``: minutes on two cores; ``paper``: seed S4."""
+    """Make a configuration. ``quick``: the built-in scene; ``cpu``: minutes on two cores; ``paper``: seed S4."""
     if name == "paper":
         return TrainConfig()
     cpu = TrainConfig(
@@ -83,10 +83,10 @@ def preset(name: PresetName) -> TrainConfig:
 
 
 def with_steps(config: TrainConfig, steps: int) -> TrainConfig:
-    """The same run compressed or stretched to ``steps`` in all: every milestone scales with it.
+    """Compress or stretch a run to ``steps`` in all; every milestone scales with it.
 
     Raises:
-        UserError: fewer than 10 steps.
+        UserError: ``steps`` is below 10.
     """
     if steps < 10:
         raise UserError(f"--steps {steps}: a run needs at least 10 steps")
@@ -112,11 +112,11 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 
 
 FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds", "data.cache_mib")
-"""Settings that change no bit of the result: not part of a checkpoint, and free when a run is resumed."""
+"""Settings that change no bit of the result: left out of checkpoints, and free when a run is resumed."""
 
 
 def lasting(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A configuration, as :func:`to_dict` makes it, without what is free to change."""
+    """Drop the settings that are free to change from the result of :func:`to_dict`."""
     return {
         name: lasting(value, f"{prefix}{name}.") if isinstance(value, dict) else value
         for name, value in values.items()
@@ -128,7 +128,7 @@ def from_dict(values: dict[str, Any], source: str = "config", base: Any = None, 
     """Read a (possibly partial) configuration over ``base`` (default: the preset it names, else ``paper``).
 
     Raises:
-        UserError: an unknown field or a value of the wrong type, with the file and the field.
+        UserError: a field is unknown or a value has the wrong type; names the file and the field.
     """
     if base is None:
         name = values.get("preset", "paper")
@@ -170,7 +170,11 @@ def _checked(value: Any, hint: Any, label: str) -> Any:
 
 
 def with_field(config: TrainConfig, name: str, value: Any, source: str) -> TrainConfig:
-    """One field replaced, by its dotted name (``motion.hyper_dim``); unknown names and wrong types raise UserError."""
+    """Replace one field by its dotted name (``motion.hyper_dim``).
+
+    Raises:
+        UserError: the name is unknown or the value has the wrong type.
+    """
     values: dict[str, Any] = {}
     inner = values
     if name in ("steps", "preset"):
@@ -183,16 +187,16 @@ def with_field(config: TrainConfig, name: str, value: Any, source: str) -> Train
 
 
 def whole_number(value: Any, label: str) -> int:
-    """The value, if it is an int.
+    """Return the value if it is an int.
 
     Raises:
-        UserError: it is not.
+        UserError: the value is not an int.
     """
     return _checked(value, int, label)
 
 
 def parse_value(text: str) -> Any:
-    """A JSON value, else the text itself."""
+    """Parse a JSON value; return any other text itself."""
     try:
         return parse_json(text)
     except ValueError:
@@ -200,10 +204,10 @@ def parse_value(text: str) -> Any:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """The JSON object in ``path``.
+    """Read the JSON object in ``path``.
 
     Raises:
-        UserError: it is missing, not JSON, or not an object.
+        UserError: the file is missing, not JSON, or not an object.
     """
     try:
         values = parse_json(path.read_text(encoding="utf-8"))

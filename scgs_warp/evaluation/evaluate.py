@@ -1,4 +1,4 @@
-"""How good is a scene: the metrics of one split, as training and ``apps/evaluate.py`` both report them."""
+"""Evaluation of a scene: the metrics of one split, as training and ``apps/evaluate.py`` report them."""
 
 from __future__ import annotations
 
@@ -8,48 +8,46 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..data import Dataset
 from ..errors import UserError
+from ..scene.scene import Scene
 from ..types import Frame
 from ..visualization.figures import contact_sheet, to_bytes
 from ..visualization.video import write_png
 from .image_metrics import psnr, ssim
 from .motion_metrics import load_ground_truth, score_motion
 
-if TYPE_CHECKING:
-    from ..scene.scene import Scene
-
 SHEET_ROWS = 8
-"""Images on a contact sheet, evenly spread over the split."""
+"""Number of images on a contact sheet, evenly spread over the split."""
 
 Lpips = Callable[[Tensor, Tensor], Tensor | float]
 
 
 def _mean(values: list[float]) -> float | None:
-    """None of no values; exact summation, so that the order of the images does not matter."""
+    """Mean with exact summation, so that the order of the images does not matter; None of an empty list."""
     return math.fsum(values) / len(values) if values else None
 
 
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, Any]:
-    """The row of one image; ``image`` and ``truth`` are [H, W, 3] in [0, 1] on the scene's device."""
+    """Measure one image; ``image`` and ``truth`` are [H, W, 3] in [0, 1] on the scene's device."""
     mask = None if frame.mask is None else frame.mask.to(image.device)
     row: dict[str, Any] = {"name": frame.name, "time": float(frame.time)}
     row["psnr"] = float(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
     row["ssim"] = float(ssim(image, truth, mask))
     if lpips is not None:
-        if mask is not None:  # outside the mask nothing is known: no difference there
+        if mask is not None:  # outside the mask the truth is unknown: show no difference
             image = torch.where(mask[..., None], image, truth)
         row["lpips"] = float(lpips(image, truth))
     return row
 
 
 class _Renders:
-    """Writes renders and ground truth as they come, and keeps some pairs for the contact sheet."""
+    """Writer of renders and ground truth; keeps some pairs for the contact sheet."""
 
     def __init__(self, folder: Path, count: int) -> None:
         self.folder = folder
@@ -72,7 +70,7 @@ class _Renders:
         self._write(self.folder / "truth" / f"{name}.png", pair[0])
         self._write(self.folder / "renders" / f"{name}.png", pair[1])
         if index in self._chosen:
-            if frame.mask is not None:  # outside it nothing is known: the sheet shows no error there
+            if frame.mask is not None:  # outside it the truth is unknown: show no error
                 pair = pair[0], to_bytes(torch.where(frame.mask.to(image.device)[..., None], image, truth))
             self._rows.append(pair)
             self._scores.append(score)
@@ -99,18 +97,18 @@ def evaluate(
     render_dir: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Render every frame of a split and compare: each metric is the mean over the images, of clamped floats.
+    """Render every frame of a split and compare it with the truth; a metric is the mean over the clamped images.
 
     Args:
-        scene: what to render.
+        scene: the scene to render.
         dataset: the truth. Both lie on its background colour; with ``random`` that is black.
-        lpips: (image, truth), both [H, W, 3] in [0, 1], to their perceptual distance; None: not measured.
-        render_dir: where ``renders/NAME.png``, ``truth/NAME.png`` and ``contact_sheet.png`` go; None: nowhere.
+        lpips: function from (image, truth), both [H, W, 3] in [0, 1], to their perceptual distance; None: not measured.
+        render_dir: folder for ``renders/NAME.png``, ``truth/NAME.png`` and ``contact_sheet.png``; None: not written.
         progress: called with (done, total) after each image.
 
     Returns:
         ``psnr`` [dB], ``ssim``, ``lpips`` (None if not measured), ``images``, and ``per_image``, a list of
-        ``name``, ``time``, ``psnr``, ``ssim`` (and ``lpips``). A metric of no images is None.
+        ``name``, ``time``, ``psnr``, ``ssim`` (and ``lpips``). The metrics of an empty split are None.
 
     Raises:
         UserError: ``render_dir`` cannot be written.
@@ -141,12 +139,12 @@ def metrics_of(
     render_dir: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """What ``metrics.json`` says: the metrics of ``evaluate``, and what they were measured on.
+    """Make the content of ``metrics.json``: the metrics of ``evaluate``, and a description of scene and data.
 
-    Where the data folder has ``ground_truth.npz``, ``epe`` and ``jitter`` of the motion, too.
+    Where the data folder has ``ground_truth.npz``, it includes ``epe`` and ``jitter`` of the motion.
 
     Args:
-        seconds: that training took, if known.
+        seconds: duration of the training, if known.
 
     Raises:
         UserError: ``render_dir`` cannot be written, or the ground truth cannot be read.
@@ -176,7 +174,7 @@ def metrics_of(
 
 
 def _plain(value: Any) -> Any:
-    """JSON knows no infinity (the PSNR of equal images) and no NaN: null."""
+    """Replace infinity (the PSNR of equal images) and NaN by None: JSON has neither."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -185,7 +183,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_metrics(metrics: dict[str, Any], path: str | Path) -> None:
-    """Write them as JSON, at once: a reader sees the old file or the new one.
+    """Write metrics as JSON atomically: a reader sees the old file or the new one.
 
     Raises:
         UserError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""How close an image is to the truth: PSNR, SSIM and LPIPS of one image; means over images are the caller's."""
+"""PSNR, SSIM and LPIPS of one image; the caller takes means over images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..errors import UserError
 from ..ops.ssim import ssim as planar_ssim
 
 # VGG16 (Simonyan and Zisserman 2015) up to relu5_3: the index of each convolution in torchvision's ``features``, and
-# its channels; LPIPS looks at the last activation of each of the five blocks.
+# its channels; LPIPS compares the last activation of each of the five blocks.
 _BLOCKS: tuple[tuple[tuple[int, int, int], ...], ...] = (
     ((0, 3, 64), (2, 64, 64)),
     ((5, 64, 128), (7, 128, 128)),
@@ -35,10 +35,10 @@ def psnr(image: Tensor, truth: Tensor) -> Tensor:
 
     Args:
         image: any shape, typically [H, W, 3], or [P, 3] of the valid pixels.
-        truth: of the same shape.
+        truth: the same shape.
 
     Returns:
-        A float64 scalar; infinite for equal images, NaN where an input is or for no pixels at all.
+        A float64 scalar; infinite for equal images, NaN where an input is NaN or there are no pixels.
 
     Raises:
         ValueError: the shapes differ.
@@ -70,7 +70,7 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
 class LPIPS:
     """Learned perceptual distance with VGG16 (Zhang et al. 2018, equation 1; weights of version 0.1).
 
-    Nothing is downloaded: the weights come from a file of the user's.
+    Nothing is downloaded: the user gives a file of weights.
     """
 
     def __init__(self, path: str | Path, device: torch.device | str = "cpu") -> None:
@@ -80,7 +80,7 @@ class LPIPS:
             path: a .safetensors file or a torch state dict (read with ``weights_only``) that holds VGG16's
                 convolutions as ``features.N.weight`` and ``.bias`` (or ``net.sliceK.N...``, as the lpips package
                 saves them) and the heads as ``linK.model.1.weight`` (or ``lins.K...``), K = 0 .. 4.
-            device: where the images will be.
+            device: device of the images.
 
         Raises:
             UserError: the file is missing, cannot be read, or lacks a tensor of the right shape.
@@ -101,7 +101,7 @@ class LPIPS:
 
     @torch.no_grad()
     def __call__(self, image: Tensor, truth: Tensor) -> Tensor:
-        """The distance of two images.
+        """Measure the distance of two images.
 
         Args:
             image: [H, W, 3] float32 in [0, 1], at least 16 pixels a side.
@@ -140,7 +140,7 @@ def _read(path: Path) -> dict[str, Tensor]:
 
             return load_file(path)
         loaded = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # each reader has its own ways to fail
+    except Exception as error:  # the readers raise errors of their own
         reason = (str(error) or type(error).__name__).splitlines()[0][:120]
         raise UserError(f"{path}: not readable as LPIPS weights ({reason}); {_REMEDY}") from error
     if not isinstance(loaded, dict):
@@ -149,7 +149,7 @@ def _read(path: Path) -> dict[str, Tensor]:
 
 
 def _by_role(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors under one spelling of their names."""
+    """Rename the tensors to one spelling."""
     found = {}
     for key, tensor in tensors.items():
         if match := re.fullmatch(r"(?:.*\.)?(?:features|slice[1-5])\.(\d+)\.(weight|bias)", key):

@@ -1,4 +1,4 @@
-"""How well a trained scene moves, where the true motion is known: end-point error and jitter of surface tracks."""
+"""Metrics of motion where the true one is known: end-point error and jitter of surface tracks."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from ..storage.numpy_files import read_npy
 FILE = "ground_truth.npz"
 OPAQUE = 0.5
 """A Gaussian of at most this opacity carries no surface point."""
-SMALLEST, LARGEST = 1e-15, 1e15
-"""Of a height or a coordinate: their squares are float32."""
+LEAST_LENGTH, MOST_LENGTH = 1e-15, 1e15
+"""Bounds of a height or a coordinate, whose squares are float32."""
 CHUNK = 128
-"""Surface points whose distances to all Gaussians are held at once."""
+"""Number of surface points whose distances to all Gaussians are in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class GroundTruth:
     visible: Tensor
     """[V, P] bool, per training view."""
     height: float
-    """Of the figure; errors are in percent of it."""
+    """Height of the figure; errors are in percent of it."""
 
 
 class MotionScore(NamedTuple):
-    """Both in percent of the figure's height; NaN where nothing could be scored (no Gaussian, no visible point)."""
+    """Scores in percent of the figure's height; NaN without any Gaussian or visible point."""
 
     epe: float
     """Mean distance between predicted and true point, over times and visible points."""
@@ -47,7 +47,7 @@ class MotionScore(NamedTuple):
 
 
 def load_ground_truth(folder: str | Path) -> GroundTruth | None:
-    """``ground_truth.npz`` of a data set, None where it has none.
+    """Read ``ground_truth.npz`` of a data set; None where the file is missing.
 
     Raises:
         UserError: the file is damaged, or a field is missing or misshapen.
@@ -61,7 +61,7 @@ def load_ground_truth(folder: str | Path) -> GroundTruth | None:
         raise UserError(f"{path}: points {points.shape} and times {times.shape} must be [T, P, 3] and [T]")
     if visible.ndim != 2 or visible.shape[1] != points.shape[1] or visible.dtype != bool:
         raise UserError(f"{path}: visible {visible.shape} must be [V, P] of booleans with P = {points.shape[1]}")
-    if height.shape != () or not SMALLEST < float(height) < LARGEST or not (np.abs(points) < LARGEST).all():
+    if height.shape != () or not LEAST_LENGTH < float(height) < MOST_LENGTH or not (np.abs(points) < MOST_LENGTH).all():
         raise UserError(f"{path}: height must be one positive number and points finite; make the file again")
     if not ((times >= 0) & (times <= 1)).all() or (np.diff(times) <= 0).any():
         raise UserError(f"{path}: times must increase within [0, 1]; make the file again")
@@ -73,15 +73,15 @@ def load_ground_truth(folder: str | Path) -> GroundTruth | None:
 def score_motion(
     truth: GroundTruth, positions_at: Callable[[float], Tensor], opacities: Tensor | None = None
 ) -> MotionScore:
-    """End-point error and jitter of a moving set of Gaussians.
+    """Score the motion of a set of Gaussians by end-point error and jitter.
 
     A surface point is carried by the opaque Gaussian nearest to it at the first time: its predicted track is
     ``point(t0) + gaussian(t) - gaussian(t0)``, so that at t0 the error is 0 and only motion is judged. A point counts,
-    at all times, if at least one training view sees it; the others nobody could reconstruct. Where no Gaussian is
-    opaque, all are candidates.
+    at all times, if at least one training view sees it; others cannot be reconstructed. Where no Gaussian is opaque,
+    all are candidates.
 
     Args:
-        positions_at: time in [0, 1] to Gaussian centres [N, 3], world units, always the same N in the same order.
+        positions_at: function from a time in [0, 1] to Gaussian centres [N, 3], world units, always in the same order.
         opacities: [N]; None: all are opaque.
     """
     counted = truth.visible.any(dim=0)
@@ -106,7 +106,7 @@ def score_motion(
 
 
 def score_tracks(predicted: Tensor, true: Tensor, height: float) -> MotionScore:
-    """The two figures of tracks [T, P, 3] in world units."""
+    """Score tracks [T, P, 3] in world units."""
     error = predicted.double() - true.double()
     bend = error[2:] - 2.0 * error[1:-1] + error[:-2]
     percent = 100.0 / height
@@ -114,7 +114,7 @@ def score_tracks(predicted: Tensor, true: Tensor, height: float) -> MotionScore:
 
 
 def _nearest(points: Tensor, centres: Tensor) -> Tensor:
-    """[P] index of the centre nearest to each point, the first of equals."""
+    """Index [P] of the centre nearest to each point, the first of equals."""
     found = [
         torch.cdist(chunk, centres, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)
         for chunk in points.split(CHUNK)

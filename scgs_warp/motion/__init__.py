@@ -19,11 +19,10 @@ __all__ = ["ControlPoints", "HexPlane", "Motion", "PerGaussian", "Spheres", "Sta
 
 
 def build_motion(name: str, config: TrainConfig, state: Mapping[str, Tensor] | None = None) -> Motion:
-    """A motion model by name; control points and planes are as large as those in ``state``, a
-    checkpoint's tensors.
+    """Make a motion model by name; ``state``, a checkpoint's tensors, gives the sizes of control points and planes.
 
     Raises:
-        ValueError: no such model.
+        ValueError: the name is unknown.
     """
     if name == "static":
         return Static()

@@ -24,7 +24,7 @@ NODE_NAMES = ("positions", "log_radii", "hyper", "strength_logits")
 
 
 def heads_of(config: MotionConfig) -> dict[str, int]:
-    """What the network predicts for every control point."""
+    """Output channels of the network for every control point, by name."""
     heads = {"rotations": 4, "translations": 3}
     if config.shape_rotation:
         heads["shape_rotations"] = 4
@@ -47,12 +47,13 @@ def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> Defo
 
 
 def unit_rotations(raw: Tensor) -> Tensor:
-    """Network output [..., 4] to unit quaternions near the identity."""
+    """Convert network output [..., 4] to unit quaternions near the identity."""
     return F.normalize(raw + torch.eye(1, 4, device=raw.device, dtype=raw.dtype), dim=-1)
 
 
 def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | None], masked: bool) -> Gaussians:
-    """``masked``: the last hyper-coordinate is the logit of the share of the motion that a Gaussian takes part in."""
+    """Activate the moved Gaussians. ``masked``: the last hyper-coordinate is the logit of a Gaussian's share of the
+    motion."""
     means, quats, log_scales = moved
     if masked:
         with one_piece():
@@ -93,7 +94,7 @@ class ControlPoints(Motion):
         return self.positions.shape[0]
 
     def poses(self, times: Tensor) -> list[Pose]:
-        """One :class:`Pose` per time, from one call of the network. Its input is detached: the encoding's high octaves
+        """One :class:`Pose` per time, from one network evaluation. Its input is detached: the encoding's high octaves
         would shake the control points."""
         out = self.network(self.positions.detach(), times.to(self.positions.device))
         rotations = unit_rotations(out["rotations"])
@@ -110,11 +111,11 @@ class ControlPoints(Motion):
         ]
 
     def _hyper(self, gaussians: GaussianParameters) -> Tensor:
-        """[N, H] the Gaussians' hyper-coordinates, without the mask's logit."""
+        """The Gaussians' hyper-coordinates [N, H], without the mask's logit."""
         return gaussians.hyper[:, : self.config.hyper_dim].contiguous()
 
     def neighbors(self, gaussians: GaussianParameters) -> Tensor:
-        """[N, K] int32 nearest control points of every Gaussian at rest, exact at every call: in space, with
+        """Nearest control points [N, K] int32 of every Gaussian at rest, exact at every call: in space, with
         hyper-coordinates appended where the model has them."""
         points, nodes = gaussians.means.detach(), self.positions.detach()
         if self.config.hyper_dim:
@@ -138,7 +139,7 @@ class ControlPoints(Motion):
         return _posed(gaussians, moved, self.config.mask)
 
     def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
-        """As :meth:`apply_pose` with :meth:`binding`, in one pass; ``frozen`` control points get no gradient."""
+        """Bind and pose all Gaussians in one pass; ``frozen`` control points get no gradient."""
         hyper = self.config.hyper_dim > 0
         rows = (
             self.positions,
@@ -151,20 +152,20 @@ class ControlPoints(Motion):
         nodes, radii, strengths, hyper_nodes = rows
         assert nodes is not None and radii is not None
         hyper_points = self._hyper(gaussians) if hyper else None
-        found = self.neighbors(gaussians)
+        indices = self.neighbors(gaussians)
         moved = skin_rbf(
-            gaussians.means, gaussians.quats, nodes, radii, pose, found, strengths, hyper_points, hyper_nodes
+            gaussians.means, gaussians.quats, nodes, radii, pose, indices, strengths, hyper_points, hyper_nodes
         )
         return _posed(gaussians, moved, self.config.mask)
 
     def cache_binding(self, gaussians: GaussianParameters | None) -> None:
-        """For rendering: neighbours and weights do not depend on time. None forgets them."""
+        """Keep neighbours and weights for rendering, as they do not depend on time; None forgets them."""
         with torch.no_grad():
             self._cached = None if gaussians is None else self.binding(gaussians)
         self._cached_for = None if gaussians is None else self._binding_state(gaussians)
 
     def _binding_state(self, gaussians: GaussianParameters) -> list[tuple[Tensor, int, int]]:
-        """What :meth:`binding` depends on. Two of these are equal if no tensor was replaced or changed in place."""
+        """Identify the inputs of :meth:`binding`: equal as long as no tensor is replaced or changed in place."""
         own = self.positions, self.log_radii, self.hyper, self.strength_logits
         return [
             (x, x.data_ptr(), 0 if x.is_inference() else x._version) for x in (gaussians.means, gaussians.hyper, *own)

@@ -18,14 +18,14 @@ from .base import Motion, TrainingPose
 
 SPATIAL = 64
 TEMPORAL = 25
-"""Texels along t where nobody says how many."""
+"""Default number of texels along t."""
 MULTIPLES = (1, 2)
 """Spatial resolutions: 64 and 128; time keeps its own in both, as in the 4D-GS configurations for D-NeRF."""
 WIDTH = 64
 HEADS = {"means": 3, "quats": 4, "log_scales": 3}
-"""What the heads change, and how many numbers of it."""
+"""Outputs of the heads and their widths."""
 BOUND = 1.6
-"""Half size of the planes' cube, normalised units."""
+"""Half the edge of the planes' cube, normalised units."""
 
 
 class HexPlane(Motion):
@@ -64,7 +64,7 @@ class HexPlane(Motion):
         self._packed = PackedLayers()
 
     def features(self, positions: Tensor, time: float | Tensor) -> Tensor:
-        """[N, 64] products of bilinear samples; positions outside the cube take the border's value."""
+        """Features [N, 64], products of bilinear samples; positions outside the cube take the border's value."""
         return plane_features(positions / BOUND, time, list(self.planes))
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
@@ -80,7 +80,7 @@ class HexPlane(Motion):
         return TrainingPose(self.gaussians_at(gaussians, time), variation)
 
     def train(self, mode: bool = True) -> HexPlane:
-        self._packed.forget()  # the optimiser writes where torch need not count
+        self._packed.forget()  # the optimiser writes without raising torch's version counters
         return super().train(mode)
 
     def _moved(self, gaussians: GaussianParameters, features: Tensor) -> Gaussians:
@@ -95,8 +95,8 @@ class HexPlane(Motion):
         )
 
     def _decode(self, features: Tensor) -> Tensor:
-        """[N, 10]: trunk and heads as one network of three layers, which are the trunk, the heads' first layers side
-        by side, and their last ones in a block diagonal."""
+        """Evaluate trunk and heads [N, 10] as one network of three layers: the trunk, the heads' first layers side by
+        side, and their last ones in a block diagonal."""
         if features.device.type != "cpu":
             hidden = self.trunk(features)
             return torch.cat([head(hidden) for head in self.heads.values()], dim=1)
@@ -108,7 +108,7 @@ class HexPlane(Motion):
         return evaluate(packed, features, when)
 
     def _layers(self) -> tuple[list[Tensor], list[Tensor]]:
-        first, last = ([cast(nn.Linear, head[place]) for head in self.heads.values()] for place in (1, 3))  # type: ignore[index]
+        first, last = ([cast(nn.Linear, head[index]) for head in self.heads.values()] for index in (1, 3))  # type: ignore[index]
         weights = [
             self.trunk.weight,
             torch.cat([layer.weight for layer in first]),

@@ -20,8 +20,8 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
 
 
 class _Bfloat16Linear(torch.autograd.Function):
-    """A linear layer in bfloat16. The sums over the rows, which are the parameters' gradients, are made in one piece:
-    how oneDNN cuts them depends on the number of threads (seen with AMX, 9,999 rows)."""
+    """A linear layer in bfloat16. The parameters' gradients, sums over the rows, are computed in one piece: oneDNN's
+    partition depends on the number of threads (with AMX, at 9,999 rows)."""
 
     @staticmethod
     def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -39,12 +39,12 @@ class _Bfloat16Linear(torch.autograd.Function):
 
 
 def _bfloat16_linear(x: Tensor, layer: nn.Module) -> Tensor:
-    """[N, in] to [N, out], bfloat16."""
+    """Apply the layer to [N, in], giving [N, out] in bfloat16."""
     return cast(Tensor, _Bfloat16Linear.apply(x, layer.weight, layer.bias))
 
 
 class DeformationNetwork(nn.Module):
-    """Position and time to the channels of a rigid motion: ``heads`` name the outputs and their widths.
+    """Maps position and time to the channels of a rigid motion; ``heads`` name the outputs and their widths.
 
     Eight layers of 256 by default; the output of layer ``skip`` is concatenated with the input. The heads start at
     almost zero, so the scene starts at rest.
@@ -80,11 +80,11 @@ class DeformationNetwork(nn.Module):
         self._packed = PackedLayers()
 
     def train(self, mode: bool = True) -> DeformationNetwork:
-        self._packed.forget()  # the optimiser writes where torch need not count
+        self._packed.forget()  # the optimiser writes without raising torch's version counters
         return super().train(mode)
 
     def forward(self, positions: Tensor, times: Tensor) -> dict[str, Tensor]:
-        """Every position at every time.
+        """Evaluate every position at every time.
 
         Args:
             positions: [M, 3] rest positions in the normalised scene.
@@ -102,7 +102,7 @@ class DeformationNetwork(nn.Module):
         return dict(zip(self.heads, out.split(list(self.heads.values()), dim=-1)))
 
     def _layered(self, where: Tensor, when: Tensor) -> Tensor:
-        """Layer by layer in torch: on CUDA, in bfloat16, and where positions or times want a gradient."""
+        """Evaluate layer by layer in torch: on CUDA, in bfloat16, and where positions or times need a gradient."""
         count, instants = where.shape[0], when.shape[0]
         both = [where[None].expand(instants, -1, -1), when[:, None].expand(-1, count, -1)]
         inputs = torch.cat(both, dim=-1).reshape(instants * count, -1)
@@ -116,7 +116,7 @@ class DeformationNetwork(nn.Module):
         return self.head(hidden.float())
 
     def _fused(self, where: Tensor, when: Tensor) -> Tensor | None:
-        """All layers in one kernel, where there is one for them."""
+        """Evaluate all layers in one kernel; None where no kernel fits them."""
         layers = [cast(nn.Linear, layer) for layer in (*self.layers, self.head)]
         weights: list[Tensor] = [layer.weight for layer in layers]
         biases: list[Tensor] = [layer.bias for layer in layers]

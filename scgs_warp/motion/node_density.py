@@ -1,4 +1,4 @@
-"""Adaptive control points: clone where the image still pulls, prune what moves nothing (paper section 4.3)."""
+"""Adaptive control points: clone where gradients are large, prune where influence is small (paper section 4.3)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ..optim import Adam
 from .control_points import NODE_NAMES, ControlPoints
 
 PRUNE_IMPACT = 1e-2
-"""A control point whose weights over all Gaussians sum to less than this moves nothing visible."""
+"""Sum of weights over all Gaussians below which a control point is pruned: it moves nothing visible."""
 MOST_NEW = 0.1
-"""At most this share of new control points at a time: the largest gradients win."""
+"""Largest share of new control points at a time, those with the largest gradients."""
 
 
 class Influence(NamedTuple):
@@ -26,11 +26,11 @@ class Influence(NamedTuple):
     gradient: np.ndarray
     """[M] weighted mean of the Gaussians' screen gradients."""
     centre: np.ndarray
-    """[M, 3] mean position of its Gaussians, weighted by weight and gradient: where a clone is needed."""
+    """[M, 3] mean position of its Gaussians, weighted by weight and gradient: the position of a clone."""
 
 
 def influence(motion: ControlPoints, gaussians: GaussianParameters, gradient: Tensor) -> Influence:
-    """``bincount`` adds in row order, so the result does not depend on threads."""
+    """Sum over the Gaussians of each control point. ``bincount`` adds in row order, whatever the threads."""
     with torch.no_grad():
         indices, weights = motion.binding(gaussians)
     flat = indices.cpu().numpy().ravel()
@@ -56,21 +56,21 @@ def adapt_control_points(
 
     Args:
         motion, optimizer: changed; clones inherit radius, weight and hyper-coordinates, with zero moments.
-        gaussians: whose neighbours and weights count.
+        gaussians: bound to the control points.
         gradient: [N] mean screen-space gradient of each Gaussian, normalised device coordinates.
         grad_threshold: clone a control point whose weighted mean gradient exceeds this.
 
     Returns:
-        how many were cloned, how many pruned.
+        numbers of clones and of pruned control points.
     """
-    found = influence(motion, gaussians, gradient)
-    keep = found.impact >= PRUNE_IMPACT
+    sums = influence(motion, gaussians, gradient)
+    keep = sums.impact >= PRUNE_IMPACT
     fewest = motion.config.neighbors + 1
     if keep.sum() < fewest:
-        keep[np.argsort(-found.impact, kind="stable")[:fewest]] = True
-    wanted = keep & (found.gradient > grad_threshold) & np.isfinite(found.centre).all(axis=1)
+        keep[np.argsort(-sums.impact, kind="stable")[:fewest]] = True
+    wanted = keep & (sums.gradient > grad_threshold) & np.isfinite(sums.centre).all(axis=1)
     most = max(1, int(MOST_NEW * len(motion)))
-    cloned = np.argsort(-np.where(wanted, found.gradient, -1.0), kind="stable")[: min(most, int(wanted.sum()))]
+    cloned = np.argsort(-np.where(wanted, sums.gradient, -1.0), kind="stable")[: min(most, int(wanted.sum()))]
     kept = np.nonzero(keep)[0]
     if len(cloned) == 0 and len(kept) == len(motion):
         return 0, 0
@@ -80,7 +80,7 @@ def adapt_control_points(
     names = tuple(name for name in NODE_NAMES if name != "strength_logits" or motion.config.node_weight)
     pruned = len(motion) - len(kept)
     optimizer.regather(motion, names, index, fresh)
-    centres = torch.from_numpy(found.centre[cloned]).to(motion.positions)
+    centres = torch.from_numpy(sums.centre[cloned]).to(motion.positions)
     motion.positions.data[len(kept) :] = centres
     motion.graph = None
     return len(cloned), pruned

@@ -27,11 +27,11 @@ class Spheres(Motion):
         self.graph: Graph | None = None
 
     def translations(self, positions: Tensor, times: Tensor) -> Tensor:
-        """[T, n, 3] displacement of ``positions`` [n, 3] (detached: the octaves of the encoding would shake them)."""
+        """Displacements [T, n, 3] of ``positions`` [n, 3], detached: the encoding's octaves would shake them."""
         return self.network(positions.detach(), times.to(positions.device))["translations"]
 
-    def _place(self, gaussians: GaussianParameters, means: Tensor) -> Gaussians:
-        # A product with ones instead of expand: its adjoint then sums in a fixed order.
+    def _spheres_at(self, gaussians: GaussianParameters, means: Tensor) -> Gaussians:
+        # The adjoint of a product with ones sums in a fixed order; that of expand does not.
         ones = torch.ones(len(gaussians), 1, device=means.device)
         scales = (ones @ self.log_radius.exp()).expand(-1, 3)
         return Gaussians(
@@ -40,20 +40,20 @@ class Spheres(Motion):
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
         moved = gaussians.means + self.translations(gaussians.means, torch.tensor([time]))[0]
-        return self._place(gaussians, moved)
+        return self._spheres_at(gaussians, moved)
 
     def train_at(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
     ) -> TrainingPose:
         if step < config.pretrain.warm_up:
-            return TrainingPose(self._place(gaussians, gaussians.means), None)
+            return TrainingPose(self._spheres_at(gaussians, gaussians.means), None)
         rigid = config.pretrain.arap_weight > 0 and step % config.loss.arap_every == 0
         times = [time]
         if rigid:
             self.refresh_graph(gaussians, step, config.loss)
             times += arap_times(config.loss, generator(seed, 22, step * config.batch + view))
         moves = self.translations(gaussians.means, torch.tensor(times))
-        posed = self._place(gaussians, gaussians.means + moves[0])
+        posed = self._spheres_at(gaussians, gaussians.means + moves[0])
         if not rigid or self.graph is None:
             return TrainingPose(posed, None)
         weight = config.pretrain.arap_weight * config.loss.arap_every

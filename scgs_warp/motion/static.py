@@ -10,7 +10,7 @@ from .base import Motion
 
 
 class Static(Motion):
-    """Gaussians that stay where they are."""
+    """Gaussians at rest."""
 
     name = "static"
     moves = False

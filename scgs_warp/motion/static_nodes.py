@@ -1,4 +1,4 @@
-"""Gaussians that stand still, with control points to take hold of: what editing needs of a static scene."""
+"""Control points of a static scene, sampled for editing."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ..types import Gaussians, Pose
 from .base import Motion
 
 COUNT = 512
-"""Control points, where nobody says how many."""
+"""Default number of control points."""
 NEIGHBORS = 4
 OPAQUE = 0.1
-"""Gaussians of less opacity are followed by no control point: floaters would take the farthest ones."""
+"""Least opacity of Gaussians that control points are sampled from: floaters would attract the farthest ones."""
 CORE = 0.98
 """Share of the opaque Gaussians, nearest to their median first, that control points are sampled from."""
 SPACINGS = 0.75
-"""A control point's radius, in distances to its three nearest neighbours."""
+"""Ratio of a control point's radius to the mean distance to its three nearest neighbours."""
 
 
 class StaticNodes(Motion):
-    """Control points [M, 3] at rest for ever; buffers, not parameters: nothing here is trained."""
+    """Control points [M, 3] at rest; buffers, not parameters, as nothing is trained."""
 
     name = "static"
     moves = False
@@ -40,10 +40,10 @@ class StaticNodes(Motion):
     @staticmethod
     @torch.no_grad()
     def sample(gaussians: GaussianParameters, count: int = COUNT) -> StaticNodes:
-        """Spread evenly over the opaque Gaussians, as farthest points.
+        """Sample control points evenly over the opaque Gaussians, as farthest points.
 
         Args:
-            count: at most this many; fewer where there are fewer Gaussians.
+            count: number of control points, at most that of Gaussians.
         """
         means, opacities = gaussians.means.detach(), gaussians.opacities().detach()
         finite = means.isfinite().all(dim=1)
@@ -61,21 +61,21 @@ class StaticNodes(Motion):
         return self.positions.shape[0]
 
     def poses(self, times: Tensor) -> list[Pose]:
-        """Rest, at every time."""
+        """One :class:`Pose` per time, all at rest."""
         zeros = torch.zeros_like(self.positions)
         still = torch.zeros(len(self), 4, device=zeros.device)
         still[:, 0] = 1.0
         return [Pose(zeros, still) for _ in range(times.shape[0])]
 
     def trajectories(self, times: Tensor) -> Tensor:
-        """[T, M, 3]"""
+        """Control points [T, M, 3], the same at all times."""
         return self.positions.expand(times.shape[0], -1, -1)
 
     def control_points_at(self, time: float) -> Tensor:
         return self.positions
 
     def neighbors(self, gaussians: GaussianParameters) -> Tensor:
-        """[N, K] int32, nearest first."""
+        """Nearest control points [N, K] int32 of every Gaussian, nearest first."""
         means = gaussians.means.detach()
         return nearest(means, self.positions, min(NEIGHBORS, len(self)))[0]
 
@@ -87,8 +87,8 @@ class StaticNodes(Motion):
 
     @torch.no_grad()
     def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
-        """Linear blend skinning of all Gaussians (SC-GS, Eq. 6-7); to the bit as they were where no control point has
-        moved."""
+        """Linear blend skinning of all Gaussians (SC-GS, Eq. 6-7). Gaussians of unmoved control points keep their
+        bits."""
         means, quats, _ = skin(gaussians.means.detach(), gaussians.quats.detach(), self.positions, pose, *binding)
         rest = gaussians.activate()
         moved = pose.translations.any(dim=1) | pose.rotations[:, 1:].any(dim=1)
@@ -101,7 +101,7 @@ class StaticNodes(Motion):
 
 
 def spacing(nodes: Tensor) -> Tensor:
-    """[M] mean distance to the three nearest other nodes; 1 for a lone one."""
+    """Mean distance [M] to the three nearest other nodes; 1 for a single node."""
     count = min(3, nodes.shape[0] - 1)
     if count < 1:
         return torch.ones(nodes.shape[0], device=nodes.device)

@@ -1,4 +1,4 @@
-"""Where to start with sparse points: they lie on texture alone, so bare walls and the far background get some, too."""
+"""Initial points for bare walls and the far background: sparse points of a reconstruction lie on texture alone."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from ..seeding import generator
 from ..types import Camera, Frame
 
 MOST_VIEWS = 100
+"""Frames through which rays are cast, at most."""
 NEAREST = 3
-"""Projected points whose median depth is that of a pixel."""
+"""Number of projected points whose median depth is taken for a pixel."""
 FARTHEST = 1.5
-"""A surface without texture lies behind what has some: up to this many times as far."""
+"""Largest ratio of a point's depth to that of nearby texture: surfaces without texture lie behind it."""
 
 
 def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pixels [P, 2] and depths [P] of the points [P, 3] in front of the camera, inside its image."""
+    """Return pixels [Q, 2] and depths [Q] of those points [P, 3] that the camera has in its image."""
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     local = local[local[:, 2] > 1e-3]
     pixels = local @ camera.K.T
@@ -32,39 +33,39 @@ def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _valid_cells(count: int, frame: Frame, random: torch.Generator) -> Tensor:
-    """[count] pixels inside the mask, row times width plus column, with repetition; [0] where there are none."""
-    # Drawn as integers: torch.multinomial takes no more than 2^24 pixels.
+    """Draw valid pixels [count], row times width plus column, with repetition; [0] where the mask is empty."""
+    # torch.multinomial takes at most 2^24 pixels; integers have no such limit.
     if frame.mask is None:
         return torch.randint(frame.camera.width * frame.camera.height, (count,), generator=random)
     valid = frame.mask.flatten().nonzero()[:, 0]
     return valid[torch.randint(len(valid), (count,), generator=random)] if len(valid) else valid
 
 
-def backdrop(
+def background_points(
     count: int, points: Tensor, data: Sequence[Frame], normalisation: Normalisation, seed: int, key: int
 ) -> tuple[Tensor, Tensor]:
-    """Points on random rays through the images, and the colours of their pixels.
+    """Place points on random rays through the images, with the colours of their pixels.
 
-    The depth is that of the nearest sparse points in the image, times a factor between 1 and ``FARTHEST``.
+    The depth is that of the nearest sparse points in the image, times a random factor between 1 and ``FARTHEST``.
 
     Args:
-        count: how many, at most: a frame that sees no sparse point, or has no valid pixel, leaves out its share.
-        points: [P, 3] the data's own, normalised.
+        count: number of points, at most: a frame that sees no sparse point, or has no valid pixel, omits its share.
+        points: [P, 3] sparse points of the data, normalised.
 
     Returns:
-        points [B, 3], normalised, and their colours [B, 3], B <= ``count``. Their order is random: however many of the
-        first are taken, they lie in the sight of all frames.
+        points [B, 3], normalised, and colours [B, 3], B <= ``count``, in random order: any number of the first ones is
+        spread over all frames.
     """
     chosen = spread(len(data), MOST_VIEWS)
     found, colors = [], []
-    for place, index in enumerate(chosen):
+    for ray_set, index in enumerate(chosen):
         frame = data[index]
-        share = count * (place + 1) // len(chosen) - count * place // len(chosen)
+        share = count * (ray_set + 1) // len(chosen) - count * ray_set // len(chosen)
         camera = normalisation.apply_camera(frame.camera).to("cpu")
         known, depths = _project(points.cpu(), camera)
         if share == 0 or len(known) == 0:
             continue
-        random = generator(seed, key, place)
+        random = generator(seed, key, ray_set)
         cells = _valid_cells(share, frame, random)
         if len(cells) == 0:
             continue

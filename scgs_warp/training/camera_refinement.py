@@ -1,4 +1,4 @@
-"""Small corrections of the training cameras' poses, learnt with the scene: structure from motion is off by a pixel."""
+"""Camera refinement: small pose corrections learnt with the scene, as structure from motion is off by a pixel."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from ..types import Camera
 class CameraRefinement(nn.Module):
     """One element of se(3) for each training frame: ``viewmat' = viewmat exp(twist)``.
 
-    The twists act in the normalised world, about its centre, so that their mean is a motion of the scene as a whole,
-    which no image can tell: :meth:`centre` takes it out after every step. Held-out frames keep the poses they were
-    given: a correction that is learnt from a frame's own image must not reach the frames the scene is judged by.
+    The twists act in the normalised world, about its centre, so that their mean is a motion of the whole scene, which
+    no image determines: :meth:`centre` removes it after every step. Held-out frames keep their given poses: a
+    correction learnt from a frame's own image must not reach the frames that judge the scene.
     """
 
     def __init__(self, count: int) -> None:
@@ -30,7 +30,7 @@ class CameraRefinement(nn.Module):
         """[V, 6] rotation vector (radians), then translation (normalised units)."""
 
     def matrices(self, index: Sequence[int] | Tensor) -> Tensor:
-        """[n, 4, 4] rigid transforms of the frames ``index`` [n]; differentiable, at the identity too."""
+        """Rigid transforms [n, 4, 4] of the frames ``index`` [n]; differentiable, at the identity too."""
         twists = self.twists[index]
         x, y, z = twists[:, 0], twists[:, 1], twists[:, 2]
         zero = torch.zeros_like(x)
@@ -38,49 +38,50 @@ class CameraRefinement(nn.Module):
         return torch.linalg.matrix_exp(torch.stack(rows, dim=1).view(-1, 4, 4))
 
     def apply(self, camera: Camera, index: int) -> Camera:
-        """The corrected camera of frame ``index``; ``camera`` sees the normalised scene."""
+        """Correct the camera of frame ``index``, given in the normalised scene."""
         return Camera(camera.viewmat @ self.matrices([index])[0], camera.K, camera.width, camera.height)
 
     def optimizer(self) -> Adam:
+        """Make the optimiser of the twists; its rate is set every step."""
         return Adam(dict(self.named_parameters()), {"twists": 0.0})
 
     def centre(self) -> None:
-        """Take out the mean correction."""
+        """Subtract the mean correction."""
         with torch.no_grad():
             ones = torch.ones(1, len(self.twists), device=self.twists.device)
             self.twists.data -= ones @ self.twists / len(self.twists)
 
 
 def refined(data: Dataset, folder: Path, normalisation: Normalisation) -> Dataset | None:
-    """Training frames with the poses that the run in ``folder`` found for them, which are those its scene fits.
+    """Replace the poses of training frames by those that the run in ``folder`` has refined: its scene fits them.
 
     Args:
-        data: the split that was trained on, with the poses it was given.
+        data: the training split, with its given poses.
         normalisation: of the run's scene.
 
     Returns:
-        None where the run refined no poses, or those of other frames than these.
+        the data with refined poses; None where the run refined no poses, or those of other frames.
 
     Raises:
-        UserError: there is no checkpoint, or it is damaged.
+        UserError: the checkpoint is missing or damaged.
     """
     tensors, metadata = checkpoint.read(folder, ("cameras.",))
     twists = tensors.get("cameras.twists")
     if twists is None or metadata.get("frames") != data.fingerprint or twists.shape != (len(data), 6):
         return None
-    found = CameraRefinement(len(data))
-    found.twists.data[:] = twists
+    refinement = CameraRefinement(len(data))
+    refinement.twists.data[:] = twists
     cameras = []
     for index, given in enumerate(data.cameras):
         with torch.no_grad():
-            camera = found.apply(normalisation.apply_camera(given), index)
+            camera = refinement.apply(normalisation.apply_camera(given), index)
         cameras.append(normalisation.undo_camera(camera))
     return data.with_cameras(cameras)
 
 
 def camera_rate(step: int, optim: OptimConfig, start: int) -> float:
-    """Learning rate at this main step: 0 until ``start``, when the scene is worth aligning to; then it decays with that
-    of the Gaussians' positions, to a hundredth."""
+    """Learning rate at this main step: 0 until ``start``, when the scene has taken shape; then it decays log-linearly
+    to a hundredth at ``means_until``."""
     if step < start:
         return 0.0
     return log_linear(optim.cameras, 0.01 * optim.cameras, step - start, max(optim.means_until - start, 1))

@@ -1,6 +1,6 @@
-"""What to expect of a data set, in two lines, before time is spent on it: what it is, and which setting helps.
+"""Advice on a data set in two lines before training: its properties, the expected result, and the most useful setting.
 
-Thresholds are angles and shares that a user can check in the pictures; what the settings are worth is in
+Thresholds are angles and shares that a user can check in the pictures; the gains of the settings are in
 ``docs/quality.md`` and ``docs/design.md``.
 """
 
@@ -19,51 +19,51 @@ from ..types import Frame
 
 MOST_PAIRS = 12
 FEWEST_PAIRS = 6
-"""Pairs of neighbouring frames, seen from nearly the same place, whose pixels are compared."""
+"""Numbers of pairs of neighbouring frames, seen from nearly the same place, whose brightness is compared."""
 SAME_PLACE = 5.0
-"""Degrees between cameras that see the same light."""
+"""Largest angle in degrees between cameras that see the same light."""
 LITTLE_PARALLAX = 5.0
-"""Degrees: seen from the scene, the cameras are that close together. Depth is then a guess."""
+"""Angle in degrees, seen from the scene, within which all cameras lie where depth is a guess."""
 JUMPS = 10.0
-"""Degrees between neighbours in time beyond which the camera goes elsewhere at every instant, as in D-NeRF."""
+"""Angle in degrees between neighbours in time beyond which the camera jumps at every instant, as in D-NeRF."""
 GAP = 5.0
-"""Times the usual distance between instants: nothing is known of the motion in between."""
+"""Ratio to the usual distance between instants, beyond which the motion in between is unknown."""
 UNSTEADY = 0.08
-"""Relative change of brightness between neighbouring frames that is a change of exposure."""
+"""Relative change of brightness between neighbouring frames that indicates a change of exposure."""
 FEW_VISITS = 20
 """Steps per frame below which frames are hardly learnt."""
-LARGE = 1_000_000
-"""Pixels of an image that make training slow on a CPU."""
+LARGE_IMAGE = 1_000_000
+"""Pixels per image beyond which training is slow on a CPU."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a data set offers."""
+    """Properties of a data set."""
 
     frames: int
     width: int
     height: int
     instants: int
     views: int
-    """Most frames of one instant."""
+    """Largest number of frames of one instant."""
     arc: float
-    """Degrees: the largest angle between two cameras, seen from the middle of the scene."""
+    """Largest angle in degrees between two cameras, seen from the centre of the scene."""
     turn: float
-    """Degrees: the median angle between the cameras of neighbouring instants."""
+    """Median angle in degrees between the cameras of neighbouring instants."""
     gap: tuple[float, float]
-    """The longest time without a frame, from and to."""
+    """Beginning and end of the longest time without a frame."""
     typical_gap: float
     """Median distance between neighbouring instants."""
     cut_out: bool
-    """Whether alpha tells objects from nothing."""
+    """True where alpha separates objects from the background."""
     flicker: float
     """Relative change of brightness from frame to frame (the ninth decile), where the camera hardly moves."""
     points: int
-    """Initial points that the data bring."""
+    """Number of initial points in the data."""
 
 
 def survey(data: Dataset) -> Survey:
-    """Look at the cameras and times of all frames, and at the pixels of some."""
+    """Examine the cameras and times of all frames, and the pixels of some."""
     times = np.array([entry.time for entry in data.entries])
     instants, counts = np.unique(times, return_counts=True)
     steps = np.diff(instants)
@@ -91,26 +91,26 @@ def survey(data: Dataset) -> Survey:
 
 
 def _directions(data: Dataset) -> np.ndarray:
-    """[V, 3] unit vectors from the middle of the scene to the cameras."""
+    """Unit vectors [V, 3] from the centre of the scene to the cameras."""
     centre = Normalisation.fit(data.cameras, data.points).centre
     offsets = np.stack([camera.position.double().cpu().numpy() for camera in data.cameras]) - centre
     return offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
 
 
 def _flicker(data: Dataset, pairs: list[tuple[int, int]]) -> float:
-    """What exposure changes by between frames that follow each other and are seen from nearly the same place."""
+    """Measure the change of exposure between successive frames seen from nearly the same place."""
     changes = []
     if len(pairs) < FEWEST_PAIRS:
         return 0.0
-    for place in spread(len(pairs), MOST_PAIRS):
-        before, after = (_brightness(data[index], data.background == "white") for index in pairs[place])
+    for chosen in spread(len(pairs), MOST_PAIRS):
+        before, after = (_brightness(data[index], data.background == "white") for index in pairs[chosen])
         if before > 0 and after > 0:
             changes.append(abs(math.log(after / before)))
     return math.expm1(float(np.quantile(changes, 0.9))) if changes else 0.0
 
 
 def _brightness(frame: Frame, on_white: bool) -> float:
-    """Mean over what is neither transparent nor masked: a figure that fills more of the image is no brighter."""
+    """Mean over opaque valid pixels: a figure that fills more of the image is no brighter."""
     image = frame.image.mean(dim=2).double()
     weight = torch.ones_like(image) if frame.alpha is None else frame.alpha.double()
     if frame.alpha is not None and on_white:
@@ -121,7 +121,7 @@ def _brightness(frame: Frame, on_white: bool) -> float:
 
 
 def advise(found: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str, str]:
-    """Two lines: what the data are, and what to expect and which setting helps."""
+    """Write two lines: the data's properties; the expected result and the most useful setting."""
     cameras = (
         f"{found.views} views of each instant"
         if found.views > 1
@@ -152,11 +152,11 @@ def _expectation(found: Survey) -> str:
 
 
 def _help(found: Survey, config: TrainConfig, device: str) -> str:
-    """The setting that is worth most here."""
+    """Name the setting that gains most."""
     if found.instants < 2 and config.motion.model != "static":
         return "--motion static is all it needs"
-    if found.width * found.height > LARGE and device == "cpu":
-        factor = math.ceil(math.sqrt(found.width * found.height / LARGE)) * config.data.downscale
+    if found.width * found.height > LARGE_IMAGE and device == "cpu":
+        factor = math.ceil(math.sqrt(found.width * found.height / LARGE_IMAGE)) * config.data.downscale
         return f"on a CPU, --downscale {factor} makes it several times faster"
     if config.steps < FEW_VISITS * found.frames:
         wanted = math.ceil(FEW_VISITS * found.frames / 1000) * 1000

@@ -1,4 +1,7 @@
-"""Grow, split, prune, reset: from statistics and thresholds to new rows (3D-GS section 5; seed S4)."""
+"""Row operations on Gaussians and their optimiser: clone, split, prune, reset (3D-GS section 5; seed S4).
+
+``density_control.py`` decides when and on which rows.
+"""
 
 from __future__ import annotations
 
@@ -7,37 +10,14 @@ import math
 import torch
 from torch import Tensor
 
-from ..config.presets import DensifyConfig
 from ..gaussians import GaussianParameters
 from ..geometry.rotation import rotate
 from ..optim import Adam
-from ..runtime import memory
 from ..types import Stats
 
 SPLIT_SHRINK = 1.6
-"""A split Gaussian's two halves are this much smaller (3D-GS)."""
+"""Ratio of a split Gaussian's scales to those of its two halves (3D-GS)."""
 RESET_OPACITY = 0.01
-NUMBERS_PER_PARAMETER = 6
-"""float32 in memory for each parameter: itself, its gradient, two moments, the posed value and its gradient."""
-NUMBERS_OF_A_STEP = 220
-"""float32 in memory for each Gaussian: its splat, its gradients, and what four pairs of splat and tile take."""
-
-
-def threshold(config: DensifyConfig, width: int, height: int) -> float:
-    """Gradient threshold at this image size."""
-    return config.grad_threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent
-
-
-def most_that_fit(gaussians: GaussianParameters, wanted: int) -> int:
-    """How many Gaussians memory allows, at most ``wanted``: with their gradients, Adam's moments, what a step computes
-    of each, and the pairs of splat and tile that each has on average."""
-    count = len(gaussians)
-    numbers = sum(parameter.numel() for parameter in gaussians.parameters()) / max(count, 1)
-    each = round(4 * (NUMBERS_PER_PARAMETER * numbers + NUMBERS_OF_A_STEP))
-    device = gaussians.means.device
-    if memory.fits(each * max(min(wanted, 2 * count) - count, 0), device):  # no densification more than doubles them
-        return wanted
-    return min(wanted, count + memory.room(device) // each)
 
 
 def mean_gradient(stats: Stats) -> Tensor:
@@ -45,53 +25,29 @@ def mean_gradient(stats: Stats) -> Tensor:
     return torch.nan_to_num(stats.grad_norm / stats.count.clamp(min=1.0), nan=0.0, posinf=0.0)
 
 
-def densify(
-    gaussians: GaussianParameters,
-    optimizer: Adam,
-    stats: Stats,
-    config: DensifyConfig,
-    *,
-    grad_threshold: float,
-    extent: float,
-    prune_large: bool,
-    random: torch.Generator,
-) -> None:
-    """Clone small Gaussians and split large ones whose mean gradient exceeds the threshold, then prune.
+def clone_and_split(
+    gaussians: GaussianParameters, optimizer: Adam, clone: Tensor, split: Tensor, random: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Append a copy of each cloned row, and replace each split row by two smaller halves.
 
     Args:
-        gaussians, optimizer: changed in place; new rows start with zero moments.
-        stats: since the last call; the caller makes new ones.
-        extent: radius of the cameras, normalised units.
-        prune_large: also remove what is too large on screen or in space (after the first opacity reset).
-        random: where split halves land.
+        clone, split: [N] bool, disjoint.
+        random: draws the positions of the halves.
+
+    Returns:
+        the row [M] that each Gaussian came from, and [M] bool, the new rows: they are last, with zero moments.
     """
-    with torch.no_grad():
-        gradient = mean_gradient(stats)
-        chosen = _within_budget(gradient, gradient >= grad_threshold, config.max_gaussians - len(gaussians))
-        large = gaussians.scales().amax(1) > config.percent_dense * extent
-        split, clone = chosen & large, chosen & ~large
-        pieces = [torch.where(~split)[0], torch.where(clone)[0], torch.where(split)[0].repeat(2)]
-        index = torch.cat(pieces)
-        fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
-        fresh[len(pieces[0]) :] = True
-        optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
-        _spread_halves(gaussians, len(pieces[2]), random)
-        keep = _worth_keeping(gaussians, stats.max_radii[index], fresh, config, extent, prune_large)
-    prune(gaussians, optimizer, keep)
-
-
-def _within_budget(gradient: Tensor, chosen: Tensor, budget: int) -> Tensor:
-    """At most ``budget`` of the chosen ones, those with the largest gradient."""
-    if int(chosen.sum()) <= budget:
-        return chosen
-    best = torch.where(chosen, gradient, gradient.new_tensor(-1.0)).argsort(descending=True, stable=True)
-    allowed = torch.zeros_like(chosen)
-    allowed[best[: max(budget, 0)]] = True
-    return allowed & chosen
+    pieces = [torch.where(~split)[0], torch.where(clone)[0], torch.where(split)[0].repeat(2)]
+    index = torch.cat(pieces)
+    fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
+    fresh[len(pieces[0]) :] = True
+    optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
+    _spread_halves(gaussians, len(pieces[2]), random)
+    return index, fresh
 
 
 def _spread_halves(gaussians: GaussianParameters, count: int, random: torch.Generator) -> None:
-    """The last ``count`` rows are halves of split Gaussians: sampled from their parents, and smaller."""
+    """Sample the last ``count`` rows, copies of split Gaussians, from their parents, and shrink them."""
     if count == 0:
         return
     tail = slice(len(gaussians) - count, None)
@@ -101,26 +57,12 @@ def _spread_halves(gaussians: GaussianParameters, count: int, random: torch.Gene
     gaussians.log_scales.data[tail] -= math.log(SPLIT_SHRINK)
 
 
-def _worth_keeping(
-    gaussians: GaussianParameters,
-    max_radii: Tensor,
-    fresh: Tensor,
-    config: DensifyConfig,
-    extent: float,
-    prune_large: bool,
-) -> Tensor:
-    keep, scales = gaussians.opacities() >= config.min_opacity, gaussians.scales()
-    if prune_large:
-        keep &= (max_radii <= config.max_screen) | fresh
-        keep &= scales.amax(1) <= config.max_scale * extent
-    # What is not finite is never drawn, so it would have no gradient that could mend it.
-    for values in (*(getattr(gaussians, name) for name in GaussianParameters.NAMES), scales):
-        keep &= torch.isfinite(values).flatten(1).all(dim=1) if values.ndim > 1 else torch.isfinite(values)
-    return keep
-
-
 def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> Tensor:
-    """Keep the rows marked in ``keep`` [N]; if that would leave none, keep the most opaque one. Returns the rows."""
+    """Remove the rows not marked in ``keep`` [N] bool; where none is marked, keep the most opaque one.
+
+    Returns:
+        the rows [M] that were kept.
+    """
     if not bool(keep.any()):
         keep = keep.clone()
         keep[int(gaussians.opacity_logits.nan_to_num(-torch.inf, neginf=-torch.inf).argmax())] = True
@@ -132,20 +74,8 @@ def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> Tenso
     return index
 
 
-def resets(config: DensifyConfig, done: int) -> bool:
-    """Whether opacities are reset after ``done`` main steps: that needs time to heal before densification ends."""
-    every = config.opacity_reset_every
-    return done % every == 0 and done + every // 2 <= config.until
-
-
-def prunes_unseen(config: DensifyConfig, done: int) -> bool:
-    """Whether Gaussians are judged by what they make up of the images after ``done`` main steps. A reset spares what is
-    hidden: all surfaces are transparent then, and the inside is coloured again."""
-    return config.min_contribution > 0.0 and (done == config.until or resets(config, done))
-
-
 def reset_opacities(gaussians: GaussianParameters, optimizer: Adam) -> None:
-    """No opacity above 0.01 any more: what the images need comes back, floaters do not."""
+    """Limit all opacities to 0.01: Gaussians that the images need recover, floaters do not."""
     with torch.no_grad():
         gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     optimizer.reset_moments("opacity_logits")

@@ -1,90 +1,250 @@
-"""Between two steps: what the schedule wants of the numbers of Gaussians and control points."""
+"""Adaptive density control: the schedule by which Gaussians, spheres and control points are added, removed and reset.
+
+``done`` is the number of steps of the present stage that are complete. After a main step, in this order:
+
+1. visibility pruning: Gaussians that contribute to no sampled view are removed;
+2. a densification round: control points are cloned and pruned where due; Gaussians with large gradients are cloned or
+   split; transparent, oversized and non-finite ones are removed;
+3. an opacity reset.
+
+After a step of stage 1, spheres are cloned and pruned, and finally thinned to the number of control points.
+
+The operations on rows are those of ``densify.py`` (Gaussians), ``pretrain.py`` (spheres) and ``motion/node_density.py``
+(control points); ``visibility.py`` measures contributions.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+import math
+from dataclasses import replace
 
+import torch
 from torch import Tensor
 
+from ..config.presets import DensifyConfig, PretrainConfig, TrainConfig
+from ..gaussians import GaussianParameters
 from ..motion.control_points import ControlPoints
 from ..motion.node_density import adapt_control_points
 from ..motion.spheres import Spheres
+from ..optim import Adam
+from ..runtime import memory
 from ..seeding import generator
-from .densify import densify, mean_gradient, most_that_fit, prune, reset_opacities, resets, threshold
+from ..types import Stats
+from .densify import clone_and_split, mean_gradient, prune, reset_opacities
+from .frames import Frames
 from .pretrain import densify_spheres, thin_spheres
 from .state import TrainState
+from .visibility import contributions
+
+STEPS_PER_VIEW = 20
+"""Visibility pruning renders at most one view per this many steps since the last pruning. A view takes about half as
+long as a step, so the share of the time is a few percent."""
+MOST_VIEWS, FEWEST_VIEWS = 300, 50
+"""More views are not needed to see every side; fewer, where the data has more, are not enough to judge by."""
+NUMBERS_PER_PARAMETER = 6
+"""float32 values in memory per parameter: value, gradient, two moments, posed value and its gradient."""
+NUMBERS_PER_GAUSSIAN = 220
+"""float32 values in memory per Gaussian during a step: its splat, its gradients, four pairs of splat and tile."""
 
 
-def adapt(state: TrainState, size: tuple[int, int], kept: Tensor | None = None) -> str | None:
-    """After the step: what the schedule wants of numbers of Gaussians and control points. ``stage_step`` is the step
-    just done.
+# Schedule
 
-    Args:
-        size: width and height of the step's image.
-        kept: [N] bool, the Gaussians that are ``seen``; the others are pruned. None: that is not due.
+
+def round_due(config: DensifyConfig, done: int) -> bool:
+    """Decide whether Gaussians are densified after ``done`` main steps."""
+    return config.start <= done <= config.until and done % config.interval == 0
+
+
+def opacity_reset_due(config: DensifyConfig, done: int) -> bool:
+    """Decide whether opacities are reset after ``done`` main steps. A reset needs half an interval to heal before
+    densification ends."""
+    every = config.opacity_reset_every
+    return done % every == 0 and done + every // 2 <= config.until
+
+
+def visibility_pruning_due(config: DensifyConfig, done: int) -> bool:
+    """Decide whether hidden Gaussians are removed after ``done`` main steps: before each opacity reset and when
+    densification ends. A reset would spare them: all surfaces are transparent then, and the inside learns colour."""
+    return config.min_contribution > 0.0 and (done == config.until or opacity_reset_due(config, done))
+
+
+def control_points_due(config: TrainConfig, done: int) -> bool:
+    """Decide whether the round after ``done`` main steps also changes control points: the first round after each
+    multiple of ``nodes_every``, up to ``nodes_until``."""
+    if done <= config.freeze:
+        return False
+    number, late = divmod(done, config.densify.nodes_every)
+    return number > 0 and late < config.densify.interval and done - late <= config.densify.nodes_until
+
+
+def spheres_due(config: PretrainConfig, done: int) -> bool:
+    """Decide whether spheres are densified after ``done`` steps of stage 1."""
+    return done < config.densify_until and (done % config.densify_every == 0 or done == config.warm_up)
+
+
+# Thresholds and limits
+
+
+def gradient_threshold(config: DensifyConfig, width: int, height: int) -> float:
+    """Gradient threshold at this image size, normalised device coordinates."""
+    return config.grad_threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent
+
+
+def affordable_count(gaussians: GaussianParameters, wanted: int) -> int:
+    """Number of Gaussians that fit in memory, at most ``wanted``. Counts parameters, gradients, Adam's moments and the
+    intermediate values of a step."""
+    count = len(gaussians)
+    numbers = sum(parameter.numel() for parameter in gaussians.parameters()) / max(count, 1)
+    each = round(4 * (NUMBERS_PER_PARAMETER * numbers + NUMBERS_PER_GAUSSIAN))
+    device = gaussians.means.device
+    if memory.fits(each * max(min(wanted, 2 * count) - count, 0), device):  # a round at most doubles them
+        return wanted
+    return min(wanted, count + memory.room(device) // each)
+
+
+# Before a step
+
+
+def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
+    """Measure which Gaussians contribute at least ``densify.min_contribution`` pixels to one of a few sampled views.
+
+    Views are drawn at random, others each time.
 
     Returns:
-        what the user should know of it, if anything.
+        [N] bool, the rows to keep when the present step is done; None where visibility pruning is not due, or the run
+        is too short for enough views.
+    """
+    config = state.config.densify
+    done = state.stage_step + 1
+    if state.stage == "pretrain" or not visibility_pruning_due(config, done):
+        return None
+    steps = config.until if done == config.until else config.opacity_reset_every
+    count = min(len(frames), MOST_VIEWS, steps // STEPS_PER_VIEW)
+    if count < min(len(frames), FEWEST_VIEWS):
+        return None
+    order = torch.randperm(len(frames), generator=generator(state.config.seed, 52, state.step))
+    return contributions(state, frames, order[:count].tolist()) >= config.min_contribution
+
+
+# After a step
+
+
+def control_density(state: TrainState, size: tuple[int, int], visible: Tensor | None = None) -> str | None:
+    """Add, remove and reset what the schedule asks for after the present step, which ``state.step`` does not count yet.
+
+    Args:
+        size: width and height of the step's image in pixels.
+        visible: [N] bool from :func:`visible_gaussians`; the other rows are pruned. None: visibility pruning is not
+            due.
+
+    Returns:
+        a note for the user where memory limits growth, else None.
     """
     if state.stage == "pretrain":
-        _adapt_spheres(state)
+        _control_spheres(state)
         return None
-    return _adapt_gaussians(state, size, kept)
+    if state.stage_step + 1 > state.config.densify.until:
+        return None
+    return _control_gaussians(state, size, visible)
 
 
-def _adapt_spheres(state: TrainState) -> None:
+def _control_spheres(state: TrainState) -> None:
     assert isinstance(state.motion, Spheres)
     config, done = state.config, state.stage_step + 1
     if done == config.pretrain.densify_until:
         thin_spheres(state.gaussians, state.gaussian_optimizer, state.motion, config.motion.nodes)
         state.reset_stats()
-    elif done < config.pretrain.densify_until and (
-        done % config.pretrain.densify_every == 0 or done == config.pretrain.warm_up
-    ):
+    elif spheres_due(config.pretrain, done):
         densify_spheres(state.gaussians, state.gaussian_optimizer, state.motion, state.stats, config, state.step)
         state.reset_stats()
 
 
-def _adapt_gaussians(state: TrainState, size: tuple[int, int], kept: Tensor | None) -> str | None:
+def _control_gaussians(state: TrainState, size: tuple[int, int], visible: Tensor | None) -> str | None:
     config, done, note = state.config.densify, state.stage_step + 1, None
-    if done > config.until:
-        return None
-    if kept is not None:  # before there are newborn ones: a clone is hidden behind its parent
-        state.stats = state.stats.rows(prune(state.gaussians, state.gaussian_optimizer, kept))
-    if done >= config.start and done % config.interval == 0:
-        limit = threshold(config, *size)
-        if _nodes_due(state, done):
-            assert isinstance(state.motion, ControlPoints) and state.motion_optimizer is not None
-            node_limit = limit * config.node_grad_threshold / config.grad_threshold
-            gradient = mean_gradient(state.stats)
+
+    # 1. Visibility pruning comes before growth, because a new clone is hidden behind its parent.
+    if visible is not None:
+        state.stats = state.stats.rows(prune(state.gaussians, state.gaussian_optimizer, visible))
+
+    # 2. Densification round.
+    if round_due(config, done):
+        threshold = gradient_threshold(config, *size)
+        if isinstance(state.motion, ControlPoints) and control_points_due(state.config, done):
+            assert state.motion_optimizer is not None
             adapt_control_points(
-                state.motion, state.motion_optimizer, state.gaussians, gradient, grad_threshold=node_limit
+                state.motion,
+                state.motion_optimizer,
+                state.gaussians,
+                mean_gradient(state.stats),
+                grad_threshold=threshold * config.node_grad_threshold / config.grad_threshold,
             )
-        most = most_that_fit(state.gaussians, config.max_gaussians)
-        most = most if state.team is None else state.team.least(most)
+        most = affordable_count(state.gaussians, config.max_gaussians)
+        most = most if state.group is None else state.group.minimum(most)
         if most < config.max_gaussians:
             note = f"memory has room for {most:,} Gaussians, not for {config.max_gaussians:,}; they grow no further"
-            config = dataclasses.replace(config, max_gaussians=most)
-        densify(
+            config = replace(config, max_gaussians=most)
+        grow_and_prune(
             state.gaussians,
             state.gaussian_optimizer,
             state.stats,
             config,
-            grad_threshold=limit,
+            grad_threshold=threshold,
             extent=state.extent,
             prune_large=done > config.opacity_reset_every and config.prune_large != "never",
             random=generator(state.config.seed, 51, state.step),
         )
         state.reset_stats()
-    if resets(config, done):
+
+    # 3. Opacity reset.
+    if opacity_reset_due(config, done):
         reset_opacities(state.gaussians, state.gaussian_optimizer)
     return note
 
 
-def _nodes_due(state: TrainState, done: int) -> bool:
-    """Control points change at the first densification after each of their own milestones, up to ``nodes_until``."""
-    config = state.config.densify
-    if not isinstance(state.motion, ControlPoints) or done <= state.config.freeze:
-        return False
-    number, late = divmod(done, config.nodes_every)
-    return number > 0 and late < config.interval and done - late <= config.nodes_until
+def grow_and_prune(
+    gaussians: GaussianParameters,
+    optimizer: Adam,
+    stats: Stats,
+    config: DensifyConfig,
+    *,
+    grad_threshold: float,
+    extent: float,
+    prune_large: bool,
+    random: torch.Generator,
+) -> None:
+    """Clone small Gaussians and split large ones whose mean gradient reaches the threshold, then prune.
+
+    Args:
+        gaussians, optimizer: changed in place; new rows start with zero moments.
+        stats: accumulated since the last round; the caller resets them.
+        grad_threshold: norm of the screen-space gradient, normalised device coordinates.
+        extent: radius of the cameras, normalised units.
+        prune_large: also remove Gaussians that are too large on screen or in space (after the first opacity reset).
+        random: draws the positions of split halves.
+    """
+    with torch.no_grad():
+        # Grow, within the budget.
+        gradient = mean_gradient(stats)
+        growing = _within_budget(gradient, gradient >= grad_threshold, config.max_gaussians - len(gaussians))
+        large = gaussians.scales().amax(1) > config.percent_dense * extent
+        index, fresh = clone_and_split(gaussians, optimizer, growing & ~large, growing & large, random)
+
+        # Prune by opacity and by size.
+        keep, scales = gaussians.opacities() >= config.min_opacity, gaussians.scales()
+        if prune_large:
+            keep &= (stats.max_radii[index] <= config.max_screen) | fresh
+            keep &= scales.amax(1) <= config.max_scale * extent
+        # A non-finite Gaussian is never drawn, so no gradient could mend it.
+        for values in (*(getattr(gaussians, name) for name in GaussianParameters.NAMES), scales):
+            keep &= torch.isfinite(values).flatten(1).all(dim=1) if values.ndim > 1 else torch.isfinite(values)
+    prune(gaussians, optimizer, keep)
+
+
+def _within_budget(gradient: Tensor, chosen: Tensor, budget: int) -> Tensor:
+    """Reduce ``chosen`` [N] bool to ``budget`` rows, those with the largest gradients."""
+    if int(chosen.sum()) <= budget:
+        return chosen
+    best = torch.where(chosen, gradient, gradient.new_tensor(-1.0)).argsort(descending=True, stable=True)
+    allowed = torch.zeros_like(chosen)
+    allowed[best[: max(budget, 0)]] = True
+    return allowed & chosen

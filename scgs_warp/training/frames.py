@@ -1,4 +1,4 @@
-"""Training views as the loop needs them: normalised cameras, planar truth on the device, and an order."""
+"""Training views: normalised cameras, planar images on the device, and their random order."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ from ..seeding import generator
 from ..types import Camera, Frame
 
 PROGRESSIVE_SHARE = 0.2
-
-
-SMALLEST = 64
-"""Images with a shorter side than this are not halved."""
+"""Share of the frames that progressive pre-training begins with, and adds each time."""
+LEAST_HALVED_SIDE = 64
+"""Images with a shorter side than this, in pixels, are not halved."""
 
 
 def first_frames(data: Dataset) -> Dataset:
-    """The first fifth of the frames by time, with which progressive pre-training begins."""
+    """Return the first fifth of the frames by time, with which progressive pre-training begins."""
     ordered = sorted(range(len(data)), key=lambda index: data.entries[index].time)
     return data.subset(ordered[: max(1, round(PROGRESSIVE_SHARE * len(ordered)))])
 
 
 def view_number(step: int, config: TrainConfig, view: int) -> int:
-    """Counts views as ``step`` counts steps: what the order of frames and a view's random draws depend on, so that they
-    do not depend on which process looks at it."""
+    """Number the views of all steps. The order of frames and a view's random draws depend on this number, and so not on
+    the process that renders the view."""
     return step * config.batch + view
 
 
 def _half(frame: Frame) -> Pixels:
+    """Average image and alpha over 2 x 2 pixels; a pixel is valid where all four were."""
+
     def pool(image: Tensor) -> Tensor:
         return F.avg_pool2d(image[None], 2)[0]
 
@@ -44,7 +45,7 @@ def _half(frame: Frame) -> Pixels:
 
 
 class Frames:
-    """Random order without replacement, the same for the same seed; every epoch another."""
+    """Training frames in a random order without replacement: the same for the same seed, another in every epoch."""
 
     def __init__(self, data: Dataset, normalisation: Normalisation, config: TrainConfig, device: str) -> None:
         self.frames = data
@@ -59,9 +60,13 @@ class Frames:
         return len(self.frames)
 
     def index_at(self, step: int, progressive: bool, view: int = 0) -> int:
-        """The frame of this step's ``view``. ``progressive``: at first only the first 20 % of the frames by time, 20 %
-        more every ``progressive_every`` steps (seed S4), one by one rather than all at once; every other view is then
-        one of the newest 20 %, so that a limb is followed before its places of yesterday make it transparent."""
+        """Index of the frame of this step's ``view``.
+
+        Args:
+            progressive: draw from the first 20 % of the frames by time at first, and from 20 % more every
+                ``progressive_every`` steps (seed S4), added one by one. Every other view is then one of the newest
+                20 %, so that a moving limb is followed before its earlier positions make it transparent.
+        """
         first, allowed, number = 0, len(self.frames), view_number(step, self.config, view)
         if progressive:
             grown = PROGRESSIVE_SHARE * (1.0 + step / self.config.pretrain.progressive_every)
@@ -76,7 +81,7 @@ class Frames:
         return self.by_time[first + self._order[1][place]]
 
     def halved(self, index: int) -> tuple[Frame, Camera]:
-        """Frame and normalised camera at half the size, each pixel the mean of four."""
+        """Return frame and normalised camera at half the size, each pixel the mean of four."""
         entry, camera = self.frames.entries[index], self.cameras[index]
         half = self.frames.cache.get((self, index), lambda: _half(self.frames[index]))
         intrinsics = camera.K * camera.K.new_tensor([0.5, 0.5, 1.0])[:, None]
@@ -84,7 +89,7 @@ class Frames:
         return Frame(entry.camera, entry.time, *half, name=entry.name), small
 
     def expect(self, step: int, progressive: bool, view: int = 0) -> None:
-        """Begin to read the frame of this step's ``view``, if it must be read."""
+        """Start reading the frame of this step's ``view``, unless it is in memory."""
         index = self.index_at(step, progressive, view)
         if (self, index) not in self.frames.cache:
             self.frames.expect(index)
@@ -92,15 +97,18 @@ class Frames:
     def view(
         self, index: int, step: int, random_background: bool, view: int = 0
     ) -> tuple[Frame, Camera, Tensor, Tensor, Tensor | None]:
-        """Frame, normalised camera, truth [3, H, W] on the background of this step's ``view``, that background [3],
-        mask.
+        """Load the frame of this step's ``view``.
+
+        Returns:
+            frame, normalised camera, truth [3, H, W] on the view's background, that background [3], and the mask
+            [H, W] bool or None.
 
         Raises:
-            FrameError: its file cannot be read any more.
+            FrameError: the frame's file cannot be read any more.
         """
         camera = self.cameras[index]
         try:
-            if step < self.config.half_size and min(camera.width, camera.height) >= SMALLEST:
+            if step < self.config.half_size and min(camera.width, camera.height) >= LEAST_HALVED_SIDE:
                 frame, camera = self.halved(index)
             else:
                 frame = self.frames[index]
@@ -111,8 +119,8 @@ class Frames:
         if frame.alpha is not None and (random_background or self.random_background):
             random = generator(self.config.seed, 42, view_number(step, self.config, view))
             color = torch.rand(3, generator=random).to(self.device)
-            gap = 1.0 - frame.alpha.to(self.device)
-            truth = truth + gap * (color - background)[:, None, None]
+            uncovered = 1.0 - frame.alpha.to(self.device)
+            truth = truth + uncovered * (color - background)[:, None, None]
             background = color
         mask = None if frame.mask is None else frame.mask.to(self.device)
         return frame, camera, truth, background, mask

@@ -1,4 +1,4 @@
-"""Where to start without points: random ones, preferably where the images' alpha says that something is."""
+"""Initial points for data that brings none: random, preferably where the images' alpha is covered."""
 
 from __future__ import annotations
 
@@ -13,37 +13,39 @@ from ..seeding import generator
 from ..types import Camera
 
 HALF_SIZE = 1.3
-"""Half the edge of the cube in which a scene without initial points starts (normalised units)."""
+"""Half the edge of the cube in which random points lie, normalised units."""
 CANDIDATES = 100_000
+"""Random points from which the initial ones are drawn, at least."""
 MOST_VIEWS = 100
+"""Frames in which candidates are looked up, at most."""
 SHARPNESS = 3.0
-"""Points are drawn with probability (share of views that see something there) to this power: a moving limb's places are
-seen covered only part of the time, so they must not be carved away altogether."""
+"""Points are drawn with probability (share of views in which they are covered) to this power. A moving limb covers each
+of its positions only part of the time, so carving would remove it."""
 
 
 def random_points(count: int, seed: int, key: int) -> Tensor:
-    """[count, 3] uniform in the cube, normalised units."""
+    """Draw points [count, 3] uniformly in the cube, normalised units."""
     return (torch.rand(count, 3, generator=generator(seed, key)) * 2.0 - 1.0) * HALF_SIZE
 
 
 class Coverage(NamedTuple):
-    """What the views say of each point."""
+    """Coverage of each point in the views."""
 
     share: Tensor
-    """[P] share of the views, among those that have the point in the image, whose alpha there is above one half."""
+    """[P] share of views with alpha above one half at the point, among those that have it in the image."""
     colors: Tensor
-    """[P, 3] mean colour in those views; grey where there is none."""
+    """[P, 3] mean colour in the covered views; grey where there are none."""
 
 
 def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Coverage | None:
-    """Look every point up in up to 100 frames; None where no frame has alpha. ``points`` [P, 3] normalised."""
+    """Look up every point in up to 100 frames; None where no frame has alpha. ``points`` [P, 3] normalised."""
     chosen = data.with_alpha
     if not chosen:
         return None
     covered, seen, colors = torch.zeros(len(points)), torch.zeros(len(points)), torch.zeros(len(points), 3)
     for index in chosen[:: max(1, len(chosen) // MOST_VIEWS)]:
         frame = data[index]
-        row, column, inside = _places(points, normalisation.apply_camera(frame.camera))
+        row, column, inside = _pixels(points, normalisation.apply_camera(frame.camera))
         assert frame.alpha is not None
         hit = (inside & (frame.alpha[row, column] > 0.5)).float()
         covered += hit
@@ -53,8 +55,8 @@ def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Cov
     return Coverage(covered / seen.clamp(min=1.0), colors / covered.clamp(min=1.0)[:, None] + grey)
 
 
-def _places(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Row and column [P] of the pixels that the points [P, 3] fall into, and whether there is such a pixel [P]."""
+def _pixels(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Return row and column [P] of the pixels that the points [P, 3] project to, and [P] bool: inside the image."""
     camera = camera.to("cpu")
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     pixels = local @ camera.K.T
@@ -65,27 +67,29 @@ def _places(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def common_view(points: Tensor, data: Dataset, normalisation: Normalisation) -> Tensor:
-    """[P] share of up to 100 views that have the point, [P, 3] normalised, in the image."""
+    """Share [P] of up to 100 views that have the point in the image. ``points`` [P, 3] normalised."""
     chosen = spread(len(data), MOST_VIEWS)
     seen = torch.zeros(len(points))
     for index in chosen:
-        seen += _places(points, normalisation.apply_camera(data.entries[index].camera))[2].float()
+        seen += _pixels(points, normalisation.apply_camera(data.entries[index].camera))[2].float()
     return seen / len(chosen)
 
 
-def likely_points(
+def sample_initial_points(
     count: int, data: Dataset, normalisation: Normalisation, seed: int, key: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Random points [count, 3] in the cube and their colours [count, 3], drawn where the images are covered; where no
-    frame has alpha, in the cameras' common view, without colours."""
+    """Draw random points where the images are covered; where no frame has alpha, in the cameras' common view.
+
+    Returns:
+        points [count, 3], normalised, and colours [count, 3]; None without alpha.
+    """
     candidates = random_points(max(CANDIDATES, count), seed, key)
-    found = coverage(candidates, data, normalisation)
-    share = common_view(candidates, data, normalisation) if found is None else found.share
+    covered = coverage(candidates, data, normalisation)
+    share = common_view(candidates, data, normalisation) if covered is None else covered.share
     if not bool((share > 0).any()):
         return candidates[:count], None
     random = generator(seed, key, 1)
     chosen = torch.multinomial(share**SHARPNESS, count, replacement=True, generator=random)
     spacing = 2.0 * HALF_SIZE / len(candidates) ** (1 / 3)  # the same candidate may be drawn twice
-    return candidates[chosen] + spacing * (
-        torch.rand(count, 3, generator=random) - 0.5
-    ), None if found is None else found.colors[chosen]
+    points = candidates[chosen] + spacing * (torch.rand(count, 3, generator=random) - 0.5)
+    return points, None if covered is None else covered.colors[chosen]

@@ -1,4 +1,4 @@
-"""Training: ``fit`` is the loop, ``training_step`` one step of it, in the order things happen."""
+"""The training loop: :func:`fit` prepares a run and repeats ``step.training_step`` until the last step."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ from ..runtime.progress import Progress, progress
 from ..runtime.stop_signals import stop_signals
 from ..scene.scene import Scene
 from ..storage import checkpoint
-from .density_control import adapt
+from .density_control import control_density, visible_gaussians
 from .frames import Frames
 from .multi_view import check_replicas, check_share
-from .process_group import Lost, Team
-from .run_folder import Onlooker, RunFolder
+from .process_group import ProcessGroup, ProcessLost
+from .run_folder import ReadOnlyRunFolder, RunFolder
 from .state import TrainState
 from .step import training_step
-from .visibility import seen
 
 MOST_FAILURES = 20
-"""Non-finite steps in a row after which training stops at the last good state."""
+"""Consecutive non-finite steps after which training stops at the last good state."""
 COMPARE_EVERY = 500
-"""Steps after which processes that train together make sure that they hold the same scene."""
+"""Steps between two comparisons of the scenes that the processes of a group hold."""
 
 
 def fit(
@@ -43,132 +42,149 @@ def fit(
     resume: bool = False,
     settings: dict[str, Any] | None = None,
     tensorboard: bool = False,
-    team: Team | None = None,
+    group: ProcessGroup | None = None,
 ) -> Scene:
     """Train a scene; the run directory holds a resumable checkpoint at any time.
 
     Args:
-        config: the complete configuration: a ``config.preset``, and what ``config.with_steps`` and ``from_dict`` make
-            of it.
-        data: training frames, world units (``data.load``).
+        config: the complete configuration: a ``config.preset``, possibly changed by ``config.with_steps`` and
+            ``from_dict``.
+        data: training frames in world units (``data.load``).
         output: run directory; made if needed.
-        device: where everything is computed, ``cpu`` or ``cuda``.
-        test: held-out frames, looked at for the curve and the previews alone; nothing is selected by them.
-        resume: continue from the checkpoint in ``output``, to the same bits as an uninterrupted run; from the one
-            before it where that is damaged, from the beginning where the run was killed before there was any.
-        settings: what to write to ``config.json``; default: the configuration.
+        device: ``cpu`` or ``cuda``; everything is computed there.
+        test: held-out frames for the curve and the previews; they select nothing.
+        resume: continue from the checkpoint in ``output``, to the same bits as an uninterrupted run. Where it is
+            damaged, the previous one is used; where the run was killed before its first checkpoint, training starts
+            from step 0.
+        settings: content of ``config.json``; default: the configuration.
         tensorboard: also write event files for TensorBoard to ``output``; changes no bit of the scene.
-        team: the processes that share each step's views (``parallel.team_of``); ``config.batch`` must be a multiple of
-            their number. The first of them writes, ``output`` is read by all.
+        group: the processes that share each step's views (``process_group.join_processes``); ``config.batch`` must be a
+            multiple of their number. The first one writes to ``output``, all read from it.
 
     Returns:
         the scene after the last step, in every process.
 
     Raises:
-        UserError: a bad configuration, a checkpoint that does not fit or cannot be written, an image that is gone,
-            repeated non-finite losses, no TensorBoard, a process of the team was lost. What was saved last is intact.
-        NotEnoughMemory: one tile of an image takes more than there is; the checkpoint is saved.
-        KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal, the checkpoint being saved.
+        UserError: the configuration cannot run, a checkpoint does not fit or cannot be written, an image is gone, the
+            loss was non-finite repeatedly, TensorBoard is missing, or a process was lost. The last checkpoint is
+            intact.
+        NotEnoughMemory: one tile of an image needs more memory than there is; the checkpoint is saved.
+        KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal; the checkpoint is saved.
     """
+    # 1. Refuse what cannot run.
     check(config)
-    check_share(config, team)
+    check_share(config, group)
     environment.ensure_configured()
     if data.background != config.data.background:
         raise UserError(f"{data.folder}: loaded on {data.background}, but data.background is {config.data.background}")
     if len(data) == 0:
         raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
-    folder_type = RunFolder if team is None or team.first else Onlooker
+
+    # 2. Open the run folder, and start or resume the state.
+    folder_type = RunFolder if group is None or group.first else ReadOnlyRunFolder
     with folder_type(output, config, settings, resume=resume, tensorboard=tensorboard) as folder:
-        begin = partial(_state, folder, config, data, device)
-        # The first of several processes may have to put a checkpoint in its place before the others read it.
-        state = team.in_turn(begin) if team is not None and resume else begin()
-        state.team = team
+        open_state = partial(_start_or_resume, folder, config, data, device)
+        # The first process may have to restore a checkpoint before the others read it.
+        state = group.in_turn(open_state) if group is not None and resume else open_state()
+        state.group = group
         frames = Frames(data, state.normalisation, config, device)
-        folder.begin(state.step)
+        folder.start(state.step)
+
+        # 3. Train.
         with progress(config.steps, "training", start=state.step) as bar, stop_signals() as stop:
             folder.tell = bar.print
             try:
                 check_replicas(state)
-                _loop(state, frames, folder, test, bar, stop)
-            except Lost as lost:
-                raise _without_others(state, folder, lost) from lost
+                _train(state, frames, folder, test, bar, stop)
+            except ProcessLost as lost:
+                raise _process_lost(state, folder, lost) from lost
         state.motion.eval()
         return state.scene()
 
 
-def _state(folder: RunFolder, config: TrainConfig, data: Dataset, device: str) -> TrainState:
-    """Where the run begins, or goes on."""
-    if folder.resume and folder.has_begun:
+def _start_or_resume(folder: RunFolder, config: TrainConfig, data: Dataset, device: str) -> TrainState:
+    if folder.resume and folder.has_no_checkpoint:
         folder.tell(f"{folder.path}: there is no checkpoint yet; training begins again from step 0")
     elif folder.resume:
         try:
             return TrainState.resume(folder.path, config, data, device)
         except checkpoint.DamagedCheckpoint as error:
-            if isinstance(folder, Onlooker):
+            if isinstance(folder, ReadOnlyRunFolder):
                 raise UserError(f"{error}; the first process could read it") from error
             folder.tell(f"warning: {checkpoint.fall_back(folder.path, error)}")
         return TrainState.resume(folder.path, config, data, device)
     return TrainState.begin(config, data, device)
 
 
-def _loop(
+def _train(
     state: TrainState, frames: Frames, folder: RunFolder, test: Dataset | None, bar: Progress, stop: threading.Event
 ) -> None:
     config, noted = state.config, False
     saved_at = time.monotonic()
     while state.step < config.steps:
+        # 1. Enter the main stage when stage 1 is over.
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
             state.begin_main()
+
+        # 2. Measure visibility where pruning is due, then render, compare and update the parameters.
         try:
-            kept = seen(state, frames)
+            visible = visible_gaussians(state, frames)
             result = training_step(state, frames)
-        except NotEnoughMemory:  # before anything was changed: the run goes on where there is more
+        except NotEnoughMemory:  # nothing has changed yet: a machine with more memory can continue
             state.save(folder.path)
             raise
         except FrameError as error:
             state.save(folder.path)
-            saved = f"step {state.step} is saved: " if state.team is None or state.team.first else ""
+            saved = f"step {state.step} is saved: " if state.group is None or state.group.first else ""
             raise UserError(f"{error}; {saved}continue with --resume") from error
         if result.failed is None:
             state.failures = 0
         else:
             _count_failure(state, result.failed, folder, bar)
+
+        # 3. Score held-out frames, before an opacity reset could put a dip into the curve.
         done = state.step + 1
         if test is not None and (done % config.evaluate_every == 0 or done == config.steps):
-            folder.look_at_test(state.scene(), test, done)  # not after an opacity reset: the curve would show its dips
-        state.whole = False
-        note = adapt(state, result.size, kept)
+            folder.log_test_psnr(state.scene(), test, done)
+
+        # 4. Adaptive density control.
+        state.consistent = False
+        note = control_density(state, result.size, visible)
         if note is not None and not noted:
             noted = True
             bar.print(f"step {state.step}: {note}")
             folder.log({"step": state.step, "stage": state.stage, "note": note})
         state.step += 1
-        state.whole = True
+        state.consistent = True
+
+        # 5. Agree with the other processes on stopping, and on the scene.
         last = state.step == config.steps
-        stopping = stop.is_set() if state.team is None else state.team.any(stop.is_set())
+        stopping = stop.is_set() if state.group is None else state.group.any(stop.is_set())
         if last or stopping or state.step % COMPARE_EVERY == 0:
             check_replicas(state)
+
+        # 6. Log, save, stop.
         folder.record(state, result, bar)
         now = time.monotonic()
         if now - saved_at >= config.checkpoint_seconds or last or stopping:
             state.save(folder.path)
             saved_at = time.monotonic()
         if stopping:
-            if state.team is not None:
-                state.team.meet()  # torchrun ends all processes when one has ended: the first must have saved
+            if state.group is not None:
+                state.group.barrier()  # torchrun ends all processes when one has ended: the first must have saved
             bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
             raise KeyboardInterrupt
 
 
-def _without_others(state: TrainState, folder: RunFolder, lost: Lost) -> UserError:
-    """What is left to do when another process is gone: no step can be finished, but mostly none has been begun either,
-    for parameters change when all views are there."""
-    assert state.team is not None
+def _process_lost(state: TrainState, folder: RunFolder, lost: ProcessLost) -> UserError:
+    """Save what can be saved after another process is gone. No further step can be finished, but mostly none has begun:
+    parameters change only when all views are there."""
+    assert state.group is not None
     if state.step == 0:
         return UserError(f"{folder.path}: {lost}; no step was done yet")
-    if state.whole:
+    if state.consistent:
         state.save(folder.path)
-    where = f"step {state.step} is saved" if state.team.first and state.whole else f"reached step {state.step}"
+    where = f"step {state.step} is saved" if state.group.first and state.consistent else f"reached step {state.step}"
     return UserError(
         f"{folder.path}: {lost}; {where}, continue from the checkpoint with --resume, on one process or any number "
         f"that divides batch {state.config.batch}"
@@ -176,6 +192,11 @@ def _without_others(state: TrainState, folder: RunFolder, lost: Lost) -> UserErr
 
 
 def _count_failure(state: TrainState, term: str, folder: RunFolder, bar: Progress) -> None:
+    """Report a dropped step.
+
+    Raises:
+        UserError: too many steps in a row were dropped.
+    """
     state.failures += 1
     bar.print(f"step {state.step}: {term} is not finite; the step was dropped")
     folder.log({"step": state.step, "stage": state.stage, "dropped": term})

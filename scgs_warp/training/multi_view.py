@@ -1,6 +1,6 @@
-"""Steps of more than one view: looked at one after the other, or by several processes, to the same bits.
+"""Steps of more than one view: one after the other, or shared by several processes, to the same bits.
 
-Gradients and statistics are added view by view in their order. Process ``r`` of ``W`` takes the views ``r``, ``r + W``
+Gradients and statistics are added view by view in order. Process ``r`` of ``W`` takes the views ``r``, ``r + W``
 and so on: after each round the next ``W`` views are complete.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,47 +15,46 @@ from torch import Tensor
 from ..config.presets import TrainConfig
 from ..errors import UserError
 from ..types import Stats
-from .process_group import Team, Total
-
-if TYPE_CHECKING:
-    from .frames import Frames
-    from .state import StepResult, TrainState
+from .frames import Frames
+from .process_group import OrderedReduction, ProcessGroup
+from .state import StepResult, TrainState
 
 TERMS = ("image loss", "regulariser")
-"""What a view can fail by, before it has gradients."""
+"""Terms of the loss whose non-finite value drops a view, before it has gradients."""
 DIFFER = "the processes no longer hold the same scene; are the data, the packages and the kind of processor the same?"
 
 
 def all_views(
-    state: TrainState, frames: Frames, look: Callable[[TrainState, Frames, int, Stats], StepResult]
+    state: TrainState, frames: Frames, one_view: Callable[[TrainState, Frames, int, Stats], StepResult]
 ) -> StepResult:
-    """All views of a step, shared with the other processes if there are any.
+    """Render and compare all views of a step, shared with the other processes if there are any.
 
     Args:
-        look: one view, forward and backward; adds to the gradients and to the statistics it is given.
+        one_view: forward and backward pass of one view; adds to the gradients and to the statistics it is given.
 
     Returns:
-        the first view this process saw, with the losses of all (their mean), the size of the first view of all, and
-        the first failure of all. Unless it failed, parameters have the mean gradient, and ``state.stats`` has grown.
+        the first view of this process, with the mean losses over all views, the size of the first view of all, and the
+        first failure of all. Without a failure, the parameters have the mean gradient, and ``state.stats`` has grown.
 
     Raises:
-        UserError: the processes are not at the same point. Lost: there are no longer as many.
+        UserError: the processes are not at the same point.
+        ProcessLost: another process is gone.
     """
-    team, batch = state.team, state.config.batch
-    size, rank = (1, 0) if team is None else (team.size, team.rank)
+    group, batch = state.group, state.config.batch
+    size, rank = (1, 0) if group is None else (group.size, group.rank)
     rows: list[list[float]] = []
     shown: StepResult | None = None
-    totals = None if team is None else (Total(team), Total(team, torch.maximum))
+    totals = None if group is None else (OrderedReduction(group), OrderedReduction(group, torch.maximum))
     stats = _empty(state)
     for first in range(0, batch, size):
-        if team is not None:  # a round's gradients are those of one view
+        if group is not None:  # gradients of a round are those of one view
             _drop_gradients(state)
             stats = _empty(state)
-        result = look(state, frames, first + rank, stats)
+        result = one_view(state, frames, first + rank, stats)
         shown = shown or result
         added = [] if result.failed else [*_gradients(state), stats.grad_norm, stats.count]
         row = _row(result, sum(vector.numel() for vector in added))
-        rows += [row] if team is None else team.rows(row)
+        rows += [row] if group is None else group.gather_rows(row)
         failed = next((TERMS[int(row[0])] for row in rows if row[0] >= 0), None)
         if failed is not None:
             return _result(shown, rows, failed)
@@ -91,7 +89,7 @@ def _drop_gradients(state: TrainState) -> None:
 
 
 def _row(result: StepResult, length: int) -> list[float]:
-    """A view in numbers: which term failed (-1: none), losses, size, and how much there is to add."""
+    """Encode a view in numbers: index of the failed term (-1: success), losses, size, elements to reduce."""
     code = -1 if result.failed is None else TERMS.index(result.failed)
     losses = float(result.loss), float(result.l1), float(result.ssim), result.regulariser
     return [code, *losses, *result.size, length]
@@ -104,30 +102,30 @@ def _result(shown: StepResult, rows: list[list[float]], failed: str | None) -> S
     return shown._replace(loss=loss, l1=l1, ssim=ssim, regulariser=regulariser, size=size, failed=failed)
 
 
-def check_share(config: TrainConfig, team: Team | None) -> None:
-    """Refuse a batch that the processes cannot share.
+def check_share(config: TrainConfig, group: ProcessGroup | None) -> None:
+    """Refuse a batch that the processes cannot share evenly.
 
     Raises:
-        UserError: naming both numbers.
+        UserError: names both numbers.
     """
-    if team is not None and config.batch % team.size:
+    if group is not None and config.batch % group.size:
         raise UserError(
-            f"batch is {config.batch}, which {team.size} processes cannot share evenly; give --batch a multiple of "
-            f"{team.size}, or --nproc-per-node a divisor of {config.batch}"
+            f"batch is {config.batch}, which {group.size} processes cannot share evenly; give --batch a multiple of "
+            f"{group.size}, or --nproc-per-node a divisor of {config.batch}"
         )
 
 
 def check_replicas(state: TrainState) -> None:
-    """Compare the parameters of all processes; they are the same by construction, unless processors round differently.
+    """Compare the parameters of all processes, which are equal by construction unless processors round differently.
 
     Raises:
         UserError: they differ.
     """
-    if state.team is None:
+    if state.group is None:
         return
     digest = zlib.crc32(str(state.step).encode())
     for module in (state.gaussians, state.motion, state.cameras):
         for parameter in module.parameters():
             digest = zlib.crc32(parameter.detach().cpu().contiguous().numpy().tobytes(), digest)
-    if not state.team.agree(digest):
+    if not state.group.agree(digest):
         raise UserError(f"step {state.step}: {DIFFER}")

@@ -1,4 +1,4 @@
-"""Stage 1: find the control points. Spheres are grown and pruned, thinned to N_p, trained on, and handed to stage 2."""
+"""Initial models of both stages, and the spheres of stage 1: grown, pruned, thinned to N_p control points."""
 
 from __future__ import annotations
 
@@ -19,32 +19,33 @@ from ..types import Stats
 from .densify import mean_gradient
 
 TRAJECTORY_TIMES = 16
-"""Instants whose positions make the space in which farthest-point sampling chooses control points."""
+"""Number of instants whose positions span the space in which farthest-point sampling chooses control points."""
 START_RADIUS = 0.5
-"""Of the spheres of progressive pre-training, as a share of their spacing."""
+"""Radius of the spheres at the start of progressive pre-training, as a share of their spacing."""
 DEAD_OPACITY = 0.01
+"""Spheres of less opacity are removed."""
 SOLID_OPACITY = 0.1
-"""Spheres of less show nothing: neither control points nor Gaussians begin there while there are others."""
+"""Neither control points nor Gaussians begin at spheres of less opacity while there are others."""
 FEWEST_SPHERES = 256
-"""Stage 1 works as if there were at least so many control points: fewer spheres cannot make out a figure."""
+"""Least number of control points that sphere counts are derived from: fewer spheres cannot represent a figure."""
 
 
-def sphere_base(config: TrainConfig) -> int:
-    """What the numbers of spheres in stage 1 are multiples of: N_p, or more where that is too few."""
+def sphere_unit(config: TrainConfig) -> int:
+    """Unit of the sphere counts in stage 1: N_p, but at least ``FEWEST_SPHERES``."""
     return max(config.motion.nodes, FEWEST_SPHERES)
 
 
-def begin_spheres(
+def initial_spheres(
     config: TrainConfig, points: Tensor, colors: Tensor, device: str
 ) -> tuple[GaussianParameters, Spheres]:
-    """Spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and the
+    """Make spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and the
     network at rest.
 
     The sample is spread evenly, since with all frames at once a limb may be anywhere. Progressive pre-training knows
     the first pose: there the spheres stay as dense as the points, and start smaller than their spacing, because one
     that sticks out of a thin limb turns transparent before it has shrunk.
     """
-    count = min(round(sphere_base(config) * config.pretrain.start_ratio), len(points))
+    count = min(round(sphere_unit(config) * config.pretrain.start_ratio), len(points))
     index = torch.arange(count, device=points.device)
     if not config.pretrain.progressive and count < len(points):
         index = farthest_points(points, count)
@@ -56,9 +57,12 @@ def begin_spheres(
     return gaussians, Spheres(network, radius).to(device)
 
 
-def begin_motion(config: TrainConfig, points: Tensor, times: int = 0) -> Motion:
-    """A motion model without a first stage; control points are then a sample of ``points`` [P, 3], at rest. ``times``:
-    number of the training frames' times, after which feature planes are made."""
+def initial_motion(config: TrainConfig, points: Tensor, times: int = 0) -> Motion:
+    """Make a motion model for a run without stage 1; control points are a sample of ``points`` [P, 3], at rest.
+
+    Args:
+        times: number of distinct training times, which sizes feature planes.
+    """
     if config.motion.model == "hexplane":
         return HexPlane(config.seed, config.motion.plane_times or max(2, times // 2))
     if config.motion.model != "control-points":
@@ -77,10 +81,11 @@ def densify_spheres(
     config: TrainConfig,
     step: int,
 ) -> None:
-    """Remove transparent spheres, clone those that the image pulls at most, keep between N_p and the cap.
+    """Remove transparent spheres and clone those with the largest gradients, keeping between N_p and the cap.
 
-    A threshold on the gradient does not carry over from Gaussians to large spheres, so the share is fixed. A clone
-    lands within a radius of its parent. Too few left (a short first stage can fall to a dozen): more are cloned.
+    A threshold on the gradient does not carry over from Gaussians to large spheres, so the cloned share is fixed. A
+    clone lands within a radius of its parent. Where too few are left (a short stage 1 can fall to a dozen), more are
+    cloned.
     """
     with torch.no_grad():
         opacities = gaussians.opacities()
@@ -88,7 +93,7 @@ def densify_spheres(
         if not bool(alive.any()):
             alive[:] = True
         kept = torch.where(alive)[0]
-        limit = round(sphere_base(config) * config.pretrain.max_ratio)
+        limit = round(sphere_unit(config) * config.pretrain.max_ratio)
         if len(kept) > limit and step + 1 >= config.pretrain.warm_up:
             kept = kept[opacities[kept].argsort(descending=True, stable=True)[:limit]].sort().values
         gradient = mean_gradient(stats)[kept]
@@ -106,9 +111,9 @@ def densify_spheres(
 
 
 def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Spheres, nodes: int) -> None:
-    """Farthest-point sampling to N_p in trajectory space, so that parts that move apart are both represented.
+    """Reduce spheres to N_p by farthest-point sampling in trajectory space, so that parts that move apart both stay.
 
-    Among solid spheres, if they are enough: the farthest ones of all are strays in empty space that nobody sees.
+    Sample solid spheres only, if there are enough: the farthest of all are strays in empty space.
     """
     if len(gaussians) <= nodes:
         return
@@ -124,8 +129,8 @@ def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Sphere
     spheres.graph = None
 
 
-def control_points_of(gaussians: GaussianParameters, spheres: Spheres, config: TrainConfig) -> ControlPoints:
-    """The spheres' centres become control points. All start with one radius (seed S4: o_i is shared): the spheres' own,
+def control_points_from_spheres(gaussians: GaussianParameters, spheres: Spheres, config: TrainConfig) -> ControlPoints:
+    """Make control points at the spheres' centres. All start with one radius (seed S4: o_i is shared): the spheres',
     but no less than their typical spacing, so that neighbours blend."""
     positions = gaussians.means.detach()
     spacing = float(neighbor_distance(positions).median())
@@ -134,10 +139,10 @@ def control_points_of(gaussians: GaussianParameters, spheres: Spheres, config: T
     return ControlPoints(positions, radii, spheres.network, config.motion)
 
 
-def begin_gaussians(
+def initial_gaussians(
     config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None = None
 ) -> GaussianParameters:
-    """The Gaussians of stage 2: at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
+    """Make the Gaussians of stage 2: at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
     options: dict[str, Any] = {
         "sh_degree": config.sh_degree,
         "hyper_dim": config.motion.hyper_dim + config.motion.mask,

@@ -1,8 +1,8 @@
-"""Several processes that train one scene together: who this one is among them, and what they tell each other.
+"""The process group: several processes that train one scene together.
 
 ``torchrun`` starts the processes (``runtime/torchrun.py``). Every process holds the whole scene and takes its share of
-a step's views (``training/multi_view.py``). Sums over processes are taken
-element by element in the processes' order, whatever the network does: only collectives that move data are used.
+a step's views (``training/multi_view.py``). Sums over processes are taken element by element in rank order, whatever
+the network does: only collectives that move data are used.
 """
 
 from __future__ import annotations
@@ -22,32 +22,31 @@ from ..errors import UserError
 from ..runtime.torchrun import ProcessRank
 
 PATIENCE = timedelta(minutes=10)
-"""A process that is silent for so long counts as lost. Ended ones are noticed at once; this is for those that hang, and
-leaves time for compiling kernels and for what the first process alone has to do."""
-
+"""Silence after which a process counts as lost. Ended processes are noticed at once; this limit is for those that hang.
+It leaves time for compiling kernels and for the work of the first process alone."""
 PIECE = 1 << 22
-"""Elements that are moved at once, 16 MiB: such buffers are used again, in gloo as here; the system hands out larger
-ones page by page each time, which took longer than to move them."""
+"""Elements moved at once, 16 MiB. Buffers of this size are used again, in gloo as here; larger ones come from the
+system page by page each time, which takes longer than moving them."""
 
 T = TypeVar("T")
 
 
-class Lost(UserError):
-    """Another process has ended, or hangs."""
+class ProcessLost(UserError):
+    """Raised when another process has ended or hangs."""
 
 
 @contextlib.contextmanager
-def team_of(where: ProcessRank | None, device: str) -> Iterator[Team | None]:
-    """Join the processes that ``torchrun`` started, for the time of the context; None without it.
+def join_processes(where: ProcessRank | None, device: str) -> Iterator[ProcessGroup | None]:
+    """Join the processes that ``torchrun`` started, for the time of the context; yield None without ``torchrun``.
 
     Processes other than the first print nothing to standard output meanwhile.
 
     Args:
-        where: of ``process_rank()``.
-        device: ``cpu`` or ``cuda``; of the latter each process takes the GPU of its place on the machine.
+        where: from ``process_rank()``; None for a process on its own.
+        device: ``cpu`` or ``cuda``; on CUDA each process takes the GPU of its local rank.
 
     Raises:
-        UserError: not enough GPUs, or the others cannot be reached.
+        UserError: there are not enough GPUs, or the other processes cannot be reached.
     """
     if where is None:
         yield None
@@ -71,15 +70,15 @@ def team_of(where: ProcessRank | None, device: str) -> Iterator[Team | None]:
             if where.rank > 0:
                 nowhere = stack.enter_context(open(os.devnull, "w"))
                 stack.enter_context(contextlib.redirect_stdout(nowhere))
-            yield Team(where)
+            yield ProcessGroup(where)
     finally:
         with contextlib.suppress(RuntimeError):
             dist.destroy_process_group()
 
 
 def _choose_network(where: ProcessRank) -> None:
-    """Processes on one machine talk through its loopback interface: nothing listens on a network, and the machine's
-    name need not be known to anybody. The user's choice wins."""
+    """Choose the loopback interface for processes on one machine: nothing listens on a network, and the machine's name
+    need not resolve. The user's choice wins."""
     if where.local_size == where.size and hasattr(socket, "if_nameindex"):
         loopback = [name for _, name in socket.if_nameindex() if name.startswith("lo")]
         if loopback:
@@ -101,14 +100,14 @@ def _choose_gpu(where: ProcessRank) -> None:
     os.environ.setdefault("TORCH_NCCL_BLOCKING_WAIT", "1")  # a lost process becomes an error that can be reported
 
 
-class Team:
-    """What the processes of a job do together. Every method is called by all of them, in the same order.
+class ProcessGroup:
+    """Collective operations of the processes of a job. All processes call every method, in the same order.
 
-    Attributes: ``waited`` and ``moved``, the seconds that this process waited for the others at a step's views, and
-    those that sums took; ``bytes``, what it received for sums.
+    Attributes: ``waited`` and ``moved``, seconds that this process spent waiting for the others at the end of views,
+    and on sums; ``bytes`` received for sums.
 
     Raises:
-        Lost: (all methods) another process ended, or was silent for ``PATIENCE``.
+        ProcessLost: (all methods) another process ended, or was silent for ``PATIENCE``.
     """
 
     def __init__(self, where: ProcessRank) -> None:
@@ -118,11 +117,11 @@ class Team:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that writes and prints."""
+        """True for the process that writes and prints."""
         return self.rank == 0
 
-    def rows(self, row: list[float]) -> list[list[float]]:
-        """What each process has to say, in their order: as many numbers from each."""
+    def gather_rows(self, row: list[float]) -> list[list[float]]:
+        """Collect one row of numbers per process, in rank order; all rows have the same length."""
         mine = torch.tensor(row, dtype=torch.float64)
         everyone = torch.empty(self.size * len(row), dtype=torch.float64)
         began = time.perf_counter()
@@ -131,48 +130,48 @@ class Team:
         return everyone.view(self.size, -1).tolist()
 
     def any(self, flag: bool) -> bool:
-        """Whether one of them says so."""
-        return any(row[0] for row in self.rows([float(flag)]))
+        """Return True if any process passes True."""
+        return any(row[0] for row in self.gather_rows([float(flag)]))
 
-    def least(self, number: int) -> int:
-        """The least of what they say, of 53 bits at most."""
-        return int(min(row[0] for row in self.rows([float(number)])))
+    def minimum(self, number: int) -> int:
+        """Return the smallest number of all processes, of at most 53 bits."""
+        return int(min(row[0] for row in self.gather_rows([float(number)])))
 
-    def meet(self) -> None:
-        """Go on when all are here."""
-        self.rows([0.0])
+    def barrier(self) -> None:
+        """Wait until all processes have arrived."""
+        self.gather_rows([0.0])
 
     def agree(self, number: int) -> bool:
-        """Whether all have the same number, of 53 bits at most."""
-        return len({row[0] for row in self.rows([float(number)])}) == 1
+        """Return True if all processes pass the same number, of at most 53 bits."""
+        return len({row[0] for row in self.gather_rows([float(number)])}) == 1
 
     def in_turn(self, work: Callable[[], T]) -> T:
-        """What ``work`` returns, done by one process after the other: what one makes, the next finds."""
+        """Run ``work`` in one process after the other, so that each finds what the one before has made."""
         done: list[T] = []
         for rank in range(self.size):
             if rank == self.rank:
                 done.append(work())
-            self.meet()
+            self.barrier()
         return done[0]
 
     def summary(self) -> str:
-        """What sharing took, for the terminal."""
+        """Describe the cost of sharing in one line, for the terminal."""
         return (
             f"{self.size} processes: this one waited {self.waited:.1f} s for the others, "
             f"and moved {self.bytes / 1e9:.2f} GB for sums in {self.moved:.1f} s"
         )
 
-    def exchange(self, values: Tensor) -> Tensor:
-        """[size, n / size] this process's part of the ``values`` [n] of each of them, in their order; ``size`` divides
-        n."""
+    def all_to_all(self, values: Tensor) -> Tensor:
+        """Return this process's part of every process's ``values`` [n], in rank order: [size, n / size]. ``size``
+        divides n."""
         import torch.distributed as dist
 
         parts = torch.empty_like(values)
         self._timed(lambda: dist.all_to_all_single(parts, values), values)
         return parts.view(self.size, -1)
 
-    def join(self, part: Tensor) -> Tensor:
-        """[size m] the parts [m] of all of them, in their order."""
+    def all_gather(self, part: Tensor) -> Tensor:
+        """Concatenate the parts [m] of all processes in rank order: [size m]."""
         whole = part.new_empty(self.size * len(part))
         self._timed(lambda: self._gather(whole, part), whole)
         return whole
@@ -186,7 +185,7 @@ class Team:
     def _gather(self, out: Tensor, values: Tensor) -> None:
         import torch.distributed as dist
 
-        # Torch 2.13 has renamed it.
+        # Torch 2.13 renamed the collective.
         gather = getattr(dist, "all_gather_single", None) or dist.all_gather_into_tensor
         _or_lost(lambda: gather(out, values))
 
@@ -194,16 +193,16 @@ class Team:
 def _or_lost(call: Callable[[], Any]) -> None:
     try:
         call()
-    except RuntimeError as error:  # what gloo says differs with the system, and names addresses alone
-        raise Lost(
+    except RuntimeError as error:  # gloo's messages differ between systems and name addresses only
+        raise ProcessLost(
             "another process of this job has ended (its own message, if any, says why) or was silent for "
             f"{PATIENCE.total_seconds():.0f} seconds"
         ) from error
 
 
 def pieces(vectors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
-    """The contiguous ``vectors`` of any shape as flat views, dealt out to lists of ``PIECE`` elements in all; the last
-    may have fewer."""
+    """Deal out the contiguous ``vectors``, of any shape, as flat views to lists of ``PIECE`` elements in all; the last
+    list may have fewer."""
     piece: list[Tensor] = []
     room = PIECE
     for vector in vectors:
@@ -218,24 +217,24 @@ def pieces(vectors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
         yield piece
 
 
-class Total:
-    """A sum over processes and over calls of :meth:`add`, in a fixed order; or the largest.
+class OrderedReduction:
+    """A sum, or a maximum, over processes and over calls of :meth:`add`, in a fixed order.
 
-    Each process adds up one part of the vectors, and the parts are joined at the end: every element is added in the
+    Each process reduces one part of the vectors, and the parts are gathered at the end: every element is reduced in the
     same order in one place, and the bytes that a process receives do not grow with the number of processes.
     """
 
-    def __init__(self, team: Team, combine: Callable[..., Tensor] = torch.add) -> None:
+    def __init__(self, group: ProcessGroup, combine: Callable[..., Tensor] = torch.add) -> None:
         """``combine``: ``torch.add`` or ``torch.maximum``."""
-        self.team, self.combine = team, combine
+        self.group, self.combine = group, combine
         self._parts: list[Tensor] = []
 
     def add(self, vectors: Sequence[Tensor]) -> None:
-        """What each process has, first that of the first: contiguous tensors, of the same shapes in all of them and at
-        every call."""
+        """Reduce the vectors of all processes in rank order: contiguous tensors, of the same shapes in all processes
+        and at every call."""
         for index, piece in enumerate(pieces(vectors)):
-            rest = -sum(map(len, piece)) % self.team.size
-            theirs = self.team.exchange(torch.cat([*piece, piece[0].new_zeros(rest)]))
+            rest = -sum(map(len, piece)) % self.group.size
+            theirs = self.group.all_to_all(torch.cat([*piece, piece[0].new_zeros(rest)]))
             if index == len(self._parts):
                 self._parts.append(theirs[0].clone())
                 theirs = theirs[1:]
@@ -243,9 +242,9 @@ class Total:
                 self.combine(self._parts[index], part, out=self._parts[index])
 
     def write(self, vectors: Sequence[Tensor]) -> None:
-        """Overwrite the tensors, of the same shapes again, with the total: the same bits in all processes."""
+        """Overwrite tensors of the same shapes with the result: the same bits in all processes."""
         for part, piece in zip(self._parts, pieces(vectors)):
-            whole = self.team.join(part)
+            whole = self.group.all_gather(part)
             for target in piece:
                 target.copy_(whole[: len(target)])
                 whole = whole[len(target) :]

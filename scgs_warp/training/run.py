@@ -1,4 +1,4 @@
-"""A whole run, and what it leaves behind when training is over: scores, contact sheet, curves, a turntable."""
+"""A whole run: load, train, evaluate, and write scores, contact sheet, curves and a turntable."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from ..visualization import video
 from ..visualization.figures import curves
 from ..visualization.overlay import Painter
 from .loop import fit
-from .process_group import Team
+from .process_group import ProcessGroup
 from .run_folder import read_seconds
 
 FILM_FRAMES = 120
 FILM_SIZE = 400
 FPS = 30.0
 QUIET_SECONDS = 2.0
-"""Reading that takes longer shows how far it is."""
+"""Seconds of reading after which a progress bar appears."""
 
 
 def settings_of(config: TrainConfig, folder: Path) -> dict[str, Any]:
-    """What ``config.json`` of a run on the data in ``folder`` says."""
+    """Content of ``config.json`` for a run on the data in ``folder``."""
     settings = to_dict(config)
     settings["data"]["folder"] = str(folder.resolve())
     return settings
 
 
 def load_splits(config: TrainConfig, folder: Path) -> tuple[Dataset, Dataset]:
-    """Training and held-out frames, which share what ``config.data`` gives them of memory."""
-    look, cache = dataclasses.asdict(config.data), ImageCache(config.data.cache_mib)
+    """Load training and held-out frames, which share one cache of ``config.data.cache_mib``."""
+    options, cache = dataclasses.asdict(config.data), ImageCache(config.data.cache_mib)
 
     def read(split: str) -> Dataset:
         began, shown = time.monotonic(), []
@@ -54,12 +54,12 @@ def load_splits(config: TrainConfig, folder: Path) -> tuple[Dataset, Dataset]:
                 elif time.monotonic() - began > QUIET_SECONDS:
                     shown.append(stack.enter_context(progress(total, f"reading {split} images", start=done)))
 
-            return load(folder, split, **look, cache=cache, progress=show)
+            return load(folder, split, **options, cache=cache, progress=show)
 
     return read("train"), read("test")
 
 
-def train_and_finish(
+def train_and_evaluate(
     config: TrainConfig,
     data: Path,
     output: Path,
@@ -68,33 +68,33 @@ def train_and_finish(
     resume: bool = False,
     frames: int = FILM_FRAMES,
     lpips: Lpips | None = None,
-    look: Callable[[Dataset], None] | None = None,
+    before_training: Callable[[Dataset], None] | None = None,
     tensorboard: bool = False,
-    team: Team | None = None,
+    group: ProcessGroup | None = None,
 ) -> dict[str, Any]:
-    """Load, train, evaluate: what ``apps/train.py`` does.
+    """Load, train and evaluate, as ``apps/train.py`` does.
 
     Args:
-        data: folder of the data set; its train split is learnt, its test split measured.
+        data: folder of the data set; trains on its train split, evaluates on its test split.
         output: run directory.
         resume: continue the run in ``output``.
         frames: length of the turntable; 0: none.
-        lpips: the perceptual distance, if it is to be measured.
-        look: called with the training frames before training begins.
+        lpips: the perceptual distance; None: not measured.
+        before_training: called with the training frames.
         tensorboard: also write event files for TensorBoard to ``output``.
-        team: the processes that share the work of training; the first does the rest.
+        group: the processes that share the training; the first one evaluates.
 
     Returns:
-        what ``metrics.json`` holds; nothing in other processes than the first.
+        the content of ``metrics.json``; empty in processes other than the first.
 
     Raises:
-        UserError: of the data, the configuration, the run directory or the training; or scores and pictures cannot
-            be written after it.
-        KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal, the checkpoint being saved.
+        UserError: from the data, the configuration, the run directory or the training; or scores and pictures cannot be
+            written afterwards.
+        KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal; the checkpoint is saved.
     """
     train, test = load_splits(config, data)
-    if look is not None:
-        look(train)
+    if before_training is not None:
+        before_training(train)
     scene = fit(
         config,
         train,
@@ -104,33 +104,33 @@ def train_and_finish(
         resume=resume,
         settings=settings_of(config, data),
         tensorboard=tensorboard,
-        team=team,
+        group=group,
     )
-    if team is not None and not team.first:
+    if group is not None and not group.first:
         return {}
     try:
-        return finish(scene, test, output, frames=frames, lpips=lpips)
+        return write_results(scene, test, output, frames=frames, lpips=lpips)
     except (UserError, OSError) as error:
         raise UserError(
             f"{one_line(error)}; the scene is trained and saved: --resume makes the missing scores and pictures"
         ) from error
 
 
-def finish(
+def write_results(
     scene: Scene, test: Dataset, folder: Path, *, frames: int = FILM_FRAMES, lpips: Lpips | None = None
 ) -> dict[str, Any]:
-    """Evaluate the last step on the test split and write every picture.
+    """Evaluate the trained scene on the test split, and write metrics and pictures.
 
     Args:
-        scene: as training left it.
+        scene: result of the training.
         test: held-out frames.
         folder: the run directory; ``metrics.json``, ``contact_sheet.png``, ``curves.png``, ``turntable.mp4``,
             ``evaluation/`` go there.
         frames: length of the turntable; 0: none.
-        lpips: the perceptual distance, if it is to be measured.
+        lpips: the perceptual distance; None: not measured.
 
     Returns:
-        what ``metrics.json`` holds.
+        the content of ``metrics.json``.
     """
     scene.freeze_binding()
     renders = folder / "evaluation" / test.split
@@ -149,12 +149,12 @@ def finish(
     curves(folder / "log.jsonl", folder / "curves.png")
     if frames > 0:
         turntable(scene, folder / "turntable.mp4", frames)
-    write_metrics(metrics, folder / "metrics.json")  # last: a folder that has it is taken to have everything
+    write_metrics(metrics, folder / "metrics.json")  # last: its presence marks the folder as complete
     return metrics
 
 
 def turntable(scene: Scene, path: Path, frames: int, size: int = FILM_SIZE) -> None:
-    """A film of the moving scene seen from all around."""
+    """Render a film of the moving scene from a camera that circles it."""
     path_cameras = cameras.turntable(scene.overview, frames, size)
     views = [(camera, frame / max(frames - 1, 1)) for frame, camera in enumerate(path_cameras)]
     painter = Painter(scene, "rgb", views)
@@ -165,7 +165,7 @@ def turntable(scene: Scene, path: Path, frames: int, size: int = FILM_SIZE) -> N
 
 
 def summary(metrics: dict[str, Any]) -> str:
-    """The scores, one line each, for the terminal."""
+    """Format the scores for the terminal, one per line."""
     names = ("psnr", "ssim", "lpips", "epe", "jitter", "seconds", "gaussians", "control_points", "step")
     found = [(name, metrics[name]) for name in names if metrics.get(name) is not None]
     return "\n".join(

@@ -1,4 +1,4 @@
-"""A run directory: config.json, log.jsonl, previews/, and who may write to it."""
+"""A run directory: config.json, log.jsonl, previews/, and the lock that admits one trainer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -23,24 +23,24 @@ from ..scene.scene import Scene
 from ..storage.checkpoint import FILE, PREVIOUS
 from ..storage.files import write_atomically
 from ..visualization.figures import read_log
+from .state import StepResult, TrainState
 from .tensorboard import TensorBoard, check_installed
 
-if TYPE_CHECKING:
-    from .state import StepResult, TrainState
-
 LOG_EVERY = 50
+"""Steps between two log lines."""
 PREVIEW_SECONDS = 15.0
 LOCK = ".lock"
 TEST_IMAGES = 4
+"""Held-out images that the curve is measured on, about."""
 BOARD_IMAGES = 20
-"""Training pictures that a run shows in TensorBoard."""
+"""Number of training pictures per run in TensorBoard."""
 
 
 def read_seconds(folder: Path) -> float | None:
-    """Seconds of training according to the log; None without one."""
+    """Read the seconds of training from the log; None without a log."""
     newest: float | None = None
     for entry in _entries(folder):
-        with suppress(ValueError, KeyError, TypeError):  # not ours
+        with suppress(ValueError, KeyError, TypeError):  # a damaged line
             newest = float(entry["seconds"])
     return newest
 
@@ -51,24 +51,24 @@ def _entries(folder: Path) -> list[dict[str, Any]]:
 
 
 def refuse_existing(path: Path, resume: bool) -> None:
-    """Nothing is ever overwritten.
+    """Refuse to overwrite a run.
 
     Raises:
-        UserError: there is a run in ``path`` and ``resume`` was not asked for.
+        UserError: ``path`` holds a run, and ``resume`` is False.
     """
     if not resume and ((path / FILE).exists() or (path / PREVIOUS).exists()):
         raise UserError(f"{path}: holds a run already; continue it with --resume or choose another --output")
 
 
 class RunFolder:
-    """Use as a context manager: holds a lock, so that two trainers cannot share one directory.
+    """The run directory of a trainer; a context manager that holds a lock, so that two trainers cannot share it.
 
     With ``tensorboard`` the log's entries, and a picture now and then, also go to event files. Log, previews, event
-    files and the look at held-out frames are for the eye: where they fail, training says so once and goes on.
+    files and the scores of held-out frames are optional: where they fail, training warns once and goes on.
 
     Raises:
-        UserError: not writable, in use, or there is a run already and ``resume`` was not asked for; ``tensorboard``
-            without the package.
+        UserError: the directory is not writable, in use, or holds a run while ``resume`` is False; ``tensorboard`` is
+            asked for without its package.
     """
 
     def __init__(
@@ -91,11 +91,13 @@ class RunFolder:
         self._began = time.perf_counter()
         self._shown_at = 0.0
         self._psnr: float | None = None
+        self._regulariser = 0.0
+        """Weighted term of the last step that carried it since the last log line: one step in a few carries ARAP."""
         self._told: set[str] = set()
         self._torn = False
-        """Whether the log may end in the middle of a line."""
+        """True while the log may end in the middle of a line."""
         self.tell: Callable[[str], None] = say
-        """Shows a line that is no error."""
+        """Prints a line that is no error."""
 
     def __enter__(self) -> RunFolder:
         if self.resume and not self.path.is_dir():
@@ -125,7 +127,7 @@ class RunFolder:
 
     @contextmanager
     def _optional(self, what: str) -> Iterator[None]:
-        """Around what a run can do without."""
+        """Turn a failure of an optional output into one warning."""
         try:
             yield
         except (OSError, UserError) as error:
@@ -137,7 +139,7 @@ class RunFolder:
         self._lock_file = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             import fcntl
-        except ImportError:  # not on Windows: there a second trainer is the user's own care
+        except ImportError:  # Windows has no fcntl: there the user must not start a second trainer
             return
         try:
             fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -147,24 +149,24 @@ class RunFolder:
                 f"{self.path}: another trainer is running here; wait for it or choose another --output"
             ) from error
         except OSError:
-            pass  # a file system without locks: there a second trainer is the user's own care, too
+            pass  # a file system without locks: the same
 
     @property
-    def has_begun(self) -> bool:
-        """Whether a run has begun here that no checkpoint was written of."""
+    def has_no_checkpoint(self) -> bool:
+        """True where a run has begun but has not written a checkpoint."""
         names = (FILE, PREVIOUS)
         return (self.path / "config.json").is_file() and not any((self.path / name).exists() for name in names)
 
-    def begin(self, step: int) -> None:
-        """Write the configuration; drop log lines after ``step``, which a resumed run will write again, and what was
-        half written when the process was killed."""
+    def start(self, step: int) -> None:
+        """Write the configuration, drop log lines after ``step``, which a resumed run writes again, and remove files
+        that a killed process left half written."""
         for left in self.path.glob(".*.tmp"):
             with suppress(OSError):
                 left.unlink()
         self._write_settings()
         entries: list[dict[str, Any]] = []
         for entry in _entries(self.path) if self.resume else []:
-            with suppress(ValueError, TypeError):  # not ours
+            with suppress(ValueError, TypeError):  # a damaged line
                 if int(entry.get("step", 0)) <= step:
                     self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
                     entries.append(entry)
@@ -180,10 +182,11 @@ class RunFolder:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of training, those before a resume counted in."""
+        """Seconds of training, including those before a resume."""
         return self.seconds + time.perf_counter() - self._began
 
     def log(self, entry: dict[str, Any]) -> None:
+        """Append an entry to ``log.jsonl`` and to the event files."""
         line = json.dumps({**entry, "seconds": round(self.elapsed, 2)}) + "\n"
         with self._optional("log lines"):
             torn, self._torn = self._torn, True
@@ -193,8 +196,8 @@ class RunFolder:
         self._on_board(lambda board: board.record(entry))
 
     def _on_board(self, action: Callable[[TensorBoard], None]) -> None:
-        """For those who watch in TensorBoard, if somebody does."""
-        board, self._board = self._board, None  # one that has failed once fails for good, or waits for ever
+        """Write to the event files, if there are any."""
+        board, self._board = self._board, None  # a board that failed once fails always, or waits for ever
         if board is not None:
             with self._optional("the event files for TensorBoard"):
                 action(board)
@@ -204,12 +207,15 @@ class RunFolder:
         self._on_board(lambda board: board.show(name, truth, render, step))
 
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
-        """Progress, a log line every 50 steps, a preview every 15 seconds. ``state.step`` counts the step as done."""
+        """Advance the progress bar; log every 50 steps, write a preview every 15 seconds. ``state.step`` counts this
+        step."""
         due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
+        if result.failed is None and result.regulariser:
+            self._regulariser = result.regulariser
         if due and result.failed is None:
-            seen = slice(None) if result.mask is None else result.mask  # as the loss and the test's score do
-            now = float(psnr(result.render[:, seen], result.truth[:, seen]))
-            if math.isfinite(now):  # equal images, both empty, have none
+            valid = slice(None) if result.mask is None else result.mask  # as in the loss and the score of the test
+            now = float(psnr(result.render[:, valid], result.truth[:, valid]))
+            if math.isfinite(now):  # the PSNR of equal images is infinite
                 self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
             self.log(
                 {
@@ -218,12 +224,13 @@ class RunFolder:
                     "loss": float(result.loss),
                     "l1": float(result.l1),
                     "ssim": float(result.ssim),
-                    "regulariser": result.regulariser,
+                    "regulariser": self._regulariser,
                     "psnr": None if self._psnr is None else round(self._psnr, 3),
                     "gaussians": len(state.gaussians),
                     "control_points": len(getattr(state.motion, "positions", ())),
                 }
             )
+            self._regulariser = 0.0
         if due or result.failed:
             bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
         else:
@@ -237,7 +244,7 @@ class RunFolder:
                 self.show(result)
 
     def show(self, result: StepResult) -> None:
-        """``previews/latest.png``: truth beside render."""
+        """Write ``previews/latest.png``: truth beside render."""
         import cv2
 
         pair = torch.cat([result.truth, result.render], dim=2).clamp(0.0, 1.0)
@@ -246,14 +253,14 @@ class RunFolder:
         if done:
             write_atomically(self.path / "previews" / "latest.png", content.tobytes())
 
-    def look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
-        """PSNR of a few test images after ``step`` steps, for the curve."""
+    def log_test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
+        """Log the PSNR of a few test images after ``step`` steps."""
         scene.motion.eval()
-        with self._optional("the look at held-out frames"):
-            self._look_at_test(scene, test, step)
+        with self._optional("scores of held-out frames"):
+            self._test_psnr(scene, test, step)
         scene.motion.train()
 
-    def _look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+    def _test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
         wanted = range(0, len(test), max(1, len(test) // TEST_IMAGES))
         values = []
         for i in wanted:
@@ -268,10 +275,10 @@ class RunFolder:
             self.log({"step": step, "test_psnr": sum(values) / len(values)})
 
 
-class Onlooker(RunFolder):
-    """The run directory as processes see it that leave it to another one: nothing is written."""
+class ReadOnlyRunFolder(RunFolder):
+    """The run directory in processes other than the first: nothing is written."""
 
-    def __enter__(self) -> Onlooker:
+    def __enter__(self) -> ReadOnlyRunFolder:
         return self
 
     def __exit__(
@@ -279,7 +286,7 @@ class Onlooker(RunFolder):
     ) -> None:
         pass
 
-    def begin(self, step: int) -> None:
+    def start(self, step: int) -> None:
         pass
 
     def log(self, entry: dict[str, Any]) -> None:
@@ -288,5 +295,5 @@ class Onlooker(RunFolder):
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
         pass
 
-    def look_at_test(self, scene: Scene, test: Dataset, step: int) -> None:
+    def log_test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
         pass

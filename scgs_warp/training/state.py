@@ -1,4 +1,4 @@
-"""Everything a training run is at one step, and how it is saved and resumed to the same bits."""
+"""The state of a training run at one step, saved and resumed to the same bits."""
 
 from __future__ import annotations
 
@@ -23,35 +23,43 @@ from ..scene.validation import check_metadata, check_motion, check_resumed, chec
 from ..seeding import generator
 from ..storage import checkpoint
 from ..types import Stats
-from .background_points import backdrop
+from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .frames import first_frames
-from .initial_points import likely_points
-from .pretrain import begin_gaussians, begin_motion, begin_spheres, control_points_of, sphere_base, thin_spheres
-from .process_group import Team
+from .initial_points import sample_initial_points
+from .pretrain import (
+    control_points_from_spheres,
+    initial_gaussians,
+    initial_motion,
+    initial_spheres,
+    sphere_unit,
+    thin_spheres,
+)
+from .process_group import ProcessGroup
 
 Stage = Literal["pretrain", "main"]
 
 
 class StepResult(NamedTuple):
-    """What a step reports: detached scalars, the mean over its views, and a picture for previews."""
+    """Report of a step: detached scalars, the mean over its views, and a picture for previews."""
 
     loss: Tensor
     l1: Tensor
     ssim: Tensor
     regulariser: float
+    """Weighted; 0 in steps without the term."""
     render: Tensor
     truth: Tensor
     mask: Tensor | None
-    """[H, W] bool, the pixels that count; None: all."""
+    """[H, W] bool, True where the pixel is valid; None: everywhere."""
     failed: str | None
-    """The name of the term that was not finite, if any; the step was dropped."""
+    """Name of the non-finite term for which the step was dropped, if any."""
     size: tuple[int, int]
-    """Width and height of the step's first view, in pixels."""
+    """Width and height of the step's first view in pixels."""
 
 
 class TrainState:
-    """Parameters, optimisers, statistics, step. ``step`` counts both stages; ``stage_step`` the present one."""
+    """Parameters, optimisers, statistics and step. ``step`` counts both stages, ``stage_step`` the present one."""
 
     def __init__(
         self,
@@ -74,16 +82,16 @@ class TrainState:
         self.stage: Stage = stage
         self.step, self.fingerprint = step, fingerprint
         self.failures = 0
-        self.team: Team | None = None
-        """The processes that share each step's views, if this is one of several; no part of a checkpoint."""
-        self.whole = True
-        """Whether ``step`` counts all that has been done to the parameters."""
+        self.group: ProcessGroup | None = None
+        """The processes that share each step's views; no part of a checkpoint."""
+        self.consistent = True
+        """False between an update of the parameters and the increment of ``step``: not to be saved."""
         self.cameras = CameraRefinement(frames if config.optim.cameras > 0 else 0).to(gaussians.means.device)
         self.camera_optimizer = self.cameras.optimizer()
         self.enter(gaussians, motion)
 
     def enter(self, gaussians: GaussianParameters, motion: Motion) -> None:
-        """Take these models, with fresh optimisers and statistics."""
+        """Replace the models, with fresh optimisers and statistics."""
         self.gaussians, self.motion = gaussians, motion
         self.gaussian_optimizer = Adam(dict(gaussians.named_parameters()), self.gaussian_rates())
         self.motion_optimizer = motion.optimizer(self.config)
@@ -91,27 +99,29 @@ class TrainState:
 
     @staticmethod
     def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
+        """Make the state at step 0."""
         normalisation = Normalisation.fit(data.cameras, data.points)
-        config = suited(config, data)
+        config = resolve_auto(config, data)
         points, colors = (tensor.to(device) for tensor in _initial_points(config, data, normalisation))
-        # A camera that stands still has no extent of its own; sizes are then judged by that of the content.
+        # A camera that stands still has no extent; then that of the content is used.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
         rest = (normalisation, overview(data.cameras), extent, points, colors)
-        seen = {"fingerprint": data.fingerprint, "frames": len(data)}
+        identity = {"fingerprint": data.fingerprint, "frames": len(data)}
         if config.pretrain_steps > 0:
-            spheres = begin_spheres(config, points, colors, device)
-            return TrainState(config, *spheres, *rest, stage="pretrain", **seen)
-        gaussians = begin_gaussians(config, points, colors)
-        rest_points = points if data.points is None or not given(data, config) else points[: len(data.points)]
-        motion = begin_motion(config, rest_points, len(data.times.unique())).to(device)  # none on bare walls
-        return TrainState(config, gaussians, motion, *rest, stage="main", **seen)
+            spheres = initial_spheres(config, points, colors, device)
+            return TrainState(config, *spheres, *rest, stage="pretrain", **identity)
+        gaussians = initial_gaussians(config, points, colors)
+        # Control points start on the data's points, not on those of bare walls.
+        own = len(data.points) if data.points is not None and has_initial_points(data, config) else len(points)
+        motion = initial_motion(config, points[:own], len(data.times.unique())).to(device)
+        return TrainState(config, gaussians, motion, *rest, stage="main", **identity)
 
     def begin_main(self) -> None:
-        """From stage 1 to stage 2: spheres become control points, new Gaussians are made."""
+        """Enter stage 2: spheres become control points, and Gaussians are made."""
         assert isinstance(self.motion, Spheres)
         thin_spheres(self.gaussians, self.gaussian_optimizer, self.motion, self.config.motion.nodes)
-        points = control_points_of(self.gaussians, self.motion, self.config)
-        gaussians = begin_gaussians(self.config, self.points, self.colors, (self.gaussians, self.motion))
+        points = control_points_from_spheres(self.gaussians, self.motion, self.config)
+        gaussians = initial_gaussians(self.config, self.points, self.colors, (self.gaussians, self.motion))
         self.stage = "main"
         self.enter(gaussians, points)
 
@@ -128,15 +138,15 @@ class TrainState:
         return len(self.cameras.twists) > 0 and self.stage == "main" and self.stage_step >= self.config.rest_steps
 
     def optimizers(self) -> list[Adam]:
-        found = [self.gaussian_optimizer, self.motion_optimizer, self.camera_optimizer]
-        return [optimizer for optimizer in found if optimizer is not None]
+        every = [self.gaussian_optimizer, self.motion_optimizer, self.camera_optimizer]
+        return [optimizer for optimizer in every if optimizer is not None]
 
     def reset_stats(self) -> None:
         absolute = self.config.densify.absolute_grad and self.stage == "main"
         self.stats = Stats.zeros(len(self.gaussians), self.device, absolute)
 
     def gaussian_rates(self) -> dict[str, float]:
-        """Learning rates of the Gaussians that do not follow a schedule, and where the others start."""
+        """Learning rates of the Gaussians: the constant ones, and the initial values of the others."""
         rates, spheres = self.config.optim, self.stage == "pretrain"
         return {
             "means": rates.means,
@@ -150,12 +160,12 @@ class TrainState:
         }
 
     def scene(self) -> Scene:
-        """The scene as it stands, for evaluation and pictures; shares the parameters."""
+        """The present scene, for evaluation and pictures; shares the parameters."""
         return Scene(self.gaussians, self.motion, self.normalisation, self.config, self.overview, step=self.step)
 
     def save(self, folder: Path) -> None:
-        """Write the checkpoint; of several processes the first does."""
-        if self.team is not None and not self.team.first:
+        """Write the checkpoint, in the first process only."""
+        if self.group is not None and not self.group.first:
             return
         tensors = dict(self.scene().tensors())
         tensors.update(self.gaussian_optimizer.tensors("adam.gaussians"))
@@ -183,13 +193,13 @@ class TrainState:
         """Continue from the checkpoint in ``folder``.
 
         Raises:
-            UserError: there is none, it is damaged, or it was made with another configuration.
+            UserError: the checkpoint is missing, damaged, or made with another configuration.
         """
-        config = suited(config, data)
+        config = resolve_auto(config, data)
         tensors, metadata = checkpoint.read(folder)
         source = str(folder / checkpoint.FILE)
         check_metadata(metadata, source)
-        _same_configuration(metadata["config"], to_dict(config), source)
+        _check_same_configuration(metadata["config"], to_dict(config), source)
         if metadata.get("frames") != data.fingerprint:
             raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
         check_tensors(tensors, source)
@@ -232,20 +242,20 @@ class TrainState:
         return state
 
 
-def given(data: Dataset, config: TrainConfig) -> bool:
-    """Whether the data brings points to begin with: enough to tell where the scene is, and for every Gaussian to have
-    its control points among them. Fewer are no more than noise of a failed reconstruction."""
+def has_initial_points(data: Dataset, config: TrainConfig) -> bool:
+    """Decide whether the data brings enough initial points to locate the scene and to sample control points from.
+    Fewer are noise of a failed reconstruction."""
     fewest = max(FEWEST_POINTS, config.motion.neighbors + 1)
     return data.points is not None and len(data.points) >= fewest
 
 
-def suited(config: TrainConfig, data: Dataset) -> TrainConfig:
-    """What is ``auto``, decided by what the data offers; the figures are of a hand over a shelf, 128 x 96.
+def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
+    """Replace ``auto`` values by those that suit the data. Figures are of a hand over a shelf, 128 x 96.
 
-    Images without alpha are filled: bare walls are as large as they are (Gaussians not pruned for it: 1.9 dB), and
-    much of what they show rests beside what moves (hyper-coordinates: 0.55 dB; a motion mask: 0.2 dB, none on top).
-    Where there are points, control points begin as a sample of them, and Gaussians at them (2 dB better than spheres
-    that have to find both).
+    Images without alpha are filled: bare walls need large Gaussians (not pruning them gains 1.9 dB), and much of the
+    image rests beside moving surfaces (hyper-coordinates gain 0.55 dB; a motion mask 0.2 dB, and nothing on top).
+    Where the data brings points, control points begin as a sample of them, and Gaussians at them (2 dB better than
+    spheres that have to find both).
     """
     filled = not data.with_alpha
     motion, growth = config.motion, config.densify
@@ -254,37 +264,38 @@ def suited(config: TrainConfig, data: Dataset) -> TrainConfig:
         config = replace(config, motion=replace(motion, hyper_dim=hyper_dim))
     if growth.prune_large == "auto":
         config = replace(config, densify=replace(growth, prune_large="never" if filled else "always"))
-    if given(data, config) and not config.pretrain.with_points:
+    if has_initial_points(data, config) and not config.pretrain.with_points:
         config = replace(config, init_from="points", pretrain=replace(config.pretrain, steps=0))
     return config
 
 
 def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
-    """Points [P, 3], normalised, and colours [P, 3]: the data's own points in a random order, and some for what has no
-    texture; else likely ones."""
-    count = max(config.init_points, round(sphere_base(config) * config.pretrain.start_ratio))
-    if data.points is None or not given(data, config):
-        # Progressive pre-training starts from the pose of the first frames; what others cover is not there yet.
+    """Choose points [P, 3], normalised, and colours [P, 3]: the data's own in a random order, with points behind them
+    for surfaces without texture; else points sampled where the images are covered."""
+    count = max(config.init_points, round(sphere_unit(config) * config.pretrain.start_ratio))
+    if data.points is None or not has_initial_points(data, config):
+        # Progressive pre-training starts from the pose of the first frames, so only they are sampled.
         frames = first_frames(data) if config.pretrain.progressive and config.pretrain_steps else data
-        points, colors = likely_points(count, frames, normalisation, config.seed, 31)
+        points, colors = sample_initial_points(count, frames, normalisation, config.seed, 31)
         return points, torch.full_like(points, 0.5) if colors is None else colors
     order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
     points = normalisation.apply(data.points)[order].float().contiguous()
     colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
-    if data.with_alpha:  # then nothing lies behind
+    if data.with_alpha:  # nothing lies behind the points
         return points, colors
-    behind = backdrop(count - len(points), points, data, normalisation, config.seed, 35)
+    behind = background_points(count - len(points), points, data, normalisation, config.seed, 35)
     return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]])
 
 
-def _same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
+def _check_same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
+    """Refuse to resume with other settings than the checkpoint's."""
     for name, value in wanted.items():
         if f"{prefix}{name}" in FREE_TO_CHANGE:
             continue
         if isinstance(value, dict):
             inner = saved.get(name, {})
-            _same_configuration(inner if isinstance(inner, dict) else {}, value, source, f"{prefix}{name}.")
-        elif name not in saved:  # what that version did instead cannot be asked for
+            _check_same_configuration(inner if isinstance(inner, dict) else {}, value, source, f"{prefix}{name}.")
+        elif name not in saved:  # no value of the field stands for that version's behaviour
             raise UserError(
                 f"{source}: made by another version, which had no {prefix}{name}; train again with another --output"
             )

@@ -1,4 +1,4 @@
-"""One training step, in the order things happen."""
+"""One training step: views, poses, renders and losses in order, then the update of the parameters."""
 
 from __future__ import annotations
 
@@ -20,20 +20,26 @@ from .multi_view import all_views
 from .state import StepResult, TrainState
 
 SETTLED = 0.05
-"""What remains of the constant rates at the last step."""
+"""Factor of the constant learning rates at the last step."""
 
 
 def training_step(state: TrainState, frames: Frames) -> StepResult:
-    """One step: look at each view of the batch, then change the parameters. Changes ``state``, except its ``step``."""
+    """Render and compare each view of the batch, then update the parameters.
+
+    Changes ``state``, except its ``step``. A non-finite loss or gradient leaves all parameters as they are.
+    """
+    # 1. Learning rates, and the gradients of all views.
     set_rates(state)
     if state.config.batch == 1:
         result = one_view(state, frames, 0, state.stats)
     else:
         result = all_views(state, frames, one_view)
-    failed = result.failed or _bad_gradient(state)
+
+    # 2. Update.
+    failed = result.failed or _non_finite_gradient(state)
     if failed is None:
         state.gaussian_optimizer.step()
-        if state.motion_optimizer is not None and not frozen(state):
+        if state.motion_optimizer is not None and not motion_frozen(state):
             state.motion_optimizer.step()
         if state.refines_cameras:
             state.camera_optimizer.step()
@@ -44,38 +50,47 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
 
 
 def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> StepResult:
-    """One frame: pose, render, compare, go back. Adds to the parameters' gradients and to ``stats``; a loss that is not
-    finite adds nothing.
+    """Pose, render and compare one frame, and propagate gradients back.
+
+    Adds to the parameters' gradients and to ``stats``; a non-finite loss adds no gradients.
 
     Args:
-        view: which one of the step's batch.
+        view: index of the view in the step's batch.
     """
     config, step = state.config, state.stage_step
     pretraining = state.stage == "pretrain"
+
+    # 1. View: frame, camera and background. The frame after this process's next view is read in the background.
     progressive = config.pretrain.progressive and pretraining
     index = frames.index_at(step, progressive, view)
     random_background = pretraining and config.pretrain.random_background
     frame, camera, truth, background, mask = frames.view(index, state.step, random_background, view)
-    later, next_view = divmod(view + (1 if state.team is None else state.team.size), config.batch)
+    later, next_view = divmod(view + (1 if state.group is None else state.group.size), config.batch)
     frames.expect(step + later, progressive, next_view)
     if state.refines_cameras:
         camera = state.cameras.apply(camera, index)
 
+    # 2. Pose: the Gaussians at the frame's time, and the regulariser of the motion.
     time = noisy_time(frame.time, state, len(frames), view)
     posed, regulariser = state.motion.train_at(state.gaussians, time, step, config, config.seed, view)
+
+    # 3. Render. Statistics for densification are collected until it ends.
     collecting = pretraining or step < config.densify.until
     picture, _ = draw(
         posed,
         camera,
         background,
-        sh_degree=min(state.gaussians.sh_degree, step // config.densify.sh_every),
+        sh_degree=sh_degree(state, step),
         stats=stats if collecting else None,
         antialiased=config.antialiased,
     )
+
+    # 4. Compare.
     loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim)
     total = loss if regulariser is None else loss + regulariser
 
-    failed = _not_finite(loss, regulariser)
+    # 5. Propagate back, unless the loss is non-finite.
+    failed = _non_finite_term(loss, regulariser)
     if failed is None:
         total.backward()
     weighted = 0.0 if regulariser is None else float(regulariser.detach())
@@ -83,13 +98,18 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     return StepResult(*losses, picture.detach(), truth, mask, failed, size)
 
 
-def frozen(state: TrainState) -> bool:
-    """Main steps in which only the Gaussians learn (seed S4)."""
+def sh_degree(state: TrainState, step: int) -> int:
+    """Degree of spherical harmonics at this step of the stage: one more every ``densify.sh_every`` steps."""
+    return min(state.gaussians.sh_degree, step // state.config.densify.sh_every)
+
+
+def motion_frozen(state: TrainState) -> bool:
+    """True for the first main steps, in which only the Gaussians learn (seed S4)."""
     return state.stage == "main" and state.stage_step < state.config.rest_steps
 
 
 def set_rates(state: TrainState) -> None:
-    """Every learning rate is a function of the step."""
+    """Set every learning rate, each a function of the step."""
     config, step = state.config, state.stage_step
     means = log_linear(config.optim.means, config.optim.means_end, step, config.optim.means_until)
     settled = settling(step, config)
@@ -112,8 +132,8 @@ def settling(step: int, config: TrainConfig) -> float:
 
 
 def noisy_time(time: float, state: TrainState, frames: int, view: int = 0) -> float:
-    """The view's time with noise, for data whose cameras stand elsewhere at every time: it keeps the motion from
-    jumping from frame to frame."""
+    """Add noise to a view's time, for data whose cameras stand elsewhere at every time: it keeps the motion from
+    jumping from frame to frame. The noise fades until ``optim.network_until``."""
     config = state.config
     fade = max(0.0, 1.0 - state.stage_step / config.optim.network_until)
     spread = config.motion.time_noise * fade / max(frames - 1, 1)
@@ -123,7 +143,7 @@ def noisy_time(time: float, state: TrainState, frames: int, view: int = 0) -> fl
     return min(max(time + spread * float(noise), 0.0), 1.0)
 
 
-def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
+def _non_finite_term(loss: Tensor, regulariser: Tensor | None) -> str | None:
     if not math.isfinite(float(loss.detach())):
         return "image loss"
     if regulariser is not None and not math.isfinite(float(regulariser.detach())):
@@ -131,7 +151,7 @@ def _not_finite(loss: Tensor, regulariser: Tensor | None) -> str | None:
     return None
 
 
-def _bad_gradient(state: TrainState) -> str | None:
+def _non_finite_gradient(state: TrainState) -> str | None:
     named = [pair for optimizer in state.optimizers() for pair in optimizer.gradients()]
     bad = first_not_finite([gradient for _, gradient in named])
     return None if bad is None else f"gradient of {named[bad][0]}"

@@ -24,13 +24,13 @@ TAGS = {
     "gaussians": "size/gaussians",
     "control_points": "size/control_points",
 }
-"""Fields of a log entry, and the curves they make."""
-LONGEST = 1024
-"""Pixels of a picture's longer side, at most: TensorBoard holds them all in memory."""
+"""Fields of a log entry and the names of their curves."""
+LONGEST_SIDE = 1024
+"""Largest side of a picture in pixels: TensorBoard holds all pictures in memory."""
 
 
 def check_installed() -> None:
-    """Before anything is computed.
+    """Refuse ``--tensorboard`` without its package, before anything is computed.
 
     Raises:
         UserError: the package is missing.
@@ -42,18 +42,17 @@ def check_installed() -> None:
 class TensorBoard:
     """The event files of one run directory.
 
-    A run that is resumed goes on in a file of its own, which takes back what an earlier one says of steps that will be
-    done again. What the log has and the files lack (a kill before it was written, a part of the run without
-    TensorBoard) is written again.
+    A resumed run continues in a file of its own, which withdraws the earlier file's values of steps to be repeated.
+    Log entries that the files lack (after a kill, or a part of the run without TensorBoard) are written again.
 
     Args:
         folder: the run directory.
-        entries: those of ``log.jsonl`` up to ``step``.
-        step: the step the run stands at.
-        seconds: of training so far.
+        entries: the entries of ``log.jsonl`` up to ``step``.
+        step: number of steps done.
+        seconds: seconds of training so far.
 
     Raises:
-        OSError: of each method: the files cannot be written. Such a board is of no further use.
+        OSError: (all methods) the files cannot be written; the board cannot be used any further.
     """
 
     def __init__(self, folder: Path, entries: list[dict[str, Any]], step: int, seconds: float) -> None:
@@ -69,7 +68,7 @@ class TensorBoard:
         self._writer.flush()
 
     def record(self, entry: dict[str, Any]) -> None:
-        """A log entry, on disk when this returns: a kill loses no more here than in the log."""
+        """Write a log entry to disk: a kill loses no more here than in the log."""
         self._write(entry, time.time(), {})
         self._writer.flush()
 
@@ -81,15 +80,15 @@ class TensorBoard:
                 self._writer.add_scalar(tag, float(value), step, walltime=moment)
 
     def show(self, name: str, truth: Tensor, render: Tensor, step: int) -> None:
-        """Truth beside render.
+        """Write a picture of truth beside render.
 
         Args:
-            name: of the pictures, one for each step.
+            name: name of the series of pictures, one per step.
             truth, render: [3, H, W] in [0, 1].
-            step: steps done.
+            step: number of steps done.
         """
         pair = torch.cat([truth.detach(), render.detach().to(truth.device)], dim=2).clamp(0.0, 1.0)
-        shrink = math.ceil(max(pair.shape[1:]) / LONGEST)
+        shrink = math.ceil(max(pair.shape[1:]) / LONGEST_SIDE)
         if 1 < shrink <= min(pair.shape[1:]):
             pair = torch.nn.functional.avg_pool2d(pair, shrink)
         self._writer.add_image(name, pair.cpu(), step)
@@ -99,13 +98,13 @@ class TensorBoard:
         self._writer.close()
 
     def _thread_ended(self, ended: threading.ExceptHookArgs) -> None:
-        """The package's own thread writes the files; it prints a traceback of what it also raises at the next call."""
+        """Silence the package's writer thread, which prints a traceback of errors that the next call raises as well."""
         if not issubclass(ended.exc_type, OSError) or not type(ended.thread).__module__.startswith("tensorboard."):
             self._loud(ended)
 
 
 def newest_steps(folder: Path, step: int) -> dict[str, int]:
-    """The last step, ``step`` at most, of each curve in the event files of a folder."""
+    """Find the last step, at most ``step``, of each curve in the event files of a folder."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     if not any(folder.glob("events.out.tfevents.*")):

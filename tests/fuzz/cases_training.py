@@ -29,7 +29,7 @@ from scgs_warp.optim import Adam
 from scgs_warp.runtime.launch import launch
 from scgs_warp.scene.scene import Scene
 from scgs_warp.seeding import generator
-from scgs_warp.training.densify import densify
+from scgs_warp.training.density_control import grow_and_prune
 from scgs_warp.types import Stats
 
 from . import laws
@@ -187,7 +187,7 @@ def case_densify(d: Draw, device: str) -> None:
     stats = Stats(*on(device, stats.grad_norm, stats.count, stats.max_radii))
     config = DensifyConfig(max_gaussians=count + int(d.rng.integers(0, 50)))
     options = {"grad_threshold": 0.5, "extent": 1.0, "prune_large": d.chance(), "random": generator(0, 1)}
-    densify(made, optimizer, stats, config, **options)
+    grow_and_prune(made, optimizer, stats, config, **options)
     left = len(made)
     assert 1 <= left <= config.max_gaussians
     for name in GaussianParameters.NAMES:

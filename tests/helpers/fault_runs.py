@@ -85,5 +85,5 @@ def done(tmp_path_factory) -> tuple[Path, Path]:
     """A data set and a complete run on it."""
     folder = tmp_path_factory.mktemp("done")
     data = write_dnerf(folder / "data", size=24)
-    run.train_and_finish(config(), data, folder / "run", frames=2)
+    run.train_and_evaluate(config(), data, folder / "run", frames=2)
     return data, folder / "run"

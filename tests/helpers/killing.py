@@ -29,12 +29,12 @@ from helpers.tiny import tiny_config, tiny_dataset  # isort: skip
 from scgs_warp.config.presets import TrainConfig
 from scgs_warp.runtime import environment
 from scgs_warp.storage import checkpoint, files
-from scgs_warp.training import density_control, loop, visibility
+from scgs_warp.training import density_control, loop
 from scgs_warp.training.state import TrainState
 
 STEPS = 48
 FRAMES = 6
-visibility.STEPS_PER_VIEW = 1  # so short a run would look at no view
+density_control.STEPS_PER_VIEW = 1  # else so short a run samples no view
 
 
 def settings() -> TrainConfig:
@@ -96,7 +96,7 @@ MOMENTS: dict[str, Callable[[], None]] = {
     "before the folder is flushed": lambda: wrapped(files, "sync_folder", nth(13, always)),
     "after the stage has changed": lambda: wrapped(TrainState, "begin_main", lambda *_: None, die),
     "while spheres are added": lambda: wrapped(density_control, "densify_spheres", lambda *_: None, nth(2, always)),
-    "while Gaussians are added": lambda: wrapped(density_control, "densify", lambda *_: None, nth(3, always)),
+    "while Gaussians are added": lambda: wrapped(density_control, "grow_and_prune", lambda *_: None, nth(3, always)),
     "before the unseen are pruned": lambda: wrapped(density_control, "prune", nth(1, always)),
 }
 """Moments of a kill by name, and how to reach each."""
@@ -107,9 +107,9 @@ LATE = ("before the first checkpoint",)
 def narrate(tell: Callable[[str], None]) -> None:
     """Report what the run is doing."""
     wrapped(loop, "training_step", lambda state, _: tell(f"{state.stage} step"))
-    wrapped(loop, "adapt", lambda state, *_: tell(f"{state.stage} densification, if due"))
+    wrapped(loop, "control_density", lambda state, *_: tell(f"{state.stage} densification, if due"))
     wrapped(TrainState, "begin_main", lambda *_: tell("stage change"))
-    wrapped(density_control, "densify", lambda *_: tell("main densification"))
+    wrapped(density_control, "grow_and_prune", lambda *_: tell("main densification"))
     wrapped(density_control, "densify_spheres", lambda *_: tell("pretrain densification"))
     wrapped(checkpoint, "write", lambda *_: tell("checkpoint: gathering"))
     wrapped(files, "write_and_flush", lambda *_: tell("checkpoint: writing"))

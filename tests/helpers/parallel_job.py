@@ -30,7 +30,7 @@ from scgs_warp.runtime.torchrun import process_rank
 from scgs_warp.training import loop, process_group
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
-from scgs_warp.training.process_group import Team, team_of
+from scgs_warp.training.process_group import ProcessGroup, join_processes
 from scgs_warp.training.state import StepResult, TrainState
 
 SHORT = timedelta(seconds=6)
@@ -70,12 +70,12 @@ DATA: dict[str, tuple[TrainConfig, Callable[[], Dataset]]] = {
 }
 
 
-def at_step(step: int, rank: int, team: Team | None, act: Callable[[TrainState], None]) -> None:
+def at_step(step: int, rank: int, group: ProcessGroup | None, act: Callable[[TrainState], None]) -> None:
     """Have one process do something before a step's views."""
     original = loop.training_step
 
     def acting(state: TrainState, frames: Frames) -> StepResult:
-        if state.step == step and (team is None or team.rank == rank):
+        if state.step == step and (group is None or group.rank == rank):
             act(state)
         return original(state, frames)
 
@@ -98,18 +98,20 @@ def hang(state: TrainState) -> None:
     time.sleep(1.5 * SHORT.total_seconds())
 
 
-def play(name: str, team: Team | None, output: Path) -> None:
+def play(name: str, group: ProcessGroup | None, output: Path) -> None:
     """One scenario: a run of ``DATA``, or one of those with a mishap on the plain one."""
     mishaps = {"stopped": (20, 1, ask), "killed": (23, 1, kill), "hung": (7, 0, hang), "nudged": (6, 1, nudge)}
     if name in mishaps:
         step, rank, act = mishaps[name]
-        at_step(step, rank, team, act)
+        at_step(step, rank, group, act)
     process_group.PIECE = 999 if name == "rich" else 1 << 22
     loop.COMPARE_EVERY = 5 if name == "nudged" else 500
     config, data = DATA.get(name, DATA["plain"])
-    scene = fit(config, data(), output=output / name, team=team, resume=name == "resumed")
-    if name == "long" and team is not None:
-        save_file({key: value.detach().clone() for key, value in scene.tensors().items()}, output / f"{team.rank}.long")
+    scene = fit(config, data(), output=output / name, group=group, resume=name == "resumed")
+    if name == "long" and group is not None:
+        save_file(
+            {key: value.detach().clone() for key, value in scene.tensors().items()}, output / f"{group.rank}.long"
+        )
 
 
 def main(arguments: list[str] | None) -> None:
@@ -120,13 +122,13 @@ def main(arguments: list[str] | None) -> None:
     while scenarios:
         process_group.PATIENCE = SHORT if scenarios[0] == "hung" else timedelta(minutes=2)
         os.environ["MASTER_PORT"] = ports.pop()
-        with team_of(process_rank(), "cpu") as team:
-            assert team is not None
+        with join_processes(process_rank(), "cpu") as group:
+            assert group is not None
             while scenarios:
                 name = scenarios.pop(0)
                 loop.training_step = untouched
                 try:
-                    play(name, team, output)
+                    play(name, group, output)
                 except KeyboardInterrupt:
                     refused[name] = "interrupted"
                 except UserError as error:
@@ -134,7 +136,7 @@ def main(arguments: list[str] | None) -> None:
                     if not scenarios:
                         raise
                 finally:
-                    (output / f"{team.rank}.json").write_text(json.dumps(refused))
+                    (output / f"{group.rank}.json").write_text(json.dumps(refused))
                 if name in ENDING or (scenarios and scenarios[0] in ENDING):
                     break
 

@@ -15,7 +15,7 @@ from scgs_warp.motion import build_motion
 from scgs_warp.motion.hexplane import BOUND, HexPlane
 from scgs_warp.ops.planes import PAIRS, Smoothness, plane_variation
 from scgs_warp.runtime import environment
-from scgs_warp.training.pretrain import begin_motion
+from scgs_warp.training.pretrain import initial_motion
 
 
 def model_and_gaussians(seed: int, count: int = 60) -> tuple[HexPlane, GaussianParameters]:
@@ -85,7 +85,7 @@ def test_a_training_step_adds_the_smoothness():
 @pytest.mark.parametrize("times, expected", [(0, 7), (30, 30)])
 def test_planes_follow_the_number_of_training_times(times, expected):
     config = TrainConfig(motion=MotionConfig("hexplane", plane_times=times))
-    model = begin_motion(config, torch.zeros(1, 3), times=15)
+    model = initial_motion(config, torch.zeros(1, 3), times=15)
     assert isinstance(model, HexPlane)
     assert [plane.shape[0] for plane in model.planes] == [*(3 * [64] + 3 * [expected]), *(3 * [128] + 3 * [expected])]
     again = build_motion("hexplane", config, model.state_dict())

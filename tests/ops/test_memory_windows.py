@@ -19,7 +19,7 @@ from scgs_warp.rendering.rasterize import rasterization
 from scgs_warp.rendering.render import render
 from scgs_warp.runtime import debug, memory
 from scgs_warp.training.loop import fit
-from scgs_warp.training.visibility import weights_in
+from scgs_warp.training.visibility import view_contributions
 from scgs_warp.types import Camera, Gaussians, Splats, Stats
 
 LISTS = ("splats", "slots")
@@ -155,7 +155,15 @@ def test_rasterization_and_render_go_through_windows(device: str, monkeypatch: p
         gaussians = Gaussians(means, quats, scales, opacities, colors, torch.zeros(200, 0, 3, device=device))
         camera = Camera(viewmat, K, 100, 80)
         image = render(gaussians, camera)
-        return [renders, alphas, *gradients, image.rgb, image.alpha, image.depth, weights_in(gaussians, camera)[0]]
+        return [
+            renders,
+            alphas,
+            *gradients,
+            image.rgb,
+            image.alpha,
+            image.depth,
+            view_contributions(gaussians, camera)[0],
+        ]
 
     whole = results()
     cuts = squeeze(monkeypatch, 25_000)

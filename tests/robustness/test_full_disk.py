@@ -32,7 +32,7 @@ from scgs_warp.data import load
 from scgs_warp.errors import UserError
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint, files
-from scgs_warp.training import run as finish
+from scgs_warp.training import run as training_run
 from scgs_warp.training import run_folder
 from scgs_warp.training.loop import fit
 from scgs_warp.training.run_folder import RunFolder
@@ -212,10 +212,10 @@ def test_pictures_and_metrics_that_cannot_be_written(name, done, tmp_path, monke
     if name.endswith(".mp4"):
         monkeypatch.setattr(video._Mp4, "_write", full)
     with pytest.raises(UserError, match=r"No space left on device.*--resume makes the missing") as caught:
-        finish.train_and_finish(config(), data, run, frames=2, resume=True)
+        training_run.train_and_evaluate(config(), data, run, frames=2, resume=True)
     assert name in str(caught.value) and not (run / "metrics.json").exists() and checkpoint_bytes(run) == before
     monkeypatch.undo()
-    finish.train_and_finish(config(), data, run, frames=2, resume=True)
+    training_run.train_and_evaluate(config(), data, run, frames=2, resume=True)
     assert (run / "metrics.json").exists() and checkpoint_bytes(run) == before
 
 
@@ -226,10 +226,10 @@ def test_real_disk_full_after_training(done, tmp_path):
         scene, test = Scene.load(run), load(done[0], "test")
         disk.fill()
         with pytest.raises(UserError, match="No space left on device"):
-            finish.finish(scene, test, run, frames=2)
+            training_run.write_results(scene, test, run, frames=2)
         assert not (run / "metrics.json").exists()
         disk.free()
-        finish.finish(scene, test, run, frames=2)
+        training_run.write_results(scene, test, run, frames=2)
         assert (run / "metrics.json").stat().st_size > 100
 
 

@@ -20,7 +20,7 @@ from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.runtime import memory
 from scgs_warp.runtime.memory import GIB, NotEnoughMemory
 from scgs_warp.scene.scene import Scene
-from scgs_warp.training import densify, density_control, step
+from scgs_warp.training import density_control, step
 from scgs_warp.training.loop import fit
 from scgs_warp.visualization import video
 
@@ -177,13 +177,13 @@ def test_all_frames_of_a_gif_are_planned(monkeypatch: pytest.MonkeyPatch):
 def test_gaussians_grow_as_far_as_memory_allows(monkeypatch: pytest.MonkeyPatch):
     gaussians = gaussians_from_points(torch.rand(1000, 3), None, sh_degree=3, hyper_dim=0)
     allow(monkeypatch, 10 * GIB)
-    assert densify.most_that_fit(gaussians, 10**9) == 10**9  # twice as many fit: more is for later to ask
+    assert density_control.affordable_count(gaussians, 10**9) == 10**9  # twice as many fit: more is for later to ask
     allow(monkeypatch, 2**20)
-    most = densify.most_that_fit(gaussians, 10**9)
+    most = density_control.affordable_count(gaussians, 10**9)
     assert 1000 + 2**20 // 4000 < most < 1000 + 2**20 // 1500
-    assert densify.most_that_fit(gaussians, 1100) == 1100
+    assert density_control.affordable_count(gaussians, 1100) == 1100
     allow(monkeypatch, 0)
-    assert densify.most_that_fit(gaussians, 10**9) == 1000
+    assert density_control.affordable_count(gaussians, 10**9) == 1000
 
 
 def test_training_says_that_memory_ends_growth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
@@ -193,7 +193,7 @@ def test_training_says_that_memory_ends_growth(monkeypatch: pytest.MonkeyPatch, 
         asked.append(len(gaussians))
         return len(gaussians)
 
-    monkeypatch.setattr(density_control, "most_that_fit", most)
+    monkeypatch.setattr(density_control, "affordable_count", most)
     fit(tiny_config(60, motion={"model": "static"}), tiny_dataset(6, 32), output=tmp_path / "run")
     assert len(asked) > 1 and all(later <= first for first, later in itertools.pairwise(asked))
     said = capsys.readouterr()

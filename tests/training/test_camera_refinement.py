@@ -23,7 +23,7 @@ from scgs_warp.scene.scene import Scene
 from scgs_warp.storage.checkpoint import read
 from scgs_warp.training.camera_refinement import CameraRefinement, camera_rate, refined
 from scgs_warp.training.loop import fit
-from scgs_warp.training.run import train_and_finish
+from scgs_warp.training.run import train_and_evaluate
 from scgs_warp.types import Camera, Frame
 
 COUNT, SIZE = 24, 48
@@ -124,7 +124,7 @@ def refined_run(tmp_path_factory) -> tuple[Path, Path]:
     data = write_dnerf(tmp_path_factory.mktemp("data") / "blobs")
     run = tmp_path_factory.mktemp("runs") / "refined"
     config = tiny_config(120, motion={"model": "static"}, optim={"cameras": 2e-2}, coarse=0)
-    train_and_finish(config, data, run, frames=0)
+    train_and_evaluate(config, data, run, frames=0)
     return data, run
 
 

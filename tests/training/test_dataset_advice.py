@@ -8,33 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from helpers.handheld import handheld
 from helpers.layouts import write_colmap, write_poses_bounds
-from helpers.scenes import look_at
 from helpers.tiny import tiny_dataset
 from scgs_warp.config.presets import preset
 from scgs_warp.data import Dataset, load
-from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.training.dataset_advice import Survey, advise, survey
-from scgs_warp.training.initial_points import common_view, likely_points, random_points
-from scgs_warp.types import Camera, Frame
-
-
-def handheld(
-    frames: int = 40, step: float = 1.0, exposure: float = 0.0, alpha: bool = False, views: int = 1
-) -> Dataset:
-    """A camera that moves by ``step`` degrees a frame around a grey scene, its exposure going up and down."""
-    K = torch.tensor([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]])
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    made = []
-    for index in range(frames):
-        angle = torch.deg2rad(torch.tensor(step * index, dtype=torch.float64))
-        eye = torch.stack([4 * angle.cos(), 4 * angle.sin(), 0.5 * torch.ones_like(angle)])
-        camera = Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), up).float(), K, 32, 24)
-        image = torch.full((24, 32, 3), 0.5 * (1 + exposure * (index % 2)))
-        mask = torch.ones(24, 32, dtype=torch.bool)
-        covered = torch.ones(24, 32) if alpha else None
-        made.append(Frame(camera, (index // views) / max((frames - 1) // views, 1), image, covered, mask, f"{index}"))
-    return Dataset(made, folder=Path("handheld"), split="train")
 
 
 def lines(data: Dataset, **changes) -> tuple[str, str]:
@@ -123,20 +102,6 @@ def test_many_views(tmp_path):
 def test_a_single_frame():
     assert survey(handheld(1)).instants == 1 and isinstance(survey(handheld(1)), Survey)
     assert len(lines(handheld(1))) == 2
-
-
-def test_points_begin_in_the_common_view():
-    """Cameras that walk past a wall do not all see all of the cube."""
-    data = handheld(20, 0.0)
-    for index, entry in enumerate(data.entries):
-        entry.camera.viewmat[0, 3] += 0.4 * index
-    normalisation = Normalisation.fit(data.cameras)
-    plain = random_points(2000, 0, 31)
-    points, colors = likely_points(2000, data, normalisation, 0, 31)
-    assert colors is None and points.shape == (2000, 3)
-    before, after = (common_view(p, data, normalisation) for p in (plain, points))
-    assert after.mean() > before.mean() + 0.05 and (before < 0.3).sum() > 5 * (after < 0.3).sum()
-    assert torch.equal(points, likely_points(2000, data, normalisation, 0, 31)[0])
 
 
 def test_the_app_says_it(tmp_path, capsys):

@@ -13,6 +13,7 @@ from scgs_warp.config.presets import TrainConfig
 from scgs_warp.runtime import environment
 from scgs_warp.training import loop
 from scgs_warp.training.loop import fit
+from scgs_warp.training.state import TrainState
 
 MODELS = {
     # large enough for torch to share work among threads, which it does from 32,768 numbers on
@@ -61,3 +62,34 @@ def test_the_same_bits(model, tmp_path, device, all_threads, monkeypatch):
                 trained(config, tmp_path / "pieces", threads, device, resume=begin > 0)
         else:
             assert trained(config, tmp_path / "pieces", threads, device, resume=True) == whole, "resumed runs differ"
+
+
+RIVALS = [("hexplane", False), ("per-gaussian", False), ("per-gaussian", True)]
+"""Model, and whether its network learns in bfloat16."""
+
+
+@pytest.mark.parametrize("model, bfloat16", RIVALS)
+def test_rivals_past_their_coarse_steps(model, bfloat16, tmp_path, all_threads, monkeypatch):
+    data, config = (
+        tiny_dataset(6),
+        tiny_config(30, motion={"model": model, "bfloat16": bfloat16}, coarse=6, checkpoint_seconds=0.0),
+    )
+    results = []
+    for threads in (1, 2):
+        environment.configure(threads)
+        fit(config, data, output=tmp_path / f"{threads}")
+        results.append((tmp_path / f"{threads}/checkpoint.safetensors").read_bytes())
+    assert results[0] == results[1], "one thread and two differ"
+    save = TrainState.save
+
+    def save_and_stop(state: TrainState, folder) -> None:
+        save(state, folder)
+        if state.step == 17:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainState, "save", save_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit(config, data, output=tmp_path / "cut")
+    fit(config, data, output=tmp_path / "cut", resume=True)
+    assert (tmp_path / "cut/checkpoint.safetensors").read_bytes() == results[0]

@@ -1,4 +1,4 @@
-"""A step of training: noise on the time of a frame."""
+"""Functions of the step: learning rates, degree of spherical harmonics, frozen motion, noise on times."""
 
 from __future__ import annotations
 
@@ -7,8 +7,78 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from helpers.tiny import tiny_config
-from scgs_warp.training.step import noisy_time
+from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.config import presets as C
+from scgs_warp.training.density_control import control_density
+from scgs_warp.training.frames import Frames
+from scgs_warp.training.state import TrainState
+from scgs_warp.training.step import SETTLED, motion_frozen, noisy_time, set_rates, settling, sh_degree, training_step
+
+
+def test_constant_rates_settle_in_the_last_share_of_the_run():
+    config = C.preset("paper")
+    begin = round(0.85 * config.main_steps)
+    factors = [settling(step, config) for step in range(0, config.main_steps + 1, 500)]
+    assert factors[begin // 500] == 1.0 and factors == sorted(factors, reverse=True)
+    assert factors[-1] == SETTLED < settling(begin + 100, config) < 1.0
+    assert settling(config.main_steps, C.with_field(config, "optim.settle", 0.0, "test")) == 1.0
+
+
+SCHEDULE = {
+    "pretrain": {"steps": 10, "warm_up": 4},
+    "freeze": 5,
+    "optim": {"means_until": 40, "network_until": 20, "settle": 0.5, "cameras": 1e-3},
+    "densify": {"sh_every": 15},
+}
+"""Of a run of 50 steps, 40 of them main steps."""
+
+
+def state_at(step: int) -> TrainState:
+    """A state at ``step`` with its rates set."""
+    state = TrainState.begin(tiny_config(50, **SCHEDULE), tiny_dataset(3), "cpu")
+    if step >= 10:
+        state.begin_main()
+    state.step = step
+    set_rates(state)
+    return state
+
+
+@pytest.mark.parametrize(
+    "step, means, sh_dc, network, positions, cameras",
+    [
+        (0, 8e-4, 1e-2, 8e-4, None, None),
+        (4, 8e-4 * 0.01 ** (4 / 40), 1e-2, 8e-4, None, None),
+        (9, 8e-4 * 0.01 ** (9 / 40), 1e-2, 8e-4 * 0.002 ** (5 / 20), None, None),
+        (10, 8e-4, 2.5e-3, 8e-4, 8e-5, 0.0),
+        (15, 8e-4 * 0.01 ** (5 / 40), 2.5e-3, 8e-4, 8e-5, 1e-3),
+        (35, 8e-4 * 0.01 ** (25 / 40), 2.5e-3 * SETTLED ** (5 / 20), 1.6e-6, 1.6e-7, 1e-3 * 0.01 ** (20 / 35)),
+        (50, 8e-6, 2.5e-3 * SETTLED, 1.6e-6, 1.6e-7, 1e-5),
+    ],
+)
+def test_learning_rates(step, means, sh_dc, network, positions, cameras):
+    """Stage 1 ends at step 10; control points, network and poses join five steps later."""
+    state = state_at(step)
+    assert state.motion_optimizer is not None
+    gaussians, motion = state.gaussian_optimizer.groups, state.motion_optimizer.groups
+    assert gaussians["means"].rate == pytest.approx(means)
+    assert gaussians["sh_dc"].rate == pytest.approx(sh_dc)
+    assert motion["network.head.weight"].rate == pytest.approx(network)
+    assert ("positions" in motion) == (positions is not None)
+    assert positions is None or motion["positions"].rate == pytest.approx(positions)
+    assert state.refines_cameras == bool(cameras)
+    assert cameras is None or state.camera_optimizer.groups["twists"].rate == pytest.approx(cameras)
+
+
+def test_spherical_harmonics_grow_and_motion_thaws():
+    state = state_at(10)
+    degrees, frozen = [], []
+    for step in range(10, 50):
+        state.step = step
+        degrees.append(sh_degree(state, state.stage_step))
+        frozen.append(motion_frozen(state))
+    assert degrees == [0] * 15 + [1] * 15 + [2] * 10
+    assert frozen == [True] * 5 + [False] * 35
+    assert not motion_frozen(state_at(3)), "stage 1 trains the network"
 
 
 def test_noisy_times_fade_and_repeat():
@@ -24,3 +94,17 @@ def test_noisy_times_fade_and_repeat():
     assert spread(500) == 0.0 and spread(0) == spread(0)
     state = SimpleNamespace(config=tiny_config(1000), stage_step=0, step=0)
     assert noisy_time(0.3, state, 11) == 0.3
+
+
+@pytest.mark.parametrize("model", ["hexplane", "per-gaussian"])
+def test_the_motion_rests_through_the_coarse_steps(model):
+    data, config = tiny_dataset(6), tiny_config(30, motion={"model": model}, coarse=6)
+    state = TrainState.begin(config, data, "cpu")
+    frames = Frames(data, state.normalisation, config, "cpu")
+    before = [parameter.detach().clone() for parameter in state.motion.parameters()]
+    for step in range(config.coarse + 2):
+        training_step(state, frames)
+        control_density(state, (48, 48))
+        state.step += 1
+        same = [torch.equal(old, new) for old, new in zip(before, state.motion.parameters())]
+        assert all(same) if step < config.coarse else not all(same), step

@@ -1,0 +1,23 @@
+"""The static model: the same Gaussians at all times, and nothing to train."""
+
+from __future__ import annotations
+
+import torch
+
+from helpers.tiny import tiny_config
+from scgs_warp.gaussians import gaussians_from_points
+from scgs_warp.motion import Static, build_motion
+
+
+def test_gaussians_stay():
+    config = tiny_config(20)
+    motion = build_motion("static", config)
+    assert isinstance(motion, Static) and not motion.moves and motion.optimizer(config) is None
+    gaussians = gaussians_from_points(torch.rand(5, 3), None, sh_degree=1, hyper_dim=0)
+    rest = gaussians.activate()
+    for time in (0.0, 0.5, torch.tensor([1.0])):
+        posed = motion.gaussians_at(gaussians, time)
+        for name, value in vars(rest).items():
+            assert torch.equal(getattr(posed, name), value), name
+    pose = motion.train_at(gaussians, 0.3, 0, config, 0)
+    assert pose.regulariser is None and motion.control_points_at(0.5).shape == (0, 3)

@@ -1,0 +1,216 @@
+"""Adaptive density control: the schedule, the choice of rows, visibility pruning."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from helpers.gaussian_rows import make
+from helpers.hidden_gaussian import state_with_hidden_gaussian
+from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.config.presets import DensifyConfig, PretrainConfig, preset, with_steps
+from scgs_warp.runtime.memory import NotEnoughMemory
+from scgs_warp.seeding import generator
+from scgs_warp.training import density_control
+from scgs_warp.training.density_control import (
+    control_density,
+    control_points_due,
+    gradient_threshold,
+    grow_and_prune,
+    opacity_reset_due,
+    round_due,
+    spheres_due,
+    visibility_pruning_due,
+    visible_gaussians,
+)
+from scgs_warp.training.loop import fit
+from scgs_warp.training.visibility import contributions
+from scgs_warp.types import Stats
+
+
+def test_schedule_of_a_short_run():
+    """Rounds, resets and visibility pruning as functions of the main steps that are done."""
+    config = DensifyConfig(start=10, until=40, every=5, rounds=100, opacity_reset_every=12)
+    steps = range(1, 60)
+    assert [done for done in steps if round_due(config, done)] == [10, 15, 20, 25, 30, 35, 40]
+    assert [done for done in steps if opacity_reset_due(config, done)] == [12, 24], "36 has no time to heal"
+    assert [done for done in steps if visibility_pruning_due(config, done)] == [12, 24, 40]
+    off = DensifyConfig(start=10, until=40, opacity_reset_every=12, min_contribution=0.0)
+    assert not any(visibility_pruning_due(off, done) for done in steps)
+    stage1 = PretrainConfig(densify_until=20, densify_every=6, warm_up=3)
+    assert [done for done in steps if spheres_due(stage1, done)] == [3, 6, 12, 18]
+
+
+@pytest.mark.parametrize(
+    "name, first, last, rounds, resets",
+    [
+        ("paper", 600, 39_900, 132, [10_000, 20_000, 30_000]),
+        ("cpu", 400, 12_000, 117, [3_000, 6_000, 9_000]),
+        ("quick", 200, 3_500, 34, [875, 1_750, 2_625]),
+    ],
+)
+def test_schedule_of_the_presets(name, first, last, rounds, resets):
+    config = preset(name)
+    steps = range(1, config.main_steps + 1)
+    due = [done for done in steps if round_due(config.densify, done)]
+    assert (due[0], due[-1], len(due)) == (first, last, rounds)
+    assert [done for done in steps if opacity_reset_due(config.densify, done)] == resets
+
+
+@pytest.mark.parametrize(
+    "name, steps, due",
+    [
+        ("paper", 80_000, [5_100, 10_200, 15_000, 20_100, 25_200]),
+        ("paper", 40_000, [2_550, 5_100, 7_500, 10_050, 12_600]),
+        ("cpu", 24_000, [2_000, 4_000, 6_000, 8_000]),
+    ],
+)
+def test_control_points_change_at_the_first_round_after_each_milestone(name, steps, due):
+    config = with_steps(preset(name), steps)
+    rounds = range(config.densify.interval, config.densify.until + 1, config.densify.interval)
+    assert [done for done in rounds if control_points_due(config, done)] == due
+
+
+def test_threshold_follows_the_resolution():
+    config = DensifyConfig(grad_threshold=2e-4, resolution_exponent=0.66)
+    assert gradient_threshold(config, 800, 800) == pytest.approx(2e-4)
+    assert 4.8e-4 < gradient_threshold(config, 200, 200) < 5.2e-4
+
+
+def run_round(gaussians, optimizer, gradient, config, **options):
+    stats = Stats.zeros(len(gaussians), gradient.device)
+    stats.count.fill_(2.0)
+    stats.grad_norm.copy_(gradient * 2.0)
+    defaults = {"grad_threshold": 0.5, "extent": 1.0, "prune_large": False, "random": generator(0, 1)}
+    grow_and_prune(gaussians, optimizer, stats, config, **{**defaults, **options})
+
+
+def test_small_ones_are_cloned_large_ones_split(device):
+    gaussians, optimizer = make(4, device)
+    with torch.no_grad():
+        gaussians.log_scales.copy_(torch.tensor([0.001, 0.001, 0.5, 0.5]).log()[:, None].expand(4, 3))
+    before = gaussians.means.detach().clone()
+    run_round(gaussians, optimizer, torch.tensor([1.0, 0.0, 1.0, 0.0], device=device), DensifyConfig())
+    # rows: 0 1 3 kept, clone of 0, two halves of 2
+    assert len(gaussians) == 6
+    assert torch.equal(gaussians.means[:4], before[[0, 1, 3, 0]])
+    assert torch.allclose(gaussians.scales()[4:], torch.full((2, 3), 0.5 / 1.6, device=device))
+    assert not torch.equal(gaussians.means[4], gaussians.means[5])
+
+
+def test_budget_takes_the_largest_gradients(device):
+    gaussians, optimizer = make(10, device)
+    gradient = torch.arange(10, device=device).float() + 1.0
+    marks = gaussians.means.detach().clone()
+    run_round(gaussians, optimizer, gradient, DensifyConfig(max_gaussians=12, percent_dense=10.0))
+    assert len(gaussians) == 12
+    assert torch.equal(gaussians.means[10:], marks[[8, 9]])
+
+
+def test_transparent_large_and_broken_ones_go(device):
+    gaussians, optimizer = make(5, device)
+    with torch.no_grad():
+        gaussians.log_scales.fill_(-4.0)
+        gaussians.opacity_logits[0] = -9.0
+        gaussians.log_scales[1] = 3.0
+        gaussians.means[2, 1] = float("nan")
+    run_round(gaussians, optimizer, torch.zeros(5, device=device), DensifyConfig(), prune_large=True)
+    assert len(gaussians) == 2
+
+
+def test_the_look_takes_views_at_random_and_not_more_than_it_may(monkeypatch):
+    """Of a rig whose cameras come in the same order at every instant, others each time."""
+    state, frames = state_with_hidden_gaussian(opacity_reset_every=16)
+    taken = []
+    monkeypatch.setattr(
+        density_control, "contributions", lambda state, frames, indices: taken.append(indices) or torch.ones(1)
+    )
+    monkeypatch.setattr(density_control, "FEWEST_VIEWS", 3)
+    for per_view, step in ((4, 15), (4, 32), (4, 39), (5, 15), (6, 15)):
+        monkeypatch.setattr(density_control, "STEPS_PER_VIEW", per_view)
+        state.step = step
+        assert (visible_gaussians(state, frames) is None) == (per_view == 6 or step == 32), (
+            "4, none due, all, 3, 2 are too few"
+        )
+    assert [len(set(indices)) for indices in taken] == [len(indices) for indices in taken] == [4, 6, 3]
+    assert all(index in range(6) for indices in taken for index in indices)
+    monkeypatch.setattr(density_control, "MOST_VIEWS", 3)
+    state.step = 39
+    visible_gaussians(state, frames)
+    assert len(taken[-1]) == 3
+    assert taken[0] != taken[2][: len(taken[0])] or taken[0] != taken[1][: len(taken[0])], "the same ones at every look"
+
+
+@pytest.mark.parametrize("step, due", [(18, False), (19, True), (38, False), (39, True), (40, False), (59, False)])
+def test_the_unseen_go_before_a_reset_and_at_the_end_of_densification(step, due, monkeypatch):
+    monkeypatch.setattr(density_control, "STEPS_PER_VIEW", 1)
+    state, frames = state_with_hidden_gaussian()
+    kept = contributions(state, frames, list(range(6))) >= state.config.densify.min_contribution
+    assert 0 < int(kept.sum()) < len(kept)
+    before = state.gaussians.means.detach().clone()
+    state.stats.count[:] = torch.arange(len(kept))
+    state.step = step
+    found = visible_gaussians(state, frames)
+    assert (found is not None) == due and (found is None or torch.equal(found, kept))
+    control_density(state, (48, 48), found)
+    stay = torch.where(kept if due else torch.ones_like(kept))[0]
+    assert torch.equal(state.gaussians.means, before[stay])
+    assert torch.equal(state.stats.count, stay.float()), "the others' statistics go on"
+    faint = bool((state.gaussians.opacities() < 0.02).all())
+    assert faint == (step == 19), "reset where it was due, after the look at the images"
+
+
+def test_those_that_stay_are_judged_for_densification_by_all_their_steps(monkeypatch):
+    """Newborn ones are not judged by the look: a clone is hidden behind its parent."""
+    state, _ = state_with_hidden_gaussian(every=40)
+    state.step = 39
+    kept = torch.ones(len(state.gaussians), dtype=torch.bool)
+    kept[0] = False
+    state.stats.count.fill_(2.0)
+    state.stats.grad_norm[:2] = 1e3
+    parent = state.gaussians.means[1].detach().clone()
+    control_density(state, (48, 48), kept)
+    assert len(state.gaussians) == len(kept), "one gone, one of those that stay doubled"
+    assert float((state.gaussians.means[-1].detach() - parent).norm()) < 2.0 and not state.stats.count.any()
+
+
+def test_memory_that_ends_at_the_look_costs_no_step(monkeypatch, tmp_path):
+    monkeypatch.setattr(density_control, "STEPS_PER_VIEW", 1)
+    config = tiny_config(60, motion={"model": "static"}, checkpoint_seconds=1e9)
+    data = tiny_dataset(6)
+    fit(config, data, output=tmp_path / "whole")
+
+    def full(*_):
+        raise NotEnoughMemory("there is none")
+
+    with monkeypatch.context() as patch, pytest.raises(NotEnoughMemory):
+        patch.setattr(density_control, "contributions", full)
+        fit(config, data, output=tmp_path / "cut")
+    fit(config, data, output=tmp_path / "cut", resume=True)
+    files = [(tmp_path / name / "checkpoint.safetensors").read_bytes() for name in ("whole", "cut")]
+    assert files[0] == files[1]
+
+
+def test_switched_off_everything_stays(monkeypatch):
+    monkeypatch.setattr(density_control, "STEPS_PER_VIEW", 1)
+    state, frames = state_with_hidden_gaussian(min_contribution=0.0)
+    state.step = 39
+    assert visible_gaussians(state, frames) is None
+
+
+@pytest.mark.parametrize(
+    "name, steps, looks",
+    [("paper", 80_000, (10, 20, 30, 40)), ("cpu", 24_000, (3, 6, 9, 12)), ("quick", 7_000, (3.5,))],
+)
+def test_when_the_presets_look(name, steps, looks, monkeypatch):
+    """In thousands of main steps, with 150 frames; ``quick`` is too short for more than one."""
+    state, _ = state_with_hidden_gaussian()
+    state.config, state.stage = preset(name), "main"
+    monkeypatch.setattr(density_control, "contributions", lambda *_: torch.ones(1))
+    assert state.config.steps == steps
+    due = []
+    for step in range(0, state.config.main_steps):
+        if visibility_pruning_due(state.config.densify, step + 1):
+            state.step = step + state.config.pretrain_steps
+            due += [(step + 1) / 1000] if visible_gaussians(state, [0] * 150) is not None else []
+    assert tuple(due) == looks

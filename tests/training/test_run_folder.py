@@ -1,0 +1,79 @@
+"""The run folder: its lock, its log, and the read-only form of other processes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.errors import UserError
+from scgs_warp.evaluation.image_metrics import psnr
+from scgs_warp.training.frames import Frames
+from scgs_warp.training.run_folder import ReadOnlyRunFolder, RunFolder, read_seconds, refuse_existing
+from scgs_warp.training.state import TrainState
+from scgs_warp.training.step import training_step
+
+
+def test_two_trainers_cannot_share_a_directory(tmp_path):
+    config = tiny_config(20)
+    with (
+        RunFolder(tmp_path / "run", config, None, resume=False),
+        pytest.raises(UserError, match="another trainer"),
+        RunFolder(tmp_path / "run", config, None, resume=False),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_the_psnr_of_training_is_that_of_valid_pixels(masked, tmp_path, device):
+    config = tiny_config(50)
+    mask = torch.zeros(48, 48, dtype=torch.bool)
+    mask[5:40, :20] = True
+    data = tiny_dataset(3)
+    frames = [dataclasses.replace(frame, mask=mask if masked else None) for frame in data]
+    data = type(data)(frames, folder=Path("masked"), split="train")
+    state = TrainState.begin(config, data, device)
+    result = training_step(state, Frames(data, state.normalisation, state.config, device))
+    state.step = 50
+    bar = SimpleNamespace(advance=lambda steps, **shown: None)
+    with RunFolder(tmp_path / "run", config, None, resume=False) as folder:
+        folder.record(state, result, bar)
+    logged = json.loads((tmp_path / "run/log.jsonl").read_text())["psnr"]
+    scores = [float(psnr(result.render[:, seen], result.truth[:, seen])) for seen in (mask.to(device), slice(None))]
+    assert abs(scores[0] - scores[1]) > 0.1
+    assert logged == pytest.approx(scores[0 if masked else 1], abs=1e-3)
+
+
+def test_a_resumed_log_drops_later_and_damaged_lines(tmp_path):
+    config = tiny_config(50)
+    with RunFolder(tmp_path / "run", config, None, resume=False) as folder:
+        for step in (10, 20, 30):
+            folder.log({"step": step, "loss": 0.5})
+    with (tmp_path / "run/log.jsonl").open("a") as log:
+        log.write('{"step": 4')
+    with RunFolder(tmp_path / "run", config, None, resume=True) as folder:
+        folder.start(20)
+        assert folder.elapsed >= 0.0
+    lines = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [10, 20]
+    assert read_seconds(tmp_path / "run") == lines[-1]["seconds"] and read_seconds(tmp_path) is None
+
+
+def test_only_the_first_process_writes(tmp_path):
+    with ReadOnlyRunFolder(tmp_path / "run", tiny_config(50), None, resume=False) as folder:
+        folder.start(0)
+        folder.log({"step": 1})
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_not_overwritten(tmp_path):
+    refuse_existing(tmp_path, resume=False)
+    (tmp_path / "checkpoint.safetensors").touch()
+    refuse_existing(tmp_path, resume=True)
+    with pytest.raises(UserError, match="holds a run already"):
+        refuse_existing(tmp_path, resume=False)

@@ -1,0 +1,76 @@
+"""The state of a run: what it starts from, and which checkpoints it resumes."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.errors import UserError
+from scgs_warp.storage import checkpoint
+from scgs_warp.training.loop import fit
+from scgs_warp.training.state import TrainState, has_initial_points, resolve_auto
+
+
+def checkpoint_bytes(folder: Path) -> bytes:
+    return (folder / "checkpoint.safetensors").read_bytes()
+
+
+def test_a_camera_that_stands_still():
+    """Its centres have no extent; Gaussians must not all count as too large."""
+    data = tiny_dataset(6)
+    frames = [dataclasses.replace(frame, camera=data[0].camera) for frame in data]
+    still = type(data)(frames, folder=Path("still"), split="train")
+    assert still.extent == 0.0
+    assert TrainState.begin(tiny_config(), still, "cpu").extent > 1.0
+
+
+def test_resume_refuses_other_frames(tmp_path):
+    config = tiny_config(20)
+    fit(config, tiny_dataset(3), output=tmp_path / "run")
+    with pytest.raises(UserError, match="other frames"):
+        fit(config, tiny_dataset(4), output=tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize(("section", "field"), [("motion", "shading"), (None, "half_size")])
+def test_resume_refuses_a_run_of_another_version(section, field, tmp_path):
+    """What it did without the field is no value that could be given."""
+    config, data = tiny_config(20), tiny_dataset(3)
+    fit(config, data, output=tmp_path / "run")
+    tensors, metadata = checkpoint.read(tmp_path / "run")
+    del (metadata["config"][section] if section else metadata["config"])[field]
+    checkpoint.write(tmp_path / "run", tensors, metadata)
+    name = f"{section}.{field}" if section else field
+    with pytest.raises(UserError, match=f"made by another version, which had no {name}; train again with another --"):
+        fit(config, data, output=tmp_path / "run", resume=True)
+
+
+def test_what_changes_no_bit_may_differ_on_resume(tmp_path):
+    fit(tiny_config(20), tiny_dataset(3), output=tmp_path / "run")
+    before = checkpoint_bytes(tmp_path / "run")
+    other = tiny_config(20, evaluate_every=7, checkpoint_seconds=0.0)
+    assert fit(other, tiny_dataset(3), output=tmp_path / "run", resume=True).step == 20
+    fit(other, tiny_dataset(3), output=tmp_path / "again")
+    assert checkpoint_bytes(tmp_path / "again") == before
+
+
+def test_auto_follows_alpha_when_there_are_no_points():
+    data, config = tiny_dataset(3), tiny_config(20)
+    assert not has_initial_points(data, config)
+    resolved = resolve_auto(config, data)
+    assert resolved.densify.prune_large == "always" and resolved.motion.hyper_dim == config.motion.hyper_dim
+    filled = type(data)([dataclasses.replace(f, alpha=None) for f in data], folder=Path("filled"), split="train")
+    resolved = resolve_auto(config, filled)
+    assert resolved.densify.prune_large == "never" and resolved.motion.hyper_dim == 4
+    assert resolved.pretrain_steps == config.pretrain_steps > 0
+
+
+def test_the_main_stage_begins_with_control_points():
+    state = TrainState.begin(tiny_config(60), tiny_dataset(3), "cpu")
+    assert (state.stage, state.motion.name, state.stage_step) == ("pretrain", "spheres", 0)
+    state.step = state.config.pretrain_steps
+    state.begin_main()
+    assert (state.stage, state.motion.name, state.stage_step) == ("main", "control-points", 0)
+    assert len(state.gaussians) == len(state.stats.count) == state.config.init_points
