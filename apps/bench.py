@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -230,7 +231,8 @@ def main(args: list[str] | None) -> None:
         assert isinstance(options, Options)
         report = measure(options, plan)
     if options.json is not None:
-        bench.write(report, options.json)
+        words = shlex.join(sys.argv[1:] if args is None else args)
+        bench.write({"command": f"python apps/bench.py {words}", **report}, options.json)
     if isinstance(options, Scaling):
         show_scaling(report)
         for path in plot.draw(report, options.figures):

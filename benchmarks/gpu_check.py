@@ -34,7 +34,7 @@ from scgs_warp.benchmark.plan import MIDDLE, Plan, posed
 from scgs_warp.benchmark.run import bench
 from scgs_warp.benchmark.scenes import load_of, scene_camera, synthetic_scene
 from scgs_warp.benchmark.summary import table_s2
-from scgs_warp.benchmark.timing import machine, now
+from scgs_warp.benchmark.timing import provenance
 from scgs_warp.benchmark.workloads import Leaves
 from scgs_warp.config.presets import MOTIONS
 from scgs_warp.ops.binning import bin_splats
@@ -381,7 +381,7 @@ def main() -> int:
     environment.configure()
     target = options.output or ROOT / "benchmarks" / f"gpu_check_{options.device}.json"
     gpu = torch.cuda.get_device_name() if options.device == "cuda" else None
-    report: Report = {"date": now(), "gpu": gpu, "device": options.device, "machine": machine(options.device)}
+    report: Report = {**provenance(options.device), "gpu": gpu, "device": options.device}
     start = time.perf_counter()
     for part in parts:
         if time.perf_counter() - start < options.seconds:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shlex
 import shutil
 import statistics
 import subprocess
@@ -244,8 +245,10 @@ def main() -> int:
     finally:
         if options.build is None:
             shutil.rmtree(folder, ignore_errors=True)
+    words = ("CHECKOUT" if word == str(options.checkout) else word for word in sys.argv[1:])
+    command = f"python benchmarks/opensplat.py {shlex.join(words)}"
     extra = {"opensplat": commit_of(options.checkout), "flags": options.flags}
-    report = {"date": timing.now(), "machine": timing.machine("cpu"), "what": "opensplat", **extra, **found}
+    report = {"command": command, **timing.provenance("cpu"), "what": "opensplat", **extra, **found}
     if options.json is not None:
         write(report, options.json)
     print(json.dumps(report, indent=2))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import statistics
 import sys
 import time
@@ -29,7 +30,7 @@ from scgs_warp.apps.cli import prepare
 from scgs_warp.apps.cli import run as run_app
 from scgs_warp.benchmark.memory import model_mib, peak_mib
 from scgs_warp.benchmark.scenes import synthetic_scene, training_data, training_state
-from scgs_warp.benchmark.timing import machine, now
+from scgs_warp.benchmark.timing import provenance
 from scgs_warp.optim import Adam
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.torchrun import place
@@ -115,15 +116,14 @@ def main(arguments: list[str] | None) -> None:
         for _ in range(options.steps):
             clock.step(step)
         result = {
-            "command": vars(options) | {"json": None},
+            "command": f"python benchmarks/sharing.py {shlex.join(sys.argv[1:] if arguments is None else arguments)}",
             "processes": processes,
             "threads": environment.thread_count(),
             "model_mib": round(model_mib(scene), 1),
             "peak_mib": round(peak_mib(device) or 0.0),
             "mib_per_step": round((team.bytes / options.steps if team else 0) / 2**20, 2),
             "rows": clock.rows(),
-            "machine": machine(device),
-            "date": now(),
+            **provenance(device),
         }
         print(json.dumps(result, indent=1))
         if options.json and (team is None or team.first):

@@ -17,7 +17,7 @@ from .memory import resident_mib
 from .plan import MIDDLE, Place, Plan, posed
 from .scenes import load_of, synthetic_scene
 from .summary import compare_frames, motion_costs
-from .timing import machine, now
+from .timing import provenance
 from .workloads import frame_rows, frames_of, raster_rows, step_rows
 
 What = Literal["frame", "raster", "step", "edit"]
@@ -34,8 +34,8 @@ def bench(what: What, plan: Plan) -> dict[str, Any]:
     """Measure.
 
     Returns:
-        ``date``, ``machine``, ``what`` and ``rows``, dictionaries with ``KEYS``; of frames also ``motion``, what moving
-        the scene costs, and ``compared``, several motion models in turns. Ready for JSON.
+        ``date``, ``commit``, ``machine``, ``what`` and ``rows``, dictionaries with ``KEYS``; for frames also
+        ``motion``, what moving the scene costs, and ``compared``, several motion models in turns. Ready for JSON.
 
     Raises:
         UserError: the run cannot be read, gsplat is asked for and not usable, or the renderers disagree.
@@ -62,7 +62,7 @@ def bench(what: What, plan: Plan) -> dict[str, Any]:
             compared += compare_frames(drawn, threads, plan.seconds, plan.device)
     finally:
         environment.configure(before)
-    report = {"date": now(), "machine": machine(plan.device), "what": what, "rows": rows}
+    report = {**provenance(plan.device), "what": what, "rows": rows}
     return {**report, "motion": motion_costs(rows, compared), "compared": compared} if what == "frame" else report
 
 

@@ -14,7 +14,7 @@ from .memory import resident_mib
 from .plan import MIDDLE, Place, Plan, posed
 from .roofline import Limits, Work, backward_work, draw_work, frame_work, measure_limits
 from .scenes import LARGEST, SMALLEST, Load, load_of, scene_camera, synthetic_scene
-from .timing import machine, now
+from .timing import provenance
 from .workloads import frame_rows, raster_rows
 
 
@@ -111,9 +111,9 @@ def scaling(plan: Plan, points: dict[str, tuple[int, ...]]) -> dict[str, Any]:
         points: per sweep its values.
 
     Returns:
-        ``date``, ``machine``, ``what``, ``base``, ``limits`` (per number of threads) and ``sweeps``: per name a list of
-        ``point``, ``rows`` (with ``KEYS``), ``work`` (bytes and flops by whole and stage) and ``limits``, the least
-        milliseconds by row name (None on a GPU). Ready for JSON.
+        ``date``, ``commit``, ``machine``, ``what``, ``base``, ``limits`` (per number of threads) and ``sweeps``: per
+        name a list of ``point``, ``rows`` (with ``KEYS``), ``work`` (bytes and flops by whole and stage) and
+        ``limits``, the least milliseconds by row name (None on a GPU). Ready for JSON.
 
     Raises:
         UserError: a point cannot be measured.
@@ -135,7 +135,7 @@ def scaling(plan: Plan, points: dict[str, tuple[int, ...]]) -> dict[str, Any]:
         entry["limits"] = None if limit is None else least_times(limit, entry["work"])
     base = {"gaussians": plan.gaussians, "nodes": plan.nodes, "threads": sweeps.plan.threads[0]}
     limits = {str(threads): limit._asdict() for threads, limit in sorted(sweeps.limits.items())}
-    head = {"date": now(), "machine": machine(plan.device), "what": "scaling", "base": base}
+    head = {**provenance(plan.device), "what": "scaling", "base": base}
     return {**head, "limits": limits, "sweeps": found}
 
 

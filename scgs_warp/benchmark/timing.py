@@ -6,6 +6,7 @@ import contextlib
 import gc
 import platform
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime, timezone
@@ -203,5 +204,22 @@ def machine(device: str) -> dict[str, Any]:
     }
 
 
-def now() -> str:
-    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+def commit() -> str | None:
+    """The commit of the checkout that is measured, followed by ``-dirty`` if code differs from it; None outside of a
+    checkout."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    code = [".", ":(exclude)docs", ":(exclude)README.md", ":(exclude)benchmarks/results"]
+    try:
+        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
+        differs = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=root, check=False).returncode
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head.stdout.strip() + ("-dirty" if differs else "")
+
+
+def provenance(device: str) -> dict[str, Any]:
+    """``date``, ``commit`` and ``machine`` of a measurement."""
+    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return {"date": now, "commit": commit(), "machine": machine(device)}
