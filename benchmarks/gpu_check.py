@@ -30,7 +30,7 @@ import gpu_trust
 from gpu_rules import compare_gradients, compare_images, time_of
 from torch import Tensor
 
-from scgs_warp.benchmark.plan import MIDDLE, Plan, posed
+from scgs_warp.benchmark.plan import MIDDLE, BenchPlan, posed
 from scgs_warp.benchmark.run import bench
 from scgs_warp.benchmark.scenes import load_of, scene_camera, synthetic_scene
 from scgs_warp.benchmark.summary import table_s2
@@ -321,7 +321,7 @@ def step(s: Setting) -> Report:
     """Training steps at half the size, with and without ARAP, and their stages."""
     count, size = next(iter(s.scenes.values()))
     half = (size[0] // 2, size[1] // 2)
-    plan = Plan(
+    plan = BenchPlan(
         None, min(count, 40_000), s.nodes, half, ("control-points",), s.device, (environment.thread_count(),), s.seconds
     )
     return {"rows": bench("step", plan)["rows"]}

@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import shlex
 import shutil
 import statistics
 import subprocess
@@ -34,7 +33,7 @@ import torch  # isort: skip
 from torch import Tensor
 
 from scgs_warp.benchmark import timing
-from scgs_warp.benchmark.gsplat import TOLERANCE, agree
+from scgs_warp.benchmark.gsplat import TOLERANCE, check_agreement
 from scgs_warp.benchmark.plan import MIDDLE, posed
 from scgs_warp.benchmark.run import write
 from scgs_warp.benchmark.scenes import Size, camera_size, load_of, synthetic_scene
@@ -151,7 +150,7 @@ def timed(passes: dict[str, Callable[[], Any]], seconds: float) -> dict[str, dic
     """Medians and least times in milliseconds; all passes in turns, so that a disturbance meets both sides."""
     times: dict[str, list[float]] = {name: [] for name in passes}
     began = time.perf_counter()
-    while time.perf_counter() - began < seconds or len(next(iter(times.values()))) < timing.FEWEST + 1:
+    while time.perf_counter() - began < seconds or len(next(iter(times.values()))) < timing.MIN_REPEATS + 1:
         for name, function in passes.items():
             start = time.perf_counter()
             function()
@@ -175,7 +174,7 @@ def compare(module: Any, count: int, size: Size, seconds: float) -> dict[str, An
     image, found = ours.forward(), wide.forward()
     pictures = {"boxes_widened": differences(image.detach(), found[0].permute(2, 0, 1))}
     pictures["as_it_is"] = differences(image.detach(), theirs.forward()[0].permute(2, 0, 1))
-    agree(image.detach(), found[0].permute(2, 0, 1), "OpenSplat")
+    check_agreement(image.detach(), found[0].permute(2, 0, 1), "OpenSplat")
     v_means, _, v_opacities, v_colors = ours.backward(image, v_image)
     w_means, _, w_colors, w_opacities = wide.backward(found, v_planar)
     pairs = {
@@ -245,8 +244,7 @@ def main() -> int:
     finally:
         if options.build is None:
             shutil.rmtree(folder, ignore_errors=True)
-    words = ("CHECKOUT" if word == str(options.checkout) else word for word in sys.argv[1:])
-    command = f"python benchmarks/opensplat.py {shlex.join(words)}"
+    command = timing.command_line("benchmarks/opensplat.py", sys.argv[1:])
     extra = {"opensplat": commit_of(options.checkout), "flags": options.flags}
     report = {"command": command, **timing.provenance("cpu"), "what": "opensplat", **extra, **found}
     if options.json is not None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import statistics
 import sys
 import time
@@ -30,7 +29,7 @@ from scgs_warp.apps.cli import prepare
 from scgs_warp.apps.cli import run as run_app
 from scgs_warp.benchmark.memory import model_mib, peak_mib
 from scgs_warp.benchmark.scenes import synthetic_scene, training_data, training_state
-from scgs_warp.benchmark.timing import provenance
+from scgs_warp.benchmark.timing import command_line, provenance
 from scgs_warp.optim import Adam
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.torchrun import place
@@ -116,7 +115,7 @@ def main(arguments: list[str] | None) -> None:
         for _ in range(options.steps):
             clock.step(step)
         result = {
-            "command": f"python benchmarks/sharing.py {shlex.join(sys.argv[1:] if arguments is None else arguments)}",
+            "command": command_line("benchmarks/sharing.py", sys.argv[1:] if arguments is None else arguments),
             "processes": processes,
             "threads": environment.thread_count(),
             "model_mib": round(model_mib(scene), 1),

@@ -18,7 +18,6 @@ import ctypes
 import gc
 import json
 import os
-import shlex
 import sys
 import tempfile
 import time
@@ -32,7 +31,7 @@ import numpy as np  # isort: skip
 from scipy.stats import theilslopes
 from soak_editor import RandomUser
 
-from scgs_warp.benchmark.timing import provenance
+from scgs_warp.benchmark.timing import command_line, provenance
 from scgs_warp.config.presets import MOTIONS, TrainConfig, from_dict, preset, with_steps
 from scgs_warp.data.synthetic.builtin import make_synthetic
 from scgs_warp.edit import EditSession
@@ -180,7 +179,7 @@ def main() -> int:
     environment.configure(options.threads)
     parts = ("editor", "training") if options.part == "both" else (options.part,)
     seconds = 60.0 * options.minutes / len(parts)
-    found: dict[str, Any] = {"command": f"python benchmarks/soak.py {shlex.join(sys.argv[1:])}", **provenance("cpu")}
+    found: dict[str, Any] = {"command": command_line("benchmarks/soak.py", sys.argv[1:]), **provenance("cpu")}
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         run = train_once(place, "control-points")

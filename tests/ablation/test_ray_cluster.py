@@ -45,16 +45,16 @@ def machine(cpus: float, gpus: float = 0.0) -> Machine:
 )
 def test_cells_fill_the_machines(machines, jobs, threads, cuda, share, places):
     found = ray_cluster.threads_of_a_cell(machines, jobs, threads, cuda)
-    assert (found, ray_cluster.places(machines, found, cuda)) == (share, places)
+    assert (found, ray_cluster.cells_at_a_time(machines, found, cuda)) == (share, places)
     assert all(found <= each.cpus for each in machines), "every machine can take a cell"
 
 
 def test_machines_without_room_are_left_out():
     head, one, two = machine(0), machine(4), machine(8, 1)
-    assert ray_cluster.fitting([head, one, two], cuda=False) == [one, two]
-    assert ray_cluster.fitting([head, one, two], cuda=True) == [two]
+    assert ray_cluster.usable_machines([head, one, two], cuda=False) == [one, two]
+    assert ray_cluster.usable_machines([head, one, two], cuda=True) == [two]
     with pytest.raises(UserError, match="none of the cluster's 2 machines has a GPU"):
-        ray_cluster.fitting([head, one], cuda=True)
+        ray_cluster.usable_machines([head, one], cuda=True)
 
 
 # What a worker says.
@@ -73,16 +73,16 @@ def plan(blobs: Path, output: Path, *values: str, steps: int = 30) -> list[ablat
 
 def asked(question: dict) -> dict:
     """As a machine of a cluster is: with plain data. Another open file is as good as another process to a lock."""
-    return ray_worker.look(json.loads(json.dumps(question)))
+    return ray_worker.inspect_machine(json.loads(json.dumps(question)))
 
 
 def test_a_machine_that_sees_all_has_no_problem(blobs, tmp_path):
-    with ray_runner._token(tmp_path / "out") as (file, token):
+    with ray_runner.token_file(tmp_path / "out") as (file, token):
         question = {"token_file": str(file), "token": token, "weights": None}
         question["data"] = {str(blobs): ray_worker.fingerprint(blobs)}
         answer = asked(question)
         assert answer["problem"] is None and answer["host"] and answer["processor"]
-        assert ray_worker.difference(answer["identity"], ray_worker.identity()) is None
+        assert ray_worker.identity_difference(answer["identity"], ray_worker.identity()) is None
     assert not (tmp_path / "out").exists(), "looking leaves nothing behind"
 
 
@@ -90,7 +90,7 @@ def test_a_machine_that_sees_all_has_no_problem(blobs, tmp_path):
 def test_a_machine_says_what_is_wrong(wrong, blobs, tmp_path):
     other = Path(shutil.copytree(blobs, tmp_path / "other"))
     (other / "transforms_test.json").write_text("{}")
-    with ray_runner._token(tmp_path / "out") as (file, token):
+    with ray_runner.token_file(tmp_path / "out") as (file, token):
         question = {"token_file": str(file), "token": token, "weights": None}
         question["data"] = {str(blobs): ray_worker.fingerprint(blobs)}
         if wrong == "folder":
@@ -148,24 +148,24 @@ def order(cell: ablate.Cell, **more) -> dict:
 
 def test_a_worker_trains_a_cell(blobs, tmp_path, all_threads):
     cell = plan(blobs, tmp_path, "8")[0]
-    assert ray_worker.work(json.loads(json.dumps(order(cell)))) == {"failure": None, "stopped": False}
+    assert ray_worker.train_cell(json.loads(json.dumps(order(cell)))) == {"failure": None, "stopped": False}
     folder = Path(cell.folder)
     assert json.loads((folder / "metrics.json").read_text())["step"] == 30
     assert json.loads((folder / "worker.json").read_text())["pid"] == os.getpid()
     assert "training 30/30" in (folder / "train.log").read_text()
-    assert ray_runner._steps_done(folder) == 30
+    assert ray_runner.steps_done(folder) == 30
 
 
 def test_a_worker_says_why_it_failed(blobs, tmp_path, all_threads):
     broken = Path(shutil.copytree(blobs, tmp_path / "broken"))
     (broken / "train/train_002.png").write_bytes(b"not a picture")
-    answer = ray_worker.work(order(plan(broken, tmp_path, "8")[0]))
+    answer = ray_worker.train_cell(order(plan(broken, tmp_path, "8")[0]))
     assert "train_002.png" in answer["failure"] and not answer["stopped"]
 
 
 def test_another_version_trains_nothing(blobs, tmp_path, all_threads):
     cell = plan(blobs, tmp_path, "8")[0]
-    answer = ray_worker.work(order(cell, identity={**ray_worker.identity(), "torch": "1.0"}))
+    answer = ray_worker.train_cell(order(cell, identity={**ray_worker.identity(), "torch": "1.0"}))
     assert "has torch " in answer["failure"] and "not 1.0" in answer["failure"]
     assert not Path(cell.folder).exists()
 
@@ -175,7 +175,7 @@ def test_a_stopped_worker_is_no_failure(blobs, tmp_path, monkeypatch, all_thread
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ray_worker, "attempt", stopped)
-    assert ray_worker.work(order(plan(blobs, tmp_path, "8")[0])) == {"failure": None, "stopped": True}
+    assert ray_worker.train_cell(order(plan(blobs, tmp_path, "8")[0])) == {"failure": None, "stopped": True}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no such locks")
@@ -188,10 +188,10 @@ def test_a_lost_workers_lock_is_waited_for(blobs, tmp_path, monkeypatch, all_thr
     folder.mkdir(parents=True)
     with open(folder / ".lock", "w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        assert "another trainer" in ray_worker.work(order(cell))["failure"]
+        assert "another trainer" in ray_worker.train_cell(order(cell))["failure"]
         clock = SimpleNamespace(monotonic=time.monotonic, sleep=lambda seconds: fcntl.flock(held, fcntl.LOCK_UN))
         monkeypatch.setattr(ray_worker, "time", clock)
-        assert ray_worker.work(order(cell, attempt=2, wait=30.0)) == {"failure": None, "stopped": False}
+        assert ray_worker.train_cell(order(cell, attempt=2, wait=30.0)) == {"failure": None, "stopped": False}
     assert "waiting for the lock" in (folder / "train.log").read_text()
 
 
@@ -264,7 +264,7 @@ def sweep(ray: FakeRay, cells: list[ablate.Cell]) -> tuple[list[str], dict[str, 
     """Lines that are shown, and how each cell ended."""
     lines: list[str] = []
     ends: dict[str, str | None] = {}
-    running = ray_runner._Sweep(
+    running = ray_runner.Sweep(
         ray, {}, 2, False, lines.append, lambda place, cell, failure: ends.update({cell.value: failure})
     )
     running.run([(cell.name, cell) for cell in cells])
@@ -286,7 +286,7 @@ def test_a_lost_cell_is_begun_again(how, blobs, tmp_path, capsys):
 
 def test_a_gpu_for_each_cell(blobs, tmp_path):
     ray = FakeRay()
-    ray_runner._Sweep(ray, {}, 4, True, print, lambda *end: None).run([("1", plan(blobs, tmp_path, "8")[0])])
+    ray_runner.Sweep(ray, {}, 4, True, print, lambda *end: None).run([("1", plan(blobs, tmp_path, "8")[0])])
     assert ray.options["num_gpus"] == 1 and ray.options["num_cpus"] == 4
 
 
@@ -312,7 +312,7 @@ def test_failures_stop_no_other(blobs, tmp_path):
 def test_results_that_are_not_seen_are_a_failure(blobs, tmp_path, monkeypatch):
     monkeypatch.setattr(ray_runner, "VISIBLE_SECONDS", 0.0)
     monkeypatch.setattr(FakeRay, "get", lambda self, ref: {"failure": None, "stopped": False})
-    monkeypatch.setattr(ray_runner, "_appears", lambda path: False)
+    monkeypatch.setattr(ray_runner, "appears", lambda path: False)
     _, ends = sweep(FakeRay(), plan(blobs, tmp_path, "8"))
     assert ends["8"] is not None and "is the folder shared?" in ends["8"]
 
@@ -325,12 +325,12 @@ def test_a_lost_cluster_ends_the_sweep(blobs, tmp_path, monkeypatch):
         place = f"127.0.0.1:{gcs.getsockname()[1]}"
         ray = FakeRay()
         ray.get_runtime_context = lambda: SimpleNamespace(gcs_address=place)
-        head = ray_cluster.Head(ray, "auto")
+        head = ray_cluster.HeadMonitor(ray, "auto")
         until = time.monotonic() + 0.6
         while time.monotonic() < until:
             head.check()  # it answers
             gcs.accept()[0].close()
-    running = ray_runner._Sweep(ray, {}, 1, False, print, lambda *end: None, head.check)
+    running = ray_runner.Sweep(ray, {}, 1, False, print, lambda *end: None, head.check)
     with pytest.raises(UserError, match="head of the cluster is gone"):
         running.run([(cell.name, cell) for cell in plan(blobs, tmp_path, "8", "16")])
     assert ray.cancelled == [0, 1]
@@ -380,5 +380,5 @@ def test_without_ray(monkeypatch, blobs, tmp_path, capsys):
 
 def test_what_ray_says_becomes_one_line():
     text = "Traceback (most recent call last):\n  File ...\nRuntimeError: Version mismatch: 2.9 and 2.60\n\n"
-    assert ray_cluster._reason(text) == "Version mismatch: 2.9 and 2.60"
-    assert ray_cluster._reason("") == "Ray gave no reason"
+    assert ray_cluster.last_error_line(text) == "Version mismatch: 2.9 and 2.60"
+    assert ray_cluster.last_error_line("") == "Ray gave no reason"

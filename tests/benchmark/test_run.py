@@ -10,7 +10,7 @@ import torch
 from helpers.bench_rows import TINY, check_rows, report_of, rows_of
 from scgs_warp.apps import bench as app
 from scgs_warp.benchmark import gsplat, memory, scenes, summary, workloads
-from scgs_warp.benchmark import plan as bench_place
+from scgs_warp.benchmark import plan as bench_plan
 from scgs_warp.benchmark import run as bench
 from scgs_warp.benchmark import timing as bench_clock
 from scgs_warp.config.presets import MOTIONS
@@ -125,22 +125,22 @@ def test_frames_are_drawn_as_of_a_loaded_run_and_steps_as_in_training(motion):
     scene = scenes.synthetic_scene(motion, 60, 12, "cpu")
     assert not scene.motion.training
     assert scenes.training_state(scene, arap=False).motion.training
-    plan = bench.Plan(None, 60, 12, 32, (motion,), "cpu", (1,), 0.0)
-    place = bench_place.Place(scene, plan, scenes.Load(1, 1.0), 1)
-    names = [row["name"] for row in workloads.step_rows(place)]
+    plan = bench.BenchPlan(None, 60, 12, 32, (motion,), "cpu", (1,), 0.0)
+    case = bench_plan.BenchCase(scene, plan, scenes.Load(1, 1.0), 1)
+    names = [row["name"] for row in workloads.step_rows(case)]
     assert not scene.motion.training and ("step/network" in names) == (motion != "static")
 
 
 def test_on_a_gpu_stages_are_those_of_a_frame_drawn_step_by_step(monkeypatch):
     """The whole is a recorded graph there; the steps that are timed instead draw the same picture."""
     scene = scenes.synthetic_scene("control-points", 120, 12, "cpu")
-    plan = bench.Plan(None, 120, 12, 48, ("control-points",), "cuda", (1,), 0.0)
-    place = bench_place.Place(scene, plan, scenes.Load(1, 1.0), 1)
+    plan = bench.BenchPlan(None, 120, 12, 48, ("control-points",), "cuda", (1,), 0.0)
+    case = bench_plan.BenchCase(scene, plan, scenes.Load(1, 1.0), 1)
     given, drawn = {}, []
     monkeypatch.setattr(
-        bench_place.Place, "rows", lambda self, *args, **options: given.update(options, args=args) or []
+        bench_plan.BenchCase, "rows", lambda self, *args, **options: given.update(options, args=args) or []
     )
-    workloads.frame_rows(place)
+    workloads.frame_rows(case)
     draw = render_module.render
     monkeypatch.setattr(render_module, "render", lambda *args, **kw: drawn.append(draw(*args, **kw)) or drawn[-1])
     given["staged"](3)
@@ -201,24 +201,24 @@ def test_a_file_that_cannot_be_written(tmp_path):
 
 def test_renderers_must_agree_before_they_are_timed():
     image = torch.rand(3, 40, 50)
-    gsplat.agree(image, image + 5e-5)
+    gsplat.check_agreement(image, image + 5e-5)
     flipped = image.clone()
     flipped[0, 3, 4] += 1 / 255
-    gsplat.agree(image, flipped)
+    gsplat.check_agreement(image, flipped)
     for changed in (image + 2e-4, image.where(torch.arange(50) != 7, image + 1e-3), image * torch.nan):
         with pytest.raises(UserError, match="differ"):
-            gsplat.agree(image, changed)
+            gsplat.check_agreement(image, changed)
     flipped[0, 3, 4] += 1.0
     with pytest.raises(UserError, match="differ"):
-        gsplat.agree(image, flipped)
+        gsplat.check_agreement(image, flipped)
 
 
 def test_against_a_peer_that_is_ours_and_one_that_is_wrong():
     scene = scenes.synthetic_scene("static", 120, 12, "cpu")
-    plan = bench.Plan(None, 120, 12, 48, ("static",), "cpu", (1,), 0.0)
-    place = bench.Place(scene, plan, scenes.Load(1, 1.0), 1)
+    plan = bench.BenchPlan(None, 120, 12, 48, ("static",), "cpu", (1,), 0.0)
+    case = bench.BenchCase(scene, plan, scenes.Load(1, 1.0), 1)
     ours = gsplat.rasterize.rasterization
-    rows = gsplat.Peers(ours).rows(place)
+    rows = gsplat.Peers(ours).rows(case)
     assert [(row["renderer"], row["name"]) for row in rows] == [
         ("scgs_warp", "raster/forward"),
         ("scgs_warp", "raster/both"),
@@ -226,7 +226,7 @@ def test_against_a_peer_that_is_ours_and_one_that_is_wrong():
         ("gsplat", "raster/both"),
     ]
     with pytest.raises(UserError, match="differ"):
-        gsplat.Peers(lambda *args, **kwargs: (0.5 * ours(*args, **kwargs)[0],)).rows(place)
+        gsplat.Peers(lambda *args, **kwargs: (0.5 * ours(*args, **kwargs)[0],)).rows(case)
 
 
 def test_stages_unwrap_what_they_wrap_and_count_nested_ones_once():
@@ -260,7 +260,7 @@ def test_nothing_stays_wrapped(tmp_path):
 def test_warm_up_is_left_out_and_time_bounds_the_repeats():
     calls: list[int] = []
     timing = bench_clock.repeat(calls.append, 0.0, "cpu")
-    assert calls == list(range(bench_clock.WARM_UP + bench_clock.FEWEST)) and 0 <= timing.least <= timing.median
+    assert calls == list(range(bench_clock.WARM_UP + bench_clock.MIN_REPEATS)) and 0 <= timing.least <= timing.median
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -335,11 +335,11 @@ def test_two_threads_scaling_leaves_the_thread_count_alone():
 def test_extra_memory_is_what_measuring_takes():
     """A call that holds 64 MiB, then one that holds nothing: the peak counts anew for each row."""
     scene = scenes.synthetic_scene("static", 120, 12, "cpu")
-    plan = bench.Plan(None, 120, 12, 48, ("static",), "cpu", (1,), 0.0)
+    plan = bench.BenchPlan(None, 120, 12, 48, ("static",), "cpu", (1,), 0.0)
     before = memory.resident_mib("cpu")
-    place = bench_place.Place(scene, plan, scenes.Load(1, 1.0), 1, before)
+    case = bench_plan.BenchCase(scene, plan, scenes.Load(1, 1.0), 1, before)
     held, idle = (
-        place.rows("x", function, {})[0] for function in (lambda i: torch.ones(16, 2**20).sum(), lambda i: None)
+        case.rows("x", function, {})[0] for function in (lambda i: torch.ones(16, 2**20).sum(), lambda i: None)
     )
     if idle["peak_mib"] > held["peak_mib"] - 32:
         pytest.skip("the peak cannot be reset here")
