@@ -34,17 +34,17 @@ def changed_since(commit: str | None, paths: tuple[str, ...]) -> bool:
 
 
 def reported_note(commits: Iterable[str]) -> str:
-    """The legend of ``REPORTED``; empty without commits."""
+    """Write the legend of ``REPORTED``; empty without commits."""
     names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
     return f"{REPORTED} Reported at commit {names}, not measured by a committed run." if names else ""
 
 
 def older_note(commits: Iterable[str]) -> str:
-    """The legend of ``OLDER``; empty without commits."""
+    """Write the legend of ``OLDER``; empty without commits."""
     names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
     return f"{OLDER} Measured at commit {names}; the measured code has changed since." if names else ""
 
 
 def without_older_marks(page: str) -> str:
-    """Drop what depends on the history of the repository, so that only figures are compared."""
+    """Remove the marks that depend on the history of the repository, so that only figures are compared."""
     return re.sub(rf"\n*^{OLDER} .*$", "", page, flags=re.MULTILINE).replace(f" {OLDER}", "")

@@ -62,7 +62,7 @@ class Source:
         return self.run(row, "mean").get(key)
 
     def label(self, row: str, text: str) -> str:
-        """``text`` with the marks that the runs of the row ask for."""
+        """Add the marks of the row's runs to ``text``, and remember their commits for the notes."""
         runs = [run for (name, own, _), run in self.runs.items() if (name, own) == (self.name, row)]
         reported = [run["commit"] for run in runs if run["provenance"] == "reported"]
         measured = (run["commit"] for run in runs if run["provenance"] == "measured")
@@ -76,7 +76,7 @@ class Source:
 
 
 def duration(seconds: float | None) -> str:
-    """``3 min 22 s``, from an hour on ``1 h 30 min``."""
+    """Write a duration as ``3 min 22 s``, from an hour on as ``1 h 30 min``."""
     if seconds is None:
         return ""
     if seconds >= 3600:
@@ -99,17 +99,17 @@ def percent(value: float | None, digits: int) -> str:
 
 
 def training_time(run: Run) -> str:
-    """Duration, and the make of the processor."""
+    """Write the duration and the make of the processor."""
     return f"{duration(run['seconds'])} ({run['processor'].split()[0].strip(',')})" if "seconds" in run else ""
 
 
 def cost(run: Run) -> str:
-    """Time, make of the processor, and number of Gaussians."""
+    """Write time, make of the processor, and number of Gaussians."""
     return f"{training_time(run)}, {thousands(run['gaussians'])}" if run else ""
 
 
 def beside_published(source: Source) -> str:
-    """D-NeRF's scenes, and under each row of ours how long it took."""
+    """Write the scenes of D-NeRF beside published figures, and under each own row its cost."""
     lines = []
     for row, text in (
         ("sc-gs", "SC-GS, published (80,000 steps)"),
@@ -130,7 +130,7 @@ def beside_published(source: Source) -> str:
 
 
 def node_counts(source: Source) -> str:
-    """The supplement's Table S1."""
+    """Write the numbers of control points beside the supplement's Table S1."""
     lines = []
     for count in ("64", "128", "256", "512", "1024", "2048", "4096"):
         own, before = source.run(count, "mean"), source.run(f"{count}-before", "mean")
@@ -155,7 +155,7 @@ def node_counts(source: Source) -> str:
 
 
 def motion_models(source: Source) -> str:
-    """Control points and their rivals at equal steps."""
+    """Write control points and their rivals at equal steps."""
     ours = source.mean("control-points", TWO, "psnr")
     published = {row: math.fsum(known[scene] for scene in TWO) / 2 for row, known in PUBLISHED_PSNR.items()}
     lines = []
@@ -185,7 +185,7 @@ def motion_models(source: Source) -> str:
 
 
 def arap(source: Source) -> str:
-    """Motion of control points where the truth is known."""
+    """Write the ARAP ablation, where the true motion is known."""
     base = source.run("per-gaussian", "figure")
     lines = []
     for row, text in (
@@ -249,7 +249,7 @@ def changes(scenes: tuple[str, ...], base: str) -> Callable[[Source], str]:
 
 
 def overview(source: Source) -> str:
-    """The README's rows, from the runs of the other tables."""
+    """Write the overview from the runs of the other tables."""
     lines = []
     arap_runs, published = Source(source.runs, "arap"), Source(source.runs, "published")
     source.label("figure", "")
@@ -300,7 +300,10 @@ def quality_table(name: str, results: Path) -> str:
 
 
 def reported_table(path: Path) -> str:
-    """A table as it was reported: ``commit``, ``head`` and ``rows``, each with ``cells`` and perhaps its ``commit``."""
+    """Write a table as it was reported.
+
+    Its file holds ``commit``, ``head`` and ``rows``, each with ``cells`` and, if it differs, its ``commit``.
+    """
     values = json.loads(path.read_text(encoding="utf-8"))
     lines = [[f"{row['cells'][0]} {REPORTED}".strip(), *row["cells"][1:]] for row in values["rows"]]
     commits = [row.get("commit", values["commit"]) for row in values["rows"]]

@@ -1,12 +1,12 @@
-"""What it costs that several processes share a step's views: bytes, and the time of each part of a step.
+"""Measure the cost of sharing a step's views among processes: bytes, and the time of each part of a step.
 
     torchrun --standalone --nproc-per-node 2 benchmarks/sharing.py                 # two processes on this machine
     torchrun --standalone --nproc-per-node 2 benchmarks/sharing.py --size 800 --json sharing.json
     python benchmarks/sharing.py                                                   # one process, for comparison
 
-Every process looks at one view per step. The scene is ``apps/bench.py step``'s synthetic one. Milliseconds are medians
-over steps of the first process, by the clock and of processor time (that of all its threads): on a machine that does
-other work the second is the steadier one, but does not count waiting.
+Every process renders one view per step of the synthetic scene of ``apps/bench.py step``. Milliseconds are medians over
+steps of the first process, by the clock and as processor time of all its threads; on a busy machine the latter is
+steadier, but does not include waiting.
 """
 
 from __future__ import annotations
@@ -45,11 +45,12 @@ PARTS = [
     ("join", Team, "join"),
     ("adam", Adam, "step"),
 ]
-"""What rows call them: a view forward and backward, waiting for the others at its end, two ways of moving gradients."""
+"""Names of rows, and the functions that they time: a view forward and backward, waiting for the others at its end, two
+ways of moving gradients, and Adam."""
 
 
 class Clock:
-    """Times calls of functions, step by step."""
+    """Times of functions, step by step."""
 
     def __init__(self, device: str) -> None:
         self.wait = torch.cuda.synchronize if device == "cuda" else lambda: None
@@ -81,7 +82,7 @@ class Clock:
 
     def rows(self) -> list[dict[str, Any]]:
         found: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        for step in self.steps[len(self.steps) // 5 :]:  # the first ones allocate
+        for step in self.steps[len(self.steps) // 5 :]:  # The first steps allocate.
             for name, times in step.items():
                 found[name].append(times)
         medians = {name: [1e3 * statistics.median(column) for column in zip(*times)] for name, times in found.items()}

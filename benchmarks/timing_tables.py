@@ -21,7 +21,7 @@ def counted(threads: int) -> str:
 
 
 def machine_line(report: Report) -> str:
-    """Where and when it was measured, and whether rows of several threads count."""
+    """State machine, versions and date."""
     machine = report["machine"]
     where = machine["gpu"] or f"{machine['processor']}, {machine['cores']} cores"
     versions = f"torch {machine['torch']}, Warp {machine['warp']}"
@@ -29,7 +29,7 @@ def machine_line(report: Report) -> str:
 
 
 def scaling_line(rows: list[Report]) -> str:
-    """What the machine gave to two threads, and what follows from it."""
+    """State the speed-up of two threads, and warn where it was too small."""
     values = [row["two_thread_scaling"] for row in rows if row["share"] is None and row["device"] == "cpu"]
     if not values:
         return ""
@@ -48,7 +48,7 @@ def size_line(row: Report) -> str:
 
 
 def stages(report: Report) -> str:
-    """Wholes and their stages: a row each, two columns a number of threads; one table a motion model."""
+    """Write a table for each motion model: wholes and stages, two columns for each number of threads."""
     parts = [machine_line(report) + scaling_line(report["rows"])]
     for motion in dict.fromkeys(row["motion"] for row in report["rows"]):
         rows = [row for row in report["rows"] if row["motion"] == motion]
@@ -134,7 +134,7 @@ def opensplat(report: Report) -> str:
 
 
 def scaling(report: Report) -> str:
-    """One table a sweep: the wholes beside their limits."""
+    """Write a table for each sweep: the wholes and their limits."""
     limits = [
         f"{counted(one['threads'])}: {one['gigabytes']:.1f} GB/s copied, {one['gigaflops']:.0f} GFLOP/s"
         for one in report["limits"].values()
@@ -162,7 +162,7 @@ def scaling(report: Report) -> str:
 
 
 def speed_overview(results: Path) -> str:
-    """The README's rows, from the results of the other tables; empty cells where one is missing."""
+    """Write the overview from the results of the other tables; cells stay empty where one is missing."""
     lines, older = [], []
     for text, name, whole in (
         ("a whole dynamic frame, 512 control points, the network evaluated for every frame", "frame-cpu", "frame"),
@@ -192,9 +192,9 @@ class Benchmark(NamedTuple):
 
     write: Callable[[Report], str]
     command: str
-    """What measures it, without ``--json``."""
+    """Command that measures it, without ``--json``."""
     measures: tuple[str, ...] = RENDERING
-    """The folders whose code is timed."""
+    """Folders with the code that is timed."""
 
 
 BENCHMARKS = {
