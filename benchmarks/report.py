@@ -19,6 +19,7 @@ from pathlib import Path
 
 from provenance import ROOT, without_older_marks
 from quality_tables import WRITERS, quality_table, reported_table
+from repeatable_tables import REPEATABLE, repeatable_table
 from timing_tables import BENCHMARKS, speed_overview, timing_table
 
 RESULTS = ROOT / "benchmarks" / "results"
@@ -27,8 +28,13 @@ MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
 
 def table_names(results: Path) -> list[str]:
     """Names of all tables that must stand on a page."""
-    reported = sorted(path.stem for path in (results / "reported").glob("*.json"))
-    return [*BENCHMARKS, "speed-overview", *(f"quality-{name}" for name in WRITERS), *reported]
+    reported = {path.stem for path in (results / "reported").glob("*.json")}
+    return [
+        *BENCHMARKS,
+        "speed-overview",
+        *(f"quality-{name}" for name in WRITERS),
+        *sorted(reported | set(REPEATABLE)),
+    ]
 
 
 def section(name: str, results: Path) -> str:
@@ -43,9 +49,14 @@ def section(name: str, results: Path) -> str:
         return speed_overview(results)
     if name.startswith("quality-") and name[len("quality-") :] in WRITERS:
         return quality_table(name[len("quality-") :], results)
+    measured = repeatable_table(name, results) if name in REPEATABLE else None
+    if measured is not None:
+        return measured
     path = results / "reported" / f"{name}.json"
     if path.is_file():
         return reported_table(path)
+    if name in REPEATABLE:
+        return "Not measured yet."
     raise ValueError(f"<!-- table: {name} -->: no such table")
 
 

@@ -79,7 +79,7 @@ def test_every_table_from_tiny_results(report, tmp_path, monkeypatch, capsys):
     assert report.main(options) == 0 and report.main([*options, "--check"]) == 0
     text = page.read_text(encoding="utf-8")
     assert "\nold\n" not in text and text.endswith("end\n")
-    assert text.count("Not measured yet") == 2 and "1000000 --size 1920x1080" in text
+    assert text.count("Not measured yet: ") == 2 and "1000000 --size 1920x1080" in text
     result = json.loads((tmp_path / "frame-cpu.json").read_text(encoding="utf-8"))
     first = result["rows"][0]
     assert f"`{result['command']}`" in text and result["command"].startswith(
@@ -132,6 +132,28 @@ def test_a_measured_run_replaces_the_reported_one(report, tmp_path):
         (results / "quality" / f"a-{scene}.json").write_text(json.dumps(run), encoding="utf-8")
     text = report.section("quality-parts-settling", results)
     assert "| 40.50 | 41.50 | 41.00 |  |" in text and "| settle † | 42.00 | 43.00 | 42.50 | +1.50 |" in text
+
+
+def test_repeated_measurements_replace_the_reported_table(report, tmp_path):
+    shutil.copytree(report.RESULTS / "reported", tmp_path / "reported")
+    tables = benchmark_script("repeatable_tables")
+    origin = {"date": "2026-01-01", "commit": COMMIT, "machine": {"gpu": None, "processor": "x", "cores": 2}}
+    origin["machine"].update(torch="2", warp="1")
+    parts = {"view": 50.0, "exchange": 6.0, "join": 5.0, "step": 90.0}
+    rows = [{"name": name, "ms": 1.0, "cpu_ms": time} for name, time in parts.items()]
+    drag = {"edit/drag": 40.0, "edit/drag/solve": 6.0, "edit/drag/skin": 14.0}
+    edits = [{"name": name, "ms_median": time, "threads": 1, "control_points": 512} for name, time in drag.items()]
+    for name in ("sharing-200", "sharing-400", "sharing-800", "sharing-400-300k"):
+        assert "†" in report.section("scaling-step", tmp_path)
+        for ending in ("", "-alone"):
+            result = {**origin, "rows": rows, "peak_mib": 700 + len(ending), "mib_per_step": 15.4}
+            (tmp_path / f"{name}{ending}.json").write_text(json.dumps(result), encoding="utf-8")
+    for name in ("edit-cpu", "edit-4096-cpu"):
+        (tmp_path / f"{name}.json").write_text(json.dumps({**origin, "rows": edits}), encoding="utf-8")
+    texts = [report.section(name, tmp_path) for name in tables.REPEATABLE]
+    assert all("†" not in text and "x, 2 cores; torch 2" in text for text in texts)
+    assert "| 11 ms | 11 ms | 11 ms | 11 ms |" in texts[0] and "| 29 ms |" in texts[0]
+    assert "| 706 MiB | 700 MiB |" in texts[1] and "| 512 | 20.0 ms | 6.0 ms | 40.0 ms |" in texts[2]
 
 
 def test_scores_of_a_run_are_recorded(report, tmp_path, capsys):
