@@ -174,7 +174,9 @@ def speed_overview(results: Path) -> str:
         ("a dynamic frame of 1,000,000 Gaussians at 1920 x 1080", "million-cpu", "frame"),
     ):
         path = results / f"{name}.json"
-        report = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"rows": [], "motion": []}
+        report: Report = {"rows": [], "motion": []}
+        if path.is_file():
+            report = json.loads(path.read_text(encoding="utf-8"))
         rows = report["rows"] if whole else report["motion"]
         times = {}
         for row in reversed(rows):  # the first model of motion counts
