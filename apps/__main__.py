@@ -1,4 +1,4 @@
-"""The console script: ``scgs-warp train ...`` is ``python apps/train.py ...``."""
+"""Console script: ``scgs-warp train ...`` is ``python apps/train.py ...``."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import importlib
 import sys
 
 APPS = {
-    "train": "learn a scene",
+    "train": "reconstruct a scene from images",
     "evaluate": "score a run on held-out views",
-    "view": "film a scene",
-    "edit": "move parts of it, in the browser or by script",
-    "export": "write it for other programs, or as a web page",
-    "capture": "make a data set of a video",
-    "synthesize": "make a data set of an animated mesh",
+    "view": "render a film of a scene",
+    "edit": "move parts of a scene, in the browser or by script",
+    "export": "write a scene for other programs, or as a web page",
+    "capture": "make a data set from a video",
+    "synthesize": "make a data set from an animated mesh",
     "ablate": "compare settings in a table",
-    "bench": "measure how fast it is here",
+    "bench": "measure speed on this machine",
 }
 
 
@@ -29,7 +29,7 @@ def main() -> int:
         if arguments and arguments[0] not in ("-h", "--help"):
             print(f"error: no command {arguments[0]!r}; give one of {', '.join(APPS)}", file=sys.stderr)
             return 2
-        print("usage: scgs-warp COMMAND [options]; 'scgs-warp train --help' explains each option\n")
+        print("usage: scgs-warp COMMAND [options]; 'scgs-warp COMMAND --help' explains its options\n")
         print("\n".join(f"  {name:11} {what}" for name, what in APPS.items()))
         return 0
     app = importlib.import_module(f"scgs_warp.apps.{arguments[0]}")

@@ -1,4 +1,4 @@
-"""Ablations, a training run a cell: the number of control points, the model of motion, ARAP on and off."""
+"""Ablations with one training run per cell: the number of control points, the motion model, ARAP on and off."""
 
 from __future__ import annotations
 
@@ -19,51 +19,51 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Listed before the settings."""
+class SweepOptions:
+    """Options that --help lists before the settings."""
 
     ablation: tyro.conf.Positional[Literal["nodes", "motion", "arap"]]
     """nodes: 64 to 4096 control points; motion: static, hexplane, per-gaussian and control-points; arap: on, off, and
     the per-gaussian baseline where the data's true motion is known."""
     output: Path
-    """Folder of the table and the plot (ABLATION.json, .md, .png), and of a run directory for each cell,
-    SCENE/VALUE[-seedN]. Cells that are there already are taken as they are; begun ones are continued."""
+    """Folder for the table and the plot (ABLATION.json, .md, .png) and for the run folder of each cell,
+    SCENE/VALUE[-seedN]. Finished cells are kept, interrupted ones are continued."""
     data: tuple[Path, ...] = ()
-    """Folders of data sets; without any the built-in scene, made on first use."""
+    """Folders of data sets; by default the built-in scene, which is made on first use."""
     values: tuple[str, ...] = ()
-    """The rows, with commas or spaces between; all by default. The table also has what was trained before."""
+    """Rows, separated by commas or spaces; all by default. The table also shows cells that were trained before."""
     seeds: tuple[str, ...] = ()
-    """Train every cell once for each; with commas or spaces between. The table then has standard deviations."""
+    """Seeds, separated by commas or spaces. Every cell is trained once with each; the table has standard deviations."""
     jobs: int = 1
-    """Cells at a time, each in a process of its own with its share of the threads; with --ray, on each machine."""
+    """Cells to train at a time, each in its own process with a share of the threads; with --ray, on each machine."""
     ray: str | None = None
-    """Train the cells on a Ray cluster: local (one of this machine's, for this sweep), auto (the one that runs here),
-    HOST:PORT, or ray://HOST:PORT from outside. --threads are those of each machine. By default, processes here."""
+    """Ray cluster to train on: local (one on this machine, for this command only), auto (the one that runs here),
+    HOST:PORT, or ray://HOST:PORT from outside of it. --threads then counts for each machine. By default no cluster."""
     lpips_weights: Path | None = None
-    """VGG16 and LPIPS weights; without them LPIPS is not measured."""
+    """File with VGG16 and LPIPS weights; without it LPIPS is not measured."""
     table_only: bool = False
-    """Only make table and plot, of the cells that are there."""
+    """Train nothing; make the table and the plot from finished cells."""
 
 
 @dataclass(frozen=True)
-class Options(Settings, Place):
-    """Train what differs in one thing alone, and put the results beside the published ones."""
+class Options(Settings, SweepOptions):
+    """Train runs that differ in one setting only, and compare the results with published ones."""
 
     preset: PresetName | None = None
-    """cpu by default: some 15 minutes a cell; quick: a few minutes; paper: the full schedule. All cells are trained for
-    equally many steps."""
+    """Schedule of all cells. cpu (the default): about 15 minutes per cell; quick: a few minutes; paper: the full
+    schedule."""
 
 
 def words(texts: tuple[str, ...]) -> list[str]:
-    """Texts with commas or spaces between, one by one."""
+    """Split texts at commas and spaces."""
     return [word for text in texts for word in text.replace(",", " ").split()]
 
 
 def check(options: Options) -> None:
-    """Refuse what the ablation itself decides.
+    """Refuse options that the ablation itself sets.
 
     Raises:
-        UserError: naming the option.
+        UserError: names the option.
     """
     from scgs_warp.ablation.cells import VARIED
     from scgs_warp.errors import UserError
@@ -85,10 +85,10 @@ def check(options: Options) -> None:
 
 
 def find_scenes(folders: tuple[Path, ...], named: str | None, device: str) -> dict[str, Path]:
-    """Data folders by their names, which the table and the run directories have.
+    """Return the data folders by their names, which the table and the run folders use.
 
     Raises:
-        UserError: one is missing, or two have one name.
+        UserError: a folder is missing, or two have the same name.
     """
     from scgs_warp.errors import UserError
 
@@ -106,7 +106,7 @@ def find_scenes(folders: tuple[Path, ...], named: str | None, device: str) -> di
 
 
 def make_cells(options: Options, device: str) -> list[Cell]:
-    """All cells that were asked for, checked before the first is trained."""
+    """Plan and check all cells before the first is trained."""
     from scgs_warp.ablation.cells import parse_seeds, parse_values, plan
 
     check(options)
@@ -116,7 +116,7 @@ def make_cells(options: Options, device: str) -> list[Cell]:
     if options.lpips_weights is not None:
         from scgs_warp.evaluation.image_metrics import LPIPS
 
-        LPIPS(options.lpips_weights, device)  # says at once what is wrong with them
+        LPIPS(options.lpips_weights, device)  # Damaged weights are reported before anything is trained.
     scenes = find_scenes(options.data, named, device)
     return plan(
         options.ablation,
@@ -131,10 +131,10 @@ def make_cells(options: Options, device: str) -> list[Cell]:
 
 
 def train(options: Options, cells: list[Cell]) -> dict[str, str]:
-    """All cells, here or on a cluster; the table is there from the first, and renewed with each.
+    """Train all cells, here or on a cluster, and write the table again after each.
 
     Returns:
-        what went wrong, by the cells' names.
+        Reasons of failures, by the cells' names.
     """
     from scgs_warp.ablation.cells import is_done
     from scgs_warp.ablation.local_runner import run_cells
@@ -168,7 +168,7 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.ablation.table import build, write
     from scgs_warp.errors import UserError
 
-    # What a cluster has need not be here.
+    # A GPU of the cluster need not exist on this machine.
     here = options.device if options.ray is None else "auto"
     cells = [] if options.table_only else make_cells(options, prepare(here, options.threads, options.memory_gib))
     failures = train(options, cells) if cells else {}

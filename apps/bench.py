@@ -1,4 +1,4 @@
-"""Measure what a frame, a rasterisation, a training step or a drag in the editor costs, by stages, and how it grows."""
+"""Measure the time of a frame, a rasterisation, a training step or a drag in the editor, by stages and by size."""
 
 from __future__ import annotations
 
@@ -14,60 +14,60 @@ FIGURES = Path("docs/images")
 
 @dataclass(frozen=True)
 class Common:
-    """What every benchmark takes."""
+    """Options of every benchmark."""
 
     gaussians: int | None = None
-    """Size of the synthetic scene; 49,000 by default, the mean of the paper's D-NeRF scenes."""
+    """Gaussians of the synthetic scene; 49,000 by default, the mean of the paper's D-NeRF scenes."""
     nodes: int | None = None
     """Control points of the synthetic scene; 512 by default."""
     size: str = "800"
     """Longer side of the images in pixels, or WIDTHxHEIGHT."""
     motion: str | None = None
-    """Motion models, with commas between: control-points, per-gaussian, hexplane, static. control-points by default."""
+    """Motion models, separated by commas: control-points (the default), per-gaussian, hexplane, static."""
     seconds: float = 2.0
-    """How long each row is measured; slow ones take longer, for five repeats."""
+    """Time to measure each row; slow rows take longer, for at least five repeats."""
     json: Path | None = None
-    """Write all rows, with date and machine, to this file."""
+    """Write all rows to this file, with command, date, commit and machine."""
     device: Device = "auto"
     """Where to compute; auto takes a GPU if there is one."""
     threads: int | None = None
-    """CPU threads; by default everything is measured on one and on all."""
+    """CPU threads; by default everything is measured on one thread and on all."""
     memory_gib: float | None = None
-    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
-    with the figure. By default what the machine has free."""
+    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
+    refused with the size. By default what is free on the machine."""
 
 
 @dataclass(frozen=True)
 class Options(Common):
-    """What the measurements of one size take."""
+    """Options of benchmarks of one size."""
 
     run: Path | None = None
-    """Measure this run's scene instead of a synthetic one."""
+    """Run folder whose scene is measured instead of a synthetic one."""
     against: Literal["gsplat"] | None = None
-    """Time gsplat on the same Gaussians beside this project; raster alone, on a GPU."""
+    """Also time gsplat on the same Gaussians; with raster only, on a GPU."""
 
 
 @dataclass(frozen=True)
 class Frame(Options):
-    """A frame of the moving scene: network, skinning, projection, harmonics, binning, compositing."""
+    """Measure a frame of the moving scene: network, skinning, projection, harmonics, binning, compositing."""
 
     table_s2: bool = False
-    """All four motion models, and their speeds relative to each other beside those of the paper's Table S2."""
+    """Measure all four motion models, and compare their relative speeds with the paper's Table S2."""
 
 
 @dataclass(frozen=True)
 class Raster(Options):
-    """Rasterising Gaussians that stand still: forward, and forward with all gradients."""
+    """Measure rasterising Gaussians at rest: forward, and forward with all gradients."""
 
 
 @dataclass(frozen=True)
 class Step(Options):
-    """A training step of the joint phase, with and without the ARAP term."""
+    """Measure a training step of the joint phase, with and without the ARAP term."""
 
 
 @dataclass(frozen=True)
 class Edit(Options):
-    """From a drag of a handle in the editor to the new picture: solve, skin, render, encode."""
+    """Measure a drag of a handle in the editor up to the new picture: solve, skin, render, encode."""
 
     size: str = "512"
     """Longer side of the picture in pixels, or WIDTHxHEIGHT; the editor shows at most 512 while something moves."""
@@ -75,23 +75,23 @@ class Edit(Options):
 
 @dataclass(frozen=True)
 class Scaling(Common):
-    """Frames and rasterisations as Gaussians, pixels, control points and threads grow, beside the machine's limits."""
+    """Sweep frames and rasterisations over Gaussians, pixels, control points and threads; show the machine's limits."""
 
     sweeps: str = "gaussians,resolution,nodes,threads"
-    """What to vary, with commas between; own points after a colon: nodes:64/128. What a sweep does not vary stays at
+    """Quantities to vary, separated by commas, with optional points after a colon: nodes:64/128. The others stay at
     --gaussians, --nodes, --size and all threads (or --threads)."""
     figures: Path = FIGURES
-    """Folder for one figure a sweep: scaling-NAME.png."""
+    """Folder for one figure per sweep: scaling-NAME.png."""
 
 
 COMMANDS = {"frame": Frame, "raster": Raster, "step": Step, "edit": Edit, "scaling": Scaling}
 
 
 def check(options: Common) -> None:
-    """Refuse what cannot work before anything is loaded.
+    """Refuse impossible options before anything is loaded.
 
     Raises:
-        UserError: naming the option and the remedy.
+        UserError: names the option and the remedy.
     """
     from scgs_warp.config.presets import MotionConfig
     from scgs_warp.errors import UserError
@@ -116,7 +116,7 @@ def check(options: Common) -> None:
 
 
 def show(report: dict[str, Any]) -> None:
-    """The rows as a table on the terminal."""
+    """Print the rows as a table."""
     from rich.console import Console
     from rich.table import Table
 
@@ -154,7 +154,7 @@ def show(report: dict[str, Any]) -> None:
 
 
 def show_motion(report: dict[str, Any]) -> None:
-    """What moving the scene costs, and what is left of the speed of Gaussians at rest."""
+    """Print the cost of motion, and the speed relative to Gaussians at rest."""
     for cost in report["motion"]:
         rest = cost["ratio_to_static"]
         print(
@@ -164,7 +164,7 @@ def show_motion(report: dict[str, Any]) -> None:
 
 
 def show_table_s2(report: dict[str, Any]) -> None:
-    """Speeds relative to Gaussians at rest, here and in the paper."""
+    """Print speeds relative to Gaussians at rest, here and in the paper."""
     for row in report["table_s2"]:
         print(
             f"{row['motion']}, {row['threads']} threads: {row['fps']:.1f} frames/s, {row['ratio_to_static']:.2f} of "
@@ -174,7 +174,7 @@ def show_table_s2(report: dict[str, Any]) -> None:
 
 
 def show_scaling(report: dict[str, Any]) -> None:
-    """Whole frames and rasterisations, and the machine's limits."""
+    """Print the machine's limits and the whole frames and rasterisations."""
     for limit in report["limits"].values():
         best = f"{limit['gigabytes']:.1f} GB/s copied, {limit['gigaflops']:.0f} GFLOP/s"
         print(f"at best, {limit['threads']} threads: {best}")
@@ -189,7 +189,7 @@ def show_scaling(report: dict[str, Any]) -> None:
 
 
 def measure(options: Options, plan: Any) -> dict[str, Any]:
-    """One size: rows, and what they say together."""
+    """Measure one size: rows and their summaries."""
     from scgs_warp.benchmark import run as bench
     from scgs_warp.benchmark import summary
 
@@ -210,9 +210,10 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.benchmark import run as bench
     from scgs_warp.benchmark.scenes import camera_size
     from scgs_warp.benchmark.summary import PAPER_FPS
+    from scgs_warp.benchmark.timing import command_line
 
     table = isinstance(options, Frame) and options.table_s2
-    plan = bench.Plan(
+    plan = bench.BenchPlan(
         run=getattr(options, "run", None),
         gaussians=49_000 if options.gaussians is None else options.gaussians,
         nodes=512 if options.nodes is None else options.nodes,
@@ -230,7 +231,8 @@ def main(args: list[str] | None) -> None:
         assert isinstance(options, Options)
         report = measure(options, plan)
     if options.json is not None:
-        bench.write(report, options.json)
+        command = command_line("apps/bench.py", sys.argv[1:] if args is None else args)
+        bench.write({"command": command, **report}, options.json)
     if isinstance(options, Scaling):
         show_scaling(report)
         for path in plot.draw(report, options.figures):

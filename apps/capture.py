@@ -1,4 +1,4 @@
-"""Make a data set of a film: ``python apps/capture.py film.mp4 --output data/film``."""
+"""Make a data set from a video: ``python apps/capture.py film.mp4 --output data/film``."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from scgs_warp.apps.cli import Device, prepare, run
 
 @dataclass(frozen=True)
 class Options:
-    """Find where a video was filmed from: frames, cameras, times and points, in a folder for train.py --data."""
+    """Find the cameras of a video; write frames, cameras, times and points to a folder for train.py --data."""
 
     video: tyro.conf.Positional[Path]
-    """A video, or a folder of images that one camera took."""
+    """Video, or folder of images from one camera."""
     output: Path
-    """Folder to make. The same command goes on where it was interrupted; finished work is never overwritten."""
+    """Folder to make. The same command continues an interrupted one; finished work is never overwritten."""
     frames: int | None = None
-    """At most so many frames, the sharpest, spread over time and motion; 150 of a video by default, all of a folder."""
+    """Most frames to pick: the sharpest, spread over time and motion. By default 150 of a video and all of a folder."""
     start: float | None = None
     """Second of the video to begin at."""
     end: float | None = None
@@ -29,26 +29,27 @@ class Options:
     size: int = 1280
     """Longer side of the images in pixels; smaller ones are not enlarged."""
     masks: str = "auto"
-    """auto: what moves against the scene at rest is found and takes no part in finding the cameras; none; or a folder
-    or video of masks, black where something moves."""
+    """Parts that take no part in finding the cameras. auto: what moves is found; none; or a folder or video of masks,
+    black where something moves."""
     matching: Literal["auto", "sequential", "exhaustive"] = "auto"
-    """Frames compared with those around them, or each with each; auto: by their number."""
+    """Compare frames with their neighbours, or each with each; auto: by their number."""
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
         "SIMPLE_RADIAL"
     )
-    """COLMAP's name; one camera for all frames, found with the poses. OPENCV for wide angles, OPENCV_FISHEYE beyond."""
+    """COLMAP's model of the one camera of all frames, found with the poses: OPENCV for wide angles, OPENCV_FISHEYE for
+    wider ones."""
     fov: float | None = None
-    """Horizontal field of view in degrees, to begin with, if you know it."""
+    """Horizontal field of view in degrees to begin with, if it is known."""
     features: int = 4096
-    """At most, of a frame."""
+    """Most features of a frame."""
     least: float = 0.5
-    """Share of the frames that must get a camera; with less it is an error, which says what to do."""
+    """Least share of the frames that must get a camera; below it the command fails and says what to do."""
     seed: int = 0
-    """Of what is drawn at random; the same film and seed give the same frames and cameras."""
+    """Random seed; the same video and seed give the same frames and cameras."""
     device: Device = "auto"
-    """Where features are compared; auto takes a GPU if there is one."""
+    """Where to compare features; auto takes a GPU if there is one."""
     threads: int | None = None
-    """CPU threads; all cores by default. pycolmap's own work takes one."""
+    """CPU threads; all cores by default. pycolmap itself uses one."""
 
 
 def main(args: list[str] | None) -> None:

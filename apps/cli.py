@@ -1,4 +1,4 @@
-"""What every app shares: device and threads, one-line errors, exit status 2."""
+"""Shared parts of the apps: device and threads, errors in one line, exit statuses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Device = Literal["auto", "cpu", "cuda"]
 
 
 def choose_device(device: Device) -> str:
-    """``auto`` takes a GPU where there is one.
+    """Return the device; ``auto`` takes a GPU if there is one.
 
     Raises:
-        UserError: ``cuda`` was asked for and there is none.
+        UserError: ``cuda`` was asked for, and there is no GPU.
     """
     import torch
 
@@ -33,19 +33,19 @@ def choose_device(device: Device) -> str:
 
 
 def _tell(text: str) -> None:
-    with suppress(OSError):  # the terminal was closed
+    with suppress(OSError):  # The terminal may be closed.
         print(text, file=sys.stderr, flush=True)
 
 
 def run(main: Callable[[list[str] | None], None], args: list[str] | None = None) -> int:
-    """Run an app; a user's mistake becomes one line on stderr and status 2, Ctrl-C status 130."""
+    """Run an app; a user's mistake gives one line on stderr and status 2, Ctrl-C status 130."""
     try:
         main(args)
     except UserError as error:
         _tell(f"error{process_label()}: {one_line(error)}")
         return 2
     except OSError as error:
-        if isinstance(error, BrokenPipeError):  # the reader (head, a pager) has seen enough
+        if isinstance(error, BrokenPipeError):  # The reader (head, a pager) has closed the pipe.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         _tell(f"error: {one_line(error)}")
@@ -72,5 +72,5 @@ def prepare(device: Device, threads: int | None, memory_gib: float | None = None
         from scgs_warp.runtime import memory
 
         memory.set_limit(memory_gib)
-        os.environ[memory.LIMIT_VARIABLE] = str(memory_gib)  # for processes of our own, too
+        os.environ[memory.LIMIT_VARIABLE] = str(memory_gib)  # Child processes read it.
     return choose_device(device)

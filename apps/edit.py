@@ -1,4 +1,4 @@
-"""Edit a scene: take hold of control points and move them, in the browser, or by script into a film."""
+"""Edit a scene by moving control points, in the browser or by a script."""
 
 from __future__ import annotations
 
@@ -12,57 +12,57 @@ from scgs_warp.apps.cli import Device, prepare, run
 if TYPE_CHECKING:
     from scgs_warp.edit import EditSession
 
-MOST_NODES = 20_000
+MAX_NODES = 20_000
 
 
 @dataclass(frozen=True)
 class Options:
-    """Edit a trained scene or a 3D-GS file: with a script and an output, as a film; otherwise in the browser."""
+    """Edit a trained scene or a 3D-GS file: by a script into a film or a file, otherwise in the browser."""
 
     run: Path | None = None
-    """Folder of a run, as apps/train.py writes it."""
+    """Run folder, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: a .ply of 3D Gaussian splatting, a .splat or a .spz, as a scene that stands still."""
+    """File of 3D Gaussian splatting (.ply, .splat or .spz) to edit instead of a run; it does not move by itself."""
     script: Path | None = None
-    """An edit, as JSON (docs/editing.md). Without an output, the editor begins with it."""
+    """Edit to load, as JSON (docs/editing.md). Without an output, the editor opens with it."""
     output: Path | None = None
-    """Where the script's film goes: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
+    """Film of the script to write: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     export: Path | None = None
-    """A .ply to write the edited scene to, as it is at the time --at."""
+    """File to write the edited scene to, a .ply, as the scene is at the second --at of the film."""
     at: float = 0.0
-    """Second of the film that --export shows."""
+    """Second of the film that --export writes."""
     nodes: int = 512
-    """Control points of a scene that stands still."""
+    """Control points for a scene without motion."""
     size: int | None = None
     """Longer side of the film in pixels, instead of the script's."""
     port: int = 8080
-    """Of the editor's page, on 127.0.0.1; the next free one is taken. With --share: where others reach it."""
+    """Port of the editor on 127.0.0.1, or the next free one. With --share, the port for other machines."""
     share: bool = False
-    """Let other machines in: the page is served on all interfaces, behind a proxy that asks for a token."""
+    """Serve the editor to other machines: on all interfaces, behind a proxy that asks for a token."""
     folder: Path | None = None
-    """Where the editor keeps edits, films and exports; by default edits/ in the run, or beside the .ply."""
+    """Folder for the editor's edits, films and exports; by default edits/ in the run folder, or beside the file."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
-    with the figure. By default what the machine has free."""
+    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
+    refused with the size. By default what is free on the machine."""
 
 
 def check(options: Options) -> None:
-    """Refuse what cannot work before anything is loaded.
+    """Refuse impossible options before anything is loaded.
 
     Raises:
-        UserError: naming the option and the remedy.
+        UserError: names the option and the remedy.
     """
     from scgs_warp.errors import UserError
     from scgs_warp.visualization import video
 
     if (options.run is None) == (options.ply is None):
         raise UserError("edit.py: give one of --run and --ply")
-    if not 1 <= options.nodes <= MOST_NODES:
-        raise UserError(f"--nodes {options.nodes}: give 1 to {MOST_NODES}")
+    if not 1 <= options.nodes <= MAX_NODES:
+        raise UserError(f"--nodes {options.nodes}: give 1 to {MAX_NODES}")
     if options.size is not None and not 16 <= options.size <= 8192:
         raise UserError(f"--size {options.size}: give 16 to 8192 pixels")
     if options.output is not None:
@@ -78,7 +78,7 @@ def check(options: Options) -> None:
 
 
 def open_session(options: Options, device: str) -> EditSession:
-    """The scene, ready to be edited, with the script's edit if there is one."""
+    """Open the scene for editing, and load the script if there is one."""
     from scgs_warp.edit import EditSession
     from scgs_warp.motion import Static
     from scgs_warp.scene.from_gaussians import open_gaussians, with_control_points
@@ -100,10 +100,10 @@ def open_session(options: Options, device: str) -> EditSession:
 
 
 def open_browser(session: EditSession, options: Options) -> None:
-    """The editor's page; returns when the user is done (Ctrl-C).
+    """Serve the editor until Ctrl-C.
 
     Raises:
-        UserError: it cannot be shown here.
+        UserError: the editor cannot run here.
     """
     import secrets
 
@@ -126,7 +126,7 @@ def open_browser(session: EditSession, options: Options) -> None:
             print(
                 "what is sent is not encrypted: outside a network that you trust, forward the port over SSH", flush=True
             )
-        with stop_signals() as stop:  # also where a shell has background processes ignore Ctrl-C
+        with stop_signals() as stop:  # Shells may make background processes ignore Ctrl-C.
             stop.wait()
         print("the editor has ended", flush=True)
     finally:
@@ -144,7 +144,7 @@ def main(args: list[str] | None) -> None:
     if browser:
         from scgs_warp.editor.app import import_viser
 
-        import_viser()  # before the scene: loading may take a while
+        import_viser()  # A missing package is reported before the scene is loaded.
     device = prepare(options.device, options.threads, options.memory_gib)
     session = open_session(options, device)
     if browser:

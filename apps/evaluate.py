@@ -1,4 +1,4 @@
-"""Measure a trained scene on a split it has not seen; write renders beside ground truth."""
+"""Score a trained scene on held-out views, and write renders beside the ground truth."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Measure a trained scene on a split it has not seen; write renders beside ground truth to RUN/evaluation."""
+    """Score a trained scene on held-out views, and write renders beside the ground truth to RUN/evaluation."""
 
     run: Path
-    """Folder of a run, as apps/train.py writes it."""
+    """Run folder, as apps/train.py writes it."""
     split: Literal["train", "test", "val"] = "test"
-    """Which frames; those of training are seen from the poses that training refined, if it did."""
+    """Frames to score; training frames are rendered from their refined poses if training refined them."""
     data: Path | None = None
-    """The data set, if it is no longer where it was for training."""
+    """Folder of the data set, if it has moved since training."""
     lpips_weights: Path | None = None
-    """VGG16 and LPIPS weights; without them LPIPS is not measured."""
+    """File with VGG16 and LPIPS weights; without it LPIPS is not measured."""
     json: Path | None = None
-    """Where the metrics go; RUN/evaluation/SPLIT/metrics.json by default."""
+    """File for the metrics; RUN/evaluation/SPLIT/metrics.json by default."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
-    with the figure. By default what the machine has free."""
+    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
+    refused with the size. By default what is free on the machine."""
 
 
 def load_data(scene: Scene, options: Options) -> Dataset:
-    """The split as the run saw its training images: same size, same background.
+    """Load the split with the size and the background of the training images.
 
     Raises:
-        UserError: the run does not say where its data lies, or it is not there, or it has no such split.
+        UserError: the run does not name its data folder, the folder is missing, or it has no such split.
     """
     from scgs_warp import data
     from scgs_warp.errors import UserError
@@ -69,7 +69,7 @@ def training_seconds(folder: Path) -> float | None:
 
 
 def show(metrics: dict[str, Any]) -> None:
-    """The metrics as a table on the terminal."""
+    """Print the metrics as a table."""
     from rich.console import Console
     from rich.table import Table
 

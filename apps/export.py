@@ -1,4 +1,4 @@
-"""Write a scene as files that other programs open: ``python apps/export.py --run runs/jj --output jj.glb``."""
+"""Export a scene to formats of other programs: ``python apps/export.py --run runs/jj --output jj.glb``."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Options(ExportRequest):
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
-    with the figure. By default what the machine has free."""
+    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
+    refused with the size. By default what is free on the machine."""
 
 
 def main(args: list[str] | None) -> None:

@@ -1,4 +1,4 @@
-"""The settings of a run as options, for every app that trains, and the configuration they make."""
+"""Options for the settings of a run, for every app that trains, and the configuration that they give."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ BUILTIN = Path("data/figure")
 
 @dataclass(frozen=True)
 class Settings:
-    """What is asked of a run, whatever it is for."""
+    """Settings of a training run."""
 
     preset: PresetName | None = None
-    """quick: a few minutes on two cores; cpu: some 15 minutes, most of the quality; paper: the full schedule.
-    Default: quick for the built-in scene, cpu for yours."""
+    """Schedule. quick: a few minutes on two cores; cpu: about 15 minutes, most of the quality; paper: the full one.
+    By default quick for the built-in scene and cpu for others."""
     config: Path | None = None
-    """A config.json of an earlier run, or any part of one; flags override it."""
+    """config.json of an earlier run, or a part of one; options override it."""
     downscale: int | None = None
-    """Divide the images' width and height by this."""
+    """Factor by which the images' width and height are divided."""
     resample: Literal["area", "bicubic"] | None = None
-    """How images are reduced: area, or bicubic as the official code does it."""
+    """Filter that reduces images: area, or bicubic as in the official code."""
     background: Literal["black", "white", "random"] | None = None
-    """What lies behind transparent pixels."""
+    """Background of transparent pixels."""
     batch: int | None = None
-    """Views per step, whose gradients are averaged; with torchrun as many as processes by default (docs/scaling.md)."""
+    """Views per step, whose gradients are averaged; with torchrun one per process by default (docs/scaling.md)."""
     steps: int | None = None
-    """Steps of both stages together; every milestone scales with it."""
+    """Steps of both stages together; every milestone of the schedule scales with it."""
     nodes: int | None = None
-    """Control points."""
+    """Number of control points."""
     progressive: bool = False
-    """Pre-train on the first fifth of the frames, then on more and more: for large motions."""
+    """Pre-train on the first fifth of the frames, then on more and more; for large motions."""
     max_gaussians: int | None = None
-    """Never have more Gaussians than this: bounds memory."""
+    """Most Gaussians at any time, which bounds memory."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Any other field of the configuration, as NAME=VALUE; again for each: --set motion.hyper_dim=8 --set freeze=0."""
+    """Any other field of the configuration as NAME=VALUE; may be repeated: --set motion.hyper_dim=8 --set freeze=0."""
     device: Device = "auto"
     """Where to compute; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
-    with the figure. By default what the machine has free."""
+    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
+    refused with the size. By default what is free on the machine."""
 
 
 def configuration(
@@ -60,17 +60,17 @@ def configuration(
     usual: PresetName | None = None,
     usual_batch: int = 1,
 ) -> tuple[TrainConfig, str | None]:
-    """The complete configuration, and the data folder that ``file`` names.
+    """Build the complete configuration, and return it with the data folder that ``file`` names.
 
     Args:
-        file: a config.json, or any part of one, under the options; None: there is none.
-        flags: fields that options of the app's own set, by their dotted names; None: not set.
-        usual: the preset where neither options nor ``file`` name one; None: cpu if ``file`` names a data folder, else
-            quick.
-        usual_batch: views per step where neither says so.
+        file: A config.json or a part of one, which options override, or None.
+        flags: Fields that the app's own options set, by their dotted names; None leaves a field unset.
+        usual: Preset if neither the options nor ``file`` name one; None stands for cpu if ``file`` names a data folder,
+            otherwise quick.
+        usual_batch: Views per step if neither the options nor ``file`` set them.
 
     Raises:
-        UserError: naming the option or the file and its field.
+        UserError: names the option, or the file and its field.
     """
     from scgs_warp.config import presets, validation
     from scgs_warp.errors import UserError
@@ -83,7 +83,7 @@ def configuration(
         values["preset"] = options.preset
     values.setdefault("batch", usual_batch)
     values.setdefault("preset", usual or ("cpu" if folder else "quick"))
-    # A complete file says where its milestones lie; a partial one that names the steps wants them scaled.
+    # A complete file states its milestones; those of a partial one that names the steps are scaled.
     steps = values.pop("steps", None) if "pretrain" not in values else None
     made = presets.from_dict(values, str(file or "options"))
     if steps is not None:
@@ -118,7 +118,7 @@ def configuration(
 
 
 def builtin_scene(device: str) -> Path:
-    """The built-in scene, made on first use."""
+    """Return the folder of the built-in scene, which is made on first use."""
     from scgs_warp.data.synthetic.builtin import make_synthetic
     from scgs_warp.runtime.progress import progress
 

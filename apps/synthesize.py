@@ -12,52 +12,52 @@ from scgs_warp.apps.cli import Device, prepare, run
 
 @dataclass(frozen=True)
 class Options:
-    """Film a moving mesh: pictures in D-NeRF layout and the true motion of its surface, for train.py --data."""
+    """Render an animated mesh: images in D-NeRF layout and the true motion of its surface, for train.py --data."""
 
     output: Path
-    """Folder to make; transforms_train.json, train/ and so on, ground_truth.npz, contact_sheet.png."""
+    """Folder to make, with transforms_train.json, train/ and so on, ground_truth.npz, contact_sheet.png."""
     mesh: Path | None = None
-    """A .glb or .gltf; skins, moving nodes and morph targets play. Without it, the built-in figure."""
+    """File .glb or .gltf; skins, moving nodes and morph targets are animated. By default the built-in figure."""
     clip: str | None = None
-    """Name of the animation; the first one by default. A wrong name gets the list."""
+    """Name of the animation; the first one by default. A wrong name prints the list."""
     start: float | None = None
-    """Second of the clip at which time is 0; its first keyframe by default."""
+    """Second of the clip that becomes time 0; its first keyframe by default."""
     end: float | None = None
-    """Second of the clip at which time is 1; its last keyframe by default."""
+    """Second of the clip that becomes time 1; its last keyframe by default."""
     size: tuple[int, ...] = (400,)
-    """Of the pictures in pixels: one number, or width and height."""
+    """Size of the images in pixels: one number, or width and height."""
     train: int = 150
-    """Instants that training sees, spread over the time; each is one picture of every camera."""
+    """Training times, spread over the motion; each gives one image per camera."""
     test: int = 20
-    """Held-out pictures, spread over the time, each from a place of its own."""
+    """Test images, spread over the motion, each from its own position."""
     val: int = 10
-    """The same again, for tuning; 0 leaves them out."""
+    """Validation images, like the test images; 0 for none."""
     cameras: Literal["sphere", "path"] = "sphere"
-    """sphere: anywhere on a dome, a new place for every picture (a rig: places that stay); path: moving round."""
+    """sphere: positions on a dome, new for every image (fixed for a rig); path: cameras that move round the figure."""
     views: int = 1
-    """Cameras that film together: 1 is monocular, more are a synchronised rig."""
+    """Number of synchronised cameras; 1 is monocular, more are a rig."""
     turns: float = 1.0
-    """How often a path goes round; less than 1 is an arc."""
+    """Turns of a path; less than 1 is an arc."""
     elevation: tuple[float, float] = (2.866, 58.212)
-    """Lowest and highest camera, degrees."""
+    """Elevation of the lowest and the highest camera, degrees."""
     fov: float = 39.597752
-    """Horizontal field of view, degrees; cameras stand where the whole motion just fits."""
+    """Horizontal field of view, degrees; cameras stand where the whole motion just fits the image."""
     samples: int = 4
-    """Rays per pixel and axis: 4 makes 16 rays a pixel, 1 is without anti-aliasing."""
+    """Rays per pixel and axis: 4 gives 16 rays per pixel, 1 no anti-aliasing."""
     background: Literal["transparent", "black", "white"] = "transparent"
-    """transparent: RGBA pictures; else RGB on that ground."""
+    """transparent: RGBA images; otherwise RGB images on that colour."""
     light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
     """Direction to the light; z is up and the figure faces -y."""
     ambient: float = 0.5
-    """Light from all around."""
+    """Strength of ambient light."""
     diffuse: float = 0.5
-    """Light from the direction of --light, times the cosine with the surface."""
+    """Strength of the light from --light, multiplied by the cosine with the surface normal."""
     unlit: bool = False
-    """Show textures and colours as they are, without light."""
+    """Show textures and colours without lighting."""
     seed: int = 0
-    """Of cameras and surface points; the same seed gives the same bytes."""
+    """Random seed of cameras and surface points; the same seed gives the same bytes."""
     device: Device = "auto"
-    """Where rays are cast; auto takes a GPU if there is one."""
+    """Where to cast rays; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
 

@@ -1,4 +1,4 @@
-"""Train a scene: ``python apps/train.py`` makes and learns the built-in one, ``--data DIR`` learns yours."""
+"""Train a scene: ``python apps/train.py`` makes and trains the built-in one, ``--data DIR`` trains another."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ RUNS = Path("runs")
 
 
 @dataclass(frozen=True)
-class Place:
-    """Listed before the settings."""
+class RunFolders:
+    """Options that --help lists before the settings."""
 
     data: Path | None = None
     """Folder of a data set: D-NeRF, nerfstudio, HyperNeRF, NeRF-DS, Panoptic, Neural 3D Video or COLMAP (docs/data.md).
-    Without it the built-in scene is made."""
+    By default the built-in scene, which is made on first use."""
     output: Path | None = None
-    """Run directory; runs/NAME by default."""
+    """Run folder; runs/NAME-PRESET by default."""
 
 
 @dataclass(frozen=True)
-class Options(Settings, Place):
+class Options(Settings, RunFolders):
     """Reconstruct a moving scene from posed frames."""
 
     motion: MotionName | None = None
-    """How the scene moves: control points (ours), one network query per Gaussian, feature planes, not at all."""
+    """Motion model: control points (SC-GS), one network query per Gaussian, feature planes, or no motion."""
     seed: int | None = None
-    """The same seed gives the same bits on the same machine."""
+    """Random seed; the same seed gives the same bits on the same machine."""
     resume: bool = False
     """Continue the run in --output."""
     tensorboard: bool = False
-    """Also write curves and pictures for TensorBoard to the run directory: tensorboard --logdir runs."""
+    """Also write curves and images for TensorBoard to the run folder: tensorboard --logdir runs."""
 
 
 def default_output(options: Options) -> Path:
-    """runs/NAME-PRESET, NAME being that of the data folder."""
+    """Return runs/NAME-PRESET, with the name of the data folder."""
     name = (options.data or BUILTIN).resolve().name
     return RUNS / f"{name}-{options.preset or ('cpu' if options.data else 'quick')}"
 
@@ -78,7 +78,7 @@ def main(args: list[str] | None) -> None:
 
     with join_processes(where, device) as group:
         folder = options.data or (Path(named) if named else None)
-        if folder is None:  # of several processes one makes it
+        if folder is None:  # Only one of several processes makes it.
             folder = group.in_turn(lambda: builtin_scene(device)) if group else builtin_scene(device)
         rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "group": group}
         metrics = train_and_evaluate(config, folder, output, before_training=show_advice, **rest)

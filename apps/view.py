@@ -1,4 +1,4 @@
-"""Render a film of a trained scene, off screen: a turntable, the motion, or both."""
+"""Render a film of a trained scene to a file: a turntable, the motion, or both."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from scgs_warp.apps.cli import Device, prepare, run
 if TYPE_CHECKING:
     from scgs_warp.scene.scene import Scene
 
-LARGEST = 8192
+LARGEST_SIDE = 8192
 
 
 @dataclass(frozen=True)
 class Options:
-    """Render a film of a trained scene, off screen."""
+    """Render a film of a trained scene to a file."""
 
     output: Path
-    """Where the film goes: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
+    """Film to write: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     run: Path | None = None
-    """Folder of a run, as apps/train.py writes it."""
+    """Run folder, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: a .ply of 3D Gaussian splatting, a .splat or a .spz, as a scene that stands still."""
+    """File of 3D Gaussian splatting (.ply, .splat or .spz) to show instead of a run; it does not move."""
     mode: Literal["turntable", "time", "both"] = "both"
-    """turntable: the camera goes round, the scene stands still; time: the scene moves; both: both at once. Where the
-    training cameras saw the scene from one side only, the camera swings within what they saw."""
+    """turntable: the camera moves round a still scene; time: the scene moves; both: both at once. If the training
+    cameras saw the scene from one side only, the camera swings within that range."""
     show: Literal["rgb", "depth", "alpha", "nodes", "trajectories"] = "rgb"
-    """Colours, depth (near is warm), coverage, control points, or the way that control points have come."""
+    """Colours, depth (near is warm), alpha, control points, or their trajectories."""
     frames: int = 120
-    """Length of the film."""
+    """Frame count of the film."""
     size: int = 512
     """Longer side of the film in pixels; the proportions are those of the training images."""
     fps: float = 30.0
-    """Frames a second."""
+    """Frames per second."""
     time: float = 0.5
-    """The instant that a turntable shows, from 0 to 1."""
+    """Time that a turntable shows, from 0 to 1."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Take no more memory than this, on a GPU of its own: large images are drawn in bands, what does not fit is refused
-    with the figure. By default what the machine has free."""
+    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
+    refused with the size. By default what is free on the machine."""
 
 
 def check(options: Options) -> None:
-    """Refuse what cannot work before anything is loaded.
+    """Refuse impossible options before anything is loaded.
 
     Raises:
-        UserError: naming the option and the remedy.
+        UserError: names the option and the remedy.
     """
     from scgs_warp.errors import UserError
     from scgs_warp.visualization import video
@@ -60,9 +60,10 @@ def check(options: Options) -> None:
         raise UserError("view.py: give one of --run and --ply")
     if options.frames < 1:
         raise UserError(f"--frames {options.frames}: a film needs at least 1")
-    if not 16 <= options.size <= LARGEST:
-        taken = f"; a frame of {options.size} x {options.size} would take {video.frame_gib(options.size):,.1f} GiB"
-        raise UserError(f"--size {options.size}: give 16 to {LARGEST} pixels{taken if options.size > LARGEST else ''}")
+    if not 16 <= options.size <= LARGEST_SIDE:
+        memory = f"; a frame of {options.size} x {options.size} would take {video.frame_gib(options.size):,.1f} GiB"
+        needed = memory if options.size > LARGEST_SIDE else ""
+        raise UserError(f"--size {options.size}: give 16 to {LARGEST_SIDE} pixels{needed}")
     if not 0 < options.fps <= 1000:
         raise UserError(f"--fps {options.fps:g}: give more than 0 and at most 1000 frames a second")
     if not 0 <= options.time <= 1:
@@ -71,7 +72,7 @@ def check(options: Options) -> None:
 
 
 def open_scene(options: Options, device: str) -> Scene:
-    """What is filmed."""
+    """Load the run or the file."""
     from scgs_warp.scene.scene import Scene
 
     if options.ply is not None:

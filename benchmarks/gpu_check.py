@@ -1,12 +1,12 @@
-"""Everything that needs a GPU, in one call: agreement, timings beside gsplat's, tests. Writes one JSON.
+"""Check and measure everything that needs a GPU in one call: agreement, timings beside gsplat's, tests.
 
     python benchmarks/gpu_check.py                            # on a machine with a GPU: all parts
     python benchmarks/gpu_check.py --parts frames,dynamic     # some of them
     python benchmarks/gpu_check.py --seconds 540              # no part begins after that time
     python benchmarks/gpu_check.py --device cpu --quick       # the same logic, small, anywhere
 
-The parts are guarded: what breaks says so in the JSON, which is written after every part, and the others run. Exit
-status 1 if a check fails or a part was left out for want of time.
+The result is one JSON, which is written after every part. A part that breaks is recorded there, and the others run.
+The exit status is 1 if a check fails or if there was no time for a part.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ import gpu_trust
 from gpu_rules import compare_gradients, compare_images, time_of
 from torch import Tensor
 
-from scgs_warp.benchmark.plan import MIDDLE, Plan, posed
+from scgs_warp.benchmark.plan import MIDDLE, BenchPlan, posed
 from scgs_warp.benchmark.run import bench
 from scgs_warp.benchmark.scenes import load_of, scene_camera, synthetic_scene
 from scgs_warp.benchmark.summary import table_s2
-from scgs_warp.benchmark.timing import machine, now
+from scgs_warp.benchmark.timing import provenance
 from scgs_warp.benchmark.workloads import Leaves
 from scgs_warp.config.presets import MOTIONS
 from scgs_warp.ops.binning import bin_splats
@@ -53,10 +53,10 @@ from scgs_warp.types import Camera, Image, Splats
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES_A_SECOND = 1000.0
 MOTION_MS = 0.15
-"""What the dynamic frame shall reach on a GPU, and what its motion may cost."""
+"""Aims on a GPU: frames per second of the dynamic frame, and the time of its motion."""
 TESTS_SECONDS = 500.0
 SLOWEST_FORM = 50_000
-"""The pixel form and the portable one are timed up to so many Gaussians."""
+"""Most Gaussians for which the slow forms of compositing are timed."""
 
 
 class Setting(NamedTuple):
@@ -67,7 +67,7 @@ class Setting(NamedTuple):
     nodes: int
     repeats: int
     seconds: float
-    """For every row of the step and stage timings."""
+    """Time for every row of the step and stage timings."""
 
 
 Report = dict[str, Any]
@@ -81,12 +81,12 @@ def setting(device: str, quick: bool) -> Setting:
 
 
 def leaves_of(count: int, size: tuple[int, int], device: str) -> Leaves:
-    """The benchmarks' figure at rest, as leaves."""
+    """Make the synthetic figure at rest, as leaves."""
     return Leaves(*posed(synthetic_scene("static", count, 0, device), size, MIDDLE))
 
 
 def drawn(leaves: Leaves, form: str) -> list[Tensor]:
-    """Image [4, H, W] (colour, depth), alpha [1, H, W], and the gradients of a random gradient to both."""
+    """Return image [4, H, W] (colour, depth), alpha [1, H, W], and all gradients for a random gradient of both."""
     own, camera = leaves.gaussians, leaves.camera
     splats = project(*leaves.geometry, camera.viewmat, camera.K, camera.width, camera.height)
     colors = spherical_harmonics(own.sh_dc, own.sh_rest, own.means, camera.position, leaves.degree)
@@ -107,7 +107,7 @@ def compare(results: list[Tensor], truth: list[Tensor], names: list[str]) -> Rep
 
 
 def agreement(s: Setting) -> Report:
-    """The device's fastest form against the CPU's (on a CPU, against the readable one), and twice for the same bits."""
+    """Compare the device's fastest form with the CPU's (on a CPU, with the readable one), and two runs bit by bit."""
     count, size = next(iter(s.scenes.values()))
     leaves = leaves_of(count, size, s.device)
     ours, again = drawn(leaves, "auto"), drawn(leaves, "auto")
@@ -118,7 +118,7 @@ def agreement(s: Setting) -> Report:
 
 
 def forms(s: Setting) -> Report:
-    """Every form of compositing that runs on the device: images and gradients against the pixel form's, and times."""
+    """Compare every form of compositing on the device with the pixel form, images and gradients, and time it."""
     names = ("cuda", "blocks") if s.device == "cuda" else ("cpu",)
     report: Report = {"passed": True}
     for scene, (count, size) in s.scenes.items():
@@ -132,7 +132,7 @@ def forms(s: Setting) -> Report:
 
 
 def form_times(leaves: Leaves, form: str, s: Setting) -> Report:
-    """Of compositing three channels, alone."""
+    """Time compositing of three channels alone."""
     own, camera = leaves.gaussians, leaves.camera
     with torch.no_grad():
         splats = project(*leaves.geometry, camera.viewmat, camera.K, camera.width, camera.height)
@@ -150,7 +150,7 @@ def form_times(leaves: Leaves, form: str, s: Setting) -> Report:
 
 
 def stepwise(scene: Scene, camera: Camera, at: float) -> Image:
-    """A frame without a graph and with the exact number of pairs."""
+    """Draw a frame without a graph and with the exact number of pairs."""
     with torch.no_grad():
         view = scene.normalisation.apply_camera(camera).to(scene.device)
         color = torch.tensor(scene.background_color, device=scene.device)
@@ -161,8 +161,10 @@ def stepwise(scene: Scene, camera: Camera, at: float) -> Image:
 
 
 def frames(s: Setting) -> Report:
-    """Recorded frames against frames drawn step by step (``same_bits`` says whether to the last bit) and the CPU's, of
-    every motion that can be recorded; the last of them finds too little room."""
+    """Compare recorded frames with frames drawn step by step (``same_bits``: equal to the last bit) and with the CPU's.
+
+    Every motion model that can be recorded draws five frames, the last of which has too little room for its pairs.
+    """
     report: Report = {"passed": True}
     for motion in MOTIONS:
         report[motion] = frames_of(motion, s)
@@ -209,7 +211,7 @@ def raster_of(leaves: Leaves, rasterization: Callable[..., Any], s: Setting) -> 
 
 
 def raster(s: Setting) -> Report:
-    """Ours through the entry point that gsplat shares, and its stages alone, forward."""
+    """Time ``rasterization``, and its forward stages alone."""
     report: Report = {}
     for name, (count, size) in s.scenes.items():
         leaves = leaves_of(count, size, s.device)
@@ -244,7 +246,7 @@ def stage_times(leaves: Leaves, s: Setting) -> Report:
 
 
 def gsplat(s: Setting) -> Report:
-    """Both renderers in one run. Images are compared first; building gsplat's extension may take minutes."""
+    """Compare images with gsplat's, then time both renderers; building gsplat's extension may take minutes."""
     if s.device != "cuda":
         return {"skipped": "gsplat composites on CUDA only"}
     import gsplat as peer
@@ -264,7 +266,7 @@ def gsplat(s: Setting) -> Report:
 
 
 def motion_ms(scene: Scene, s: Setting) -> float:
-    """Of posing all Gaussians alone, recorded where it can be."""
+    """Time posing of all Gaussians, recorded if possible, in milliseconds."""
     at = torch.full((1,), 0.4, device=scene.device)
 
     @torch.no_grad()
@@ -277,7 +279,7 @@ def motion_ms(scene: Scene, s: Setting) -> float:
 
 
 def two_under_way(graph: FrameGraph, scene: Scene, camera: Camera, repeats: int) -> float:
-    """Milliseconds a frame where the next one starts before the last is waited for."""
+    """Return milliseconds per frame if each frame starts before the one before it is finished."""
     view, color = scene.normalisation.apply_camera(camera), torch.tensor(scene.background_color)
     start, last = time.perf_counter(), graph.submit(view, 0.1, color)
     for index in range(repeats):
@@ -289,7 +291,7 @@ def two_under_way(graph: FrameGraph, scene: Scene, camera: Camera, repeats: int)
 
 
 def dynamic(s: Setting) -> Report:
-    """The moving scene's frame with every motion model: frames a second, the share of motion, Table S2."""
+    """Time frames of the moving scene with every motion model: frames per second, the share of motion, Table S2."""
     rows = [dynamic_row(name, s) for name in MOTIONS]
     for row in rows:
         row["ratios"] = {peer["motion"]: row["fps"] / peer["fps"] for peer in rows}
@@ -318,17 +320,17 @@ def dynamic_row(motion: str, s: Setting) -> Report:
 
 
 def step(s: Setting) -> Report:
-    """Training steps at half the size, with and without ARAP, and their stages."""
+    """Time training steps at half the size, with and without ARAP, and their stages."""
     count, size = next(iter(s.scenes.values()))
     half = (size[0] // 2, size[1] // 2)
-    plan = Plan(
+    plan = BenchPlan(
         None, min(count, 40_000), s.nodes, half, ("control-points",), s.device, (environment.thread_count(),), s.seconds
     )
     return {"rows": bench("step", plan)["rows"]}
 
 
 def tests(s: Setting) -> Report:
-    """The tests that run on CUDA: those whose ``device`` is that, and those of its own files."""
+    """Run the tests on CUDA."""
     selection = ["tests/kernels/test_ssim.py", "-k", "bad_arguments"] if s.quick else ["-k", "cuda and not gpu_check"]
     command = [sys.executable, "-m", "pytest", "-x" if s.quick else "--maxfail=50", "-p", "no:cacheprovider"]
     result = subprocess.run(
@@ -353,7 +355,7 @@ PARTS: dict[str, Callable[[Setting], Report]] = {
 
 
 def attempt(name: str, report: Report, function: Callable[..., Report], *args: Any) -> None:
-    """One part that breaks must not take the others with it: the machine may be ours only once."""
+    """Run one part; record its failure instead of raising it, so that the others run."""
     start = time.perf_counter()
     try:
         report[name] = function(*args)
@@ -367,21 +369,21 @@ def attempt(name: str, report: Report, function: Callable[..., Report], *args: A
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--quick", action="store_true", help="small scenes and one test: does the script itself work?")
-    parser.add_argument("--parts", default=",".join(PARTS), help="of %(default)s")
+    parser.add_argument("--quick", action="store_true", help="small scenes and one test, to try the script itself")
+    parser.add_argument("--parts", default=",".join(PARTS), help="parts to run, of %(default)s")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="no part begins after that time")
     parser.add_argument("--output", type=Path, default=None, help="JSON; by default beside this script")
     options = parser.parse_args()
     parts = options.parts.split(",")
     if unknown := [part for part in parts if part not in PARTS]:
-        parser.error(f"--parts: {', '.join(unknown)} is none; choose from {', '.join(PARTS)}")
+        parser.error(f"--parts: {', '.join(unknown)} not known; choose from {', '.join(PARTS)}")
     if options.device == "cuda" and not torch.cuda.is_available():
         print("gpu_check: torch finds no GPU; use --device cpu --quick to try the script", file=sys.stderr)
         return 2
     environment.configure()
     target = options.output or ROOT / "benchmarks" / f"gpu_check_{options.device}.json"
     gpu = torch.cuda.get_device_name() if options.device == "cuda" else None
-    report: Report = {"date": now(), "gpu": gpu, "device": options.device, "machine": machine(options.device)}
+    report: Report = {**provenance(options.device), "gpu": gpu, "device": options.device}
     start = time.perf_counter()
     for part in parts:
         if time.perf_counter() - start < options.seconds:

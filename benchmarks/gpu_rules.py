@@ -1,4 +1,4 @@
-"""How ``gpu_check`` times, and when it says that two results agree."""
+"""Timing in ``gpu_check``, and the rules by which two results agree."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from torch import Tensor
 
 PIXEL_TOLERANCE = 1e-4
 LARGEST_DIFFERENCE = 8e-3
-"""One alpha threshold that flips moves a pixel by up to 1/255, two by up to this."""
+"""Largest difference of a pixel: one flipped alpha threshold moves it by up to 1/255, two by up to this."""
 GRADIENT_TOLERANCE = 1e-2
 
 
 def time_of(function: Callable[[], Any], device: str, repeats: int) -> dict[str, float]:
-    """Milliseconds of a call after three to warm up: median and least of calls that are waited for one by one, and the
-    mean of as many in a row."""
+    """Time calls after three to warm up, in milliseconds.
+
+    Returns:
+        ``ms_median`` and ``ms_min`` of calls that are waited for one by one; ``ms_in_a_row``, the mean in a row.
+    """
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
     for _ in range(3):
         function()
@@ -38,7 +41,7 @@ def time_of(function: Callable[[], Any], device: str, repeats: int) -> dict[str,
 
 
 def compare_images(a: Tensor, b: Tensor) -> dict[str, Any]:
-    """The rule of agreement: 99.9 % of pixels within the tolerance, none beyond one flipped threshold."""
+    """Compare images: 99.9 % of pixels within the tolerance, none beyond ``LARGEST_DIFFERENCE``."""
     difference = (a.detach().cpu() - b.detach().cpu()).abs().amax(0)
     within = float((difference <= PIXEL_TOLERANCE).double().mean())
     largest = float(difference.max())
@@ -47,7 +50,7 @@ def compare_images(a: Tensor, b: Tensor) -> dict[str, Any]:
 
 
 def compare_gradients(ours: Tensor, theirs: Tensor) -> dict[str, Any]:
-    """Relative L2 per Gaussian, with a floor of 1e-6 of the tensor's norm."""
+    """Compare gradients by the relative L2 error per Gaussian, with a floor of 1e-6 of the tensor's norm."""
     a, b = (t.detach().cpu().double().reshape(len(t), -1) for t in (ours, theirs))
     error = (a - b).norm(dim=1) / torch.maximum(b.norm(dim=1), 1e-6 * b.norm())
     p99 = float(error.kthvalue(max(1, int(0.99 * len(error)))).values)

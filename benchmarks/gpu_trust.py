@@ -1,4 +1,4 @@
-"""Parts of ``gpu_check.py`` that feed a device what breaks it, and that share a step among processes."""
+"""Parts of ``gpu_check.py`` for robustness: poisoned inputs, a crowded screen, steps shared by processes."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from scgs_warp.types import Camera, Gaussians
 ROOT = Path(__file__).resolve().parent.parent
 FUZZ_SECONDS = 240.0
 TRAINING = "--downscale 2 --steps 60 --nodes 40 --max-gaussians 2000 --batch 2 --threads 1".split()
-"""A run of seconds, two views a step."""
+"""Options of a run of seconds with two views per step."""
 
 
 def run(command: list[str], seconds: float) -> None:
-    """Raises what a part shows."""
+    """Run a command; raise a RuntimeError with the end of its output if it fails."""
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=seconds)
     if done.returncode != 0:
         raise RuntimeError(f"status {done.returncode}: {(done.stderr or done.stdout)[-800:]}")
 
 
 def fuzz(device: str, quick: bool) -> dict[str, Any]:
-    """Poisoned inputs of every op."""
+    """Run the fuzzing campaign: poisoned inputs of every op."""
     cases = 40 if quick else 2000
     with tempfile.TemporaryDirectory() as folder:
         summary = Path(folder) / "summary.json"
@@ -39,7 +39,7 @@ def fuzz(device: str, quick: bool) -> dict[str, Any]:
 
 
 def crowded(device: str, quick: bool) -> dict[str, Any]:
-    """Gaussians that all fill the screen, with little memory allowed: drawn in bands that fit."""
+    """Draw Gaussians that all fill the screen in little memory, in bands."""
     count, width, height, gib = (1000, 320, 240, 4.0) if quick else (1_000_000, 1920, 1080, 4.0)
     g = torch.Generator().manual_seed(0)
     means = torch.randn(count, 3, generator=g) * 0.05 + torch.tensor([0.0, 0.0, 4.0])
@@ -62,7 +62,7 @@ def crowded(device: str, quick: bool) -> dict[str, Any]:
 
 
 def share(device: str) -> dict[str, Any]:
-    """``torchrun`` with one process (NCCL on a GPU) gives the checkpoint of a run without it."""
+    """Compare the checkpoint of ``torchrun`` with one process (NCCL on a GPU) with that of a plain run."""
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "figure"
         size = ["--size", "96", "--train", "8", "--test", "2"]

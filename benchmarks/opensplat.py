@@ -1,15 +1,15 @@
-"""Compositing on a CPU beside OpenSplat's rasteriser, on one thread, in one process: the same splats, images compared.
+"""Compare compositing on a CPU with OpenSplat's rasteriser, on one thread and with the same splats.
 
     git clone https://github.com/pierotofy/OpenSplat /somewhere/else
     python benchmarks/opensplat.py /somewhere/else --json benchmarks/results/opensplat.json
 
-OpenSplat is AGPL: none of it is in this repository. The checkout is compiled where it lies, one source file, against
-the installed torch, with the flags of its release build (a C++ compiler and ninja are needed, and some minutes once).
+OpenSplat is under the AGPL, and none of it is in this repository. One source file of the checkout is compiled against
+the installed torch, with the flags of its release build; that needs a C++ compiler, ninja and some minutes once.
 
 Both sides get the same projected splats of the synthetic scene. OpenSplat's forward pass sorts splats by depth, so ours
-is timed with binning, which does the same for us; compositing alone is given beside it. Its rasteriser ends a splat at
-three standard deviations, ours where alpha falls under 1/255: images are compared with its boxes widened to the latter
-(the images must then agree), timed as it is, and the difference that its own boxes make is stated.
+is timed with binning, which sorts, too; compositing alone is given beside it. OpenSplat ends a splat at three standard
+deviations, this project where alpha falls under 1/255. With its boxes widened to that the images must agree; it is
+timed unchanged, and the difference that its own boxes make is stated.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ import torch  # isort: skip
 from torch import Tensor
 
 from scgs_warp.benchmark import timing
-from scgs_warp.benchmark.gsplat import TOLERANCE, agree
+from scgs_warp.benchmark.gsplat import TOLERANCE, check_agreement
 from scgs_warp.benchmark.plan import MIDDLE, posed
 from scgs_warp.benchmark.run import write
 from scgs_warp.benchmark.scenes import Size, camera_size, load_of, synthetic_scene
@@ -47,7 +47,7 @@ from scgs_warp.types import Splats
 SOURCE = Path("rasterizer/gsplat-cpu/gsplat_cpu.cpp")
 HEADER = Path("rasterizer/gsplat-cpu/bindings.h")
 WIDENED = 2.0 * math.log(255.0) / 9.0
-"""Three standard deviations times the root of this reach the distance at which an opaque splat's alpha is 1/255."""
+"""Factor on covariances that takes three standard deviations to the distance where an opaque splat's alpha is 1/255."""
 BINDING = """
 #include <torch/extension.h>
 #include <memory>
@@ -79,7 +79,7 @@ PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {{
 
 
 def build(checkout: Path, folder: Path, flags: list[str]) -> Any:
-    """OpenSplat's CPU rasteriser as a Python module; compiled once per folder and set of flags."""
+    """Compile OpenSplat's CPU rasteriser as a Python module, once per folder and set of flags."""
     from torch.utils.cpp_extension import load
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ def build(checkout: Path, folder: Path, flags: list[str]) -> Any:
 
 
 class Theirs:
-    """OpenSplat's two passes on our splats. Its pixel centres are at whole numbers, ours at halves."""
+    """OpenSplat's two passes on the same splats; its pixel centres are at whole numbers, ours at halves."""
 
     def __init__(self, module: Any, splats: Splats, colors: Tensor, widen: float = 1.0) -> None:
         self.module, self.size = module, (splats.width, splats.height)
@@ -126,7 +126,7 @@ class Ours:
         self.tiles = bin_splats(splats)
 
     def forward(self) -> Tensor:
-        """[3, H, W], with what the backward pass needs."""
+        """Draw [3, H, W] for the backward pass."""
         return composite(self.splats, self.leaves["colors"], bin_splats(self.fixed))[0]
 
     def composite_only(self) -> Tensor:
@@ -147,10 +147,10 @@ def relative(ours: Tensor, theirs: Tensor) -> float:
 
 
 def timed(passes: dict[str, Callable[[], Any]], seconds: float) -> dict[str, dict[str, float]]:
-    """Medians and least times in milliseconds; all passes in turns, so that a disturbance meets both sides."""
+    """Time all passes in turns, so that a disturbance affects both sides; medians and least times in milliseconds."""
     times: dict[str, list[float]] = {name: [] for name in passes}
     began = time.perf_counter()
-    while time.perf_counter() - began < seconds or len(next(iter(times.values()))) < timing.FEWEST + 1:
+    while time.perf_counter() - began < seconds or len(next(iter(times.values()))) < timing.MIN_REPEATS + 1:
         for name, function in passes.items():
             start = time.perf_counter()
             function()
@@ -174,7 +174,7 @@ def compare(module: Any, count: int, size: Size, seconds: float) -> dict[str, An
     image, found = ours.forward(), wide.forward()
     pictures = {"boxes_widened": differences(image.detach(), found[0].permute(2, 0, 1))}
     pictures["as_it_is"] = differences(image.detach(), theirs.forward()[0].permute(2, 0, 1))
-    agree(image.detach(), found[0].permute(2, 0, 1), "OpenSplat")
+    check_agreement(image.detach(), found[0].permute(2, 0, 1), "OpenSplat")
     v_means, _, v_opacities, v_colors = ours.backward(image, v_image)
     w_means, _, w_colors, w_opacities = wide.backward(found, v_planar)
     pairs = {
@@ -244,8 +244,9 @@ def main() -> int:
     finally:
         if options.build is None:
             shutil.rmtree(folder, ignore_errors=True)
+    command = timing.command_line("benchmarks/opensplat.py", sys.argv[1:])
     extra = {"opensplat": commit_of(options.checkout), "flags": options.flags}
-    report = {"date": timing.now(), "machine": timing.machine("cpu"), "what": "opensplat", **extra, **found}
+    report = {"command": command, **timing.provenance("cpu"), "what": "opensplat", **extra, **found}
     if options.json is not None:
         write(report, options.json)
     print(json.dumps(report, indent=2))

@@ -1,240 +1,99 @@
-"""The tables of docs/benchmarks.md from the JSON files in benchmarks/results/: no figure is typed by hand.
+"""Write every table with figures in README.md and docs/*.md from the JSON files in benchmarks/results/.
 
     python benchmarks/report.py            # rewrite what stands between the markers
-    python benchmarks/report.py --check    # only say whether it is up to date: exit status 1 if not
+    python benchmarks/report.py --check    # write nothing; exit with status 1 where a table is not what its JSON gives
 
-A table NAME stands between ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, and comes from results/NAME.json. Where
-that file is missing, the command that makes it stands there instead.
+A table NAME stands between ``<!-- table: NAME -->`` and ``<!-- /table -->``, in any page, once or more. Timings come
+from results/NAME.json, scores of training runs from results/quality/, and results/reported/NAME.json holds tables that
+were reported without a committed run. Rows of reported figures are marked with a dagger, rows whose commit is older
+than the newest one that touched the code they measure with a double dagger; ``--check`` leaves the latter out of
+account, since they depend on the history and not on the result.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from provenance import ROOT, without_older_marks
+from quality_tables import WRITERS, quality_table, reported_table
+from repeatable_tables import REPEATABLE, repeatable_table
+from timing_tables import BENCHMARKS, speed_overview, timing_table
+
 RESULTS = ROOT / "benchmarks" / "results"
-PAGE = ROOT / "docs" / "benchmarks.md"
-TRUSTED_SCALING = 1.8
-
-Report = dict[str, Any]
+MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
 
 
-def table(head: list[str], lines: list[list[str]]) -> str:
-    """Markdown; the first column to the left, numbers to the right."""
-    rule = ["---"] + ["---:"] * (len(head) - 1)
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, rule, *lines])
-
-
-def number(value: float | None, digits: int = 1) -> str:
-    return "" if value is None else f"{value:,.{digits}f}"
-
-
-def counted(threads: int) -> str:
-    return "1 thread" if threads == 1 else f"{threads} threads"
-
-
-def machine_line(report: Report) -> str:
-    """Where and when it was measured, and whether rows of several threads count."""
-    machine = report["machine"]
-    where = machine["gpu"] or f"{machine['processor']}, {machine['cores']} cores"
-    versions = f"torch {machine['torch']}, Warp {machine['warp']}"
-    return f"{where}; {versions}; {report['date'][:10]}."
-
-
-def scaling_line(rows: list[Report]) -> str:
-    """What the machine gave to two threads, and what follows from it."""
-    values = [row["two_thread_scaling"] for row in rows if row["share"] is None and row["device"] == "cpu"]
-    if not values:
-        return ""
-    text = f" `two_thread_scaling` {min(values):.2f} to {max(values):.2f}"
-    several = [row["two_thread_scaling"] for row in rows if row["share"] is None and row["threads"] > 1]
-    if several and min(several) < TRUSTED_SCALING:
-        return f"{text}, below {TRUSTED_SCALING} in some rows: of those, quote the one-thread column."
-    return f"{text}."
-
-
-def size_line(row: Report) -> str:
-    return (
-        f"{row['gaussians']:,} Gaussians, {row['control_points']:,} control points, {row['width']} x {row['height']}, "
-        f"{row['pairs']:,} pairs, {row['contributors']:.1f} splats a covered pixel."
-    )
-
-
-def stages(report: Report) -> str:
-    """Wholes and their stages: a row each, two columns a number of threads; one table a motion model."""
-    parts = [machine_line(report) + scaling_line(report["rows"])]
-    for motion in dict.fromkeys(row["motion"] for row in report["rows"]):
-        rows = [row for row in report["rows"] if row["motion"] == motion]
-        threads = sorted({row["threads"] for row in rows})
-        head = [motion if report["what"] != "raster" else "stage"]
-        for count in threads:
-            head += [f"{counted(count)}, median ms", "least ms"]
-        lines = []
-        for name in dict.fromkeys(row["name"] for row in rows):
-            found = {row["threads"]: row for row in rows if row["name"] == name}
-            first = next(iter(found.values()))
-            whole = first["share"] is None
-            line = [f"**{name}**" if whole else name]
-            for count in threads:
-                row = found.get(count)
-                line += ["", ""] if row is None else [number(row["ms_median"]), number(row["ms_min"])]
-            lines.append(line)
-        parts += [size_line(rows[0]), table(head, lines)]
-        parts.append(memory_line(rows))
-    parts += motion_lines(report)
-    return "\n\n".join(part for part in parts if part)
-
-
-def memory_line(rows: list[Report]) -> str:
-    extra = [row["extra_mib"] for row in rows if row["share"] is None and row["extra_mib"] is not None]
-    if not extra:
-        return ""
-    return f"Memory: the model {number(rows[0]['model_mib'])} MiB, measuring it at most {number(max(extra))} MiB more."
-
-
-def motion_lines(report: Report) -> list[str]:
-    lines = []
-    for cost in report.get("motion", []):
-        ratio = cost["ratio_to_static"]
-        rest = "" if ratio is None else f"; {ratio:.2f} of the frames/s of `static`"
-        lines.append(
-            f"- `{cost['motion']}` on {counted(cost['threads'])}: motion (network and skinning) "
-            f"{number(cost['ms_median'], 2)} ms median, {number(cost['ms_min'], 2)} ms least{rest}."
-        )
-    return ["\n".join(lines)] if lines else []
-
-
-def table_s2(report: Report) -> str:
-    head = ["motion", "threads", "frames/s", "of static", "x per-gaussian", "paper: frames/s", "of static", "x p.-g."]
-    lines = [
-        [
-            row["motion"],
-            str(row["threads"]),
-            number(row["fps"]),
-            number(row["ratio_to_static"], 2),
-            number(row["ratio_to_per_gaussian"], 2),
-            number(row["paper_fps"]),
-            number(row["paper_ratio_to_static"], 2),
-            number(row["paper_ratio_to_per_gaussian"], 2),
-        ]
-        for row in report["table_s2"]
+def table_names(results: Path) -> list[str]:
+    """Names of all tables that must stand on a page."""
+    reported = {path.stem for path in (results / "reported").glob("*.json")}
+    return [
+        *BENCHMARKS,
+        "speed-overview",
+        *(f"quality-{name}" for name in WRITERS),
+        *sorted(reported | set(REPEATABLE)),
     ]
-    first = machine_line(report) + scaling_line(report["rows"])
-    return "\n\n".join([first, size_line(report["rows"][0]), table(head, lines)])
-
-
-def opensplat(report: Report) -> str:
-    head = ["one thread", "scgs_warp, median ms", "least ms", "OpenSplat, median ms", "least ms", "ratio of medians"]
-    lines = []
-    for name in ("forward", "backward"):
-        ours, theirs = report["rows"][f"scgs_warp/{name}"], report["rows"][f"opensplat/{name}"]
-        times = [number(side[key]) for side in (ours, theirs) for key in ("ms_median", "ms_min")]
-        lines.append([name, *times, number(report["ratios"][name])])
-    lines.append(["both", "", "", "", "", number(report["ratios"]["both"])])
-    picture = report["pictures"]["as_it_is"]
-    alone = report["rows"]["scgs_warp/composite"]
-    texts = [
-        machine_line(report),
-        f"{report['gaussians']:,} Gaussians, {report['width']} x {report['height']}, {report['pairs']:,} pairs, "
-        f"{report['contributors']:.1f} splats a covered pixel; OpenSplat {report['opensplat']} with "
-        f"`{report['flags']}`.",
-        table(head, lines),
-        f"Forward includes sorting on both sides; our compositing alone takes {number(alone['ms_median'])} ms (least "
-        f"{number(alone['ms_min'])}). Of the images {100 * picture['pixels_within_1e-4']:.3f} % of pixels are within "
-        f"1e-4, none differs by more than {picture['largest']:.1g}.",
-    ]
-    return "\n\n".join(texts)
-
-
-def scaling(report: Report) -> str:
-    """One table a sweep: the wholes beside their limits."""
-    limits = [
-        f"{counted(one['threads'])}: {one['gigabytes']:.1f} GB/s copied, {one['gigaflops']:.0f} GFLOP/s"
-        for one in report["limits"].values()
-    ]
-    rows = [row for entries in report["sweeps"].values() for entry in entries for row in entry["rows"]]
-    parts = [machine_line(report) + scaling_line(rows)]
-    if limits:
-        parts.append(f"At best: {'; '.join(limits)}.")
-    wholes = ("frame", "raster/both")
-    for name, entries in report["sweeps"].items():
-        head = [name, "pairs", "splats a covered pixel"]
-        for whole in wholes:
-            head += [f"{whole}, median ms", "limit ms"]
-        lines = []
-        for entry in entries:
-            first = entry["rows"][0]
-            line = [f"{entry['point']:,}", f"{first['pairs']:,}", number(first["contributors"])]
-            for whole in wholes:
-                row = next(row for row in entry["rows"] if row["name"] == whole)
-                limit = None if entry["limits"] is None else entry["limits"][whole]
-                line += [number(row["ms_median"]), number(limit, 2)]
-            lines.append(line)
-        parts.append(table(head, lines))
-    return "\n\n".join(parts)
-
-
-TABLES: dict[str, tuple[Callable[[Report], str], str]] = {
-    "frame-cpu": (stages, "apps/bench.py frame --motion control-points,static"),
-    "raster-cpu": (stages, "apps/bench.py raster"),
-    "step-cpu": (stages, "apps/bench.py step --gaussians 40000 --size 400"),
-    "edit-cpu": (stages, "apps/bench.py edit"),
-    "table-s2-cpu": (table_s2, "apps/bench.py frame --table-s2"),
-    "million-cpu": (stages, "apps/bench.py frame --gaussians 1000000 --size 1920x1080"),
-    "opensplat": (opensplat, "benchmarks/opensplat.py CHECKOUT"),
-    "scaling-cpu": (scaling, "apps/bench.py scaling"),
-}
-"""Per table what writes it, and the command that measures it."""
-
-
-def command(name: str) -> str:
-    return f"python {TABLES[name][1]} --json benchmarks/results/{name}.json"
 
 
 def section(name: str, results: Path) -> str:
-    path = results / f"{name}.json"
-    said = f"`{command(name)}`"
-    if not path.is_file():
-        return f"Not measured yet: {said}"
-    return f"{said}\n\n{TABLES[name][0](json.loads(path.read_text(encoding='utf-8')))}"
+    """Write the table ``name``.
+
+    Raises:
+        ValueError: there is no such table.
+    """
+    if name in BENCHMARKS:
+        return timing_table(name, results)
+    if name == "speed-overview":
+        return speed_overview(results)
+    if name.startswith("quality-") and name[len("quality-") :] in WRITERS:
+        return quality_table(name[len("quality-") :], results)
+    measured = repeatable_table(name, results) if name in REPEATABLE else None
+    if measured is not None:
+        return measured
+    path = results / "reported" / f"{name}.json"
+    if path.is_file():
+        return reported_table(path)
+    if name in REPEATABLE:
+        return "Not measured yet."
+    raise ValueError(f"<!-- table: {name} -->: no such table")
 
 
 def fill(page: str, results: Path) -> str:
-    """The page with every table anew.
+    """Write every table of a page anew.
 
     Raises:
-        ValueError: a marker is missing.
+        ValueError: a marker names a table that does not exist, or a table has no end.
     """
-    for name in TABLES:
-        pattern = re.compile(f"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-        if not pattern.search(page):
-            raise ValueError(f"the page has no <!-- begin {name} --> ... <!-- end {name} -->")
-        text = section(name, results)
-        page = pattern.sub(lambda match, text=text: f"{match[1]}{text}\n{match[2]}", page)
-    return page
+    if page.count("<!-- table:") != page.count("<!-- /table -->"):
+        raise ValueError("the page needs a <!-- /table --> for every <!-- table: NAME -->")
+    return MARKED.sub(lambda match: f"{match[1]}{section(match[2], results)}\n{match[3]}", page)
 
 
 def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
+    parser.add_argument("--pages", type=Path, nargs="+", help="Markdown files; by default README.md and docs/*.md")
     options = parser.parse_args(args)
-    page = options.page.read_text(encoding="utf-8")
-    filled = fill(page, options.results)
-    if filled == page:
-        return 0
-    if options.check:
-        print(f"{options.page} is not what {options.results} gives: run benchmarks/report.py", file=sys.stderr)
+    paths = options.pages or [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    pages = {path: path.read_text(encoding="utf-8") for path in paths}
+    homeless = set(table_names(options.results)) - {
+        match[2] for page in pages.values() for match in MARKED.finditer(page)
+    }
+    if homeless:
+        print(f"no page has <!-- table: {' --> nor <!-- table: '.join(sorted(homeless))} -->", file=sys.stderr)
         return 1
-    options.page.write_text(filled, encoding="utf-8")
-    return 0
+    status = 0
+    for path, page in pages.items():
+        filled = fill(page, options.results)
+        if options.check and without_older_marks(filled) != without_older_marks(page):
+            print(f"{path} is not what {options.results} gives: run benchmarks/report.py", file=sys.stderr)
+            status = 1
+        elif not options.check and filled != page:
+            path.write_text(filled, encoding="utf-8")
+    return status
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""What it costs that several processes share a step's views: bytes, and the time of each part of a step.
+"""Measure the cost of sharing a step's views among processes: bytes, and the time of each part of a step.
 
     torchrun --standalone --nproc-per-node 2 benchmarks/sharing.py                 # two processes on this machine
     torchrun --standalone --nproc-per-node 2 benchmarks/sharing.py --size 800 --json sharing.json
     python benchmarks/sharing.py                                                   # one process, for comparison
 
-Every process looks at one view per step. The scene is ``apps/bench.py step``'s synthetic one. Milliseconds are medians
-over steps of the first process, by the clock and of processor time (that of all its threads): on a machine that does
-other work the second is the steadier one, but does not count waiting.
+Every process renders one view per step of the synthetic scene of ``apps/bench.py step``. Milliseconds are medians over
+steps of the first process, by the clock and as processor time of all its threads; on a busy machine the latter is
+steadier, but does not include waiting.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from scgs_warp.apps.cli import prepare
 from scgs_warp.apps.cli import run as run_app
 from scgs_warp.benchmark.memory import model_mib, peak_mib
 from scgs_warp.benchmark.scenes import synthetic_scene, training_data, training_state
-from scgs_warp.benchmark.timing import machine, now
+from scgs_warp.benchmark.timing import command_line, provenance
 from scgs_warp.optim import Adam
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.torchrun import process_rank
@@ -45,11 +45,12 @@ PARTS = [
     ("join", ProcessGroup, "all_gather"),
     ("adam", Adam, "step"),
 ]
-"""What rows call them: a view forward and backward, waiting for the others at its end, two ways of moving gradients."""
+"""Names of rows, and the functions that they time: a view forward and backward, waiting for the others at its end, two
+ways of moving gradients, and Adam."""
 
 
 class Clock:
-    """Times calls of functions, step by step."""
+    """Times of functions, step by step."""
 
     def __init__(self, device: str) -> None:
         self.wait = torch.cuda.synchronize if device == "cuda" else lambda: None
@@ -81,7 +82,7 @@ class Clock:
 
     def rows(self) -> list[dict[str, Any]]:
         found: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        for step in self.steps[len(self.steps) // 5 :]:  # the first ones allocate
+        for step in self.steps[len(self.steps) // 5 :]:  # The first steps allocate.
             for name, times in step.items():
                 found[name].append(times)
         medians = {name: [1e3 * statistics.median(column) for column in zip(*times)] for name, times in found.items()}
@@ -115,15 +116,14 @@ def main(arguments: list[str] | None) -> None:
         for _ in range(options.steps):
             clock.step(step)
         result = {
-            "command": vars(options) | {"json": None},
+            "command": command_line("benchmarks/sharing.py", sys.argv[1:] if arguments is None else arguments),
             "processes": processes,
             "threads": environment.thread_count(),
             "model_mib": round(model_mib(scene), 1),
             "peak_mib": round(peak_mib(device) or 0.0),
             "mib_per_step": round((group.bytes / options.steps if group else 0) / 2**20, 2),
             "rows": clock.rows(),
-            "machine": machine(device),
-            "date": now(),
+            **provenance(device),
         }
         print(json.dumps(result, indent=1))
         if options.json and (group is None or group.first):

@@ -1,13 +1,13 @@
-"""Does anything grow? The editor under random input, then training in a loop, watched from within the process.
+"""Watch for leaks in the editor under random input and in training in a loop, from within the process.
 
     python benchmarks/soak.py --minutes 60                        # half an hour of each
     python benchmarks/soak.py --minutes 10 --part editor
-    python benchmarks/soak.py --minutes 60 --run runs/figure-quick # the editor on a scene of yours
+    python benchmarks/soak.py --minutes 60 --run runs/figure-quick # the editor on a trained scene
     python benchmarks/soak.py --minutes 60 --json soak.json
 
-Memory, open handles and threads are sampled all the time. The first quarter of a part is warm-up. After it what is
-allocated may grow by no more than ``STEEPEST``; what is resident by no more than ``HIGHEST`` (freed memory is kept, so
-it follows the largest film so far); the numbers of handles and threads not at all. Exit status 1 if they do.
+Memory, open handles and threads are sampled all the time. The first quarter of a part is warm-up. After it allocated
+memory may grow by ``STEEPEST`` and resident memory by ``HIGHEST`` (the process keeps freed memory, so it follows the
+largest film so far); the numbers of handles and threads may not grow. Otherwise the exit status is 1.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import numpy as np  # isort: skip
 from scipy.stats import theilslopes
 from soak_editor import RandomUser
 
-from scgs_warp.benchmark.timing import machine, now
+from scgs_warp.benchmark.timing import command_line, provenance
 from scgs_warp.config.presets import MOTIONS, TrainConfig, from_dict, preset, with_steps
 from scgs_warp.data.synthetic.builtin import make_synthetic
 from scgs_warp.edit import EditSession
@@ -40,12 +40,12 @@ from scgs_warp.scene.scene import Scene
 from scgs_warp.training.run import train_and_evaluate
 
 STEEPEST = 30.0
-"""MiB an hour. An editor that is open for a working day may have a quarter of a gibibyte more at its end."""
+"""Allowed growth of allocated memory, MiB per hour: a quarter of a GiB in a working day."""
 HIGHEST = 128.0
-"""MiB that the resident memory of a part's last quarter may lie above that of its second."""
+"""Allowed growth of resident memory from a part's second quarter to its last, MiB."""
 WARM_UP = 0.25
 SAMPLES = 40
-"""In a part, about."""
+"""About the number of samples in a part."""
 PAGE = os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
@@ -59,18 +59,18 @@ class _Allocated(ctypes.Structure):
 
 
 def allocated() -> float | None:
-    """MiB that the program has asked for and not freed; None where the C library does not say."""
+    """Return allocated memory in MiB; None if the C library does not say."""
     try:
         ask = ctypes.CDLL(None).mallinfo2
     except (OSError, AttributeError):
         return None
     ask.restype = _Allocated
-    found = ask()
-    return (found.uordblks + found.hblkhd) / 2**20
+    counts = ask()
+    return (counts.uordblks + counts.hblkhd) / 2**20
 
 
 class Watch:
-    """What the process has, now and then."""
+    """Samples of the process' memory, handles and threads."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds, self.began = seconds, time.monotonic()
@@ -81,12 +81,12 @@ class Watch:
     def elapsed(self) -> float:
         return time.monotonic() - self.began
 
-    def look(self, rest: Callable[[], object] = lambda: None) -> bool:
-        """Take a sample if it is time to; whether the part is over. ``rest``: called first, to finish what runs."""
+    def sample(self, rest: Callable[[], object] = lambda: None) -> bool:
+        """Take a sample if one is due, after calling ``rest`` to finish running work; tell whether the part is over."""
         if self.elapsed >= self._due:
             rest()
             self._due = self.elapsed + self._every
-            gc.collect()  # cycles that wait for the collector are no leak
+            gc.collect()  # Cycles that wait for the collector are not leaks.
             resident = int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
             threads = len(os.listdir("/proc/self/task"))
             asked = allocated()
@@ -95,11 +95,11 @@ class Watch:
         return self.elapsed >= self.seconds
 
     def verdict(self) -> dict[str, Any]:
-        """The figures, and what is wrong with them."""
+        """Summarise the samples; ``wrong`` lists what grew."""
         table = np.array(self.rows)
         warm = table[table[:, 0] >= WARM_UP * self.seconds]
         slope, _, low, high = (3600.0 * np.array(theilslopes(warm[:, 2], warm[:, 0]), np.float64)).tolist()
-        quarter = max(1, len(warm) // 3)  # of the part
+        quarter = max(1, len(warm) // 3)
         early, late = warm[:quarter], warm[-quarter:]
         figures: dict[str, Any] = {
             "seconds": round(self.elapsed, 1),
@@ -120,7 +120,7 @@ class Watch:
 
 
 def small(motion: str) -> TrainConfig:
-    """A run of a second or two."""
+    """Configure a run of a second or two."""
     fields = {
         "init_points": 300,
         "checkpoint_seconds": 0.2,
@@ -139,25 +139,25 @@ def train_once(place: Path, motion: str, resume: bool = False) -> Path:
 
 
 def soak_training(seconds: float, place: Path) -> dict[str, Any]:
-    """Runs from the images to the film, each motion model in turn, each resumed once when it is complete."""
+    """Train from images to film with each motion model in turn, and resume each run once when it is complete."""
     watch, runs = Watch(seconds), 0
-    while not watch.look():
+    while not watch.sample():
         with tempfile.TemporaryDirectory(dir=place) as folder:
             inner = Path(folder)
             (inner / "data").symlink_to(place / "data")
             for resume in (False, True):
                 train_once(inner, MOTIONS[runs % len(MOTIONS)], resume)
-                watch.look()
+                watch.sample()
         runs += 1
     return {"runs": runs, **watch.verdict()}
 
 
 def soak_editor(seconds: float, place: Path, run: Path, seed: int) -> dict[str, Any]:
-    """Every kind of input, at random, as fast as pictures come."""
+    """Send random input of every kind to the editor as fast as it draws."""
     user = RandomUser(EditSession(Scene.load(run)), place / "edits", seed)
     watch = Watch(seconds)
     try:
-        while not watch.look(user.rest):
+        while not watch.sample(user.rest):
             user.act()
     finally:
         user.stop()
@@ -168,7 +168,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0, help="for all parts together")
     parser.add_argument("--part", choices=("editor", "training", "both"), default="both")
-    parser.add_argument("--run", type=Path, help="the scene to edit; a small one is trained by default")
+    parser.add_argument("--run", type=Path, help="run folder of the scene to edit; a small one is trained by default")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)
     parser.add_argument("--json", type=Path)
@@ -179,7 +179,7 @@ def main() -> int:
     environment.configure(options.threads)
     parts = ("editor", "training") if options.part == "both" else (options.part,)
     seconds = 60.0 * options.minutes / len(parts)
-    found: dict[str, Any] = {"date": now(), "machine": machine("cpu")}
+    found: dict[str, Any] = {"command": command_line("benchmarks/soak.py", sys.argv[1:]), **provenance("cpu")}
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         run = train_once(place, "control-points")

@@ -1,4 +1,4 @@
-"""The editor without a browser, in the hands of somebody who does anything: for ``soak.py``."""
+"""Random user of the editor, without a browser, for ``soak.py``."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.visualization.video import write_png
 
 SIZE = 96
-"""Pixels of a picture."""
+"""Longer side of a picture in pixels."""
 CLIENTS = 2
 
 
 class RandomUser:
-    """Model, worker and jobs as the editor puts them together, and input for them.
+    """Model, worker and jobs, assembled as in the editor, and random input for them.
 
     Args:
-        session: the scene.
-        folder: where edits, films and exports go; emptied now and then.
+        session: Scene to edit.
+        folder: Folder for edits, films and exports; emptied now and then.
     """
 
     def __init__(self, session: EditSession, folder: Path, seed: int) -> None:
@@ -60,7 +60,7 @@ class RandomUser:
         ]  # fmt: skip
 
     def act(self) -> None:
-        """One thing that a user does, and its pictures."""
+        """Perform one random action."""
         action = self.random.choices([one for _, one in self.actions], [often for often, _ in self.actions])[0]
         try:
             action()
@@ -72,7 +72,7 @@ class RandomUser:
             self._wait(lambda: self.worker.idle or self.model.playing)
 
     def rest(self) -> None:
-        """Until nothing runs."""
+        """Wait until nothing runs."""
         self.model.play(False)
         self.jobs.wait(60.0)
         self._wait(lambda: self.worker.idle)
@@ -86,7 +86,7 @@ class RandomUser:
         while not over() and time.monotonic() < end:
             time.sleep(0.01)
 
-    # What the page does
+    # The page's part.
 
     def _changed(self) -> None:
         with self.worker.changing() as schedule:
@@ -111,7 +111,7 @@ class RandomUser:
         with self.worker.changing() as schedule:
             schedule.move(client, camera, time.monotonic())
 
-    # What a user does
+    # Actions of the user.
 
     def _target(self) -> Target:
         reach = 0.3 * self.model.session.scene.overview.radius
@@ -188,7 +188,7 @@ class RandomUser:
             self.folder.mkdir()
 
     def nonsense(self) -> None:
-        """What a broken page might send."""
+        """Send values of a broken page."""
         self.model.seek(math.nan)
         self.model.drag(Target((math.nan, 0.0, 0.0)))
 

@@ -1,7 +1,7 @@
-"""Ablations: one training run for each value, scene and seed, alike in everything else.
+"""The cells of an ablation: one training run for each value, scene and seed, alike in everything else.
 
-A cell is plain data, and :func:`run_cell` needs nothing but one: it can run here, in a child process or on another
-machine that sees the same files.
+A cell is plain data, and :func:`run_cell` needs nothing else, so that it can run in this process, in a child process or
+on another machine that sees the same files.
 """
 
 from __future__ import annotations
@@ -29,33 +29,35 @@ VALUES = {
     "motion": ("static", "hexplane", "per-gaussian", "control-points"),
     "arap": ("on", "off", "per-gaussian"),
 }
-"""The rows of each table; nodes takes any other numbers, too."""
+"""Rows of each table; ``nodes`` also takes other numbers."""
 VARIED = {
     "nodes": ("motion.nodes", "motion.model"),
     "motion": ("motion.model",),
     "arap": ("motion.model", "loss.arap", "pretrain.arap_weight"),
 }
 """Fields in which the cells of an ablation may differ."""
-NUMBERS, LARGEST = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds"), 1e12
-"""What of ``metrics.json`` stands in tables, and what no such number reaches."""
+NUMBERS = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds")
+"""Metrics of ``metrics.json`` that tables show."""
+NUMBER_LIMIT = 1e12
+"""Magnitude that no sound metric reaches."""
 ERROR = "error.txt"
-"""In a cell's folder: why it failed."""
+"""File in a cell's folder that says why the cell failed."""
 LOG = "train.log"
-"""In a cell's folder: what training printed, where it had a process of its own."""
+"""File in a cell's folder with the output of training, if that had a process of its own."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One training run; nothing in it that cannot be pickled or written as JSON."""
+    """One training run, as values that can be pickled and written as JSON."""
 
     ablation: str
     scene: str
     value: str
     seed: int
     folder: str
-    """Run directory."""
+    """Run folder."""
     settings: dict[str, Any]
-    """The complete configuration, as ``config.json`` holds it, with the folder of the data."""
+    """Complete configuration, as in ``config.json``, with the data folder."""
     device: str = "cpu"
     lpips_weights: str | None = None
 
@@ -65,44 +67,44 @@ class Cell:
 
 
 def cell_to_json(cell: Cell) -> str:
-    """For a process elsewhere."""
+    """Write a cell as JSON, for another process."""
     return json.dumps(asdict(cell))
 
 
 def cell_from_json(text: str) -> Cell:
-    """What :func:`cell_to_json` made."""
+    """Read the JSON of :func:`cell_to_json`."""
     return Cell(**parse_json(text))
 
 
 def cell_folder(value: str, seed: int) -> str:
-    """``VALUE``, or ``VALUE-seedN`` for other seeds than 0."""
+    """Name a cell's folder: ``VALUE`` for seed 0, otherwise ``VALUE-seedN``."""
     return f"{value}-seed{seed}" if seed else value
 
 
 def parse_values(ablation: str, texts: Sequence[str]) -> tuple[str, ...]:
-    """The rows that were asked for, in the table's order, each once.
+    """Parse the requested rows; sort them as the table does, without duplicates.
 
     Raises:
-        UserError: a value that the ablation does not know.
+        UserError: the ablation does not know a value.
     """
-    found = []
+    values = []
     for text in texts:
         known = re.fullmatch(r"[1-9]\d{0,6}", text) if ablation == "nodes" else text in VALUES[ablation]
         if not known:
             choice = "numbers of control points" if ablation == "nodes" else f"some of {', '.join(VALUES[ablation])}"
             raise UserError(f"--values {text!r}: {ablation} takes {choice}, with commas between")
-        found.append(text)
-    return sort_values(ablation, found)
+        values.append(text)
+    return sort_values(ablation, values)
 
 
 def sort_values(ablation: str, values: Sequence[str]) -> tuple[str, ...]:
-    """In the order of the table's rows, each once."""
+    """Sort values as the rows of the table, without duplicates."""
     key = int if ablation == "nodes" else VALUES[ablation].index
     return tuple(sorted(set(values), key=key))
 
 
-def changes(ablation: str, value: str) -> dict[str, Any]:
-    """The fields that make the row, by their dotted names."""
+def fields_of_row(ablation: str, value: str) -> dict[str, Any]:
+    """Return the fields that define a row, by their dotted names."""
     if ablation == "nodes":
         return {"motion.model": "control-points", "motion.nodes": int(value)}
     if ablation == "motion" or value == "per-gaussian":
@@ -112,12 +114,12 @@ def changes(ablation: str, value: str) -> dict[str, Any]:
 
 
 def settings_of_cell(config: TrainConfig, ablation: str, value: str, seed: int) -> TrainConfig:
-    """``config`` with the row's fields and the seed.
+    """Set a row's fields and the seed in ``config``.
 
     Raises:
-        UserError: the row cannot run with these settings.
+        UserError: the row cannot be trained with these settings.
     """
-    for name, changed in {**changes(ablation, value), "seed": seed}.items():
+    for name, changed in {**fields_of_row(ablation, value), "seed": seed}.items():
         config = with_field(config, name, changed, f"{ablation} {value}")
     if ablation == "arap" and value == "on" and config.loss.arap <= 0.0 and config.pretrain.arap_weight <= 0.0:
         raise UserError(
@@ -126,76 +128,76 @@ def settings_of_cell(config: TrainConfig, ablation: str, value: str, seed: int) 
     return check(config)
 
 
-def flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values."""
+def flatten(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted names and values."""
     for name, value in settings.items():
         if isinstance(value, dict):
-            yield from flat(value, f"{prefix}{name}.")
+            yield from flatten(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
 
 
-def recorded(folder: Path) -> dict[str, Any] | None:
-    """The complete settings that ``config.json`` in ``folder`` holds; None without one.
+def recorded_settings(folder: Path) -> dict[str, Any] | None:
+    """Read the complete settings from ``config.json`` in ``folder``; None without that file.
 
     Raises:
-        UserError: the file is not a configuration, or was written by a version that did not have all fields: what that
-            version did instead is not known here, and today's default may be another.
+        UserError: the file is not a configuration, or a version that lacked a field wrote it: today's default may
+            differ from what that version did.
     """
     path = folder / "config.json"
     if not path.is_file():
         return None
     values = read_config(path)
     data = values.get("data")
-    place = data.pop("folder", None) if isinstance(data, dict) else None
+    data_folder = data.pop("folder", None) if isinstance(data, dict) else None
     settings = to_dict(from_dict(values, str(path)))
-    there = dict(flat(values))
-    for name, _ in flat(settings):
+    there = dict(flatten(values))
+    for name, _ in flatten(settings):
         if name not in there and name not in FREE_TO_CHANGE:
             raise UserError(
                 f"{folder}: made by another version, which had no {name}; remove the folder, and the cell is trained "
                 "again, or give another --output"
             )
-    settings["data"]["folder"] = place
+    settings["data"]["folder"] = data_folder
     return settings
 
 
-def difference(
-    found: dict[str, Any], wanted: dict[str, Any], ignored: Sequence[str] = FREE_TO_CHANGE
+def first_difference(
+    actual: dict[str, Any], wanted: dict[str, Any], ignored: Sequence[str] = FREE_TO_CHANGE
 ) -> tuple[str, Any, Any] | None:
-    """The first field in which two complete settings differ: its name, and both values."""
-    there = dict(flat(found))
-    for name, value in flat(wanted):
+    """Find the first field in which two complete settings differ: its name and both values."""
+    there = dict(flatten(actual))
+    for name, value in flatten(wanted):
         if name not in ignored and there.get(name) != value:
             return name, there.get(name), value
     return None
 
 
 def check_cell(cell: Cell) -> None:
-    """What is in the cell's folder was made with the cell's settings.
+    """Check that the results in the cell's folder were made with the cell's settings.
 
     Raises:
-        UserError: it was not; names cell and field.
+        UserError: they were not; names the cell and the field.
     """
     folder = Path(cell.folder)
     if not any((folder / name).is_file() for name in ("metrics.json", CHECKPOINT, PREVIOUS)):
-        return  # nothing that could be lost
-    settings = recorded(folder)
+        return  # There is nothing that could be lost.
+    settings = recorded_settings(folder)
     if settings is None:
         raise UserError(f"{folder}: config.json is missing beside the results; restore it or remove the folder")
-    differs = difference(settings, cell.settings)
+    differs = first_difference(settings, cell.settings)
     if differs is not None:
-        name, found, wanted = differs
+        name, actual, wanted = differs
         raise UserError(
-            f"{folder}: made with {name} = {found!r}, now {wanted!r}; give the same options, or another --output"
+            f"{folder}: made with {name} = {actual!r}, now {wanted!r}; give the same options, or another --output"
         )
 
 
 def read_metrics(folder: Path) -> dict[str, Any] | None:
-    """``metrics.json`` of a cell; None while it is not there.
+    """Read a cell's ``metrics.json``; None if there is none yet.
 
     Raises:
-        UserError: it is damaged.
+        UserError: the file is damaged.
     """
     path = folder / "metrics.json"
     try:
@@ -206,33 +208,34 @@ def read_metrics(folder: Path) -> dict[str, Any] | None:
         values = None
     if (
         not isinstance(values, dict)
-        or not all(_sound(values.get(name)) for name in NUMBERS)
+        or not all(_is_sound(values.get(name)) for name in NUMBERS)
         or not isinstance(values.get("device", ""), (str, type(None)))
     ):
         raise UserError(f"{path}: damaged; remove it, and the cell is measured again")
     return values
 
 
-def _sound(value: Any) -> bool:
-    """A number of a table, or nothing."""
+def _is_sound(value: Any) -> bool:
+    """Tell whether a table can show ``value``: a finite number, or None."""
     number = as_number(value)
-    return value is None or (number is not None and abs(number) < LARGEST)
+    return value is None or (number is not None and abs(number) < NUMBER_LIMIT)
 
 
 def is_done(cell: Cell) -> bool:
-    """Whether nothing is left to do."""
+    """Tell whether a cell is trained and measured."""
     metrics = read_metrics(Path(cell.folder))
     return metrics is not None and (cell.lpips_weights is None or metrics.get("lpips") is not None)
 
 
 def run_cell(cell: Cell) -> Path:
-    """Train and measure a cell, or as much of that as is left to do.
+    """Train and measure a cell, or complete what is left to do.
 
     Returns:
-        its ``metrics.json``.
+        Path of its ``metrics.json``.
 
     Raises:
-        UserError: the cell cannot be trained; KeyboardInterrupt: stopped, with the checkpoint saved.
+        UserError: the cell cannot be trained.
+        KeyboardInterrupt: training was stopped; its checkpoint is saved.
     """
     from ..training.run import train_and_evaluate
 
@@ -256,7 +259,7 @@ def run_cell(cell: Cell) -> Path:
 
 
 def _measure_again(cell: Cell, lpips: Any) -> None:
-    """With LPIPS this time; the time of training is kept."""
+    """Evaluate a trained cell again, with LPIPS, and keep the time of training."""
     from ..data import load
     from ..evaluation.evaluate import metrics_of, write_metrics
     from ..runtime.progress import progress
@@ -272,10 +275,10 @@ def _measure_again(cell: Cell, lpips: Any) -> None:
 
 
 def attempt(cell: Cell, run: Callable[[Cell], Path] = run_cell) -> str | None:
-    """Run a cell; what goes wrong is kept in its folder, and comes back as one line.
+    """Run a cell; write the reason of a failure to its folder.
 
     Returns:
-        None if all is well.
+        The reason in one line, or None after success.
     """
     folder = Path(cell.folder)
     file = folder / ERROR
@@ -284,7 +287,7 @@ def attempt(cell: Cell, run: Callable[[Cell], Path] = run_cell) -> str | None:
         run(cell)
     except UserError as error:
         message, detail = " ".join(str(error).split()), ""
-    except Exception as error:  # a queue of hours does not end because of one cell
+    except Exception as error:  # One cell must not end a queue of hours.
         reason = (str(error) or "no reason given").splitlines()[0]
         message, detail = printable(f"{type(error).__name__}: {reason}"), traceback.format_exc()
     else:
@@ -293,20 +296,20 @@ def attempt(cell: Cell, run: Callable[[Cell], Path] = run_cell) -> str | None:
         folder.mkdir(parents=True, exist_ok=True)
         file.write_text(f"{message}\n{detail}", encoding="utf-8")
     except OSError:
-        pass  # the line is shown all the same
+        pass  # The caller shows the line anyway.
     return message
 
 
 def discover(output: Path, ablation: str) -> list[tuple[str, str, int]]:
-    """(scene, value, seed) of all the ablation's cells in ``output`` that were begun."""
-    found = []
+    """List (scene, value, seed) of every cell of the ablation that was begun in ``output``."""
+    begun = []
     for config in sorted(output.glob("*/*/config.json")):
         match = re.fullmatch(r"(.+?)(?:-seed([1-9]\d*))?", config.parent.name)
         assert match is not None
         value, seed = match[1], int(match[2] or 0)
         if value in VALUES[ablation] or (ablation == "nodes" and re.fullmatch(r"[1-9]\d{0,6}", value)):
-            found.append((config.parent.parent.name, value, seed))
-    return found
+            begun.append((config.parent.parent.name, value, seed))
+    return begun
 
 
 def plan(
@@ -320,16 +323,16 @@ def plan(
     device: str = "cpu",
     lpips_weights: Path | None = None,
 ) -> list[Cell]:
-    """All cells, seed by seed and scene by scene.
+    """Plan all cells, seed by seed and scene by scene.
 
     Args:
-        config: what all of them share.
-        scenes: data folders by the names that the table gives them.
-        values: rows; default: all. The per-Gaussian baseline of ``arap`` is then trained where motion is known.
-        seeds: default: the configuration's.
+        config: Settings that the cells share.
+        scenes: Data folders by the scenes' names in the table.
+        values: Rows; all by default, but for the per-Gaussian baseline of ``arap`` where the motion is not known.
+        seeds: The configuration's by default.
 
     Raises:
-        UserError: a cell cannot run, or its folder holds one with other settings.
+        UserError: a cell cannot be trained, or its folder holds one with other settings.
     """
     from ..evaluation.motion_metrics import FILE as GROUND_TRUTH
     from ..training.run import settings_of
@@ -350,10 +353,10 @@ def plan(
 
 
 def parse_seeds(texts: Sequence[str]) -> tuple[int, ...]:
-    """Seeds, each once.
+    """Parse seeds, without duplicates.
 
     Raises:
-        UserError: not a whole number of at least 0.
+        UserError: one is not a whole number of at least 0.
     """
     for text in texts:
         if not re.fullmatch(r"\d{1,9}", text):

@@ -1,6 +1,6 @@
 """Run the cells of an ablation one after the other in this process, or several at a time in worker processes.
 
-``python -m scgs_warp.ablation.local_runner`` is a worker process: it reads one cell as JSON.
+``python -m scgs_warp.ablation.local_runner THREADS`` is a worker process; it reads one cell as JSON from its input.
 ``ray_runner`` runs cells on a cluster.
 """
 
@@ -22,11 +22,11 @@ from .cells import ERROR, LOG, Cell, attempt, cell_from_json, cell_to_json, is_d
 POLL_SECONDS = 0.1
 INTERRUPTED = 130
 
-Report = Callable[[str], None]
-End = Callable[[str, Cell, "str | None"], None]
-"""Told of a cell that has ended: its place in the queue, the cell, and why it failed, if it did."""
-Runner = Callable[[list[tuple[str, Cell]], Report, End], None]
-"""Runs cells, and tells of each as it ends."""
+ReportLine = Callable[[str], None]
+CellEnded = Callable[[str, Cell, "str | None"], None]
+"""Callback for a cell that has ended: its label in the queue, the cell, and the reason if it failed."""
+CellRunner = Callable[[list[tuple[str, Cell]], ReportLine, CellEnded], None]
+"""Function that runs labelled cells and reports each as it ends."""
 
 
 def run_cells(
@@ -34,38 +34,38 @@ def run_cells(
     *,
     jobs: int = 1,
     threads: int | None = None,
-    report: Report = print,
+    report: ReportLine = print,
     finished: Callable[[], None] = lambda: None,
-    elsewhere: Runner | None = None,
+    elsewhere: CellRunner | None = None,
 ) -> dict[str, str]:
     """Run all cells that are not done.
 
     Args:
-        jobs: how many at a time; with more than one, each has its own process and its share of the threads.
-        threads: of all jobs together; default: all cores.
-        report: gets one line when a cell begins and one when it ends.
-        finished: called after each cell.
-        elsewhere: runs the cells instead of this machine, where ``jobs`` and ``threads`` are its own concern.
+        jobs: Cells at a time; with more than one, each has its own process and its share of the threads.
+        threads: CPU threads of all jobs together; all cores by default.
+        report: Receives one line when a cell begins and one when it ends.
+        finished: Called after each cell.
+        elsewhere: Runs the cells in place of this machine and decides about jobs and threads itself.
 
     Returns:
-        what went wrong, by the cells' names.
+        Reasons of failures, by the cells' names.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C or SIGTERM, the running cells' checkpoints being saved.
+        KeyboardInterrupt: Ctrl-C or SIGTERM came; the running cells save their checkpoints.
     """
     failures: dict[str, str] = {}
     waiting = []
     for index, cell in enumerate(cells):
-        place = f"[{index + 1}/{len(cells)}] {cell.name}"
+        label = f"[{index + 1}/{len(cells)}] {cell.name}"
         if is_done(cell):
-            report(f"{place}: done before, {_score(cell)}")
+            report(f"{label}: done before, {_score(cell)}")
         else:
-            waiting.append((place, cell))
+            waiting.append((label, cell))
 
-    def end(place: str, cell: Cell, failure: str | None) -> None:
+    def end(label: str, cell: Cell, failure: str | None) -> None:
         if failure is not None:
             failures[cell.name] = failure
-        report(f"{place}: {_score(cell)}" if failure is None else f"{place}: failed: {failure}")
+        report(f"{label}: {_score(cell)}" if failure is None else f"{label}: failed: {failure}")
         finished()
 
     if elsewhere is not None:
@@ -73,9 +73,9 @@ def run_cells(
     elif jobs > 1:
         _in_processes(waiting, jobs, threads, report, end)
     else:
-        for place, cell in waiting:
-            report(f"{place}: {cell.folder}")
-            end(place, cell, attempt(cell))
+        for label, cell in waiting:
+            report(f"{label}: {cell.folder}")
+            end(label, cell, attempt(cell))
     return failures
 
 
@@ -87,18 +87,19 @@ def _score(cell: Cell) -> str:
 
 
 class _Job(NamedTuple):
-    place: str
+    label: str
     cell: Cell
     process: subprocess.Popen
     log: IO[bytes]
 
 
-def _start(place: str, cell: Cell, threads: int, jobs: int, report: Report) -> _Job:
+def _start(label: str, cell: Cell, threads: int, jobs: int, report: ReportLine) -> _Job:
     folder = Path(cell.folder)
     folder.mkdir(parents=True, exist_ok=True)
-    report(f"{place}: {folder / LOG}")
+    report(f"{label}: {folder / LOG}")
     log = open(folder / LOG, "ab")
-    # In a session of its own, so that Ctrl-C in the terminal reaches it once, through us: the second would cut it off.
+    # The worker has a session of its own, so that it receives Ctrl-C once, from this process: a second one would end it
+    # before its checkpoint is saved.
     process = subprocess.Popen(
         [sys.executable, "-m", "scgs_warp.ablation.local_runner", str(threads)],
         stdin=subprocess.PIPE,
@@ -110,11 +111,11 @@ def _start(place: str, cell: Cell, threads: int, jobs: int, report: Report) -> _
     assert process.stdin is not None
     process.stdin.write(cell_to_json(cell).encode())
     process.stdin.close()
-    return _Job(place, cell, process, log)
+    return _Job(label, cell, process, log)
 
 
 def _failure(job: _Job) -> str | None:
-    """Why an ended process did not finish its cell; None if it did."""
+    """Say why an ended process did not finish its cell; None if it did."""
     status = job.process.returncode
     if status == 0:
         return None
@@ -129,8 +130,8 @@ def _in_processes(
     waiting: list[tuple[str, Cell]],
     jobs: int,
     threads: int | None,
-    report: Report,
-    end: End,
+    report: ReportLine,
+    end: CellEnded,
 ) -> None:
     from ..runtime.stop_signals import stop_signals
 
@@ -144,7 +145,7 @@ def _in_processes(
                 for job in [job for job in running if job.process.poll() is not None]:
                     running.remove(job)
                     job.log.close()
-                    end(job.place, job.cell, _failure(job))
+                    end(job.label, job.cell, _failure(job))
                 if stop.is_set():
                     raise KeyboardInterrupt
                 time.sleep(POLL_SECONDS)
@@ -159,7 +160,7 @@ def _in_processes(
 
 
 def main() -> int:
-    """Status 0: done; 2: failed, the reason is in the cell's folder; 130: stopped."""
+    """Run one cell. Status 0: done; 2: failed, with the reason in the cell's folder; 130: stopped."""
     environment.configure(int(sys.argv[1]))
     try:
         return 0 if attempt(cell_from_json(sys.stdin.read())) is None else 2

@@ -20,7 +20,7 @@ TITLES = {
     "seconds": "seconds",
 }
 ALWAYS = ("control_points", "gaussians", "psnr", "ssim", "seconds")
-"""Other metrics have a column if any cell has them."""
+"""Metrics that always have a column; others have one if any cell has them."""
 HEADS = {"nodes": "asked", "motion": "motion", "arap": "ARAP"}
 LABELS = {"arap": {"per-gaussian": "per-gaussian (baseline)"}}
 
@@ -35,7 +35,7 @@ def number(value: float | None, digits: int, sign: bool = False) -> str:
 
 
 def measured(found: dict[str, Any] | None, digits: int) -> str:
-    """``43.12 ± 0.08``; the spread where there are several seeds."""
+    """Format statistics as ``43.12 ± 0.08``, without the deviation if there is only one seed."""
     if found is None:
         return MISSING
     text = number(found["mean"], digits)
@@ -43,7 +43,7 @@ def measured(found: dict[str, Any] | None, digits: int) -> str:
 
 
 def columns(report: dict[str, Any], rows: list[Row]) -> list[Column]:
-    """Heading and text of each column of one table."""
+    """Return heading and text function of each column of one table."""
     ablation = report["ablation"]
     labels: dict[str, str] = LABELS.get(ablation, {})
     made: list[Column] = [(HEADS[ablation], lambda row: str(labels.get(row["value"], row["value"])))]
@@ -86,7 +86,7 @@ def _published(ablation: str, rows: list[Row]) -> list[Column]:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """A head with what all cells share, a table over all scenes, one for each scene."""
+    """Write the shared settings, a table over all scenes and one for each scene."""
     lines = [f"# Ablation: {report['ablation']}", "", settings_line(report), ""]
     for table in report["tables"]:
         lines += [f"## {table['name']}", "", *table_lines(columns(report, table["rows"]), table["rows"]), ""]
@@ -94,7 +94,7 @@ def markdown(report: dict[str, Any]) -> str:
 
 
 def settings_line(report: dict[str, Any]) -> str:
-    """In a sentence what the cells share."""
+    """State in one sentence what the cells share."""
     shared = report["settings"]
     parts = []
     if "steps" in shared:
@@ -112,7 +112,7 @@ def settings_line(report: dict[str, Any]) -> str:
 
 
 def table_lines(made: list[Column], rows: list[Row]) -> list[str]:
-    """Aligned, so that it reads as text, too."""
+    """Write aligned rows that read well as plain text."""
     texts = [[title for title, _ in made], *([text(row) for _, text in made] for row in rows)]
     widths = [max(3, *(len(line[i]) for line in texts)) for i in range(len(made))]
     rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]

@@ -1,4 +1,4 @@
-"""The figure of an ablation."""
+"""Plot of an ablation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLORS = {
     "on": "#0072b2",
     "off": "#d55e00",
 }
-"""Colours that differ for colour-blind readers too (Okabe and Ito)."""
+"""Colours that colour-blind readers can tell apart (Okabe and Ito)."""
 LABELS = {
     "on": "ARAP",
     "off": "no ARAP",
@@ -31,7 +31,7 @@ Table = dict[str, Any]
 
 
 def picture(report: dict[str, Any]) -> bytes:
-    """A PNG: for ``nodes`` PSNR and final count over the count asked for, for the others bars for each scene."""
+    """Draw a PNG: PSNR and final count over the requested count for ``nodes``, bars for each scene otherwise."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # no display, no global backend
     from matplotlib.figure import Figure
 
@@ -45,9 +45,10 @@ def picture(report: dict[str, Any]) -> bytes:
 
 
 def _points(table: Table, key: str) -> tuple[list[int], list[float], list[float]]:
-    """Counts asked for, means, spreads (0 where there is one seed); NaN, a gap in the line, where cells are missing."""
-    found = [(int(row["value"]), row[key] or {"mean": math.nan, "std": None}) for row in table["rows"]]
-    return [count for count, _ in found], [row["mean"] for _, row in found], [row["std"] or 0.0 for _, row in found]
+    """Return requested counts, means (NaN, a gap in the line, for missing cells) and deviations (0 for one seed)."""
+    statistics = [(int(row["value"]), row[key] or {"mean": math.nan, "std": None}) for row in table["rows"]]
+    counts, rows = [count for count, _ in statistics], [row for _, row in statistics]
+    return counts, [row["mean"] for row in rows], [row["std"] or 0.0 for row in rows]
 
 
 def _nodes(figure: Any, report: dict[str, Any]) -> None:
@@ -96,7 +97,7 @@ def _short(table: Table, top: Table) -> str:
 
 
 def _same_scale(ours: Any, published: Any, drawn: bool) -> None:
-    """As many dB to the centimetre on both axes, each curve in the middle of the same span."""
+    """Give both axes the same dB per centimetre, each curve in the middle of the span."""
     limits = [axes.get_ylim() for axes in ((ours, published) if drawn else (published,))]
     span = max(high - low for low, high in limits)
     for axes, (low, high) in zip((ours, published) if drawn else (published,), limits):
@@ -116,7 +117,7 @@ def _legend(figure: Any, entries: list[tuple[str, Any, str]]) -> None:
 
 
 def _bars(axes: Any, report: dict[str, Any], key: str, digits: int) -> list[float]:
-    """A group of bars for each table, a bar for each value; returns the heights."""
+    """Draw a group of bars for each table and a bar for each value; return the heights."""
     values, tables = report["values"], report["tables"]
     width = 0.84 / len(values)
     heights = []
@@ -142,7 +143,7 @@ def _bars(axes: Any, report: dict[str, Any], key: str, digits: int) -> list[floa
 
 
 def _psnr_axis(axes: Any, heights: list[float]) -> None:
-    """From a multiple of 5 dB below the lowest bar: 0 dB is no natural beginning."""
+    """Begin the axis at a multiple of 5 dB below the lowest bar, since 0 dB has no meaning."""
     if heights:
         axes.set_ylim(5 * ((min(heights) - 2) // 5), max(heights) + 1.5)
 

@@ -1,7 +1,7 @@
-"""A Ray cluster (extra ``cluster``): reached in bounded time or refused with one line, and what its machines have.
+"""Connection to a Ray cluster (extra ``cluster``) in bounded time, and the resources of its machines.
 
-``python -m scgs_warp.ablation.ray_cluster ADDRESS`` only connects: Ray itself waits two minutes for a cluster that is
-not there and then ends the process, so that a process of its own asks first.
+``python -m scgs_warp.ablation.ray_cluster ADDRESS`` only connects. It runs as a process of its own before this one
+connects, because Ray waits two minutes for a missing cluster and then ends the process.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from typing import Any
 from ..errors import UserError
 
 CONNECT_SECONDS = 5.0
-"""For a connection to be accepted."""
+"""Time for a connection to be accepted."""
 ANSWER_SECONDS = 45.0
-"""For Ray to be imported, and to answer."""
+"""Time for Ray to be imported and to answer."""
 PULSE_SECONDS = 2.0
+"""Time between two questions to the head."""
 GONE_SECONDS = 20.0
-"""Without an answer of the head the sweep ends, and says so: Ray itself ends the process after 60 s."""
+"""Silence of the head after which the sweep ends with one line; Ray ends the process after 60 s without any."""
 STORE_BYTES = 100 << 20
-"""Of shared memory for a local cluster's objects: ours are lines of text."""
-START = "start a cluster with 'ray start --head', or give --ray local"
+"""Shared memory for a local cluster's objects, which are lines of text here."""
+START_HINT = "start a cluster with 'ray start --head', or give --ray local"
 
 
 @dataclass(frozen=True)
 class Machine:
-    """A node of the cluster."""
+    """A machine of the cluster, and the resources that it offers."""
 
     id: str
     host: str
@@ -43,10 +44,10 @@ class Machine:
 
 
 def check_address(address: str) -> None:
-    """Before anything else is done; connects to nothing that takes long.
+    """Check ``--ray`` before anything else is done.
 
     Raises:
-        UserError: Ray is missing, the address is none, or nothing listens there.
+        UserError: Ray is missing, the address is malformed, or nothing listens there.
     """
     if importlib.util.find_spec("ray") is None:
         raise UserError(
@@ -61,11 +62,11 @@ def check_address(address: str) -> None:
     try:
         socket.create_connection((match[1].strip("[]"), int(match[2])), CONNECT_SECONDS).close()
     except (OSError, OverflowError) as error:
-        raise UserError(f"--ray {address}: no connection ({error}); {START}") from error
+        raise UserError(f"--ray {address}: no connection ({error}); {START_HINT}") from error
 
 
 def prepare() -> None:
-    """Ray reads its environment when it is imported. The user's values win."""
+    """Set Ray's environment, which it reads when it is imported; the user's values win."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 
@@ -74,7 +75,7 @@ def _init(address: str, **more: Any) -> Any:
     import ray._private.worker as worker
 
     if hasattr(worker, "print_to_stdstream"):
-        # Long lines on every worker that ends, even as it should; what matters of them we say ourselves.
+        # Ray prints long lines about every worker that ends, even as it should; the sweep reports losses itself.
         worker.print_to_stdstream = lambda *args, **keywords: None  # type: ignore[assignment]
     ray.init(address, log_to_driver=False, logging_level="error", **more)  # type: ignore[arg-type]
     return ray
@@ -82,11 +83,11 @@ def _init(address: str, **more: Any) -> Any:
 
 @contextmanager
 def connect(address: str, *, cpus: int, gpu: bool) -> Iterator[Any]:
-    """The module ``ray``, connected to ``address`` (see :func:`check_address`) until the end of the context.
+    """Yield the module ``ray``, connected to ``address`` (see :func:`check_address`).
 
     Args:
-        cpus: of the cluster that ``local`` starts, which listens on loopback alone.
-        gpu: whether that one may have this machine's GPUs.
+        cpus: Processors of the cluster that ``local`` starts, which listens on the loopback interface only.
+        gpu: Whether that cluster may use this machine's GPUs.
 
     Raises:
         UserError: no cluster answers, or it refuses this Python, this Ray or this user.
@@ -94,7 +95,7 @@ def connect(address: str, *, cpus: int, gpu: bool) -> Iterator[Any]:
     check_address(address)
     prepare()
     if address == "local":
-        # Ray means a machine of its own by it; to us it is the switch that makes every part of Ray use 127.0.0.1.
+        # Meant for other systems, this variable makes every part of Ray use 127.0.0.1.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
         limits = {} if gpu else {"num_gpus": 0}
         more = {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": STORE_BYTES, **limits}
@@ -104,7 +105,7 @@ def connect(address: str, *, cpus: int, gpu: bool) -> Iterator[Any]:
     try:
         ray = _init(address, **more)
     except Exception as error:
-        raise UserError(f"--ray {address}: {_reason(str(error))}; {START}") from error
+        raise UserError(f"--ray {address}: {last_error_line(str(error))}; {START_HINT}") from error
     try:
         yield ray
     finally:
@@ -112,10 +113,10 @@ def connect(address: str, *, cpus: int, gpu: bool) -> Iterator[Any]:
 
 
 def _ask(address: str) -> None:
-    """Whether a cluster answers at ``address``; in a process of its own, which can be ended.
+    """Connect to ``address`` in a process of its own, which can be ended.
 
     Raises:
-        UserError: it does not.
+        UserError: no cluster answers.
     """
     try:
         answer = subprocess.run(
@@ -127,37 +128,37 @@ def _ask(address: str) -> None:
         )
     except subprocess.TimeoutExpired as error:
         raise UserError(
-            f"--ray {address}: no Ray cluster answered within {ANSWER_SECONDS:.0f} s; {START}; from a machine outside "
-            "the cluster, give ray://HOST:10001"
+            f"--ray {address}: no Ray cluster answered within {ANSWER_SECONDS:.0f} s; {START_HINT}; from a machine "
+            "outside the cluster, give ray://HOST:10001"
         ) from error
     if answer.returncode != 0:
-        raise UserError(f"--ray {address}: {_reason(answer.stderr)}; {START}")
+        raise UserError(f"--ray {address}: {last_error_line(answer.stderr)}; {START_HINT}")
 
 
-def _reason(text: str) -> str:
-    """The last line that says something: of a traceback, the error."""
+def last_error_line(text: str) -> str:
+    """Return the last line with text: the error of a traceback."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return re.sub(r"^[\w.]+Error: ", "", lines[-1]) if lines else "Ray gave no reason"
 
 
-class Head:
-    """Whether the cluster's head is there; not known of a connection from outside, which ends with it."""
+class HeadMonitor:
+    """Watches whether the cluster's head answers; not from outside, where the connection ends with the head."""
 
     def __init__(self, ray: Any, address: str) -> None:
         self.address = address
-        self._place = None if address.startswith("ray://") else str(ray.get_runtime_context().gcs_address)
+        self._address_of_head = None if address.startswith("ray://") else str(ray.get_runtime_context().gcs_address)
         self._answered = self._asked = time.monotonic()
 
     def check(self) -> None:
-        """To be called often; asks now and then.
+        """Ask the head every ``PULSE_SECONDS``; call this often.
 
         Raises:
-            UserError: there was no answer for a while.
+            UserError: the head did not answer for ``GONE_SECONDS``.
         """
         now = time.monotonic()
-        if self._place is None or now - self._asked < PULSE_SECONDS:
+        if self._address_of_head is None or now - self._asked < PULSE_SECONDS:
             return
-        host, _, port = self._place.rpartition(":")
+        host, _, port = self._address_of_head.rpartition(":")
         try:
             socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
             self._answered = now
@@ -171,18 +172,18 @@ class Head:
 
 
 def machines(ray: Any) -> list[Machine]:
-    """Those that are alive."""
-    found = []
+    """List the machines that are alive."""
+    alive = []
     for node in ray.nodes():
         if node["Alive"]:
             has = node["Resources"]
             name = f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
-            found.append(Machine(node["NodeID"], name, has.get("CPU", 0.0), has.get("GPU", 0.0)))
-    return found
+            alive.append(Machine(node["NodeID"], name, has.get("CPU", 0.0), has.get("GPU", 0.0)))
+    return alive
 
 
-def fitting(found: Sequence[Machine], cuda: bool) -> list[Machine]:
-    """Machines that can train a cell at all; the head of a cluster often has no processors to give.
+def usable_machines(found: Sequence[Machine], cuda: bool) -> list[Machine]:
+    """Return the machines that can train a cell; the head of a cluster often offers no processors.
 
     Raises:
         UserError: there are none.
@@ -195,10 +196,10 @@ def fitting(found: Sequence[Machine], cuda: bool) -> list[Machine]:
 
 
 def threads_of_a_cell(useful: Sequence[Machine], jobs: int, threads: int | None, cuda: bool) -> int:
-    """A cell's share where ``jobs`` of them are to run on every machine at a time; on larger ones more will.
+    """Compute the threads of one cell so that ``jobs`` cells fit on every machine; larger ones then run more.
 
     Args:
-        threads: for all cells of a machine together; default: as many as it gives.
+        threads: CPU threads of a machine's cells together; all that it offers by default.
     """
     shares = []
     for machine in useful:
@@ -207,8 +208,8 @@ def threads_of_a_cell(useful: Sequence[Machine], jobs: int, threads: int | None,
     return max(1, min(shares))
 
 
-def places(useful: Sequence[Machine], threads: int, cuda: bool) -> int:
-    """How many cells run at a time."""
+def cells_at_a_time(useful: Sequence[Machine], threads: int, cuda: bool) -> int:
+    """Count the cells that the machines can run at a time."""
     return sum(int(min(m.cpus // threads, m.gpus if cuda else m.cpus)) for m in useful)
 
 

@@ -1,7 +1,8 @@
-"""The cells of an ablation as tasks of a Ray cluster: begun where there is room, begun again where a worker is lost.
+"""Run the cells of an ablation as tasks of a Ray cluster; continue a cell whose worker was lost on another one.
 
-Ray starts the processes and notices when one dies; what happens then is decided here, where the cells' folders can be
-seen: a cell that came further since the last loss is given another chance, as often as it takes.
+Ray starts the processes and notices when one dies. Its own retries stay off, because they count deaths where progress
+matters: a cell on machines that come and go may lose many workers, as long as its checkpoint advances, while one that
+takes too much memory would kill workers without end (Ray repeats what ran out of memory for ever by default).
 """
 
 from __future__ import annotations
@@ -23,71 +24,82 @@ from ..storage.checkpoint import FILE as CHECKPOINT
 from ..storage.json_files import parse_json
 from . import ray_cluster
 from .cells import LOG, Cell, cell_to_json
-from .local_runner import End, Report, Runner
+from .local_runner import CellEnded, CellRunner, ReportLine
 from .ray_cluster import Machine
-from .ray_worker import LOCK_SECONDS, PACKAGES, WORKER, difference, fingerprint, identity, look, work
+from .ray_worker import (
+    LOCK_SECONDS,
+    PACKAGES,
+    WORKER,
+    fingerprint,
+    identity,
+    identity_difference,
+    inspect_machine,
+    train_cell,
+)
 
 MOST_LOSSES = 3
-"""Workers that a cell may lose without a step forward; then it fails: it may be what kills them."""
+"""Losses without progress after which a cell fails, since it may be what kills its workers."""
 POLL_SECONDS = 0.5
-LOOK_SECONDS = 60.0
-"""For a machine to import the package and answer."""
+INSPECT_SECONDS = 60.0
+"""Time for a machine to import the package and answer."""
 STOP_SECONDS = 30.0
-"""For running cells to save their checkpoints."""
+"""Time for running cells to save their checkpoints."""
 VISIBLE_SECONDS = 60.0
-"""For a file that another machine wrote to be seen here: file systems of networks remember what was not there."""
+"""Time for another machine's file to appear here: network file systems cache that a file is absent."""
 TAIL = 4096
 
 
 @contextmanager
 def on_cluster(
     address: str, cells: Sequence[Cell], output: Path, *, jobs: int, threads: int | None, device: str
-) -> Iterator[Runner]:
-    """What ``ablate_jobs.run_cells`` takes as ``elsewhere``, as long as the context lasts.
+) -> Iterator[CellRunner]:
+    """Connect to a cluster; yield the argument ``elsewhere`` of ``local_runner.run_cells``.
 
     Args:
-        address: as ``ray_cluster.check_address`` wants it.
-        output: the folder of all cells, which all machines must share.
-        jobs: cells at a time on each machine.
-        threads: of each machine; default: all that it gives.
+        address: As ``ray_cluster.check_address`` takes it.
+        output: Folder of all cells, which all machines must share.
+        jobs: Cells at a time on each machine.
+        threads: CPU threads on each machine; all that it offers by default.
         device: ``cpu``, ``cuda``, or ``auto``: GPUs if the cluster has some.
 
     Raises:
-        UserError: no cluster, or its machines cannot train these cells.
+        UserError: there is no cluster, or its machines cannot train these cells.
     """
     local = max(1, (threads or available_threads()) // jobs) * jobs
     with ray_cluster.connect(address, cpus=local, gpu=device != "cpu") as ray:
-        found = ray_cluster.machines(ray)
-        cuda = device == "cuda" or (device == "auto" and any(machine.gpus >= 1 for machine in found))
-        useful = ray_cluster.fitting(found, cuda)
+        known = ray_cluster.machines(ray)
+        cuda = device == "cuda" or (device == "auto" and any(machine.gpus >= 1 for machine in known))
+        useful = ray_cluster.usable_machines(known, cuda)
         share = ray_cluster.threads_of_a_cell(useful, jobs, threads, cuda)
-        expected, processors = _look(ray, useful, cells, output)
+        expected, processors = _inspect_machines(ray, useful, cells, output)
 
-        def run(waiting: list[tuple[str, Cell]], report: Report, end: End) -> None:
-            count = ray_cluster.places(useful, share, cuda)
-            size, room = _some(len(useful), "machine"), f"{_some(count, 'cell')} at a time"
-            report(f"Ray cluster of {size}: {room}, each with {_some(share, 'thread')}")
+        def run(waiting: list[tuple[str, Cell]], report: ReportLine, end: CellEnded) -> None:
+            count = ray_cluster.cells_at_a_time(useful, share, cuda)
+            size, room = _counted(len(useful), "machine"), f"{_counted(count, 'cell')} at a time"
+            report(f"Ray cluster of {size}: {room}, each with {_counted(share, 'thread')}")
             if len(processors) > 1:
                 report(f"processors differ, and so may the last digits of results: {', '.join(processors)}")
-            placed = [(place, replace(cell, device="cuda" if cuda else "cpu")) for place, cell in waiting]
-            head = ray_cluster.Head(ray, address)
-            _Sweep(ray, expected, share, cuda, report, end, head.check, jobs).run(placed)
+            placed = [(label, replace(cell, device="cuda" if cuda else "cpu")) for label, cell in waiting]
+            head = ray_cluster.HeadMonitor(ray, address)
+            Sweep(ray, expected, share, cuda, report, end, head.check, jobs).run(placed)
 
         yield run
 
 
-def _some(count: int, what: str) -> str:
+def _counted(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def _look(ray: Any, useful: Sequence[Machine], cells: Sequence[Cell], output: Path) -> tuple[dict[str, str], list[str]]:
+def _inspect_machines(
+    ray: Any, useful: Sequence[Machine], cells: Sequence[Cell], output: Path
+) -> tuple[dict[str, str], list[str]]:
     """Ask every machine whether it can train the cells.
 
     Returns:
-        the identity that all of them have, and their processors' models.
+        The identity that all of them share, and the models of their processors.
 
     Raises:
-        UserError: one cannot; names it, and why.
+        UserError: a machine cannot; names it and the reason.
     """
     ours = identity()
     folders = {str(cell.settings["data"]["folder"]) for cell in cells}
@@ -95,23 +107,23 @@ def _look(ray: Any, useful: Sequence[Machine], cells: Sequence[Cell], output: Pa
         "data": {folder: fingerprint(Path(folder)) for folder in sorted(folders)},
         "weights": cells[0].lpips_weights,
     }
-    with _token(output) as (file, token):
+    with token_file(output) as (file, token):
         question |= {"token_file": str(file), "token": token}
         answers = _ask_all(ray, useful, question)
     expected: dict[str, str] = {name: value for name, value in ours.items() if name not in PACKAGES}
     for machine, answer in answers:
-        differs = difference(answer["identity"], expected)
+        differs = identity_difference(answer["identity"], expected)
         if differs is not None:
             raise UserError(f"--ray: {machine.host} has {differs}; install the same on every machine")
         if answer["problem"] is not None:
             raise UserError(f"--ray: {machine.host} {answer['problem']}")
-        expected = {**answer["identity"], **expected}  # the first one's packages count
+        expected = {**answer["identity"], **expected}  # The first machine's packages count.
     return expected, sorted({answer["processor"] for _, answer in answers})
 
 
 @contextmanager
-def _token(output: Path) -> Iterator[tuple[Path, str]]:
-    """A locked file in ``output`` with a text that nobody can guess; both are gone afterwards.
+def token_file(output: Path) -> Iterator[tuple[Path, str]]:
+    """Make a locked file with a random text in ``output``; remove it afterwards.
 
     Raises:
         UserError: ``output`` cannot be written.
@@ -150,15 +162,15 @@ def _lock(opened: IO[str]) -> None:
 def _ask_all(ray: Any, useful: Sequence[Machine], question: dict[str, Any]) -> list[tuple[Machine, dict[str, Any]]]:
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    task = ray.remote(look)
+    task = ray.remote(inspect_machine)
     refs = {}
     for machine in useful:
         there = NodeAffinitySchedulingStrategy(machine.id, soft=False)
         refs[task.options(num_cpus=0, max_retries=0, scheduling_strategy=there).remote(question)] = machine
-    done, late = ray.wait(list(refs), num_returns=len(refs), timeout=LOOK_SECONDS)
+    done, late = ray.wait(list(refs), num_returns=len(refs), timeout=INSPECT_SECONDS)
     if late:
         raise UserError(
-            f"--ray: {refs[late[0]].host} gave no answer within {LOOK_SECONDS:.0f} s; look at it, or stop it"
+            f"--ray: {refs[late[0]].host} gave no answer within {INSPECT_SECONDS:.0f} s; look at it, or stop it"
         )
     answers = []
     for ref in done:
@@ -175,25 +187,25 @@ def _ask_all(ray: Any, useful: Sequence[Machine], question: dict[str, Any]) -> l
 
 
 def _cause(error: Exception) -> str:
-    """One line, the innermost reason that Ray gives."""
+    """Return the innermost reason that Ray gives, in one line."""
     lines = [line.strip() for line in str(getattr(error, "cause", None) or error).splitlines() if line.strip()]
-    found = [line for line in lines if "Error: " in line]
-    return (found or lines or [type(error).__name__])[-1]
+    reasons = [line for line in lines if "Error: " in line]
+    return (reasons or lines or [type(error).__name__])[-1]
 
 
 @dataclass
-class _Task:
-    """A cell that was handed to the cluster."""
+class Task:
+    """A cell that was submitted to the cluster."""
 
-    place: str
+    label: str
     cell: Cell
     attempt: int = 1
     losses: int = 0
-    """Since the checkpoint last changed."""
+    """Workers lost since the checkpoint last changed."""
     mark: int = 0
-    """The checkpoint's time of change, ns, when a worker was last lost."""
+    """Modification time of the checkpoint, ns, when a worker was last lost."""
     seen: bool = False
-    """Whether it was reported to run."""
+    """Whether the report has said where it runs."""
     done: int = 0
     """Steps."""
 
@@ -207,39 +219,39 @@ class _Task:
 
 
 @dataclass
-class _Sweep:
-    """The cells on their way."""
+class Sweep:
+    """All cells of one call, from submission to their ends."""
 
     ray: Any
     expected: dict[str, str]
     threads: int
     cuda: bool
-    report: Report
-    end: End
+    report: ReportLine
+    end: CellEnded
     check: Callable[[], None] = lambda: None
-    """Raises a UserError when the cluster is lost."""
+    """Raises a UserError if the cluster is lost."""
     jobs: int = 1
     """Cells at a time on each machine."""
     sweep: str = field(default_factory=lambda: uuid.uuid4().hex)
-    running: dict[Any, _Task] = field(default_factory=dict)
-    """By what Ray calls their results."""
+    running: dict[Any, Task] = field(default_factory=dict)
+    """Tasks by Ray's references to their results."""
     ended: int = 0
 
     def __post_init__(self) -> None:
-        # A process for each cell, as the local runner has; retries are ours.
+        # Each cell gets a process of its own, as the local runner gives it, and Ray does not retry.
         options = {"num_cpus": self.threads, "num_gpus": 1 if self.cuda else 0, "max_calls": 1, "max_retries": 0}
-        self._work = self.ray.remote(**options)(work)
+        self._work = self.ray.remote(**options)(train_cell)
 
     def run(self, waiting: Sequence[tuple[str, Cell]]) -> None:
-        """All of them, to the end.
+        """Run all cells to their ends.
 
         Raises:
-            KeyboardInterrupt: after Ctrl-C or SIGTERM, the running cells' checkpoints being saved.
+            KeyboardInterrupt: Ctrl-C or SIGTERM came; the running cells save their checkpoints.
             UserError: the cluster is lost.
         """
-        tasks = [_Task(place, cell) for place, cell in waiting]
+        tasks = [Task(label, cell) for label, cell in waiting]
         for task in tasks:
-            task.mark, task.done = _changed(task.folder), min(_steps_done(task.folder), task.steps)
+            task.mark, task.done = _changed(task.folder), min(steps_done(task.folder), task.steps)
         total, done = sum(task.steps for task in tasks), sum(task.done for task in tasks)
         with progress(total, "steps of all cells", start=done) as bar, stop_signals() as stop:
             try:
@@ -252,14 +264,14 @@ class _Sweep:
                         self._collect(ref, bar)
                     if stop.is_set():
                         raise KeyboardInterrupt
-                    self._look(bar, len(tasks))
+                    self._update_progress(bar, len(tasks))
             except ConnectionError as error:
                 raise UserError(f"--ray: the connection is lost ({error}); the same command continues") from error
             finally:
                 if self.running:
                     self._stop()
 
-    def _submit(self, task: _Task) -> None:
+    def _submit(self, task: Task) -> None:
         order = {
             "cell": cell_to_json(task.cell),
             "threads": self.threads,
@@ -274,7 +286,7 @@ class _Sweep:
         task.seen = False
 
     def _collect(self, ref: Any, bar: Progress) -> None:
-        """A task has ended, somehow."""
+        """Handle a task that has ended: submit it again, or report its end."""
         task = self.running.pop(ref)
         lost, failure = self._outcome(ref)
         if lost is not None:
@@ -282,19 +294,19 @@ class _Sweep:
             task.losses = 1 if changed != task.mark else task.losses + 1
             task.mark = changed
             if task.losses < MOST_LOSSES:
-                self.report(f"{task.place}: {lost}; it goes on elsewhere, from its checkpoint if it has one")
+                self.report(f"{task.label}: {lost}; it goes on elsewhere, from its checkpoint if it has one")
                 task.attempt += 1
                 self._submit(task)
                 return
             failure = f"{lost}, {task.losses} times without a step forward; see {task.folder / LOG}"
-        elif failure is None and not _appears(task.folder / "metrics.json"):
+        elif failure is None and not appears(task.folder / "metrics.json"):
             failure = f"trained, but its metrics.json is not seen in {task.folder} here; is the folder shared?"
         bar.advance(task.steps - task.done)
         self.ended += 1
-        self.end(task.place, task.cell, failure)
+        self.end(task.label, task.cell, failure)
 
     def _outcome(self, ref: Any) -> tuple[str | None, str | None]:
-        """Why the worker was lost, or why the cell failed; neither: it is trained."""
+        """Say why the worker was lost, or why the cell failed; (None, None) if the cell is trained."""
         errors = self.ray.exceptions
         try:
             answer = self.ray.get(ref)
@@ -304,8 +316,8 @@ class _Sweep:
             return _loss(error), None
         return ("its worker was stopped", None) if answer["stopped"] else (None, answer["failure"])
 
-    def _look(self, bar: Progress, total: int) -> None:
-        """Which cells run, and how far they are."""
+    def _update_progress(self, bar: Progress, total: int) -> None:
+        """Report cells that have begun, and advance the bar."""
         active = 0
         for task in self.running.values():
             worker = _read(task.folder / WORKER)
@@ -314,25 +326,25 @@ class _Sweep:
             active += 1
             if not task.seen:
                 task.seen = True
-                self.report(f"{task.place}: on {worker['host']}, {task.folder / LOG}")
-            done = min(_steps_done(task.folder), task.steps)
+                self.report(f"{task.label}: on {worker['host']}, {task.folder / LOG}")
+            done = min(steps_done(task.folder), task.steps)
             bar.advance(done - task.done)
             task.done = done
         bar.advance(0, cells=f"{self.ended}/{total}", running=active)
 
     def _stop(self) -> None:
-        """Ask all that run to save and end; forget those that wait."""
+        """Ask running cells to save and end; cancel waiting ones."""
         self.report("stopping: cells that run save their checkpoints")
         try:
             for ref in self.running:
                 self.ray.cancel(ref, force=False)
             self.ray.wait(list(self.running), num_returns=len(self.running), timeout=STOP_SECONDS)
         except ConnectionError:
-            pass  # then the cluster ends them
+            pass  # The cluster ends tasks whose driver has left.
 
 
 def _loss(error: Exception) -> str:
-    """Why a worker is no more."""
+    """Say why a worker was lost."""
     known = {
         "WorkerCrashedError": "its worker was killed",
         "NodeDiedError": "its machine was lost",
@@ -344,7 +356,7 @@ def _loss(error: Exception) -> str:
 
 
 def _changed(folder: Path) -> int:
-    """When the checkpoint was last written, ns; 0 without one."""
+    """Return the modification time of the checkpoint, ns; 0 without one."""
     try:
         return (folder / CHECKPOINT).stat().st_mtime_ns
     except OSError:
@@ -359,8 +371,8 @@ def _read(path: Path) -> dict[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
-def _steps_done(folder: Path) -> int:
-    """By the end of the log; 0 without one."""
+def steps_done(folder: Path) -> int:
+    """Read the last step from the log; 0 without one."""
     try:
         with open(folder / "log.jsonl", "rb") as file:
             file.seek(max(0, file.seek(0, 2) - TAIL))
@@ -371,16 +383,16 @@ def _steps_done(folder: Path) -> int:
         try:
             return int(parse_json(line)["step"])
         except (ValueError, KeyError, TypeError):
-            continue  # a line that is being written, or was cut
+            continue  # The line is being written, or was cut.
     return 0
 
 
-def _appears(path: Path, seconds: float = VISIBLE_SECONDS) -> bool:
-    """Whether a file that another machine wrote is there, or comes in time."""
+def appears(path: Path, seconds: float = VISIBLE_SECONDS) -> bool:
+    """Wait for a file of another machine; False if it does not appear in time."""
     until = time.monotonic() + seconds
     while not path.is_file():
         if time.monotonic() > until:
             return False
-        list(path.parent.iterdir())  # makes a client of NFS look again
+        list(path.parent.iterdir())  # Listing the folder makes an NFS client look again.
         time.sleep(POLL_SECONDS)
     return True

@@ -1,5 +1,7 @@
-"""What the machines of a cluster do for an ablation: say what they are and see, and train a cell. Knows no cluster:
-texts, numbers, lists and dictionaries come in and go out."""
+"""Tasks that a machine of a cluster runs for an ablation: describe the machine, and train a cell.
+
+Arguments and results are plain data; nothing here depends on Ray.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +26,18 @@ from ..training.run_folder import LOCK
 from .cells import LOG, attempt, cell_from_json
 
 WORKER = "worker.json"
-"""In a cell's folder: which process of which machine trains it, or did last."""
+"""File in a cell's folder that names the machine and the process that train it, or did last."""
 PACKAGES = ("torch", "warp-lang", "numpy")
-"""Other versions of these may round differently."""
+"""Packages whose versions must agree, since others may round differently."""
 LOCK_SECONDS = 150.0
-"""A file server gives the locks of a dead machine back after its lease, NFS after 90 s."""
+"""Wait for a lost worker's lock: a file server releases the locks of a dead machine after its lease, NFS after 90 s."""
 SMALL = 1 << 22
-"""Bytes of files whose content tells data sets apart; of larger ones the size has to do."""
+"""Largest file, in bytes, whose content is part of a fingerprint; larger ones count by their size."""
 
 
 def source_hash() -> str:
-    """Of the code that trains: the package without its apps, wherever its parts are installed."""
-    found = hashlib.sha256()
+    """Hash the code that trains: the package without its apps, wherever its parts are installed."""
+    digest = hashlib.sha256()
     for name in ("scgs_warp", "scgs_warp.kernels"):
         spec = importlib.util.find_spec(name)
         assert spec is not None and spec.submodule_search_locations
@@ -43,64 +45,64 @@ def source_hash() -> str:
         files = {path.relative_to(root).as_posix(): path for path in root.rglob("*.py")}
         for relative, path in sorted(files.items()):
             if name == "scgs_warp" and relative.partition("/")[0] in ("kernels", "apps"):
-                continue  # there in an installed package, elsewhere in a clone
+                continue  # An installed package holds these; a clone has them elsewhere.
             content = path.read_bytes().replace(b"\r\n", b"\n")
-            found.update(f"{name}/{relative} {len(content)}\n".encode())
-            found.update(content)
-    return found.hexdigest()
+            digest.update(f"{name}/{relative} {len(content)}\n".encode())
+            digest.update(content)
+    return digest.hexdigest()
 
 
 def identity() -> dict[str, str]:
-    """What two machines must have in common: the version, the code and the packages that compute."""
+    """Return what two machines must have in common: the version, the code and the packages that compute."""
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {"scgs_warp": __version__, "code": source_hash()[:12], **versions}
 
 
-def difference(found: dict[str, str], wanted: dict[str, str]) -> str | None:
-    """``torch 2.8.0, not 2.9.0``: the first thing two identities differ in."""
+def identity_difference(actual: dict[str, str], wanted: dict[str, str]) -> str | None:
+    """Say in what two identities differ first: ``torch 2.8.0, not 2.9.0``."""
     for name, value in wanted.items():
-        if found.get(name) != value:
-            return f"{name} {found.get(name)}, not {value}"
+        if actual.get(name) != value:
+            return f"{name} {actual.get(name)}, not {value}"
     return None
 
 
 def fingerprint(folder: Path) -> str:
-    """Tells whether two folders of data are one, or at least copies: files on top, small ones with their content.
+    """Hash the files directly in a data folder, small ones with their content, to recognise copies.
 
     Raises:
         OSError: the folder cannot be read.
     """
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for path in sorted(folder.iterdir()):
         if path.name.startswith(".") or not path.is_file():
             continue
         size = path.stat().st_size
-        found.update(f"{path.name} {size}\n".encode())
+        digest.update(f"{path.name} {size}\n".encode())
         if size <= SMALL:
-            found.update(path.read_bytes())
-    return found.hexdigest()
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def processor() -> str:
-    """Its model, as the system calls it."""
+    """Return the processor's model, as the system calls it."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     except OSError:
-        pass  # not Linux
+        pass  # The system is not Linux.
     return platform.processor() or platform.machine()
 
 
-def look(question: dict[str, Any]) -> dict[str, Any]:
-    """What this machine is, and whether it can train the cells.
+def inspect_machine(question: dict[str, Any]) -> dict[str, Any]:
+    """Describe this machine, and check whether it can train the cells.
 
     Args:
-        question: ``token_file`` in the folder of the cells, which the asker holds locked, and the ``token`` in it;
+        question: ``token_file`` in the folder of the cells, which the driver holds locked, and the ``token`` in it;
             ``data``, fingerprints by folder; ``weights``, a file, or None.
 
     Returns:
-        ``host``, ``identity``, ``processor``, and ``problem``: one line, None if all is well.
+        ``host``, ``identity``, ``processor``, and ``problem`` in one line, None if the machine can train them.
     """
     return {
         "host": socket.gethostname(),
@@ -111,7 +113,7 @@ def look(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def _folder_problem(file: Path, token: str) -> str | None:
-    """Whether the cells' folder is the same here, can be written, and is locked for all if it is for one."""
+    """Check that the cells' folder is the shared one, can be written, and knows the locks of other machines."""
     try:
         same = file.read_text(encoding="utf-8") == token
     except OSError:
@@ -124,7 +126,7 @@ def _folder_problem(file: Path, token: str) -> str | None:
     except OSError as error:
         return f"cannot write to --output {file.parent} ({error.strerror})"
     try:
-        if os.name == "posix" and free(file):
+        if os.name == "posix" and is_unlocked(file):
             return (
                 f"takes a lock in --output {file.parent} that another machine holds: two could train one cell; "
                 "mount it with locks for all (NFS 4; Lustre with -o flock)"
@@ -134,8 +136,8 @@ def _folder_problem(file: Path, token: str) -> str | None:
     return None
 
 
-def free(file: Path) -> bool:
-    """Whether nobody holds a lock on ``file``; True where there are no such locks (Windows).
+def is_unlocked(file: Path) -> bool:
+    """Tell whether no process holds a lock on ``file``; True where there are no such locks (Windows).
 
     Raises:
         OSError: the file cannot be opened, or the file system has no locks.
@@ -157,10 +159,10 @@ def free(file: Path) -> bool:
 def _data_problem(question: dict[str, Any]) -> str | None:
     for folder, expected in question["data"].items():
         try:
-            found = fingerprint(Path(folder))
+            actual = fingerprint(Path(folder))
         except OSError as error:
             return f"cannot read --data {folder} ({error.strerror}); it must be there under the same path everywhere"
-        if found != expected:
+        if actual != expected:
             return f"has another --data {folder}; it must hold the same files everywhere"
     weights = question["weights"]
     if weights is not None and not Path(weights).is_file():
@@ -168,16 +170,16 @@ def _data_problem(question: dict[str, Any]) -> str | None:
     return None
 
 
-def work(order: dict[str, Any]) -> dict[str, Any]:
-    """Train and measure a cell, or as much of that as is left to do.
+def train_cell(order: dict[str, Any]) -> dict[str, Any]:
+    """Train and measure a cell, or complete what is left to do.
 
     Args:
         order: ``cell`` as JSON; ``threads``; ``identity`` that this machine must have; ``sweep`` and ``attempt``, by
-            which the asker knows ``worker.json``; ``wait``, seconds for a lost worker's lock; ``memory``, bytes that
-            the cell may take, or None; ``siblings``, cells at a time on this machine.
+            which the driver recognises ``worker.json``; ``wait``, seconds for a lost worker's lock; ``memory``, bytes
+            that the cell may take, or None; ``siblings``, cells at a time on this machine.
 
     Returns:
-        ``failure``, one line, or None; and ``stopped``: whether a signal ended it, the checkpoint being saved.
+        ``failure``, one line, or None; and ``stopped``: whether a signal ended it, with the checkpoint saved.
     """
     environment.configure(order["threads"])
     os.environ[memory.SIBLINGS_VARIABLE] = str(order["siblings"])
@@ -185,18 +187,18 @@ def work(order: dict[str, Any]) -> dict[str, Any]:
         memory.set_limit(order["memory"] / memory.GIB)
     cell = cell_from_json(order["cell"])
     folder = Path(cell.folder)
-    place = {"sweep": order["sweep"], "attempt": order["attempt"], "host": socket.gethostname(), "pid": os.getpid()}
+    worker = {"sweep": order["sweep"], "attempt": order["attempt"], "host": socket.gethostname(), "pid": os.getpid()}
     try:
-        differs = difference(identity(), order["identity"])
-        if differs is not None:  # a machine that joined since the cluster was looked at
-            failure = f"{place['host']} has {differs}; install the same everywhere, and change nothing meanwhile"
+        differs = identity_difference(identity(), order["identity"])
+        if differs is not None:  # The machine joined the cluster after it was inspected.
+            failure = f"{worker['host']} has {differs}; install the same everywhere, and change nothing meanwhile"
             return {"failure": failure, "stopped": False}
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / WORKER, json.dumps(place).encode())
+        write_atomically(folder / WORKER, json.dumps(worker).encode())
         with open(folder / LOG, "a", buffering=1, encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
-            print(f"on {place['host']}, process {place['pid']}")
+            print(f"on {worker['host']}, process {worker['pid']}")
             _wait_for_lock(folder / LOCK, order["wait"])
-            _check_device(cell.device, place["host"])
+            _check_device(cell.device, worker["host"])
             failure = attempt(cell)
     except KeyboardInterrupt:
         return {"failure": None, "stopped": True}
@@ -206,12 +208,12 @@ def work(order: dict[str, Any]) -> dict[str, Any]:
 
 
 def _wait_for_lock(file: Path, seconds: float) -> None:
-    """A worker that is given up may live on for a while, or its lock may."""
+    """Wait until a lost worker, or its lock, is gone."""
     until = time.monotonic() + seconds
-    if seconds <= 0.0 or not file.is_file() or free(file):
+    if seconds <= 0.0 or not file.is_file() or is_unlocked(file):
         return
     print(f"waiting for the lock {file}")
-    while time.monotonic() < until and not free(file):
+    while time.monotonic() < until and not is_unlocked(file):
         time.sleep(1.0)
 
 

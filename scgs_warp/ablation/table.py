@@ -1,4 +1,4 @@
-"""The table of an ablation, from the cells that are there, beside the published figures."""
+"""Table of an ablation: the finished cells beside the published figures."""
 
 from __future__ import annotations
 
@@ -11,27 +11,29 @@ from typing import Any
 from ..config.presets import FREE_TO_CHANGE
 from ..errors import UserError
 from ..storage.files import write_atomically
-from .cells import VARIED, Cell, cell_folder, difference, discover, read_metrics, recorded, sort_values
+from .cells import VARIED, Cell, cell_folder, discover, first_difference, read_metrics, recorded_settings, sort_values
+from .markdown import markdown
+from .plot import picture
 from .published import PUBLISHED_PSNR, TABLE_S1
 
 METRICS = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds")
 REFERENCE = {"motion": "control-points", "arap": "per-gaussian"}
-"""The row that the others of a table are compared with."""
+"""Row of each table that the others are compared with."""
 
 Row = dict[str, Any]
 
 
 def build(ablation: str, output: Path, planned: Sequence[Cell] = ()) -> dict[str, Any]:
-    """Everything the table says.
+    """Collect the cells and compute the tables.
 
     Args:
-        output: holds the cells, ``SCENE/VALUE[-seedN]``.
-        planned: cells that are to have a place even while they are missing.
+        output: Folder of the cells, ``SCENE/VALUE[-seedN]``.
+        planned: Cells that have an entry even while they are missing.
 
     Returns:
-        ``ablation``, ``settings`` (what the cells share), ``scenes``, ``values``, ``seeds``, ``cells`` (one entry each,
-        metrics None while missing) and ``tables``: the mean over scenes, if there are several, then one for each scene,
-        with ``rows`` of statistics {mean, std, count}, None where cells are missing.
+        ``ablation``, ``settings`` (shared by the cells), ``scenes``, ``values``, ``seeds``, ``cells`` (one entry each,
+        metrics None while missing) and ``tables``: the mean over several scenes, then one table for each scene, with
+        ``rows`` of statistics {mean, std, count}, None for missing cells.
 
     Raises:
         UserError: there are no cells, a file is damaged, or cells differ in more than the ablation varies.
@@ -71,21 +73,21 @@ def _without_images(cell: Row) -> Row:
 
 
 def _shared_settings(ablation: str, output: Path, cells: list[Row], planned: Sequence[Cell]) -> dict[str, Any]:
-    """What the table's head says; refuses to compare what was made differently."""
+    """Return the settings in the head of the table; refuse to compare cells with different ones."""
     ignored = (*VARIED[ablation], *FREE_TO_CHANGE, "seed", "data.folder")
     first, shared = "the options", planned[0].settings if planned else None
     for cell in cells:
         folder = output / cell["scene"] / cell_folder(cell["value"], cell["seed"])
-        settings = recorded(folder) if cell["metrics"] is not None else None
+        settings = recorded_settings(folder) if cell["metrics"] is not None else None
         if settings is None:
             continue
         if shared is None:
             first, shared = str(folder), settings
-        differs = difference(settings, shared, ignored)
+        differs = first_difference(settings, shared, ignored)
         if differs is not None:
-            name, found, wanted = differs
+            name, actual, wanted = differs
             raise UserError(
-                f"{folder}: made with {name} = {found!r}, but {first} has {wanted!r}: not one table; "
+                f"{folder}: made with {name} = {actual!r}, but {first} has {wanted!r}: not one table; "
                 "give the same options, or another --output"
             )
     if shared is None:
@@ -95,7 +97,7 @@ def _shared_settings(ablation: str, output: Path, cells: list[Row], planned: Seq
 
 
 def statistics(values: Sequence[float]) -> dict[str, Any] | None:
-    """Mean, standard deviation of a sample (None of one) and count; None of nothing."""
+    """Compute mean, standard deviation of the sample (None for one value) and count; None without values."""
     if not values:
         return None
     mean = math.fsum(values) / len(values)
@@ -104,26 +106,28 @@ def statistics(values: Sequence[float]) -> dict[str, Any] | None:
 
 
 def _over_scenes(cells: list[Row], scenes: list[str], key: str) -> dict[str, Any] | None:
-    """Seeds as the sample, each the mean over the scenes; the mean itself takes every cell there is. None unless every
-    scene has one: a mean over fewer scenes is none of these."""
-    found: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
+    """Compute the mean over scenes of their means over seeds, and the deviation of the seeds that every scene has.
+
+    None unless every scene has a cell, since a mean over fewer scenes is not comparable.
+    """
+    known: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
     for cell in cells:
-        if cell["scene"] in found and _has(cell, key):
-            found[cell["scene"]][cell["seed"]] = float(cell["metrics"][key])
-    if not all(found.values()):
+        if cell["scene"] in known and _has(cell, key):
+            known[cell["scene"]][cell["seed"]] = float(cell["metrics"][key])
+    if not all(known.values()):
         return None
-    complete = set.intersection(*(set(values) for values in found.values()))
-    sample = statistics([math.fsum(v[seed] for v in found.values()) / len(scenes) for seed in sorted(complete)])
-    mean = math.fsum(math.fsum(v.values()) / len(v) for v in found.values()) / len(scenes)
+    complete = set.intersection(*(set(values) for values in known.values()))
+    sample = statistics([math.fsum(v[seed] for v in known.values()) / len(scenes) for seed in sorted(complete)])
+    mean = math.fsum(math.fsum(v.values()) / len(v) for v in known.values()) / len(scenes)
     return {
         "mean": mean,
         "std": None if sample is None else sample["std"],
-        "count": sum(len(values) for values in found.values()),
+        "count": sum(len(values) for values in known.values()),
     }
 
 
 def _table(report: dict[str, Any], cells: list[Row], scenes: list[str]) -> dict[str, Any]:
-    """The rows of some scenes together."""
+    """Compute the rows of ``scenes`` together."""
     ablation = report["ablation"]
     alone = len(scenes) < len(report["scenes"])
     rows: list[Row] = []
@@ -143,7 +147,7 @@ def _table(report: dict[str, Any], cells: list[Row], scenes: list[str]) -> dict[
 
 
 def _compare(ablation: str, rows: list[Row]) -> None:
-    """How far each row is from the best one, or from the reference."""
+    """Add to each row its distance from the best row or from the reference."""
 
     def mean(row: Row | None, key: str) -> float | None:
         return None if row is None or row[key] is None else row[key]["mean"]
@@ -166,7 +170,7 @@ def _compare(ablation: str, rows: list[Row]) -> None:
 
 
 def _published_leads(rows: list[Row], scenes: list[str], key: str) -> None:
-    """The published mean over ``scenes``, None unless all of them are known."""
+    """Add the published means over ``scenes`` to the rows if they are known for all of these."""
     ours = PUBLISHED_PSNR["control-points"]
     if not all(scene in ours for scene in scenes):
         return
@@ -178,14 +182,11 @@ def _published_leads(rows: list[Row], scenes: list[str], key: str) -> None:
 
 
 def write(report: dict[str, Any], output: Path) -> list[Path]:
-    """``ABLATION.json``, ``ABLATION.md`` and ``ABLATION.png`` in ``output``.
+    """Write ``ABLATION.json``, ``ABLATION.md`` and ``ABLATION.png`` to ``output``.
 
     Raises:
-        UserError: they cannot be written.
+        UserError: a file cannot be written.
     """
-    from .markdown import markdown
-    from .plot import picture
-
     contents = {
         "json": (json.dumps(report, indent=2) + "\n").encode(),
         "md": markdown(report).encode(),

@@ -1,1 +1,6 @@
-"""Benchmarks of a frame, a rasterisation, a training step and an edit."""
+"""Benchmarks of a frame, a rasterisation, a training step and an edit.
+
+``run`` measures a ``plan``, and ``scaling`` sweeps over sizes. ``workloads`` and ``editing`` define what is timed,
+``scenes`` the synthetic scene, ``timing`` and ``memory`` how it is measured, ``roofline`` the least possible times, and
+``gsplat`` compares with another renderer.
+"""

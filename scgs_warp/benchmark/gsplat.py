@@ -1,4 +1,4 @@
-"""Other renderers beside this project: they must draw the same picture before they are timed."""
+"""Comparison with gsplat: both renderers must draw the same image before they are timed."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from torch import Tensor
 
 from ..errors import UserError
 from ..rendering import rasterize
-from .plan import MIDDLE, Place, Plan, posed
+from .plan import MIDDLE, BenchCase, BenchPlan, posed
 from .workloads import Leaves
 
 TOLERANCE = 1e-4
-LARGEST = 8e-3
+LARGEST_DIFFERENCE = 8e-3
 AGREEING = 0.999
-"""The rule by which two renderers agree: this share of pixels within TOLERANCE, none beyond LARGEST."""
+"""Share of pixels within TOLERANCE for two renderers to agree; no pixel may differ by more than LARGEST_DIFFERENCE."""
 
 
 class Peers:
-    """gsplat beside this project: the same Gaussians and camera through the same entry point."""
+    """gsplat and this project, given the same Gaussians and camera through the same entry point."""
 
     def __init__(self, rasterization: Callable[..., Any]) -> None:
         self.rasterization = rasterization
 
     @staticmethod
-    def find(plan: Plan) -> Peers:
-        """
+    def find(plan: BenchPlan) -> Peers:
+        """Import gsplat.
+
         Raises:
             UserError: gsplat is not installed, or there is no GPU, without which it does not composite.
         """
@@ -41,12 +42,12 @@ class Peers:
             raise UserError(f"--against gsplat: it cannot be imported ({error}); pip install gsplat==1.5.3") from error
         return Peers(gsplat.rasterization)
 
-    def rows(self, place: Place) -> list[dict[str, Any]]:
-        """Images are compared first; what disagrees is not timed."""
-        leaves = Leaves(*posed(place.scene, place.plan.size, MIDDLE))
+    def rows(self, case: BenchCase) -> list[dict[str, Any]]:
+        """Compare the images, then time both renderers."""
+        leaves = Leaves(*posed(case.scene, case.plan.size, MIDDLE))
         renderers = {"scgs_warp": rasterize.rasterization, "gsplat": self.rasterization}
         with torch.no_grad():
-            agree(leaves.rasterize(rasterize.rasterization), leaves.rasterize(self.rasterization))
+            check_agreement(leaves.rasterize(rasterize.rasterization), leaves.rasterize(self.rasterization))
         rows = []
         for renderer, function in renderers.items():
 
@@ -57,23 +58,24 @@ class Peers:
             def both(index: int, function: Callable[..., Any] = function) -> None:
                 torch.autograd.grad(leaves.rasterize(function), (*leaves.geometry, leaves.harmonics), leaves.v_image)
 
-            rows += place.rows("raster/forward", forward, {}, renderer)
-            rows += place.rows("raster/both", both, {}, renderer)
+            rows += case.rows("raster/forward", forward, {}, renderer)
+            rows += case.rows("raster/both", both, {}, renderer)
         return rows
 
 
-def agree(ours: Tensor, theirs: Tensor, name: str = "--against gsplat") -> None:
-    """
+def check_agreement(ours: Tensor, theirs: Tensor, name: str = "--against gsplat") -> None:
+    """Check that two images agree.
+
     Args:
         ours, theirs: [C, H, W].
-        name: what the message begins with.
+        name: Beginning of the message.
 
     Raises:
-        UserError: by the rule of agreement they are not the same picture.
+        UserError: they do not, by ``AGREEING`` and ``LARGEST_DIFFERENCE``.
     """
     difference = (ours - theirs).abs().amax(0)
     within, largest = float((difference <= TOLERANCE).double().mean()), float(difference.max())
-    if not (within >= AGREEING and largest <= LARGEST):  # NaN disagrees
+    if not (within >= AGREEING and largest <= LARGEST_DIFFERENCE):  # The comparison is false for NaN, too.
         raise UserError(
             f"{name}: the images differ ({100 * within:.3f} % of pixels within {TOLERANCE:g}, largest "
             f"difference {largest:.2g}), so times would compare nothing; try --gaussians instead of --run, or report it"

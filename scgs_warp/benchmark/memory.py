@@ -1,4 +1,4 @@
-"""Memory of a benchmark: what a model holds, and what measuring it takes on top."""
+"""Memory of a benchmark: the model's own, and what measuring takes beyond it."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ MIB = 2**20
 
 
 def model_mib(scene: Scene) -> float:
-    """The Gaussians' own tensors and those of the motion model: what a checkpoint of the scene holds."""
+    """Return the size of the Gaussians' tensors and the motion model's, which a checkpoint of the scene holds."""
     return sum(tensor.numel() * tensor.element_size() for tensor in scene.tensors().values()) / MIB
 
 
 def _status(key: str) -> float | None:
-    """A line of /proc/self/status in MiB; None where there is none (outside Linux)."""
-    found = memory.status(key)
-    return None if found is None else found / MIB
+    """Read a line of /proc/self/status in MiB; None outside of Linux."""
+    value = memory.status(key)
+    return None if value is None else value / MIB
 
 
 def hand_back() -> None:
-    """Freed memory goes back to the system, so that what is resident is what is used (glibc keeps it otherwise)."""
+    """Return freed memory to the system, so that resident memory is used memory (glibc keeps it otherwise)."""
     gc.collect()
     memory.hand_back()
 
 
 def resident_mib(device: str) -> float | None:
-    """In use now: allocated by torch on CUDA, resident on a CPU; None where the system does not say."""
+    """Return the memory in use: allocated by torch on CUDA, resident on a CPU; None if the system does not say."""
     hand_back()
     if device == "cuda":
         torch.cuda.synchronize()
@@ -42,7 +42,7 @@ def resident_mib(device: str) -> float | None:
 
 
 def reset_peak(device: str) -> None:
-    """From here on :func:`peak_mib` counts anew, where the system can do that."""
+    """Reset the peak of :func:`peak_mib`, where the system can do that."""
     hand_back()
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
@@ -52,8 +52,8 @@ def reset_peak(device: str) -> None:
 
 
 def peak_mib(device: str) -> float | None:
-    """Most memory since :func:`reset_peak` (CUDA: what torch allocated; Linux: resident) or since the process began
-    (elsewhere: resident); None where the system does not say."""
+    """Return the peak since :func:`reset_peak` (CUDA: allocated by torch; Linux: resident) or since the process began
+    (elsewhere: resident); None if the system does not say."""
     if device == "cuda":
         return torch.cuda.max_memory_allocated() / MIB
     peak = _status("VmHWM")
@@ -68,5 +68,5 @@ def peak_mib(device: str) -> float | None:
 
 
 def extra_mib(peak: float | None, before: float | None) -> float | None:
-    """What measuring took beyond what was there ``before`` the first frame; None where either is unknown."""
+    """Return the memory that measuring took beyond ``before``, the use before the first frame; None if unknown."""
     return None if peak is None or before is None else max(peak - before, 0.0)

@@ -1,4 +1,4 @@
-"""One scene on one number of threads, and how rows of it are made."""
+"""What a benchmark measures, and the rows that it makes."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ KEYS = (
     *("pairs", "contributors", "covered", "ms_median", "ms_min", "fps", "share"),
     *("model_mib", "peak_mib", "extra_mib", "two_thread_scaling"),
 )
-"""Of every row. ``fps`` is None for a stage, whose ``share`` is that of the whole; ``share`` is None for a whole."""
+"""Keys of every row. ``fps`` is None for a stage; ``share``, a stage's part of the whole, is None for a whole."""
 MIDDLE = 0.5
-"""The instant whose load is counted, and at which a rasterisation is measured."""
+"""Time at which the load is counted and a rasterisation is measured."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What to measure, checked."""
+class BenchPlan:
+    """Checked options of a benchmark."""
 
     run: Path | None
     gaussians: int
@@ -43,16 +43,16 @@ class Plan:
 
 @torch.no_grad()
 def posed(scene: Scene, size: Size, time: float) -> tuple[Gaussians, Camera]:
-    """Gaussians at ``time`` and the camera, both in world units."""
+    """Return the Gaussians at ``time`` and the camera, both in world units."""
     return scene.gaussians_at(time), scene_camera(scene, size)
 
 
 @dataclass(frozen=True)
-class Place:
-    """One scene on one number of threads, and how rows of it are made."""
+class BenchCase:
+    """One scene on one number of threads."""
 
     scene: Scene
-    plan: Plan
+    plan: BenchPlan
     load: Load
     threads: int
     before_mib: float | None = None
@@ -66,7 +66,7 @@ class Place:
         renderer: str = "scgs_warp",
         staged: Callable[[int], Any] | None = None,
     ) -> list[dict[str, Any]]:
-        """The whole, undisturbed, then its stages, in calls of their own (of ``staged`` where that differs)."""
+        """Time the whole, undisturbed, then its stages, in separate calls (of ``staged`` where that differs)."""
         plan, device = self.plan, self.plan.device
         plan.report(f"{name}, {self.scene.motion_name}, {self.threads} threads")
         scaling = two_thread_scaling()

@@ -1,4 +1,4 @@
-"""Sweeps as figures: milliseconds over what grows, both logarithmic; what was measured solid, the limit dashed."""
+"""Figures of sweeps: milliseconds over the swept quantity, both logarithmic; measured times solid, limits dashed."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ COLORS = {
     "frame/composite": "#d55e00",
     "raster/both": "#888888",
 }
-"""A line each; colours that differ for colour-blind readers too (Okabe and Ito)."""
+"""Lines of a figure, in colours that colour-blind readers can tell apart (Okabe and Ito)."""
 SIZE = (7.2, 4.6)
 DPI = 110
 
 
 def draw(report: dict[str, Any], folder: Path) -> list[Path]:
-    """One small PNG a sweep, ``scaling-NAME.png``.
+    """Draw one small PNG for each sweep, ``scaling-NAME.png``.
 
     Args:
-        report: what :func:`scgs_warp.benchmark.scaling.scaling` returned.
-        folder: made if need be.
+        report: Result of :func:`scgs_warp.benchmark.scaling.scaling`.
+        folder: Made if it is missing.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the folder cannot be written.
     """
     written = []
     for name, entries in report["sweeps"].items():
@@ -54,7 +54,7 @@ def draw(report: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def series(entries: list[dict[str, Any]], row_name: str) -> tuple[list[int], list[float], list[float]]:
-    """Points, medians, and limits (empty if there are none) of one line; points without that row are left out."""
+    """Return points, medians and limits of one line, without points that lack the row; limits may be empty."""
     points, medians, limits = [], [], []
     for entry in entries:
         for row in entry["rows"]:
@@ -113,7 +113,7 @@ def _short(value: float) -> str:
 
 
 def _title(name: str, entries: list[dict[str, Any]], report: dict[str, Any]) -> str:
-    """What does not change along the sweep, and the machine."""
+    """Name the quantities that stay the same along the sweep, and the machine."""
     row = entries[0]["rows"][0]
     parts = {
         "gaussians": f"{row['gaussians']:,} Gaussians",

@@ -1,8 +1,7 @@
-"""The limit beside a time: what a stage must move and compute, over what this machine moves and computes at best.
+"""Least times of stages: bytes and flops that a stage needs, over the machine's best rates.
 
-The models count what the mathematics needs, each input read once and each output written once, however the code goes
-about it. They are lower bounds, not predictions: sorting, searching a tile for pixels and rounding up to vectors cost
-more than they say.
+The models count what the mathematics needs, with each input read once and each output written once. They are lower
+bounds, not predictions: sorting, searching a tile for pixels and rounding up to vectors come on top.
 """
 
 from __future__ import annotations
@@ -26,41 +25,43 @@ from .scenes import Load
 TURNS = 10
 CHUNKS = 64
 ROUNDS = 40_000
-"""Of multiply-adds in one chunk: well under a millisecond, far above what handing it to a thread costs."""
+"""Rounds of multiply-adds in a chunk: well under a millisecond, far above the cost of handing it to a thread."""
 BLOCKS = 256
-"""MiB copied: beyond every cache."""
+"""MiB that are copied, beyond every cache."""
 FLOAT = 4
 GEOMETRY = 12 + 16 + 12 + 4
 """Bytes of a Gaussian's mean, quaternion, scales and opacity."""
 SPLAT = 8 + 12 + 4 + 4 + 8
-"""Bytes of a projected one: mean, conic, depth, opacity, radii."""
+"""Bytes of a splat: mean, conic, depth, opacity, radii."""
 PROJECT_FLOPS = 170
-"""Counted in the formulas: view transform 18, rotation 36, its product with scales and view 63, Jacobian 30, covariance
-and inverse 23."""
+"""Flops to project a Gaussian: view transform 18, rotation 36, its product with scales and view 63, Jacobian 30,
+covariance and inverse 23."""
 HARMONIC_FLOPS = 80
-"""Direction and the basis of degree 3."""
+"""Flops for the direction and the basis of degree 3."""
 BLEND_FLOPS = 28
-"""A splat at a pixel: quadratic form 10, exponential 13, opacity and thresholds 3, transmittance 2. Channels extra."""
+"""Flops of a splat at a pixel, without channels: quadratic form 10, exponential 13, opacity and thresholds 3,
+transmittance 2."""
 ADJOINT_FLOPS = 70
-"""The same backwards: the forward values again (28), and gradients of alpha, power, mean, conic and opacity."""
+"""Flops of a splat at a pixel in the adjoint: forward values (28), and gradients of alpha, power, mean, conic and
+opacity."""
 
 
 class Limits(NamedTuple):
-    """What the machine does at best on this number of threads."""
+    """Best rates of the machine on a number of threads."""
 
     threads: int
     gigabytes: float
-    """Copied a second, reading and writing both counted."""
+    """Bandwidth of copying per second; reading and writing both count."""
     gigaflops: float
-    """Single precision, a multiply-add counted as two."""
+    """Single precision; a multiply-add counts as two."""
 
     def milliseconds(self, work: Work) -> float:
-        """The least time for ``work``: moving and computing at the same time."""
+        """Return the least time for ``work`` if moving and computing overlap."""
         return 1e3 * max(work.bytes / (1e9 * self.gigabytes), work.flops / (1e9 * self.gigaflops))
 
 
 class Work(NamedTuple):
-    """What a stage must do at least."""
+    """Least work of a stage."""
 
     bytes: float
     flops: float
@@ -76,27 +77,27 @@ def _best(function: Callable[[], None]) -> float:
 
 
 def measure_limits(threads: int, blocks: int | None = None) -> Limits:
-    """Time both loops on ``threads`` threads: the best of some turns, for a limit is what can be reached."""
+    """Measure bandwidth and arithmetic on ``threads`` threads; the best turn counts."""
     before = environment.thread_count()
     environment.configure(threads)
     values = torch.empty(CHUNKS)
     computing = _best(lambda: launch(kernels.multiply_add, CHUNKS, ROUNDS, values, grain=1))
     blocks = BLOCKS if blocks is None else blocks
     moving = _copying(blocks)
-    hand_back()  # no row shall count these buffers
+    hand_back()  # These buffers must not count in a row's memory.
     environment.configure(before)
     flops = 2.0 * CHUNKS * ROUNDS * ROOFLINE_CHAINS * LANES
     return Limits(threads, 2 * FLOAT * blocks * ROOFLINE_BLOCK / moving / 1e9, flops / computing / 1e9)
 
 
 def _copying(blocks: int) -> float:
-    """Seconds for copying that many blocks."""
-    source, target = torch.ones(blocks * ROOFLINE_BLOCK), torch.zeros(blocks * ROOFLINE_BLOCK)
+    """Return the seconds for copying ``blocks`` blocks."""
+    source, target = torch.ones(blocks * ROOFLINE_BLOCK), torch.zeros(blocks * kernels.BLOCK)
     return _best(lambda: launch(kernels.copy, blocks, source, target, grain=1))
 
 
 def _network(layers: list[nn.Linear], rows: int) -> Work:
-    """A multiply-add a weight and row; weights once, every layer's input and output once."""
+    """Count a multiply-add per weight and row; weights once, every layer's input and output once."""
     weights = sum(layer.weight.numel() + layer.out_features for layer in layers)
     activations = sum(layer.in_features + layer.out_features for layer in layers)
     products = sum(layer.weight.numel() for layer in layers)
@@ -104,7 +105,7 @@ def _network(layers: list[nn.Linear], rows: int) -> Work:
 
 
 def frame_work(scene: Scene, load: Load, width: int, height: int) -> dict[str, Work]:
-    """What each stage of a frame must do: colour and depth, harmonics of degree 3, neighbours and weights cached."""
+    """Count each stage of a frame: colour and depth, harmonics of degree 3, cached neighbours and weights."""
     count = scene.gaussian_count
     work = {}
     if scene.motion.moves:
@@ -113,28 +114,28 @@ def frame_work(scene: Scene, load: Load, width: int, height: int) -> dict[str, W
         work["network"] = _network(layers, scene.control_point_count if sparse else count)
         if sparse:
             neighbors = scene.config.motion.neighbors
-            # Mean and quaternion in and out, index and weight a neighbour; per neighbour a 3 x 4 matrix and a
-            # quaternion are added up, then applied, multiplied and normalised.
+            # Mean and quaternion go in and out, index and weight of each neighbour go in. For each neighbour a 3 x 4
+            # matrix and a quaternion are added up; the sums are applied, multiplied and normalised.
             work["skin"] = Work(count * (2 * (12 + 16) + 8 * neighbors), count * (32.0 * neighbors + 56))
     return {**work, **draw_work(count, load, width, height, 4)}
 
 
 def draw_work(count: int, load: Load, width: int, height: int, channels: int) -> dict[str, Work]:
-    """Projection, harmonics, binning and compositing of one image."""
+    """Count projection, harmonics, binning and compositing of one image."""
     blended = load.contributors * load.covered
     coefficients = 48
     image = FLOAT * width * height * (channels + 1)
     return {
         "project": Work(count * (GEOMETRY + SPLAT), count * PROJECT_FLOPS),
         "harmonics": Work(count * FLOAT * (coefficients + 3 + 3), count * (HARMONIC_FLOPS + 2.0 * coefficients)),
-        # Splats read, an order of depth written; pairs written with their slot, and the list read once while sorting.
+        # Splats are read, an order of depth is written; pairs are written with their slot and read once for sorting.
         "bin": Work(count * (SPLAT + 8) + load.pairs * 12, 0.0),
         "composite": Work(load.pairs * (4 + 24 + FLOAT * channels) + image, blended * (BLEND_FLOPS + 2.0 * channels)),
     }
 
 
 def backward_work(count: int, load: Load, width: int, height: int) -> Work:
-    """The adjoint of a three-channel image down to all parameters: gradients of pairs are written and read once."""
+    """Count the adjoint of a three-channel image to all parameters; gradients of pairs are written and read once."""
     channels, coefficients = 3, 48
     blended = load.contributors * load.covered
     pair = 4 + 24 + FLOAT * channels + 2 * FLOAT * (2 + 3 + 1 + channels)

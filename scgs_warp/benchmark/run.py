@@ -1,4 +1,4 @@
-"""What a frame, a rasterisation and a training step cost, as rows that state what they were measured on."""
+"""Measure a frame, a rasterisation, a training step or an edit, as rows that state what they were measured on."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from ..scene.scene import Scene
 from .editing import edit_rows
 from .gsplat import Peers
 from .memory import resident_mib
-from .plan import MIDDLE, Place, Plan, posed
+from .plan import MIDDLE, BenchCase, BenchPlan, posed
 from .scenes import load_of, synthetic_scene
 from .summary import compare_frames, motion_costs
-from .timing import machine, now
+from .timing import provenance
 from .workloads import frame_rows, frames_of, raster_rows, step_rows
 
 What = Literal["frame", "raster", "step", "edit"]
 
 
 def thread_counts(threads: int | None, device: str) -> tuple[int, ...]:
-    """One thread and all of them, unless one number is asked for; on a GPU the CPU's threads hardly matter."""
+    """Return one thread and all of them, unless a number is given; on a GPU the CPU's threads hardly matter."""
     if threads is not None or device == "cuda":
         return (environment.thread_count() if threads is None else threads,)
     return tuple(sorted({1, environment.available_threads()}))
 
 
-def bench(what: What, plan: Plan) -> dict[str, Any]:
-    """Measure.
+def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
+    """Measure a plan.
 
     Returns:
-        ``date``, ``machine``, ``what`` and ``rows``, dictionaries with ``KEYS``; of frames also ``motion``, what moving
-        the scene costs, and ``compared``, several motion models in turns. Ready for JSON.
+        ``date``, ``commit``, ``machine``, ``what`` and ``rows``, dictionaries with ``KEYS``; for frames also
+        ``motion``, what moving the scene costs, and ``compared``, several motion models in turns. Ready for JSON.
 
     Raises:
         UserError: the run cannot be read, gsplat is asked for and not usable, or the renderers disagree.
@@ -52,8 +52,8 @@ def bench(what: What, plan: Plan) -> dict[str, Any]:
             load = load_of(*posed(scene, plan.size, MIDDLE), scene.config.antialiased and what != "raster")
             for threads in plan.threads:
                 environment.configure(threads)
-                place = Place(scene, plan, load, threads, resident)
-                rows += measure(place) if peers is None else peers.rows(place)
+                case = BenchCase(scene, plan, load, threads, resident)
+                rows += measure(case) if peers is None else peers.rows(case)
             if what == "frame":
                 drawn[scene.motion_name] = frames_of(scene, plan.size)
         for threads in plan.threads if len(drawn) > 1 else ():
@@ -62,12 +62,12 @@ def bench(what: What, plan: Plan) -> dict[str, Any]:
             compared += compare_frames(drawn, threads, plan.seconds, plan.device)
     finally:
         environment.configure(before)
-    report = {"date": now(), "machine": machine(plan.device), "what": what, "rows": rows}
+    report = {**provenance(plan.device), "what": what, "rows": rows}
     return {**report, "motion": motion_costs(rows, compared), "compared": compared} if what == "frame" else report
 
 
-def scenes(plan: Plan, what: What) -> Iterator[Scene]:
-    """The run's scene, or a synthetic one for every motion model; a rasterisation knows no motion."""
+def scenes(plan: BenchPlan, what: What) -> Iterator[Scene]:
+    """Yield the run's scene, or a synthetic one for every motion model; a rasterisation needs no motion."""
     if plan.run is not None:
         yield Scene.load(plan.run, device=plan.device)
         return
@@ -76,10 +76,10 @@ def scenes(plan: Plan, what: What) -> Iterator[Scene]:
 
 
 def check_motions(text: str) -> tuple[str, ...]:
-    """Names of motion models from a list with commas.
+    """Parse a list of motion models, separated by commas.
 
     Raises:
-        UserError: one of them is none.
+        UserError: a name is not that of a motion model.
     """
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     for name in names or ("",):
@@ -89,9 +89,10 @@ def check_motions(text: str) -> tuple[str, ...]:
 
 
 def write(report: dict[str, Any], path: Path) -> None:
-    """
+    """Write a report as JSON.
+
     Raises:
-        UserError: it cannot be written.
+        UserError: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""How cost grows: frames and rasterisations over the number of Gaussians, pixels, control points and threads."""
+"""Sweeps: frames and rasterisations over the number of Gaussians, pixels, control points and threads."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from ..errors import UserError
 from ..runtime import environment
 from ..scene.scene import Scene
 from .memory import resident_mib
-from .plan import MIDDLE, Place, Plan, posed
+from .plan import MIDDLE, BenchCase, BenchPlan, posed
 from .roofline import Limits, Work, backward_work, draw_work, frame_work, measure_limits
-from .scenes import LARGEST, SMALLEST, Load, load_of, scene_camera, synthetic_scene
-from .timing import machine, now
+from .scenes import LARGEST_SIDE, SMALLEST_SIDE, Load, load_of, scene_camera, synthetic_scene
+from .timing import provenance
 from .workloads import frame_rows, raster_rows
 
 
 def _thread_points() -> tuple[int, ...]:
-    """1, 2, 4 ... and all."""
+    """Return 1, 2, 4 ... and all threads."""
     most = environment.available_threads()
     return tuple(sorted({*(2**k for k in range(most.bit_length()) if 2**k <= most), most}))
 
@@ -30,16 +30,16 @@ POINTS: dict[str, Callable[[], tuple[int, ...]]] = {
     "nodes": lambda: (64, 128, 256, 512, 1024, 2048, 4096),
     "threads": _thread_points,
 }
-"""Points of every sweep, unless the user gives others."""
+"""Default points of every sweep."""
 
 
 def parse_sweeps(text: str) -> dict[str, tuple[int, ...]]:
-    """``"gaussians,nodes:64/128"``: names of sweeps with commas between, with their own points after a colon or not.
+    """Parse names of sweeps, separated by commas, with optional points after a colon: ``"gaussians,nodes:64/128"``.
 
     Raises:
         UserError: a name or a number is wrong.
     """
-    found: dict[str, tuple[int, ...]] = {}
+    sweeps: dict[str, tuple[int, ...]] = {}
     for part in text.split(","):
         name, colon, points = (word.strip() for word in part.partition(":"))
         if name not in POINTS:
@@ -47,20 +47,20 @@ def parse_sweeps(text: str) -> dict[str, tuple[int, ...]]:
         words = points.split("/")
         if colon and not all(word.isascii() and word.isdigit() for word in words):
             raise UserError(f"--sweeps {text}: {points!r} must be numbers with / between, such as {name}:64/128")
-        found[name] = tuple(sorted({int(word) for word in words})) if colon else POINTS[name]()
-    return found
+        sweeps[name] = tuple(sorted({int(word) for word in words})) if colon else POINTS[name]()
+    return sweeps
 
 
 @dataclass(frozen=True)
 class Sweeps:
-    """What to vary around a plan of one motion model and one number of threads."""
+    """Quantities to vary around a plan of one motion model and one number of threads."""
 
-    plan: Plan
+    plan: BenchPlan
     points: dict[str, tuple[int, ...]]
     limits: dict[int, Limits] = field(default_factory=dict)
 
-    def plans(self, name: str) -> list[tuple[int, Plan]]:
-        """(point, plan) of one sweep.
+    def plans(self, name: str) -> list[tuple[int, BenchPlan]]:
+        """Return the points of one sweep with their plans.
 
         Raises:
             UserError: a point cannot be measured.
@@ -71,29 +71,29 @@ class Sweeps:
             "nodes": lambda point: {"nodes": point},
             "threads": lambda point: {"threads": (point,)},
         }
-        found = [(point, replace(self.plan, **changes[name](point))) for point in self.points[name]]
-        for point, plan in found:
+        plans = [(point, replace(self.plan, **changes[name](point))) for point in self.points[name]]
+        for point, plan in plans:
             self._check(name, point, plan)
-        return found
+        return plans
 
-    def _check(self, name: str, point: int, plan: Plan) -> None:
+    def _check(self, name: str, point: int, plan: BenchPlan) -> None:
         least = _neighbors() + 1
         if not least <= plan.nodes <= plan.gaussians:
             raise UserError(
                 f"--sweeps {name}:{point}: {plan.nodes} control points for {plan.gaussians} Gaussians; give at "
                 f"least {least}, and no more than Gaussians"
             )
-        if name == "resolution" and not SMALLEST <= point <= LARGEST:
-            raise UserError(f"--sweeps {name}:{point}: give {SMALLEST} to {LARGEST} pixels")
+        if name == "resolution" and not SMALLEST_SIDE <= point <= LARGEST_SIDE:
+            raise UserError(f"--sweeps {name}:{point}: give {SMALLEST_SIDE} to {LARGEST_SIDE} pixels")
         if not 1 <= plan.threads[0] <= 4096:
             raise UserError(f"--sweeps {name}:{point}: give at least one thread")
 
     def measure_limits(self, threads: int) -> None:
-        """Once more at every point: a disturbance that lasts must not lower the limit. A GPU's are not measured."""
+        """Measure a CPU's limits again and keep the best: called at every point, so that no disturbance lowers them."""
         if self.plan.device == "cpu":
             best = self.limits.get(threads, Limits(threads, 0.0, 0.0))
-            found = measure_limits(threads)
-            values = max(best.gigabytes, found.gigabytes), max(best.gigaflops, found.gigaflops)
+            now = measure_limits(threads)
+            values = max(best.gigabytes, now.gigabytes), max(best.gigaflops, now.gigaflops)
             self.limits[threads] = Limits(threads, *values)
 
 
@@ -103,17 +103,17 @@ def _neighbors() -> int:
     return MotionConfig().neighbors
 
 
-def scaling(plan: Plan, points: dict[str, tuple[int, ...]]) -> dict[str, Any]:
+def scaling(plan: BenchPlan, points: dict[str, tuple[int, ...]]) -> dict[str, Any]:
     """Measure all sweeps.
 
     Args:
-        plan: what every sweep holds but for its own quantity; of motions and threads it uses the first.
-        points: per sweep its values.
+        plan: Quantities that a sweep does not vary; the first of its motions and the last of its threads count.
+        points: Values by sweep.
 
     Returns:
-        ``date``, ``machine``, ``what``, ``base``, ``limits`` (per number of threads) and ``sweeps``: per name a list of
-        ``point``, ``rows`` (with ``KEYS``), ``work`` (bytes and flops by whole and stage) and ``limits``, the least
-        milliseconds by row name (None on a GPU). Ready for JSON.
+        ``date``, ``commit``, ``machine``, ``what``, ``base``, ``limits`` (per number of threads) and ``sweeps``: per
+        name a list of ``point``, ``rows`` (with ``KEYS``), ``work`` (bytes and flops by whole and stage) and
+        ``limits``, the least milliseconds by row name (None on a GPU). Ready for JSON.
 
     Raises:
         UserError: a point cannot be measured.
@@ -135,25 +135,25 @@ def scaling(plan: Plan, points: dict[str, tuple[int, ...]]) -> dict[str, Any]:
         entry["limits"] = None if limit is None else least_times(limit, entry["work"])
     base = {"gaussians": plan.gaussians, "nodes": plan.nodes, "threads": sweeps.plan.threads[0]}
     limits = {str(threads): limit._asdict() for threads, limit in sorted(sweeps.limits.items())}
-    head = {"date": now(), "machine": machine(plan.device), "what": "scaling", "base": base}
+    head = {**provenance(plan.device), "what": "scaling", "base": base}
     return {**head, "limits": limits, "sweeps": found}
 
 
-def _measure(plan: Plan, sweeps: Sweeps) -> dict[str, Any]:
-    """Frames with their stages, and a rasterisation with gradients, of one synthetic scene."""
+def _measure(plan: BenchPlan, sweeps: Sweeps) -> dict[str, Any]:
+    """Measure frames with their stages, and a rasterisation with gradients, of one synthetic scene."""
     threads = plan.threads[0]
     sweeps.measure_limits(threads)
     environment.configure(threads)
     scene = synthetic_scene(plan.motions[0], plan.gaussians, plan.nodes, plan.device)
     resident = resident_mib(plan.device)
     load = load_of(*posed(scene, plan.size, MIDDLE))
-    place = Place(scene, replace(plan, report=lambda text: None), load, threads, resident)
-    rows = frame_rows(place) + raster_rows(place, forward=False)
+    case = BenchCase(scene, replace(plan, report=lambda text: None), load, threads, resident)
+    rows = frame_rows(case) + raster_rows(case, forward=False)
     return {"rows": rows, "work": work_of(scene, load, plan)}
 
 
-def work_of(scene: Scene, load: Load, plan: Plan) -> dict[str, dict[str, dict[str, float]]]:
-    """Bytes and flops by whole and stage."""
+def work_of(scene: Scene, load: Load, plan: BenchPlan) -> dict[str, dict[str, dict[str, float]]]:
+    """Count bytes and flops by whole and stage."""
     camera = scene_camera(scene, plan.size)
     size = camera.width, camera.height
     raster = draw_work(scene.gaussian_count, load, *size, 3)
@@ -163,23 +163,23 @@ def work_of(scene: Scene, load: Load, plan: Plan) -> dict[str, dict[str, dict[st
 
 
 def least_times(limit: Limits, works: dict[str, dict[str, dict[str, float]]]) -> dict[str, float]:
-    """Milliseconds by row name. Stages follow each other, so a whole's limit is the sum of theirs."""
-    found = {}
+    """Return least milliseconds by row name. Stages follow each other, so a whole's limit is the sum of theirs."""
+    limits = {}
     for whole, stages in works.items():
         times = {stage: limit.milliseconds(Work(**work)) for stage, work in stages.items()}
-        found[whole] = sum(times.values())
-        found.update({f"{whole}/{stage}": value for stage, value in times.items()})
-    return found
+        limits[whole] = sum(times.values())
+        limits.update({f"{whole}/{stage}": value for stage, value in times.items()})
+    return limits
 
 
-def _weight(plan: Plan) -> float:
-    """About the seconds a point takes, up to a factor: making the scene, warming up, repeats of what is slow."""
+def _weight(plan: BenchPlan) -> float:
+    """Estimate the seconds for a point, up to a factor: making the scene, warm-up, repeats of slow rows."""
     side = plan.size if isinstance(plan.size, int) else max(plan.size)
     return 2.0 + 2.0 * plan.seconds + (1.0 + plan.nodes / 1024) * plan.gaussians / 60_000 + (side / 1000) ** 2
 
 
 class _Clock:
-    """How long the rest will take, judged by how long the first part took."""
+    """Estimate of the remaining time, from the time of what is done."""
 
     def __init__(self, weights: list[float]) -> None:
         self.weights, self.finished, self.began = weights, 0, time.perf_counter()

@@ -1,4 +1,4 @@
-"""Scenes to measure: a seeded figure of any size under any motion model, its camera, and images to train on."""
+"""Synthetic scenes to measure: a seeded figure of any size under any motion model, its camera and training images."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from ..training.state import TrainState
 from ..types import Camera, Frame, Gaussians
 
 SEED = 20
-SMALLEST, LARGEST = 16, 8192
-"""Sides of an image."""
+SMALLEST_SIDE, LARGEST_SIDE = 16, 8192
+"""Bounds for the sides of an image, pixels."""
 PARTS = (  # centre, half axes, share of the Gaussians
     ((0.0, 0.0, 0.30), (0.36, 0.25, 0.50), 0.40),  # trunk
     ((0.0, 0.0, 1.00), (0.19, 0.21, 0.23), 0.14),  # head
@@ -40,29 +40,31 @@ PARTS = (  # centre, half axes, share of the Gaussians
     ((-0.19, 0.0, -0.66), (0.15, 0.16, 0.57), 0.14),
 )
 SHELL = 0.35
-"""Share of a part's half axes, from its surface inwards, in which the Gaussians lie: trained ones are not hollow."""
+"""Thickness of the shell of Gaussians, as a share of a part's half axes; trained ones lie below the surface, too."""
 SIZE = 2.0
-"""Median standard deviation of N Gaussians is SIZE / sqrt(N): what they cover together does not depend on N."""
+"""Median standard deviation of N Gaussians times sqrt(N), so that the area they cover does not depend on N."""
 SIZE_SPREAD = 0.5
 """Standard deviation of the logarithm of an axis' length."""
 OPACITY_POWER = 0.45
-"""Opacities are a uniform number to this power, between ``OPACITIES``."""
+"""Exponent of a uniform number that gives opacities between ``OPACITIES``."""
 OPACITIES = (0.02, 0.95)
 OVERVIEW = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0311, math.degrees(0.6911), 15.0, 60.0)
-"""The rig of D-NeRF: distance and field of view."""
+"""Distance and field of view of D-NeRF's cameras."""
 HEAD_WEIGHT = 2e-3
 """Standard deviation of the last layer's weights: control points move by some hundredths of the figure's height."""
 PLANE_HEAD_WEIGHT = 5e-2
-"""The same where the network is small and its features are."""
+"""The same for the small network of ``hexplane``, whose features are small."""
 HYPER_SPREAD = 0.02
 FRAMES = 4
 RATES = 1e-6
-"""Learning rates are multiplied by this: Adam does all its work, and the scene stays the same from step to step."""
+"""Factor on learning rates: Adam does all its work, and the scene stays the same from step to step."""
 
 
 def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> GaussianParameters:
-    """``count`` Gaussians in the shape of a standing figure, 2.5 units high; the same for the same arguments. With the
-    hyper-coordinates and the shading that ``motion`` asks for."""
+    """Make ``count`` Gaussians in the shape of a standing figure, 2.5 units high, determined by the arguments.
+
+    They have the hyper-coordinates and the shading that ``motion`` asks for.
+    """
     random = generator(seed, 1)
     centres, axes, shares = (torch.tensor(column) for column in zip(*PARTS))
     part = torch.multinomial(shares, count, replacement=True, generator=random)
@@ -87,8 +89,8 @@ def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> 
 
 
 def _loosen(motion: Motion, seed: int) -> None:
-    """Models start at rest; small random weights in their last layers (and features that change with time) make the
-    figure move a little."""
+    """Give a model, which starts at rest, small random weights in its last layers (and features that change with time),
+    so that the figure moves a little."""
     random = generator(seed, 2)
     heads: list[tuple[Any, float]] = []
     if isinstance(motion, ControlPoints | PerGaussian):
@@ -103,8 +105,8 @@ def _loosen(motion: Motion, seed: int) -> None:
 
 
 def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int = SEED) -> Scene:
-    """A moving figure as a trained scene: ``count`` Gaussians, ``nodes`` control points (control-points only), networks
-    of the paper's size."""
+    """Make a moving figure as a trained scene: ``count`` Gaussians, ``nodes`` control points (control-points only),
+    networks of the paper's size."""
     config = TrainConfig(seed=seed)
     config = dataclasses.replace(config, motion=dataclasses.replace(config.motion, model=motion, nodes=nodes))
     gaussians = figure(count, seed, config.motion)
@@ -117,7 +119,7 @@ def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int 
             model.log_radii.fill_(math.log(float(neighbor_distance(positions).median())))
     _loosen(model, seed)
     scene = Scene(gaussians.to(device), model.to(device), Normalisation.identity(), config, OVERVIEW)
-    scene.motion.eval()  # as a loaded run's: some models keep what training would change
+    scene.motion.eval()  # Loaded scenes are in evaluation mode, too, where some models cache.
     scene.freeze_binding()
     return scene
 
@@ -127,23 +129,25 @@ Size = int | tuple[int, int]
 
 
 def camera_size(text: str) -> Size:
-    """``"800"`` or ``"1920x1080"``.
+    """Parse ``"800"`` or ``"1920x1080"``.
 
     Raises:
-        UserError: it is neither, or a side is not one of ``SMALLEST`` to ``LARGEST`` pixels.
+        UserError: the text is neither, or a side is not one of ``SMALLEST_SIDE`` to ``LARGEST_SIDE`` pixels.
     """
     sides = text.lower().split("x")
     if not (1 <= len(sides) <= 2 and all(side.isascii() and side.isdigit() for side in sides)):
         raise UserError(f"--size {text}: give the longer side, such as 800, or width and height, such as 1920x1080")
     numbers = [int(side) for side in sides]
-    if not all(SMALLEST <= number <= LARGEST for number in numbers):
-        raise UserError(f"--size {text}: give {SMALLEST} to {LARGEST} pixels a side")
+    if not all(SMALLEST_SIDE <= number <= LARGEST_SIDE for number in numbers):
+        raise UserError(f"--size {text}: give {SMALLEST_SIDE} to {LARGEST_SIDE} pixels a side")
     return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
 
 
 def scene_camera(scene: Scene, size: Size, turn: float = 0.0) -> Camera:
-    """A world camera on the rig of the training cameras, ``turn`` degrees from where a film starts. The horizontal
-    field of view is theirs, whatever the image's proportions."""
+    """Place a camera, in world units, on the rig of the training cameras, ``turn`` degrees from where a film starts.
+
+    Its horizontal field of view is theirs for any proportions of the image.
+    """
     azimuth = scene.overview.azimuth + turn
     if isinstance(size, int):
         return orbit_camera(scene.overview, azimuth, size).to(scene.device)
@@ -155,7 +159,7 @@ def scene_camera(scene: Scene, size: Size, turn: float = 0.0) -> Camera:
 
 
 class Load(NamedTuple):
-    """How much there is to composite."""
+    """Amount of compositing that an image takes."""
 
     pairs: int
     """Pairs of splat and tile."""
@@ -167,7 +171,7 @@ class Load(NamedTuple):
 
 @torch.no_grad()
 def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> Load:
-    """Counted exactly, pixel by pixel; the camera in the units of the Gaussians."""
+    """Count the load exactly, pixel by pixel; the camera is in the units of the Gaussians."""
     geometry = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     view = camera.viewmat, camera.K, camera.width, camera.height
     splats = project(*geometry, *view, antialiased=antialiased)
@@ -182,7 +186,7 @@ def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
 
 
 def training_data(scene: Scene, size: Size, seed: int = SEED) -> Dataset:
-    """Images of the scene itself from around, with noise: a loss whose gradient reaches everything."""
+    """Render images of the scene from around and add noise, so that the gradient of the loss reaches everything."""
     frames = []
     for index in range(FRAMES):
         time = index / max(FRAMES - 1, 1)
@@ -196,14 +200,16 @@ def training_data(scene: Scene, size: Size, seed: int = SEED) -> Dataset:
 
 
 def _background(scene: Scene) -> str:
-    """Random backgrounds need alpha; the scene is rendered on what it is evaluated on."""
+    """Return the background for evaluation, since random backgrounds need alpha."""
     return "black" if scene.config.data.background == "random" else scene.config.data.background
 
 
 def training_state(scene: Scene, arap: bool) -> TrainState:
-    """The scene in the joint phase of training, at full harmonics, statistics for densification on; rates near 0. With
-    ``arap`` every step carries that term, where training does so in one of five: a median over a mixture shows neither.
-    The scene's motion is in training mode from here on."""
+    """Put the scene into the joint phase of training: full harmonics, densification statistics, rates near 0.
+
+    With ``arap`` every step carries that term (in training every fifth does), since a median over a mixture would show
+    neither kind. The scene's motion stays in training mode.
+    """
     own = scene.config
     base = TrainConfig(seed=own.seed, data=own.data, motion=own.motion, antialiased=own.antialiased)
     rates = OptimConfig()

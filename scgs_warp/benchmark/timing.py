@@ -1,13 +1,15 @@
-"""Timing for benchmarks: repeats under a time budget, stages of the code that really runs, what the machine gave."""
+"""Timing for benchmarks: repeats under a time budget, stages of the code in use, and where they were measured."""
 
 from __future__ import annotations
 
 import contextlib
 import gc
 import platform
+import shlex
 import statistics
+import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,30 +22,30 @@ from ..runtime import environment
 from ..runtime.launch import launch
 
 WARM_UP = 2
-FEWEST = 5
-"""Repeats, however slow they are."""
-MOST = 300
+MIN_REPEATS = 5
+"""Least number of repeats, however slow they are."""
+MAX_REPEATS = 300
 ROUNDS = 100_000
-"""Steps of the arithmetic loop in one chunk: some 0.2 ms, far above what handing it to a thread costs."""
+"""Steps of the arithmetic loop in one chunk: some 0.2 ms, far above the cost of handing it to a thread."""
 CHUNKS = 32
 TURNS = 7
 
 
 class Timing(NamedTuple):
-    """Milliseconds of repeated calls, warm-up left out."""
+    """Milliseconds of repeated calls, without warm-up."""
 
     median: float
     least: float
 
 
 def repeat(function: Callable[[int], Any], seconds: float, device: str) -> Timing:
-    """Call ``function(0)``, ``function(1)`` ... for about ``seconds``, at least ``FEWEST`` times after ``WARM_UP``."""
+    """Time ``function(0)``, ``function(1)`` ... for about ``seconds``, at least ``MIN_REPEATS`` after ``WARM_UP``."""
     wait = torch.cuda.synchronize if device == "cuda" else _nothing
     for index in range(WARM_UP):
         function(index)
     times: list[float] = []
     with _no_garbage_collection():
-        while len(times) < FEWEST or (sum(times) < seconds and len(times) < MOST):
+        while len(times) < MIN_REPEATS or (sum(times) < seconds and len(times) < MAX_REPEATS):
             wait()
             began = time.perf_counter()
             function(WARM_UP + len(times))
@@ -53,15 +55,20 @@ def repeat(function: Callable[[int], Any], seconds: float, device: str) -> Timin
 
 
 def turns(functions: list[Callable[[int], Any]], seconds: float, device: str) -> list[list[float]]:
-    """Milliseconds of every function's calls, one call each in turn, warm-up left out; as many turns as take about
-    ``seconds`` per function, at least ``FEWEST``."""
+    """Time several functions, one call each in turn, for about ``seconds`` per function and at least ``MIN_REPEATS``.
+
+    Returns:
+        Milliseconds of every function's calls, without warm-up.
+    """
     wait = torch.cuda.synchronize if device == "cuda" else _nothing
     times: list[list[float]] = [[] for _ in functions]
     for index in range(WARM_UP):
         for function in functions:
             function(index)
     with _no_garbage_collection():
-        while len(times[0]) < FEWEST or (sum(map(sum, times)) < 1e3 * seconds * len(times) and len(times[0]) < MOST):
+        while len(times[0]) < MIN_REPEATS or (
+            sum(map(sum, times)) < 1e3 * seconds * len(times) and len(times[0]) < MAX_REPEATS
+        ):
             for own, function in zip(times, functions):
                 wait()
                 began = time.perf_counter()
@@ -77,7 +84,7 @@ def _nothing() -> None:
 
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """As ``timeit`` does: a collection of another row's leavings is no part of this one."""
+    """Keep garbage of earlier rows out of the times, as ``timeit`` does."""
     gc.collect()
     was_on = gc.isenabled()
     gc.disable()
@@ -89,14 +96,14 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 class Stages:
-    """Stage times of the very code that runs: named functions are wrapped while it is timed, and unwrapped after.
+    """Times of stages, taken from the code in use: named functions are wrapped while it is timed.
 
-    A stage inside another one counts for the outer. On CUDA the device is waited for at both ends of a stage, so the
-    stages' sum exceeds what an undisturbed call takes; times without stages are taken apart from these.
+    A stage inside another one counts for the outer one. On CUDA both ends of a stage wait for the device, so the sum of
+    stages exceeds the time of an undisturbed call, which is taken separately.
     """
 
     def __init__(self, device: str, targets: Mapping[str, list[tuple[Any, str]]]) -> None:
-        """``targets``: per stage, the (owner, attribute) pairs whose calls belong to it."""
+        """``targets`` holds, by stage, the (owner, attribute) pairs whose calls belong to it."""
         self.device, self.targets = device, targets
         self._spent: dict[str, float] = {}
         self._inside = False
@@ -134,7 +141,7 @@ class Stages:
             yield
 
     def repeat(self, function: Callable[[int], Any], seconds: float) -> dict[str, tuple[Timing, float]]:
-        """Per stage its times and its share of the whole; ``rest`` is what belongs to none. Shares add up to 1."""
+        """Return the times and the share of each stage, and of the ``rest``; shares add up to 1."""
         spent: list[dict[str, float]] = []
 
         def once(index: int) -> None:
@@ -162,8 +169,10 @@ class Stages:
 
 
 def two_thread_scaling() -> float:
-    """How much faster two threads do pure arithmetic than one, now, on this machine: 2 at best. On a shared machine it
-    is near 1 for minutes at a time, and times of two threads mean nothing then."""
+    """Measure the speed-up of two threads at pure arithmetic, 2 at best.
+
+    On a shared machine it may be near 1 for minutes; times of two threads mean nothing then.
+    """
     before = environment.thread_count()
     values = torch.empty(CHUNKS)
     times: dict[int, list[float]] = {1: [], 2: []}
@@ -179,7 +188,7 @@ def two_thread_scaling() -> float:
 
 
 def processor() -> str:
-    """The processor's name, as well as the system tells it."""
+    """Return the processor's name as the system gives it."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -188,7 +197,7 @@ def processor() -> str:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """What figures depend on; neither names nor paths of the machine."""
+    """Describe the machine, without its name or paths."""
     import scgs_warp
 
     return {
@@ -203,5 +212,27 @@ def machine(device: str) -> dict[str, Any]:
     }
 
 
-def now() -> str:
-    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+def command_line(script: str, words: Sequence[str]) -> str:
+    """Write a command for a checkout; absolute paths keep only their last part, since folders differ by machine."""
+    names = (Path(word).name if Path(word).is_absolute() else word for word in words)
+    return f"python {script} {shlex.join(names)}"
+
+
+def commit() -> str | None:
+    """Return the commit of the measured checkout, with ``-dirty`` if its code was changed; None outside of one."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    code = [".", ":(exclude)docs", ":(exclude)README.md", ":(exclude)benchmarks/results"]
+    try:
+        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
+        differs = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=root, check=False).returncode
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head.stdout.strip() + ("-dirty" if differs else "")
+
+
+def provenance(device: str) -> dict[str, Any]:
+    """Return ``date``, ``commit`` and ``machine`` of a measurement."""
+    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return {"date": now, "commit": commit(), "machine": machine(device)}

@@ -1,4 +1,4 @@
-"""What is measured: a frame of the moving scene, a rasterisation, a training step."""
+"""Workloads: a frame of the moving scene, a rasterisation, a training step."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..seeding import generator
 from ..training import step as training
 from ..training.frames import Frames
 from ..types import Camera, Gaussians
-from .plan import MIDDLE, Place, posed
+from .plan import MIDDLE, BenchCase, posed
 from .scenes import Size, scene_camera, training_data, training_state
 
 RENDER_STAGES = {
@@ -34,14 +34,14 @@ RENDER_STAGES = {
 
 
 def motion_stages(motion: Motion, training: bool = False) -> dict[str, list[tuple[Any, str]]]:
-    """Where a motion model spends its time: the network (planes, their heads and in training their smoothness
-    included), and skinning (which in training includes the search for neighbours)."""
+    """Return the stages of a motion model: the network (with planes, their heads and in training their smoothness) and
+    skinning (in training with the search for neighbours)."""
     if isinstance(motion, ControlPoints):
-        found: dict[str, list[tuple[Any, str]]] = {"network": [(motion, "poses")]}
-        found["skin"] = [(motion, "bind_and_pose"), (motion, "apply_pose")]
+        stages: dict[str, list[tuple[Any, str]]] = {"network": [(motion, "poses")]}
+        stages["skin"] = [(motion, "bind_and_pose"), (motion, "apply_pose")]
         if training:
-            found["arap"] = [(motion, "refresh_graph"), (control_points, "rigidity")]
-        return found
+            stages["arap"] = [(motion, "refresh_graph"), (control_points, "rigidity")]
+        return stages
     if isinstance(motion, PerGaussian):
         return {"network": [(motion.network, "forward")]}
     if isinstance(motion, HexPlane):
@@ -54,12 +54,12 @@ def draw_stages(module: Any) -> dict[str, list[tuple[Any, str]]]:
 
 
 def instant(index: int) -> float:
-    """The time that frame ``index`` shows: another for each, in [0.3, 0.7]."""
+    """Return the time of frame ``index``, in [0.3, 0.7], different for each frame."""
     return 0.5 + 0.4 * ((0.37 * index) % 1.0 - 0.5)
 
 
 def frames_of(scene: Scene, size: Size) -> Callable[[int], None]:
-    """Draws frame ``index``, as a viewer would."""
+    """Return the function that draws frame ``index`` as a viewer would."""
     camera = scene_camera(scene, size)
 
     def draw(index: int) -> None:
@@ -68,13 +68,14 @@ def frames_of(scene: Scene, size: Size) -> Callable[[int], None]:
     return draw
 
 
-def frame_rows(place: Place) -> list[dict[str, Any]]:
-    """Frames of the moving scene: each at another time, so that the network runs for each; neighbours are cached.
+def frame_rows(case: BenchCase) -> list[dict[str, Any]]:
+    """Measure frames of the moving scene, each at another time, so that the network runs; neighbours are cached.
 
-    On CUDA the whole is a recorded graph, in which nothing can be timed: its stages are those of a frame drawn step by
-    step."""
-    scene = place.scene
-    camera = scene_camera(scene, place.plan.size)
+    On CUDA the whole is a recorded graph, in which nothing can be timed, so its stages are those of a frame drawn step
+    by step.
+    """
+    scene = case.scene
+    camera = scene_camera(scene, case.plan.size)
     targets = {**motion_stages(scene.motion), **draw_stages(render)}
 
     @torch.no_grad()
@@ -84,12 +85,12 @@ def frame_rows(place: Place) -> list[dict[str, Any]]:
         posed = scene.motion.gaussians_at(scene.gaussians, instant(index))
         render.render(posed, view, color, antialiased=scene.config.antialiased)
 
-    whole = frames_of(scene, place.plan.size)
-    return place.rows("frame", whole, targets, staged=steps if place.plan.device == "cuda" else None)
+    whole = frames_of(scene, case.plan.size)
+    return case.rows("frame", whole, targets, staged=steps if case.plan.device == "cuda" else None)
 
 
 class Leaves:
-    """Gaussians as the tensors that gradients are asked for, and one gradient of an image."""
+    """Gaussians as leaf tensors, and the gradient of an image."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera) -> None:
         def leaf(value: Tensor) -> Tensor:
@@ -107,24 +108,24 @@ class Leaves:
         return own.means, own.quats, own.scales, own.opacities
 
     def draw(self) -> Tensor:
-        """[3, H, W] by the project's own stages."""
+        """Draw [3, H, W] by the project's own stages."""
         own, camera = self.gaussians, self.camera
         splats = project(*self.geometry, camera.viewmat, camera.K, camera.width, camera.height)
         colors = spherical_harmonics(own.sh_dc, own.sh_rest, own.means, camera.position, self.degree)
         return composite(splats, colors, bin_splats(splats))[0]
 
     def rasterize(self, rasterization: Callable[..., Any]) -> Tensor:
-        """[3, H, W] through the entry point that gsplat and this project share."""
+        """Draw [3, H, W] through the entry point that gsplat and this project share."""
         camera = self.camera
         views = camera.viewmat[None], camera.K[None], camera.width, camera.height
         image = rasterization(*self.geometry, self.harmonics, *views, sh_degree=self.degree, packed=False)[0]
         return image[0].permute(2, 0, 1)
 
 
-def raster_rows(place: Place, forward: bool = True) -> list[dict[str, Any]]:
-    """Projection, harmonics, binning and compositing of three channels: forward (unless not wanted), and forward with
-    all gradients."""
-    leaves = Leaves(*posed(place.scene, place.plan.size, MIDDLE))
+def raster_rows(case: BenchCase, forward: bool = True) -> list[dict[str, Any]]:
+    """Measure projection, harmonics, binning and compositing of three channels: forward alone (unless ``forward`` is
+    False), and forward with all gradients."""
+    leaves = Leaves(*posed(case.scene, case.plan.size, MIDDLE))
     module = _this_module()
 
     def draw(index: int) -> None:
@@ -135,18 +136,18 @@ def raster_rows(place: Place, forward: bool = True) -> list[dict[str, Any]]:
         torch.autograd.grad(leaves.draw(), tuple(vars(leaves.gaussians).values()), leaves.v_image)
 
     backward = {"backward": [(torch.autograd, "grad")]}
-    rows = place.rows("raster/forward", draw, draw_stages(module)) if forward else []
-    return rows + place.rows("raster/both", both, {**draw_stages(module), **backward})
+    rows = case.rows("raster/forward", draw, draw_stages(module)) if forward else []
+    return rows + case.rows("raster/both", both, {**draw_stages(module), **backward})
 
 
 def _this_module() -> Any:
     return sys.modules[__name__]
 
 
-def step_rows(place: Place) -> list[dict[str, Any]]:
-    """A training step in the joint phase, on images of the scene itself; with the ARAP term where there is one."""
-    scene = place.scene
-    data = training_data(scene, place.plan.size)
+def step_rows(case: BenchCase) -> list[dict[str, Any]]:
+    """Measure training steps of the joint phase on images of the scene, without and (if any) with the ARAP term."""
+    scene = case.scene
+    data = training_data(scene, case.plan.size)
     rows = []
     for name, arap in (("step", False), ("step/arap", True)):
         if arap and not isinstance(scene.motion, ControlPoints):
@@ -155,7 +156,7 @@ def step_rows(place: Place) -> list[dict[str, Any]]:
         if cache is not None:
             cache(None)
         state = training_state(scene, arap)
-        frames = Frames(data, scene.normalisation, state.config, place.plan.device)
+        frames = Frames(data, scene.normalisation, state.config, case.plan.device)
         targets = {
             **motion_stages(scene.motion, training=True),
             **draw_stages(render),
@@ -171,7 +172,7 @@ def step_rows(place: Place) -> list[dict[str, Any]]:
                 )
             state.step += 1
 
-        rows += place.rows(name, step, targets)
+        rows += case.rows(name, step, targets)
     scene.motion.eval()
     scene.freeze_binding()
     return rows

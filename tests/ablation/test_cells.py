@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from helpers.cells import options
-from helpers.paths import ROOT
 from helpers.tiny import write_dnerf
 from scgs_warp.ablation import cells as ablate
 from scgs_warp.ablation import local_runner
@@ -40,9 +35,6 @@ def copied(trained, tmp_path) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "nodes"))
 
 
-# What the cells are.
-
-
 def test_values_are_sorted_and_unique():
     assert ablate.parse_values("nodes", ["512", "64", "512"]) == ("64", "512")
     assert ablate.parse_values("motion", ["control-points", "static"]) == ("static", "control-points")
@@ -56,7 +48,7 @@ def test_cells_differ_in_what_is_varied_alone(blobs, tmp_path):
         assert [cell.value for cell in cells] == 2 * expected, "without true motion there is no baseline to compare"
         for cell in cells:
             assert cell.settings["steps"] == 1_000
-            differs = ablate.difference(cell.settings, cells[0].settings, ("seed", *ablate.VARIED[name]))
+            differs = ablate.first_difference(cell.settings, cells[0].settings, ("seed", *ablate.VARIED[name]))
             assert differs is None
         assert len({json.dumps(cell.settings) for cell in cells}) == len(cells), "but in that they do"
         assert len({cell.folder for cell in cells}) == len(cells)
@@ -82,9 +74,6 @@ def test_a_cell_is_plain_data(blobs, tmp_path):
     cell = ablate.plan("nodes", presets.preset("cpu"), {"blobs": blobs}, tmp_path)[0]
     assert ablate.cell_from_json(ablate.cell_to_json(cell)) == cell
     assert Path(cell.folder).is_absolute() and Path(cell.settings["data"]["folder"]).is_absolute()
-
-
-# Running them.
 
 
 def test_cells_are_run_directories(trained):
@@ -226,48 +215,6 @@ def test_whatever_goes_wrong_comes_back_as_one_line(tmp_path):
     assert "Traceback" in (tmp_path / "cell" / "error.txt").read_text()
     assert ablate.attempt(cell, lambda cell: tmp_path) is None
     assert not (tmp_path / "cell" / "error.txt").exists()
-
-
-def test_a_failing_cell_stops_no_other(blobs, tmp_path, capsys):
-    """In processes of their own: the reason comes back from there, too."""
-    broken = Path(shutil.copytree(blobs, tmp_path / "broken"))
-    (broken / "train/train_002.png").write_bytes(b"not a picture")
-    output = tmp_path / "out"
-    data = ["--data", str(broken), str(blobs), "--jobs", "2"]
-    assert app.cli(["nodes", *options(blobs, output, "--values", "8"), *data]) == 2
-    captured = capsys.readouterr()
-    lines = captured.err.strip().splitlines()
-    assert len(lines) == 1 and "1 of 2 cells failed: broken/8 (" in lines[0] and "train_002.png" in lines[0]
-    report = json.loads((output / "nodes.json").read_text())
-    assert [cell["metrics"] is None for cell in report["cells"]] == [True, False]
-    assert "training 30/30" in (output / "blobs/8/train.log").read_text()
-
-
-def test_stopped_from_outside_and_resumed(blobs, tmp_path):
-    """Two processes are told, and save; the same command goes on from there."""
-    output = tmp_path / "out"
-    arguments = ["nodes", *options(blobs, output, "--values", "8,16", "--jobs", "2", steps=1_000)]
-    command = [sys.executable, str(ROOT / "apps/ablate.py"), *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    logs = {value: output / "blobs" / value / "log.jsonl" for value in ("8", "16")}
-    begun: list[str] = []
-    while not begun:
-        assert process.poll() is None
-        time.sleep(0.05)
-        begun = [value for value, log in logs.items() if log.is_file() and log.stat().st_size > 300]
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=120)
-    assert process.returncode == 130, errors
-    assert "Traceback" not in errors
-    folder, log = output / "blobs" / begun[0], logs[begun[0]]
-    assert (folder / "checkpoint.safetensors").is_file() and not (folder / "metrics.json").is_file()
-    before = log.read_text().splitlines()
-    assert app.cli(["nodes", *options(blobs, output, "--values", begun[0], steps=1_000)]) == 0
-    assert log.read_text().splitlines()[: len(before)] == before, "continued, not begun again"
-    assert json.loads((folder / "metrics.json").read_text())["step"] == 1_000
-
-
-# Mistakes.
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.app_runs import run_app
 from helpers.fake_scene import FakeScene, install
 from scgs_warp.apps import view
 from scgs_warp.geometry import cameras
@@ -143,3 +144,18 @@ def test_tracks_interpolate_between_samples() -> None:
     found = overlay.interpolate_tracks(tracks, np.array([0.0, 0.125, 0.5, 1.0, 1.5]))
     np.testing.assert_allclose(found[:, 0, 0], [0.0, 0.5, 2.0, 4.0, 4.0])
     np.testing.assert_allclose(overlay.interpolate_tracks(tracks[:1], np.array([0.3]))[:, 0, 0], [0.0])
+
+
+@pytest.mark.parametrize("show", ["rgb", "trajectories"])
+def test_a_trained_run(trained, tmp_path, show):
+    output = tmp_path / "film.gif"
+    done = run_app(
+        "view", "--run", str(trained), "--frames", "3", "--size", "32", "--show", show, "--output", str(output)
+    )
+    assert done.returncode == 0, done.stderr
+    assert output.stat().st_size > 100
+
+
+def test_a_folder_without_a_run(tmp_path) -> None:
+    done = run_app("view", "--run", str(tmp_path), "--output", str(tmp_path / "a.gif"))
+    assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr

@@ -1,47 +1,63 @@
-"""The scripts beside the benchmarks: tables come from the JSON files, and OpenSplat's side is fed what ours is."""
+"""The tables of the pages are what the committed results give."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
+import re
+import shutil
+import subprocess
 
 import pytest
-import torch
 
 from helpers.paths import ROOT
+from helpers.scripts import benchmark_script
 from scgs_warp.apps import bench as app
 from scgs_warp.benchmark import roofline
-from scgs_warp.errors import UserError
-from scgs_warp.ops.binning import bin_splats
-from scgs_warp.ops.compositing import composite
-from scgs_warp.types import Splats
 
 pytestmark = pytest.mark.usefixtures("all_threads")
 
 TINY = ["--gaussians", "120", "--nodes", "12", "--size", "48", "--seconds", "0", "--device", "cpu"]
+COMMIT = "2bd452c78f5ad6c1c2a2f2a4ff6c7f0fd3b2b2fc"
 
 
-def script(name: str):
-    spec = importlib.util.spec_from_file_location(f"benchmarks_{name}", ROOT / "benchmarks" / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture
+def report():
+    return benchmark_script("report")
 
 
-def page_of(names) -> str:
-    return "# Page\n\n" + "\n".join(f"<!-- begin {name} -->\nold\n<!-- end {name} -->\n" for name in names) + "end\n"
+def results_with(tmp_path, *runs):
+    """A folder of results that holds ``runs`` as its only scores."""
+    (tmp_path / "quality").mkdir()
+    for index, run in enumerate(runs):
+        (tmp_path / "quality" / f"{index}.json").write_text(json.dumps(run), encoding="utf-8")
+    return tmp_path
 
 
-def test_the_page_is_what_the_results_give():
-    assert script("report").main(["--check"]) == 0
+def test_the_pages_show_what_the_results_give(report):
+    assert report.main(["--check"]) == 0
 
 
-def test_every_table_from_tiny_results(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("name", ["quality-published", "frame-cpu", "speed-overview", "page-precision"])
+def test_a_changed_figure_is_found(report, tmp_path, capsys, name):
+    copies = []
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        copies.append(tmp_path / path.name)
+        shutil.copy(path, copies[-1])
+    options = ["--check", "--pages", *map(str, copies)]
+    assert report.main(options) == 0
+    figure = rf"(<!-- table: {name} -->.*?\| )(\d+)(\.\d)"
+    for page in copies:
+        text = page.read_text(encoding="utf-8")
+        wrong = re.sub(figure, lambda match: f"{match[1]}{int(match[2]) + 1}{match[3]}", text, flags=re.DOTALL)
+        if wrong != text:
+            break
+    page.write_text(wrong, encoding="utf-8")
+    assert report.main(options) == 1 and page.name in capsys.readouterr().err
+    assert page.read_text(encoding="utf-8") == wrong
+
+
+def test_every_table_from_tiny_results(report, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(roofline, "BLOCKS", 2)
-    report = script("report")
     commands = {
         "frame-cpu": ["frame", *TINY, "--motion", "control-points,static", "--threads", "1"],
         "raster-cpu": ["raster", *TINY],
@@ -54,15 +70,21 @@ def test_every_table_from_tiny_results(tmp_path, monkeypatch, capsys):
         assert app.cli([*arguments, "--json", str(tmp_path / f"{name}.json")]) == 0
     capsys.readouterr()
     page = tmp_path / "page.md"
-    page.write_text(page_of(report.TABLES), encoding="utf-8")
-    options = ["--results", str(tmp_path), "--page", str(page)]
+    names = report.table_names(tmp_path)
+    text = "".join(f"<!-- table: {name} -->\nold\n<!-- /table -->\n" for name in names)
+    page.write_text(f"# Page\n\n{text}end\n", encoding="utf-8")
+    options = ["--results", str(tmp_path), "--pages", str(page)]
     assert report.main([*options, "--check"]) == 1
     assert "old" in page.read_text(encoding="utf-8")
     assert report.main(options) == 0 and report.main([*options, "--check"]) == 0
     text = page.read_text(encoding="utf-8")
-    assert "old" not in text and text.endswith("end\n")
-    assert text.count("Not measured yet") == 2 and "1000000 --size 1920x1080" in text
-    first = json.loads((tmp_path / "frame-cpu.json").read_text(encoding="utf-8"))["rows"][0]
+    assert "\nold\n" not in text and text.endswith("end\n")
+    assert text.count("Not measured yet: ") == 2 and "1000000 --size 1920x1080" in text
+    result = json.loads((tmp_path / "frame-cpu.json").read_text(encoding="utf-8"))
+    first = result["rows"][0]
+    assert f"`{result['command']}`" in text and result["command"].startswith(
+        "python apps/bench.py frame --gaussians 120"
+    )
     assert f"| **frame** | {first['ms_median']:,.1f} | {first['ms_min']:,.1f} |" in text
     for said in (
         "frame/skin",
@@ -79,59 +101,106 @@ def test_every_table_from_tiny_results(tmp_path, monkeypatch, capsys):
     assert len(lines) > 40 and all(line.endswith("|") for line in lines)
 
 
-def test_a_page_without_a_marker(tmp_path):
-    report = script("report")
-    with pytest.raises(ValueError, match="raster-cpu"):
-        report.fill(page_of(name for name in report.TABLES if name != "raster-cpu"), tmp_path)
+def test_every_table_stands_on_a_page_and_every_marker_names_one(report, tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("<!-- table: raster-cpu -->\n<!-- /table -->\n", encoding="utf-8")
+    assert report.main(["--check", "--pages", str(page)]) == 1
+    said = capsys.readouterr().err
+    assert "<!-- table: frame-cpu -->" in said and "raster-cpu" not in said
+    with pytest.raises(ValueError, match="no-such-table"):
+        report.fill("<!-- table: no-such-table -->\n<!-- /table -->\n", tmp_path)
+    with pytest.raises(ValueError, match="for every"):
+        report.fill("<!-- table: frame-cpu -->\n", tmp_path)
 
 
-def test_two_threads_that_were_none_are_said():
+def test_a_measured_run_replaces_the_reported_one(report, tmp_path):
+    shared = {"table": "parts-settling", "commit": COMMIT}
+    reported = [
+        {"row": "none", "scene": "mutant", "psnr": 40.0},
+        {"row": "none", "scene": "standup", "psnr": 41.0},
+        {"row": "none", "scene": "mean", "psnr": 40.49},
+        {"row": "settle", "scene": "mutant", "psnr": 42.0},
+        {"row": "settle", "scene": "standup", "psnr": 43.0},
+    ]
+    measured = {**shared, "provenance": "measured", "row": "none"}
+    results = results_with(tmp_path, {**shared, "provenance": "reported", "runs": reported})
+    text = report.section("quality-parts-settling", results)
+    assert "| none † | 40.00 | 41.00 | 40.49 |  |" in text and "| settle † | 42.00 | 43.00 | 42.50 | +2.01 |" in text
+    assert f"† Reported at commit {COMMIT[:7]}, not measured by a committed run." in text
+    for scene, psnr in (("mutant", 40.5), ("standup", 41.5)):
+        run = {**measured, "scene": scene, "psnr": psnr}
+        (results / "quality" / f"a-{scene}.json").write_text(json.dumps(run), encoding="utf-8")
+    text = report.section("quality-parts-settling", results)
+    assert "| 40.50 | 41.50 | 41.00 |  |" in text and "| settle † | 42.00 | 43.00 | 42.50 | +1.50 |" in text
+
+
+def test_repeated_measurements_replace_the_reported_table(report, tmp_path):
+    shutil.copytree(report.RESULTS / "reported", tmp_path / "reported")
+    tables = benchmark_script("repeatable_tables")
+    origin = {"date": "2026-01-01", "commit": COMMIT, "machine": {"gpu": None, "processor": "x", "cores": 2}}
+    origin["machine"].update(torch="2", warp="1")
+    parts = {"view": 50.0, "exchange": 6.0, "join": 5.0, "step": 90.0}
+    rows = [{"name": name, "ms": 1.0, "cpu_ms": time} for name, time in parts.items()]
+    drag = {"edit/drag": 40.0, "edit/drag/solve": 6.0, "edit/drag/skin": 14.0}
+    edits = [{"name": name, "ms_median": time, "threads": 1, "control_points": 512} for name, time in drag.items()]
+    for name in ("sharing-200", "sharing-400", "sharing-800", "sharing-400-300k"):
+        assert "†" in report.section("scaling-step", tmp_path)
+        for ending in ("", "-alone"):
+            result = {**origin, "rows": rows, "peak_mib": 700 + len(ending), "mib_per_step": 15.4}
+            (tmp_path / f"{name}{ending}.json").write_text(json.dumps(result), encoding="utf-8")
+    for name in ("edit-cpu", "edit-4096-cpu"):
+        (tmp_path / f"{name}.json").write_text(json.dumps({**origin, "rows": edits}), encoding="utf-8")
+    texts = [report.section(name, tmp_path) for name in tables.REPEATABLE]
+    assert all("†" not in text and "x, 2 cores; torch 2" in text for text in texts)
+    assert "| 11 ms | 11 ms | 11 ms | 11 ms |" in texts[0] and "| 29 ms |" in texts[0]
+    assert "| 706 MiB | 700 MiB |" in texts[1] and "| 512 | 20.0 ms | 6.0 ms | 40.0 ms |" in texts[2]
+
+
+def test_scores_of_a_run_are_recorded(report, tmp_path, capsys):
+    recorder = benchmark_script("record_quality")
+    results, run = results_with(tmp_path), tmp_path / "run"
+    run.mkdir()
+    options = [str(run), "--table", "published", "--row", "cpu", "--scene", "hook", "--results", str(results)]
+    options += ["--command", "python apps/train.py --data hook"]
+    assert recorder.main(options) == 2 and "name a run folder" in capsys.readouterr().err
+    metrics = {"psnr": 39.5, "ssim": 0.99, "gaussians": 1000, "seconds": 90.0, "device": "cpu", "data": "/home/me/hook"}
+    (run / "metrics.json").write_text(json.dumps({**metrics, "per_image": [1]}), encoding="utf-8")
+    assert recorder.main(options) == 0
+    text = (results / "quality" / "published-cpu-hook.json").read_text(encoding="utf-8")
+    assert "/home" not in text and "per_image" not in text
+    assert json.loads(text)["provenance"] == "measured" and {"date", "commit", "machine"} <= json.loads(text).keys()
+    table = report.section("quality-published", results)
+    assert "| 39.50 |" in table and "1 min 30 s" in table and "†" not in table
+
+
+def test_results_of_older_code_are_marked(report):
+    provenance = benchmark_script("provenance")
+    found = subprocess.run(["git", "log", "-1", "--format=%H"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if found.returncode:
+        pytest.skip("not a checkout")
+    head = found.stdout.strip()
+    first = subprocess.run(
+        ["git", "rev-list", "--max-parents=0", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()[0]
+    paths = {*provenance.TRAINING, *provenance.EDITING}
+    assert all((ROOT / path).is_dir() for path in paths), "git finds no change of a folder that was moved"
+    assert not provenance.changed_since(head, provenance.RENDERING)
+    assert provenance.changed_since(f"{head}-dirty", provenance.RENDERING)
+    assert provenance.changed_since(first, provenance.RENDERING) or first == head
+    assert not provenance.changed_since(None, provenance.RENDERING)
+    assert not provenance.changed_since(40 * "0", provenance.RENDERING)
+    marked = f"| frame {provenance.OLDER} | 1 |\n\n{provenance.older_note([first])}\n<!-- /table -->\n"
+    assert provenance.without_older_marks(marked) == "| frame | 1 |\n<!-- /table -->\n"
+
+
+def test_without_git_nothing_is_marked(report, monkeypatch):
+    provenance = benchmark_script("provenance")
+    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: (_ for _ in ()).throw(FileNotFoundError("git")))
+    assert not provenance.changed_since("abcdef", ("kernels",))
+
+
+def test_rows_of_two_threads_on_a_busy_machine_are_refused():
     rows = [{"share": None, "device": "cpu", "threads": n, "two_thread_scaling": 1.5} for n in (1, 2)]
-    report = script("report")
-    assert "quote the one-thread column" in report.scaling_line(rows)
-    assert "quote" not in report.scaling_line(rows[:1]) and report.scaling_line([{**rows[0], "device": "cuda"}]) == ""
-
-
-class Stand:
-    """OpenSplat's two functions, done with our own code: what is fed to it, and in which units, shows here."""
-
-    def __init__(self, brighter: float = 1.0) -> None:
-        self.brighter = brighter
-
-    def forward(self, width, height, xys, conics, colors, opacities, background, cov2d, depths):
-        inverse = torch.linalg.inv(cov2d)
-        packed = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], 1)
-        ratio = (conics / packed)[:, 0].median()
-        assert torch.allclose(conics, ratio * packed, rtol=1e-2, atol=1e-5)
-        leaves = [value.clone().requires_grad_() for value in (xys, conics, colors, opacities)]
-        means, shapes, tints, opaque = leaves
-        radii = torch.full((len(xys), 2), 99, dtype=torch.int32)
-        splats = Splats(means + 0.5, shapes, depths, opaque[:, 0], radii, width, height)
-        image, alpha = composite(splats, tints, bin_splats(splats), background)
-        image = (self.brighter * image).permute(1, 2, 0)
-        return image.detach(), 1 - alpha.detach(), (image, leaves)
-
-    def backward(self, width, height, *arguments):
-        lists, v_image, v_alpha = arguments[-3:]
-        assert v_image.shape == (height, width, 3) and v_alpha.shape == (height, width) and len(arguments) == 11
-        return torch.autograd.grad(lists[0], lists[1], v_image, retain_graph=True)
-
-
-def test_both_sides_get_the_same_splats():
-    opensplat = script("opensplat")
-    found = opensplat.compare(Stand(), 150, (60, 50), 0.0)
-    assert found["pictures"]["as_it_is"]["largest"] < 1e-4 and (found["width"], found["height"]) == (60, 50)
-    assert max(found["gradients_relative"].values()) < 1e-3
-    median = {name: row["ms_median"] for name, row in found["rows"].items()}
-    assert found["ratios"]["forward"] == pytest.approx(median["opensplat/forward"] / median["scgs_warp/forward"])
-    report = {"machine": {"gpu": None, "processor": "x", "cores": 2, "torch": "2", "warp": "1"}, "date": "2026-01-01"}
-    text = script("report").opensplat({**report, "opensplat": "abc", "flags": "-O3", **found})
-    assert f"| {found['ratios']['both']:,.1f} |" in text and "within 1e-4" in text
-    with pytest.raises(UserError, match="OpenSplat"):
-        opensplat.compare(Stand(1.1), 150, (60, 50), 0.0)
-
-
-def test_a_folder_that_is_no_checkout(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["opensplat.py", str(tmp_path)])
-    assert script("opensplat").main() == 2
-    assert "give a checkout" in capsys.readouterr().err
+    tables = benchmark_script("timing_tables")
+    assert "quote the one-thread column" in tables.scaling_line(rows)
+    assert "quote" not in tables.scaling_line(rows[:1]) and tables.scaling_line([{**rows[0], "device": "cuda"}]) == ""

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from scgs_warp.apps import bench as app
-from scgs_warp.benchmark import plan as bench_place
+from scgs_warp.benchmark import plan as bench_plan
 
 TINY = ["--gaussians", "120", "--nodes", "12", "--size", "48", "--seconds", "0", "--threads", "1"]
 
@@ -27,7 +27,7 @@ def rows_of(tmp_path, *arguments: str) -> list[dict]:
 
 def check_rows(rows: list[dict], device: str) -> None:
     for row in rows:
-        assert tuple(row) == bench_place.KEYS
+        assert tuple(row) == bench_plan.KEYS
         assert row["device"] == device and row["threads"] == 1 and (row["width"], row["height"]) == (48, 48)
         assert 0 <= row["ms_min"] <= row["ms_median"]
         assert row["pairs"] > 0 and 1 <= row["contributors"] < 120 and row["two_thread_scaling"] > 0.3

@@ -1,0 +1,50 @@
+"""Marks for figures: where a figure comes from, and whether the code that it measures has changed since."""
+
+from __future__ import annotations
+
+import functools
+import re
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+REPORTED, OLDER = "†", "‡"
+RENDERING = ("kernels", "scgs_warp/ops", "scgs_warp/rendering", "scgs_warp/motion", "scgs_warp/scene")
+TRAINING = (*RENDERING, "scgs_warp/training", "scgs_warp/data", "scgs_warp/config")
+EDITING = (*RENDERING, "scgs_warp/edit", "scgs_warp/editor")
+
+
+@functools.cache
+def changed_since(commit: str | None, paths: tuple[str, ...]) -> bool:
+    """Tell whether a commit after ``commit`` touched ``paths``; False where git or the commit is missing.
+
+    A result that was measured with uncommitted changes (``COMMIT-dirty``) counts as changed.
+    """
+    if commit is None:
+        return False
+    if commit.endswith("-dirty"):
+        return True
+    command = ["git", "log", "-1", "--format=%h", f"{commit}..HEAD", "--", *paths]
+    try:
+        found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return found.returncode == 0 and bool(found.stdout.strip())
+
+
+def reported_note(commits: Iterable[str]) -> str:
+    """Write the legend of ``REPORTED``; empty without commits."""
+    names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
+    return f"{REPORTED} Reported at commit {names}, not measured by a committed run." if names else ""
+
+
+def older_note(commits: Iterable[str]) -> str:
+    """Write the legend of ``OLDER``; empty without commits."""
+    names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
+    return f"{OLDER} Measured at commit {names}; the measured code has changed since." if names else ""
+
+
+def without_older_marks(page: str) -> str:
+    """Remove the marks that depend on the history of the repository, so that only figures are compared."""
+    return re.sub(rf"\n*^{OLDER} .*$", "", page, flags=re.MULTILINE).replace(f" {OLDER}", "")

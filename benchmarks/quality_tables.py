@@ -1,0 +1,310 @@
+"""Tables of quality from ``results/quality/*.json``, and tables that were reported without a committed run.
+
+A file in ``results/quality/`` holds one run, or fields that several runs share and a list ``runs``. A run has
+``table``, ``row``, ``scene``, ``provenance`` (``measured``, ``reported`` or ``published``), ``commit``, ``command``,
+``processor`` and the figures of ``metrics.json``; ``label`` is the text of a row that the writer does not know. A
+measured run replaces the reported one of the same table, row and scene. A run of the scene ``mean`` holds the reported
+mean of a row whose runs are not known to more digits; it counts until all scenes of the row are measured.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from markdown_table import number, table
+from provenance import OLDER, REPORTED, TRAINING, changed_since, older_note, reported_note
+
+from scgs_warp.ablation.published import PUBLISHED_PSNR, TABLE_S1
+
+DNERF = ("jumpingjacks", "hook", "mutant", "standup")
+TWO = DNERF[:2]
+
+Run = dict[str, Any]
+Runs = dict[tuple[str, str, str], Run]
+"""Runs by table, row and scene."""
+
+
+def read_runs(results: Path) -> Runs:
+    """Read all runs; a measured one replaces a reported one."""
+    runs: Runs = {}
+    for path in sorted((results / "quality").glob("*.json")):
+        values = json.loads(path.read_text(encoding="utf-8"))
+        shared = {key: value for key, value in values.items() if key != "runs"}
+        for own in values.get("runs", [{}]):
+            run = {**shared, **own}
+            key = run["table"], run["row"], run["scene"]
+            if key not in runs or run["provenance"] == "measured":
+                runs[key] = run
+    return runs
+
+
+class Source:
+    """The runs of one table, and the marks of the rows that were written from them."""
+
+    def __init__(self, runs: Runs, name: str) -> None:
+        self.runs, self.name = runs, name
+        self.reported: list[str] = []
+        self.older: list[str] = []
+
+    def run(self, row: str, scene: str) -> Run:
+        return self.runs.get((self.name, row, scene), {})
+
+    def mean(self, row: str, scenes: Iterable[str], key: str) -> float | None:
+        """Take the reported mean unless every scene is measured."""
+        own = [self.run(row, scene) for scene in scenes]
+        if all(run.get("provenance") == "measured" for run in own) or (self.name, row, "mean") not in self.runs:
+            values = [run.get(key) for run in own]
+            return None if None in values else math.fsum(values) / len(values)  # type: ignore[arg-type]
+        return self.run(row, "mean").get(key)
+
+    def label(self, row: str, text: str) -> str:
+        """Add the marks of the row's runs to ``text``, and remember their commits for the notes."""
+        runs = [run for (name, own, _), run in self.runs.items() if (name, own) == (self.name, row)]
+        reported = [run["commit"] for run in runs if run["provenance"] == "reported"]
+        measured = (run["commit"] for run in runs if run["provenance"] == "measured")
+        older = [commit for commit in measured if changed_since(commit, TRAINING)]
+        self.reported += reported
+        self.older += older
+        return text + (f" {REPORTED}" if reported else "") + (f" {OLDER}" if older else "")
+
+    def notes(self) -> str:
+        return "\n\n".join(note for note in (reported_note(self.reported), older_note(self.older)) if note)
+
+
+def duration(seconds: float | None) -> str:
+    """Write a duration as ``3 min 22 s``, from an hour on as ``1 h 30 min``."""
+    if seconds is None:
+        return ""
+    if seconds >= 3600:
+        minutes = round(seconds / 60)
+        return f"{minutes // 60} h {minutes % 60} min"
+    whole = round(seconds)
+    return f"{whole // 60} min" + (f" {whole % 60} s" if whole % 60 else "")
+
+
+def thousands(count: float | None, digits: int = 0) -> str:
+    return "" if count is None else f"{count / 1000:.{digits}f}k"
+
+
+def signed(value: float | None) -> str:
+    return "" if value is None else f"{value:+.2f}"
+
+
+def percent(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f} %"
+
+
+def training_time(run: Run) -> str:
+    """Write the duration and the make of the processor."""
+    return f"{duration(run['seconds'])} ({run['processor'].split()[0].strip(',')})" if "seconds" in run else ""
+
+
+def cost(run: Run) -> str:
+    """Write time, make of the processor, and number of Gaussians."""
+    return f"{training_time(run)}, {thousands(run['gaussians'])}" if run else ""
+
+
+def beside_published(source: Source) -> str:
+    """Write the scenes of D-NeRF beside published figures, and under each own row its cost."""
+    lines = []
+    for row, text in (
+        ("sc-gs", "SC-GS, published (80,000 steps)"),
+        ("sc-gs-rerun", "SC-GS, independent rerun"),
+        ("deformable-3d-gs", "Deformable-3D-GS"),
+        ("4d-gs", "4D-GS"),
+        ("cpu", "**`cpu`** (24,000 steps, two CPU cores)"),
+        ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
+        ("paper", "**`paper`** (80,000 steps, one CPU core)"),
+        ("paper-less-pruning", "`paper` with `densify.min_contribution=0.02`"),
+    ):
+        runs = [source.run(row, scene) for scene in DNERF]
+        mean = source.mean(row, DNERF, "psnr")
+        lines.append([source.label(row, text), *(number(run.get("psnr"), 2) for run in runs), number(mean, 2)])
+        if any("seconds" in run for run in runs):
+            lines.append(["time, processor, Gaussians", *map(cost, runs), ""])
+    return table(["PSNR in dB", *DNERF, "mean"], lines)
+
+
+def node_counts(source: Source) -> str:
+    """Write the numbers of control points beside the supplement's Table S1."""
+    lines = []
+    for count in ("64", "128", "256", "512", "1024", "2048", "4096"):
+        own, before = source.run(count, "mean"), source.run(f"{count}-before", "mean")
+        published = TABLE_S1[count]
+        source.label(f"{count}-before", "")
+        text = source.label(count, count) if own else f"{count} {REPORTED}"
+        lines.append(
+            [
+                f"{text} (jumpingjacks alone)" if before.get("scenes") == 1 else text,
+                number(own.get("control_points"), 0),
+                number(before.get("control_points"), 0),
+                number(own.get("gaussians"), 0),
+                number(own.get("psnr"), 2),
+                number(before.get("psnr"), 2),
+                number((own or before).get("seconds"), 0),
+                number(published["control_points"], 0),
+                number(published["psnr"], 2),
+            ]
+        )
+    head = ["asked", "final", "strays kept: final", "Gaussians", "PSNR", "strays kept: PSNR", "seconds"]
+    return table([*head, "published: final", "published: PSNR"], lines)
+
+
+def motion_models(source: Source) -> str:
+    """Write control points and their rivals at equal steps."""
+    ours = source.mean("control-points", TWO, "psnr")
+    published = {row: math.fsum(known[scene] for scene in TWO) / 2 for row, known in PUBLISHED_PSNR.items()}
+    lines = []
+    for row, text in (
+        ("static", "static (3D-GS; published at 800 x 800)"),
+        ("hexplane", "`hexplane` (4D-GS)"),
+        ("per-gaussian", "`per-gaussian` (the paper's baseline)"),
+        ("control-points", "**control points**"),
+    ):
+        mean = source.mean(row, TWO, "psnr")
+        rival = row != "control-points" and mean is not None and ours is not None
+        theirs = number(published[row], 2)
+        lines.append(
+            [
+                source.label(row, text),
+                *(number(source.run(row, scene).get("psnr"), 2) for scene in TWO),
+                number(mean, 2),
+                signed(ours - mean) if rival else "",  # type: ignore[operator]
+                number(source.mean(row, TWO, "ssim"), 3),
+                thousands(source.mean(row, TWO, "gaussians"), 1),
+                number(source.mean(row, TWO, "seconds"), 0),
+                f"{theirs}, {signed(published['control-points'] - published[row])}" if rival else theirs,
+            ]
+        )
+    head = ["PSNR in dB", *TWO, "mean", "lead of control points", "SSIM", "Gaussians", "seconds"]
+    return table([*head, "published: mean, lead"], lines)
+
+
+def arap(source: Source) -> str:
+    """Write the ARAP ablation, where the true motion is known."""
+    base = source.run("per-gaussian", "figure")
+    lines = []
+    for row, text in (
+        ("on", "**control points, ARAP**"),
+        ("off", "control points without ARAP"),
+        ("per-gaussian", "one network query per Gaussian (the paper's baseline)"),
+    ):
+        run = source.run(row, "figure")
+        shares = {key: number(run[key] / base[key], 2) if run and run is not base else "" for key in ("epe", "jitter")}
+        lines.append(
+            [
+                source.label(row, text),
+                number(run.get("psnr"), 2),
+                number(run.get("ssim"), 3),
+                percent(run.get("epe"), 2),
+                shares["epe"],
+                percent(run.get("jitter"), 3),
+                shares["jitter"],
+                thousands(run.get("gaussians")),
+            ]
+        )
+    share = "of the baseline's"
+    return table(["", "PSNR", "SSIM", "motion error", share, "jitter", share, "Gaussians"], lines)
+
+
+def changes(scenes: tuple[str, ...], base: str) -> Callable[[Source], str]:
+    """Make the writer of a table of single changes.
+
+    Args:
+        scenes: columns of the table.
+        base: the row that the others are compared with, or ``TABLE/ROW``.
+    """
+
+    def write(source: Source) -> str:
+        name, _, row = base.rpartition("/")
+        origin = Source(source.runs, name or source.name)
+        rows = dict.fromkeys(own for name, own, _ in source.runs if name == source.name)
+        lines = []
+        counted = any(source.mean(own, scenes, "gaussians") is not None for own in rows)
+        for own in rows:
+            first = next(run for (name, of, _), run in source.runs.items() if (name, of) == (source.name, own))
+            mean = source.mean(own, scenes, "psnr")
+            compared = first.get("against")
+            other, _, its = (compared or "").rpartition("/")
+            reference = Source(source.runs, other).mean(its, scenes, "psnr") if compared else None
+            reference = origin.mean(row, scenes, "psnr") if reference is None else reference
+            reported = source.run(own, "mean").get("difference")
+            alone = (source.name, own) == (origin.name, row) or mean is None or reference is None
+            difference = None if alone else reported if reported is not None else mean - reference  # type: ignore[operator]
+            line = [
+                source.label(own, first.get("label", own)),
+                *(number(source.run(own, scene).get("psnr"), 2) for scene in scenes),
+                number(mean, 2),
+                signed(difference),
+            ]
+            lines.append([*line, thousands(source.mean(own, scenes, "gaussians"))] if counted else line)
+        head = ["change", *scenes, "mean", "difference"]
+        return table([*head, "Gaussians"] if counted else head, lines)
+
+    return write
+
+
+def overview(source: Source) -> str:
+    """Write the overview from the runs of the other tables."""
+    lines = []
+    arap_runs, published = Source(source.runs, "arap"), Source(source.runs, "published")
+    source.label("figure", "")
+    for row, scene, text in (
+        ("arap/on", "figure", "built-in scene, 400 x 400, `quick` (7,000 steps)"),
+        *(("published/cpu", scene, f"D-NeRF {scene}, `--downscale 2`, `cpu` (24,000 steps)") for scene in DNERF),
+        *(("published/paper", scene, f"D-NeRF {scene}, `--downscale 2`, `paper` (80,000 steps)") for scene in DNERF),
+    ):
+        name, _, own = row.partition("/")
+        run = source.runs.get((name, own, scene), {})
+        owner = arap_runs if name == "arap" else published
+        motion = f"{percent(run['epe'], 2)}, jitter {percent(run['jitter'], 3)}" if "epe" in run else ""
+        timed = run if "seconds" in run else source.run(scene, scene)
+        lines.append(
+            [
+                owner.label(own, text),
+                f"{number(run['psnr'])} dB" if run else "",
+                number(run.get("ssim"), 3),
+                motion,
+                training_time(timed),
+            ]
+        )
+    for owner in (arap_runs, published):
+        source.reported += owner.reported
+        source.older += owner.older
+    return table(["", "PSNR", "SSIM", "motion error", "training"], lines)
+
+
+WRITERS: dict[str, Callable[[Source], str]] = {
+    "published": beside_published,
+    "nodes": node_counts,
+    "motion": motion_models,
+    "arap": arap,
+    "parts": changes(TWO, "none"),
+    "parts-shading": changes(TWO, "parts/shading"),
+    "parts-threshold": changes(TWO, "parts-shading/threshold"),
+    "parts-settling": changes(("mutant", "standup"), "none"),
+    "parts-pruning": changes(TWO, "none"),
+    "overview": overview,
+}
+"""Writers by the name of the table, which the pages call ``quality-NAME``."""
+
+
+def quality_table(name: str, results: Path) -> str:
+    source = Source(read_runs(results), name)
+    text = WRITERS[name](source)
+    return "\n\n".join(part for part in (text, source.notes()) if part)
+
+
+def reported_table(path: Path) -> str:
+    """Write a table as it was reported.
+
+    Its file holds ``commit``, ``head`` and ``rows``, each with ``cells`` and, if it differs, its ``commit``.
+    """
+    values = json.loads(path.read_text(encoding="utf-8"))
+    lines = [[f"{row['cells'][0]} {REPORTED}".strip(), *row["cells"][1:]] for row in values["rows"]]
+    commits = [row.get("commit", values["commit"]) for row in values["rows"]]
+    return f"{table(values['head'], lines, numbers=False)}\n\n{reported_note(commits)}"

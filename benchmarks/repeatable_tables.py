@@ -1,0 +1,105 @@
+"""Tables of docs/scaling.md and docs/editing.md whose results can be measured again with committed scripts.
+
+Until all results of a table are there, the reported table stands in its place. A column NAME of the tables of sharing
+comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharing-NAME-alone.json``:
+
+    torchrun --standalone --nproc-per-node 2 benchmarks/sharing.py --size 200 --steps 25 --threads 1 \\
+        --json benchmarks/results/sharing-200.json
+    python benchmarks/sharing.py --size 400 --steps 25 --threads 1 --json benchmarks/results/sharing-400-alone.json
+
+The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
+and without ``--nodes 4096``).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from markdown_table import number, table
+from provenance import EDITING, OLDER, TRAINING, changed_since, older_note
+from timing_tables import machine_line
+
+COLUMNS = {"200": "200 x 200", "400": "400 x 400", "800": "800 x 800", "400-300k": "400 x 400, 300,000 Gaussians"}
+ALONE = ("400", "400-300k")
+
+Results = dict[str, dict[str, Any]]
+"""Results by the names of their files."""
+
+
+def processor_ms(result: dict[str, Any], *names: str) -> float:
+    """Sum up the processor time of some parts of a step."""
+    return sum(row["cpu_ms"] for row in result["rows"] if row["name"] in names)
+
+
+def sharing_steps(results: Results) -> str:
+    """Write the processor time of the parts of a step shared by two processes."""
+    shared = [results[f"sharing-{name}"] for name in COLUMNS]
+    moved = ("exchange", "join")
+    alone = [f"{processor_ms(results[f'sharing-{n}-alone'], 'step'):.0f} ms" if n in ALONE else "" for n in COLUMNS]
+    rest = [processor_ms(one, "step") - processor_ms(one, "view", *moved) for one in shared]
+    lines = [
+        ["one view, forward and backward", *(f"{processor_ms(one, 'view'):.0f} ms" for one in shared)],
+        [
+            "moving and adding gradients (`exchange`, `join`)",
+            *(f"{processor_ms(one, *moved):.0f} ms" for one in shared),
+        ],
+        ["averaging, Adam, statistics", *(f"{value:.0f} ms" for value in rest)],
+        ["the whole step", *(f"{processor_ms(one, 'step'):.0f} ms" for one in shared)],
+        ["the same with one process and one view", *alone],
+        ["bytes received per process", *(f"{one['mib_per_step']:.1f} MiB" for one in shared)],
+    ]
+    return table(["processor time", *COLUMNS.values()], lines)
+
+
+def sharing_memory(results: Results) -> str:
+    """Write the peaks of resident memory of one process, and of each of two."""
+    lines = []
+    for name, text in zip(ALONE, ("49,000 Gaussians, 400 x 400", "300,000 Gaussians, 400 x 400")):
+        peaks = (results[f"sharing-{name}-alone"]["peak_mib"], results[f"sharing-{name}"]["peak_mib"])
+        lines.append([text, *(f"{peak:,.0f} MiB" for peak in peaks)])
+    return table(["peak of resident memory", "one process", "each of two"], lines)
+
+
+def edit_updates(results: Results) -> str:
+    """Write the cost of an update of the editor for two numbers of control points, on one thread."""
+    lines = []
+    for result in results.values():
+        times = {row["name"]: row["ms_median"] for row in result["rows"] if row["threads"] == 1}
+        solve, skin = times["edit/drag/solve"], times["edit/drag/skin"]
+        count = f"{result['rows'][0]['control_points']:,}"
+        lines.append([count, *(f"{number(value)} ms" for value in (solve + skin, solve, times["edit/drag"]))])
+    return table(["control points", "a drag update (solve, skin)", "of which solve", "up to the picture"], lines)
+
+
+class Repeatable(NamedTuple):
+    """A table, the names of its results, and the folders with the code that they measure."""
+
+    write: Callable[[Results], str]
+    results: tuple[str, ...]
+    measures: tuple[str, ...]
+
+
+REPEATABLE = {
+    "scaling-step": Repeatable(
+        sharing_steps, (*(f"sharing-{n}" for n in COLUMNS), *(f"sharing-{n}-alone" for n in ALONE)), TRAINING
+    ),
+    "scaling-memory": Repeatable(
+        sharing_memory, (*(f"sharing-{n}" for n in ALONE), *(f"sharing-{n}-alone" for n in ALONE)), TRAINING
+    ),
+    "editing-updates": Repeatable(edit_updates, ("edit-cpu", "edit-4096-cpu"), EDITING),
+}
+
+
+def repeatable_table(name: str, folder: Path) -> str | None:
+    """Write a table from its results; None unless all of them are there."""
+    one = REPEATABLE[name]
+    paths = {result: folder / f"{result}.json" for result in one.results}
+    if not all(path.is_file() for path in paths.values()):
+        return None
+    results = {result: json.loads(path.read_text(encoding="utf-8")) for result, path in paths.items()}
+    older = [result["commit"] for result in results.values() if changed_since(result["commit"], one.measures)]
+    first = machine_line(next(iter(results.values()))) + (f" {OLDER}" if older else "")
+    return "\n\n".join(part for part in (first, one.write(results), older_note(older)) if part)
