@@ -6,12 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from helpers.bench_rows import TINY, app, check_rows, rows_of
+from helpers.bench_rows import TINY, check_rows, rows_of
 from helpers.edit_scenes import bar_scene
+from scgs_warp.apps import bench as app
 from scgs_warp.benchmark import editing
 from scgs_warp.edit import EditSession
 from scgs_warp.editor.frame_image import Picture
-from scgs_warp.editor.model import Model
+from scgs_warp.editor.model import EditorModel
 
 pytestmark = pytest.mark.usefixtures("all_threads")
 
@@ -26,7 +27,7 @@ def test_a_drag_in_the_editor(tmp_path, device, capsys):
 
 
 def test_three_handles_are_held_and_one_is_in_hand():
-    model = Model(EditSession(bar_scene()))
+    model = EditorModel(EditSession(bar_scene()))
     editing.hold(model)
     assert len(model.session.edit.handles) == editing.HANDLES == 3
     assert model.dragging and model.active == model.session.edit.handles[-1].name

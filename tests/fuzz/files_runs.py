@@ -111,7 +111,7 @@ def write_resumable(folder: Path, stage: str = "main") -> None:
     with RunFolder(folder, config, None, resume=False) as run:
         state = TrainState.begin(config, data(), "cpu")
         frames = frames_of(state)
-        run.begin(0)
+        run.start(0)
         for _ in range(2):
             training_step(state, frames)
             state.step += 1
@@ -125,7 +125,7 @@ def load_resumed(folder: Path, stage: str = "main") -> None:
     config = config_of_run(stage)
     with RunFolder(folder, config, None, resume=True) as run:
         state = TrainState.resume(folder, config, data(), "cpu")
-        run.begin(state.step)
+        run.start(state.step)
         within("seconds", run.elapsed, 0.0, 1e12)
         for optimizer in state.optimizers():
             for name, group in optimizer.groups.items():
@@ -159,7 +159,7 @@ def load_log(folder: Path) -> None:
     (folder / ".curves.png").unlink()
     expect(all(isinstance(line, dict) for line in lines), "a line that is no object")
     with RunFolder(folder, preset("cpu"), None, resume=True) as run:
-        run.begin(200)
+        run.start(200)
         within("seconds", run.elapsed, 0.0, 1e12)
 
 

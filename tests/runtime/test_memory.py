@@ -149,7 +149,7 @@ def test_a_refusal_gives_both_figures_and_the_remedy(monkeypatch: pytest.MonkeyP
 
 def test_images_take_half_of_what_is_free_at_most(monkeypatch: pytest.MonkeyPatch):
     allow(monkeypatch, 100 * 2**20)
-    assert abs(ImageCache(2048).budget - cache.SHARE * 100 * 2**20) <= 1
+    assert abs(ImageCache(2048).budget - cache.MEMORY_SHARE * 100 * 2**20) <= 1
     assert ImageCache(3).budget == 3 * 2**20
 
 
