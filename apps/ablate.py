@@ -51,7 +51,7 @@ class Options(Settings, SweepOptions):
 
     preset: PresetName | None = None
     """Schedule of all cells. cpu (the default): about 15 minutes per cell; quick: a few minutes; paper: the full
-    schedule."""
+    schedule. All cells are trained for equally many steps."""
 
 
 def words(texts: tuple[str, ...]) -> list[str]:

@@ -10,8 +10,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 REPORTED, OLDER = "†", "‡"
-RENDERING = ("kernels", "scgs_warp/ops", "scgs_warp/rendering", "scgs_warp/motion", "scgs_warp/scene")
-TRAINING = (*RENDERING, "scgs_warp/training", "scgs_warp/data", "scgs_warp/config")
+RENDERING = (
+    *("kernels", "scgs_warp/ops", "scgs_warp/runtime", "scgs_warp/geometry", "scgs_warp/rendering", "scgs_warp/motion"),
+    *("scgs_warp/scene", "scgs_warp/gaussians.py", "scgs_warp/types.py"),
+)
+TRAINING = (
+    *(*RENDERING, "scgs_warp/training", "scgs_warp/data", "scgs_warp/config", "scgs_warp/evaluation"),
+    *("scgs_warp/optim.py", "scgs_warp/seeding.py"),
+)
 EDITING = (*RENDERING, "scgs_warp/edit", "scgs_warp/editor")
 
 
@@ -42,7 +48,7 @@ def reported_note(commits: Iterable[str]) -> str:
 def older_note(commits: Iterable[str]) -> str:
     """Write the legend of ``OLDER``; empty without commits."""
     names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
-    return f"{OLDER} Measured at commit {names}; the measured code has changed since." if names else ""
+    return f"{OLDER} Recorded at commit {names}; the measured code has changed since." if names else ""
 
 
 def without_older_marks(page: str) -> str:

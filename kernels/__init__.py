@@ -3,13 +3,16 @@
 Forms
 -----
 
-A file is named after its stage of the pipeline. ``kernels/X.py`` is the portable form: plain Warp, the readable truth,
-on any device. ``cpu/X.py`` is the form for CPUs, in SIMD, and ``cuda/X.py`` the one for CUDA, by warps or blocks of
-threads; their C++ stands in ``native/``. A kernel has the same name in every form, and its adjoint ``X_adjoint``.
+A file is named after its stage of the pipeline. ``kernels/X.py`` is the portable form: plain Warp that runs on any
+device and is the readable reference. ``cpu/X.py`` is the SIMD form for CPUs, and ``cuda/X.py`` is the form for CUDA,
+which works by warps or blocks of threads; the C++ code of both is in ``native/``. A kernel that several forms share has
+the same name in each, and the adjoint of kernel ``x`` is ``x_adjoint``. Other kernels exist in one form only: for
+example, the CPU's ``skin_rbf`` does in one pass what ``rbf_weights`` and ``skin`` do in two.
 
-A CPU runs the cpu form where there is one, CUDA the cuda form; otherwise the portable form runs. Where torch is the
-portable form, CUDA runs that. The torch op of a stage lives in ``scgs_warp/ops/``, its float64 reference in
-``tests/reference/``. The last column names the tests that compare the forms, below ``tests/``; all run on a CPU.
+A CPU runs the cpu form where there is one, and CUDA runs the cuda form where there is one; otherwise the portable form
+runs. The portable form of the network is torch. The torch op of a stage is in ``scgs_warp/ops/``, and its float64
+reference is in ``tests/reference/``. The last column names the tests, below ``tests/``, that compare the forms; all of
+them run on a CPU.
 
 ===========  ===========  ================  ==================  ========================================
 stage        portable     cpu               cuda                compared in
@@ -33,12 +36,13 @@ network      torch        network                               kernels/test_net
 roofline                  roofline                              benchmark/test_scaling
 ===========  ===========  ================  ==================  ========================================
 
-- ``binning.py`` holds the geometry that both sorts share; ``cuda/binning.py`` is plain Warp, so it runs on a CPU too.
-- ``cuda/compositing_blocks.py`` uses Warp's tile API instead of native code. It serves more channels than a gradient
-  slot of ``cuda/compositing.py`` holds.
+- ``binning.py`` has no kernels: it holds the geometry that the sorts in ``cpu/`` and ``cuda/`` share.
+  ``cuda/binning.py`` is plain Warp, so it runs on a CPU too.
+- ``cuda/compositing_blocks.py`` uses Warp's tile API instead of native code. It takes over when there are more channels
+  than a gradient slot of ``cuda/compositing.py`` holds.
 - ``cuda/node_sums.py`` replaces the sums by chunks in the adjoints of ``neighbors`` and ``skinning``.
-- ``cpu/roofline.py`` measures the machine for benchmarks; it is no stage.
-- All other stages have the portable form alone.
+- ``cpu/roofline.py`` is not a stage: it measures the machine for benchmarks.
+- Every stage that the table does not list has a portable form only.
 
 Conventions
 -----------
@@ -46,11 +50,12 @@ Conventions
 - Frames: OpenCV cameras (x right, y down, z forward); ``viewmat`` is world-to-camera; quaternions are ``wxyz``.
   Pixel centres lie at +0.5. Images are planar, ``[C, H, W]``: a row of 16 pixels is one SIMD register.
 - Every kernel's first argument is ``first: int``, the grid index at which this launch starts
-  (``i = first + wp.tid()``). On a CPU ``scgs_warp.runtime.launch.launch`` splits one grid over threads with it;
-  on CUDA it is 0. Kernels therefore use a one-dimensional grid.
-- Arguments stand one to a line, grouped under ``# In:`` and ``# Out:``, named ``*_in`` and ``*_out``, with their shape
-  in a comment. Inputs are never written. Each output element is written by exactly one grid index (no atomics), so
-  the same inputs give the same bits whatever the number of threads.
+  (``i = first + wp.tid()``). On a CPU ``scgs_warp.runtime.launch.launch`` uses it to split one grid over threads, which
+  requires a one-dimensional grid. The exception are kernels that work by blocks of threads: their grid has the
+  indices ``(block, lane)``, and ``first`` is the first block.
+- Each argument has a line of its own, with its shape in a comment. Arguments are grouped under ``# In:`` and
+  ``# Out:`` and named ``*_in`` and ``*_out``. Inputs are never written. Each output element is written by exactly one
+  grid index (no atomics), so the results do not depend on the number of threads.
 - Adjoints are written by hand (``enable_backward`` is off); incoming gradients are named ``v_*_in``, results
   ``v_*_out``.
 """

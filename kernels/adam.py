@@ -1,8 +1,8 @@
 """Adam (Kingma and Ba 2015, algorithm 1) over many tensors in one launch.
 
-Tensors are named by address: a launch reads a table with one row per tensor and a list of chunks, so that 30 tensors
-cost one launch, and each value is read once and written once. This form takes one element per grid index, pads the last
-chunk of a tensor, and runs on any device; ``cpu/adam.py`` takes one chunk per grid index.
+A launch reads a table with the addresses of each tensor, one row per tensor, and a list of chunks. Thus 30 tensors cost
+one launch, and each value is read once and written once. This form updates one element per grid index, pads the last
+chunk of a tensor, and runs on any device; ``cpu/adam.py`` updates one chunk per grid index.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def adam_step(
     one_beta2: float,  # 1 - beta2
     eps: float,
 ):
-    """Take one step, changing values and moments in place. Grid: C x ADAM_CHUNK."""
+    """Update one element and its moments in place. Grid: C x ADAM_CHUNK."""
     i = first + wp.tid()
     chunk = i // _CHUNK
     tensor = int(chunks_in[chunk, 0])
@@ -42,7 +42,7 @@ def adam_step(
     averages = wp.array(ptr=wp.uint64(addresses_in[tensor, 2]), shape=(size,), dtype=float)
     squares = wp.array(ptr=wp.uint64(addresses_in[tensor, 3]), shape=(size,), dtype=float)
     g = gradients[at]
-    if wp.isfinite(g):  # a NaN stays: the caller looks for it
+    if wp.isfinite(g):  # NaN is kept, because the caller searches for it
         g = wp.clamp(g, -ADAM_GRADIENT_MAX, ADAM_GRADIENT_MAX)
     m = averages[at] + one_beta1 * (g - averages[at])
     v = beta2 * squares[at] + one_beta2 * (g * g)

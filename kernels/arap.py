@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def largest_entry(S: wp.mat33d):
-    """Return the largest absolute value, or 0 where an entry is non-finite: such a matrix has no rotation either."""
+    """Return the largest absolute entry, or 0 if an entry is non-finite; neither such matrix has a rotation."""
     largest = wp.float64(0.0)
     for a in range(3):
         for b in range(3):
@@ -32,7 +32,7 @@ def local_rotations(
 ):
     """Compute R = argmin sum w |e' - R e|^2 = U diag(1, 1, det(U V^T)) V^T with U S V^T = sum w e' e^T. Grid: M.
 
-    In float64, because a node has only a few edges, and in thin limbs they are nearly collinear.
+    The computation is in float64, because nodes have few edges and those in thin limbs are nearly collinear.
     """
     i = first + wp.tid()
     S = wp.mat33d(wp.float64(0.0))
@@ -46,7 +46,7 @@ def local_rotations(
     R = wp.identity(n=3, dtype=wp.float64)
     if largest > wp.float64(1.0e-60):
         U, _sigma, V = wp.svd3(S / largest)
-        # Singular values come in descending order: a reflection is undone along the smallest one.
+        # A reflection is undone along the smallest singular value, which comes last.
         if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):
             for a in range(3):
                 U[a, 2] = -U[a, 2]
@@ -98,7 +98,7 @@ def arap_energy_adjoint(
     v_rest_out: wp.array[wp.vec3],  # [M]
     v_posed_out: wp.array[wp.vec3],  # [M]
 ):
-    """Compute a node's gradients over the edges that leave it, then over those that lead to it. Grid: M.
+    """Sum a node's gradients over its outgoing edges, then over its incoming edges. Grid: M.
 
     Edges whose gradient overflows or is non-finite are left out.
     """

@@ -1,7 +1,7 @@
-"""As-rigid-as-possible editing of the control points: the two steps that alternate with a sparse solve.
+"""As-rigid-as-possible editing of the control points: the two kernels that run before each sparse solve.
 
-All in float64: there are a few hundred points only, and results are compared bit by bit. Edges lie in rows (``begin``)
-and are listed in both directions.
+Both compute in float64: there are only a few hundred points, and results are compared bit by bit. Edges are stored in
+compressed rows (``begin``), and each edge is listed in both directions.
 """
 
 import warp as wp
@@ -31,7 +31,7 @@ def turn_nodes(
     """Compute R = argmin sum w (|e' - R e|^2 + smoothness |R - R_j|^2) + leaning |R - asked|^2, with determinant +1
     (SR-ARAP, Levi & Gotsman). Grid: F.
 
-    Where all edges lie along one line, take the smallest of the rotations that fit them.
+    If all edges are parallel, many rotations fit equally well; the smallest is taken.
     """
     i = nodes_in[first + wp.tid()]
     S = wp.mat33d(wp.float64(0.0))
@@ -46,7 +46,7 @@ def turn_nodes(
     R = rotations_in[i]
     if largest > wp.float64(1.0e-60):
         U, sigma, V = wp.svd3(S / largest)
-        # Singular values come in descending order: a reflection is undone along the smallest one.
+        # A reflection is undone along the smallest singular value, which comes last.
         if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):
             for a in range(3):
                 U[a, 2] = -U[a, 2]
@@ -93,7 +93,7 @@ def edge_sums(
         kept = wanted  # the edge at its old length
         size = wp.length(posed)
         if size > wp.float64(0.0):
-            # Weighted by how well its direction fits: else a reversed edge would stay reversed, and a joint folded.
+            # The weight says how well the edge's direction fits; otherwise reversed edges and folds would persist.
             cosine = wp.dot(posed, wanted) / wp.max(size * wp.length(wanted), wp.float64(1e-300))
             along = wp.max(cosine, wp.float64(0.0))
             kept = (along * wp.length(edge) / size) * posed + (wp.float64(1.0) - along) * wanted

@@ -18,10 +18,10 @@ def arithmetic(
     # Out:
     values_out: wp.array[float],  # [C] written, so that no compiler drops the loop
 ):
-    """Iterate the logistic map. Grid: C."""
+    """Iterate the logistic map in C independent chains. Grid: C."""
     i = first + wp.tid()
     x = float(0.3)
-    # The map is chaotic: it has no closed form, and its one value stays in a register.
+    # The compiler cannot shorten the loop, because the chaotic map has no closed form. The value stays in a register.
     for _round in range(rounds):
         x = 3.9 * x * (1.0 - x)
     values_out[i] = x

@@ -1,9 +1,9 @@
 """Geometry of the tiles that a splat touches, shared by the sorts in ``cpu/binning.py`` and ``cuda/binning.py``.
 
-A splat reaches the pixels where its alpha is at least 1/255, the ellipse ``q <= 2 ln(255 o)``. A tile is touched where
-the rectangle of its pixel centres meets that ellipse. Of each row of tiles the touched ones are an interval: the
-ellipse cut by the row's slab is convex, so its shadow on the x axis decides exactly, at the price of two roots a row
-(the idea of AccuTile, Speedy-Splat, Hanson et al. 2024, section 4).
+A splat reaches the pixels where its alpha is at least 1/255, the ellipse ``q <= 2 ln(255 o)``. It touches a tile if the
+rectangle of the tile's pixel centres meets that ellipse. The ellipse is convex, so the tiles that it touches in a row
+of tiles form an interval: the projection onto the x axis of the part within the row. Computing it exactly takes two
+square roots per row (the idea of AccuTile, Speedy-Splat, Hanson et al. 2024, section 4).
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import warp as wp
 
 from .types import ALPHA_MIN
 
-# Counting and emitting must find the same tiles, but fused multiplications and additions may differ between kernels.
+# Counting and emitting must find the same tiles, but the compiler may fuse multiply-adds differently in each kernel.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 DEPTH_CULLED = wp.constant(3.0e38)
-"""Sort key of splats that touch no tile; finite, so that no sort of floats has to order a NaN or an infinity."""
+"""Sort key of splats that touch no tile. It is finite, so that no sort has to order a NaN or an infinity."""
 
 REACH_SLACK = wp.constant(1.0e-3)
-"""Slack added to the ellipse for the rounding of q in float32, so that no pixel at the threshold loses its splat."""
+"""Slack added to the bound on q against rounding in float32, so that no pixel at the threshold loses its splat."""
 
 LOG2_COEFFICIENTS = (1.4426933, -0.72116273, 0.47770593, -0.33924777, 0.21558853, -0.096066249, 0.020490346)
-"""log2(1 + m) / m on [0, 1], lowest power first, from a fit at Chebyshev points; log2 is right to 2e-6."""
+"""Coefficients of log2(1 + m) / m on [0, 1], lowest power first, fitted at Chebyshev points; log2 is right to 2e-6."""
 
 LOG2_0, LOG2_1, LOG2_2, LOG2_3, LOG2_4, LOG2_5, LOG2_6 = (wp.constant(value) for value in LOG2_COEFFICIENTS)
 
@@ -41,7 +41,7 @@ class Ellipse:
 
 @wp.func
 def reach_of(opacity: float) -> float:
-    """Compute ``2 ln(255 o)``, at least 0, plus slack. The library's logarithm rounds differently on each device."""
+    """Compute ``2 ln(255 o)``, at least 0, plus slack, avoiding library logarithms, which round differently per device."""
     bits = wp.cast(opacity / ALPHA_MIN, wp.uint32)
     m = wp.cast((bits & wp.uint32(0x7FFFFF)) | wp.uint32(0x3F800000), float) - 1.0
     log2 = float(LOG2_6)
@@ -61,7 +61,7 @@ def splat_ellipse(mean: wp.vec2, conic: wp.vec3, opacity: float, depth: float, r
     e.reach = float(-1.0)
     if radius[0] <= 0 or radius[1] <= 0 or not opacity >= ALPHA_MIN:
         return e
-    # A sum of finite products is finite unless one of them is not (or so large that the splat is beyond use).
+    # The sum is non-finite if a product is, or if products are so large that the splat is useless anyway.
     if not wp.isfinite(mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + opacity + depth):
         return e
     # In float64: of a needle's determinant float32 leaves nothing but rounding.
@@ -81,7 +81,7 @@ def splat_ellipse(mean: wp.vec2, conic: wp.vec3, opacity: float, depth: float, r
 
 @wp.func
 def touched(low: float, high: float, tile_size: int, tiles: int, extent: int) -> wp.vec2i:
-    """Return begin and end of the tiles, along one axis, whose span of pixel centres meets [low, high]."""
+    """Return begin and end of the tiles along one axis whose intervals of pixel centres meet [low, high]."""
     if not (high >= 0.5 and low <= float(extent) - 0.5):
         return wp.vec2i(0, 0)
     scale = 1.0 / float(tile_size)
@@ -99,7 +99,7 @@ def touched_rows(e: Ellipse, tile_size: int, rows: int, height: int) -> wp.vec2i
 
 @wp.func
 def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: int, height: int) -> wp.vec2i:
-    # The slab of the row's pixel centres, cut to the ellipse; it may cut off either tip.
+    # The row's span of pixel centres, limited to the ellipse's extent, may exclude either tip of the ellipse.
     low = wp.max(float(row * tile_size) + 0.5 - e.mean[1], -e.half_height)
     high = wp.min(float(wp.min((row + 1) * tile_size, height)) - 0.5 - e.mean[1], e.half_height)
     right = wp.clamp(e.tip, low, high)
@@ -112,12 +112,12 @@ def touched_columns(e: Ellipse, row: int, tile_size: int, columns: int, width: i
 
 @wp.func
 def rows_within(span: wp.vec2i, tile_begin: int, tile_end: int, columns: int) -> wp.vec2i:
-    """Cut the rows of tiles to those in which tiles ``tile_begin`` to ``tile_end`` lie."""
+    """Restrict a range of rows of tiles to the rows that contain tiles ``tile_begin`` to ``tile_end``."""
     return wp.vec2i(wp.max(span[0], tile_begin // columns), wp.min(span[1], (tile_end + columns - 1) // columns))
 
 
 @wp.func
 def columns_within(span: wp.vec2i, row: int, tile_begin: int, tile_end: int, columns: int) -> wp.vec2i:
-    """Cut a row's tiles to those from ``tile_begin`` to ``tile_end``."""
+    """Restrict a row's range of tiles to tiles ``tile_begin`` to ``tile_end``."""
     begin = wp.max(span[0], tile_begin - row * columns)
     return wp.vec2i(begin, wp.max(begin, wp.min(span[1], tile_end - row * columns)))

@@ -1,12 +1,13 @@
-"""Alpha compositing on any device, one thread per pixel.
+"""Alpha compositing on any device, one pixel per grid index (the adjoint: one tile).
 
-Front to back over a tile's sorted splats (3D Gaussian Splatting, Kerbl et al. 2023, equation 3)::
+Each pixel blends its tile's sorted splats front to back (3D Gaussian Splatting, Kerbl et al. 2023, equation 3)::
 
     image = sum_i channels_i alpha_i T_i + T_end background,    T_i = prod_{j < i} (1 - alpha_j)
     alpha_i = min(0.999, o_i exp(-q_i / 2)),    q = A dx^2 + 2 B dx dy + C dy^2,    d = pixel centre - mean
 
-A splat with alpha under 1/255 (or q < 0, which rounding makes of needles) is skipped; a pixel ends for good when the
-next transmittance would be <= 1e-4. The faster forms in ``cpu/`` and ``cuda/`` are tested against this one.
+A splat is skipped at a pixel where its alpha is under 1/255, or where q < 0, which rounding can cause for needle-shaped
+splats. A pixel ends before the splat that would bring its transmittance to 1e-4 or less. The faster forms in ``cpu/``
+and ``cuda/`` are tested against this one.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def add_pixel_adjoint(
     slot: int,
     v_slots: wp.array2d[float],
 ):
-    """Add to a slot the gradients to the splat's mean, conic and opacity from that to one pixel's alpha."""
+    """Add the gradients of a splat's mean, conic and opacity to its slot, given that of its alpha at one pixel."""
     d = centre - mean
     falloff = wp.exp(-0.5 * squared_distance(conic, d))
     if opacity * falloff > ALPHA_MAX:
@@ -146,7 +147,7 @@ def composite_adjoint(
     # Out:
     v_slots_out: wp.array2d[float],  # [P, S], S >= 8 + C; row: mean 2, conic 3, opacity 1, |mean| 2, channels C, rest
 ):
-    """Walk a tile pixel by pixel, back to front from the last contributor; one thread per tile and its slots."""
+    """Compute the gradients of one tile's pairs, pixel by pixel, each back to front from its last contributor."""
     tile = first + wp.tid()
     span = ranges_in[tile]
     for p in range(span[0], span[1]):
@@ -158,7 +159,7 @@ def composite_adjoint(
         for x in range(x_begin, wp.min(x_begin + tile_size, width)):
             centre = wp.vec2(float(x) + 0.5, float(y) + 0.5)
             transmittance = transmittance_in[y, x]
-            behind = float(-v_alpha_in[y, x])  # what lies behind the current splat, weighted by v_image
+            behind = float(-v_alpha_in[y, x])  # colour behind the current splat, weighted by v_image
             for c in range(channels_in.shape[1]):
                 behind += v_image_in[c, y, x] * background_in[c]
             behind *= transmittance
@@ -197,7 +198,7 @@ def sum_slots(
     v_channels_out: wp.array2d[float],  # [N, C]
     absgrad_out: wp.array[wp.vec2],  # [N]; empty: not wanted
 ):
-    """Sum each splat's slots in the order they were emitted: the same bits every time."""
+    """Sum each splat's slots in the order in which they were emitted, so that results are reproducible bit by bit."""
     i = first + wp.tid()
     begin = int(offsets_in[i])
     end = int(offsets_in[i + 1])
@@ -229,7 +230,7 @@ def sum_slots(
 
 
 SLOT_WIDTH = 16
-"""Columns of a slot that is one cache line: up to 8 channels."""
+"""Number of columns of a slot that fills one cache line and holds up to 8 channels."""
 
 Slot = wp.types.vector(length=SLOT_WIDTH, dtype=wp.float32)
 
@@ -248,7 +249,7 @@ def sum_line_slots(
     v_channels_out: wp.array2d[float],  # [N, C], C <= 8
     absgrad_out: wp.array[wp.vec2],  # [N]; empty: not wanted
 ):
-    """Sum as ``sum_slots`` does, of slots that are one vector: the same bits, in half the time on a CPU."""
+    """Sum slots of ``SLOT_WIDTH`` columns as vectors: bit-identical to ``sum_slots``, in half the time on a CPU."""
     i = first + wp.tid()
     total = Slot()
     if more != 0:
@@ -292,7 +293,7 @@ def add_stats(
     v = v_means2d_in[i]
     ndc = wp.vec2(v[0] * 0.5 * float(width), v[1] * 0.5 * float(height))
     norm = wp.length(ndc)
-    if wp.isfinite(norm):  # else its square overflows
+    if wp.isfinite(norm):  # an infinite norm means that its square overflowed
         grad_norm_out[i] = grad_norm_out[i] + norm
     count_out[i] = count_out[i] + 1.0
     max_radii_out[i] = wp.max(max_radii_out[i], float(radius) / float(wp.max(width, height)))

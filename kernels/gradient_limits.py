@@ -1,8 +1,8 @@
 """Limits for gradients, applied at the ends of adjoint kernels.
 
-Extreme but finite values have gradients that overflow. A Gaussian or control point with such a gradient passes 0, so
-that the sums it takes part in stay finite. A NaN from a loss is not hidden: it reaches the gradients of colours, which
-pass unchanged, and those of Gaussians whose incoming gradient is non-finite.
+Extreme but finite values have gradients that overflow. Such a gradient of a Gaussian or control point becomes 0, so
+that sums over many Gaussians stay finite. A NaN from a loss stays visible: gradients of colours are not limited, and
+a Gaussian whose incoming gradient is non-finite passes it on.
 """
 
 import warp as wp

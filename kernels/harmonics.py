@@ -17,7 +17,7 @@ C31 = wp.constant(0.4570457994644658)
 C30 = wp.constant(0.3731763325901154)
 C3Z = wp.constant(1.445305721320277)
 FACTORS = ("C0", "C1", "C2", "C20", "C22", "C33", "C32", "C31", "C30", "C3Z")
-"""Names of the basis functions' factors."""
+"""Names of the basis functions' constant factors, which the native code shares."""
 
 
 @wp.func
@@ -35,7 +35,7 @@ def view_ray(mean: wp.vec3, camera: wp.vec3):
 
 @wp.func
 def not_negative(color: float) -> float:
-    """Clamp a colour at 0. A non-finite one stays non-finite, so that compositing leaves the splat out."""
+    """Clamp a colour at 0. A non-finite colour stays non-finite, so that compositing leaves the splat out."""
     return wp.where(color > 0.0, color, color - color)
 
 
@@ -179,7 +179,7 @@ def spherical_harmonics_adjoint(
             s9 * (yy - xx) + s10 * x * z + s11 * (1.0 - 5.0 * zz) - 2.0 * s14 * y * z + 2.0 * s15 * x * y,
             s10 * x * y - 10.0 * z * (s11 * y + s13 * x) + s12 * (5.0 * zz - 1.0) + s14 * (xx - yy),
         )
-    # The direction is normalised: only what is perpendicular to it moves it.
+    # Only a gradient's component perpendicular to the direction counts, because the direction is normalised.
     v_mean = inverse * (g - wp.dot(g, d) * d)
     if beyond(v_mean) == 0:
-        v_means_out[i] = v_mean  # else it overflows and is left out
+        v_means_out[i] = v_mean  # an overflowing gradient is left out

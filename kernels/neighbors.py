@@ -1,7 +1,8 @@
-"""The K nearest control points of every Gaussian, and the weights with which they pull it (SC-GS, Eq. 5).
+"""The K nearest control points ("nodes") of every Gaussian, and their skinning weights (SC-GS, Eq. 5).
 
-``nearest`` is exact: one point per thread, a sorted list of the K best, the nodes in ascending order, inserted on a
-strict ``<``. Ties go to the lower index, and a distance that is NaN is never inserted.
+``nearest`` is exact. Each thread visits all nodes in ascending order for one point and keeps a sorted list of the K
+nearest so far. A node enters the list only if it is strictly nearer than one in it, so ties go to the lower index and
+NaN distances are never inserted.
 """
 
 import warp as wp
@@ -24,7 +25,7 @@ def nearest(
     indices_out: wp.array2d[wp.int32],  # [N, K] nearest first
     distances_out: wp.array2d[float],  # [N, K] squared
 ):
-    """Find the K nearest nodes of point ``i``; the sorted list lives in the outputs' own row."""
+    """Find the K nearest nodes of point ``i``; row ``i`` of the outputs holds the sorted list during the search."""
     i = first + wp.tid()
     for j in range(K):
         indices_out[i, j] = j
@@ -68,7 +69,7 @@ def rbf_weights(
     # Out:
     weights_out: wp.array2d[float],  # [N, K]
 ):
-    """Take the softmax of ``log s - d^2 / (2 r^2)`` over a Gaussian's neighbours.
+    """Compute a Gaussian's weights: the softmax of ``log s - d^2 / (2 r^2)`` over its neighbours.
 
     The first neighbour gets all the weight if no exponent is finite.
     """
@@ -115,7 +116,7 @@ def rbf_weights_adjoint(
     v_logits_out: wp.array2d[float],  # [N, K] gradient to log s - d^2 / (2 r^2)
     v_points_out: wp.array2d[float],  # [N, D]
 ):
-    """Compute the gradients of one Gaussian's values; ``rbf_reduce_*`` sums the nodes' from ``v_logits_out``."""
+    """Compute the gradients of one Gaussian's values; later kernels sum those of the nodes from ``v_logits_out``."""
     i = first + wp.tid()
     K = indices_in.shape[1]
     mean = float(0.0)
@@ -146,7 +147,7 @@ def _rbf_add(
     nodes: wp.array2d[float],
     sums: wp.array2d[float],
 ):
-    """Add pair (i, m) to its node's sums: v, v d^2, v (x - p)."""
+    """Add pair (i, m) of Gaussian and node to the node's sums: v, v d^2, v (x - p)."""
     if v != 0.0:
         d2 = float(0.0)
         for d in range(nodes.shape[1]):
@@ -169,7 +170,7 @@ def rbf_reduce_chunks(
     # Out:
     sums_out: wp.array2d[float],  # [chunks * M, 2 + D] zero on entry
 ):
-    """Sum one chunk of Gaussians for every node, on a CPU; its size does not depend on the number of threads."""
+    """Sum one chunk of Gaussians for every node, on a CPU. Chunk sizes do not depend on the number of threads."""
     chunk = first + wp.tid()
     M = nodes_in.shape[0]
     for i in range(chunk * size, wp.min((chunk + 1) * size, points_in.shape[0])):

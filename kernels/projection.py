@@ -2,8 +2,8 @@
 
 With ``A = R_view R(q) S`` (the Gaussian's axes in the camera's frame) and the Jacobian ``J`` of the perspective, the 2D
 covariance is ``(J A)(J A)^T``. Its determinant is the squared norm of the cross product of the two rows of ``J A``,
-which loses no digits where the Gaussian is seen edge-on. The adjoint recomputes all of it: reading what the forward
-pass could have stored costs more.
+which loses no digits where the Gaussian is seen edge-on. The adjoint recomputes these intermediate values, which costs
+less than storing and reading them.
 """
 
 import warp as wp
@@ -15,10 +15,10 @@ from .types import ALPHA_MIN
 wp.set_module_options({"enable_backward": False})
 
 FRUSTUM_MARGIN = wp.constant(0.3)
-"""Bound of the Jacobian, in tan(fov / 2) outside the image: at grazing angles it would explode."""
+"""Margin outside the image, in tan(fov / 2), beyond which x / z and y / z are clamped: the Jacobian would explode."""
 
 RADIUS_MAX = wp.constant(1.0e9)
-"""Largest radius in pixels: it covers every image, and a larger float would overflow int32."""
+"""Largest radius in pixels. It covers every image, and a larger float would overflow int32."""
 
 
 @wp.struct
@@ -124,7 +124,7 @@ def project(
     conic = wp.vec3(0.0)
     radii = wp.vec2i(0, 0)
     depth = float(0.0)
-    # A comparison with NaN is false: written as what must hold, the conditions cull it.
+    # Comparisons with NaN are false. Each condition states what must hold, so that NaN is culled.
     visible = z > 0.0 and z >= near_plane and z <= far_plane and opacity >= ALPHA_MIN and wp.isfinite(opacity)
     visible = visible and determinant > 0.0 and quat_inverse_norm(quat) > 0.0
     if visible:
@@ -135,7 +135,7 @@ def project(
         visible = wp.max(radius_x, radius_y) > radius_clip and radius_x > 0.0 and radius_y > 0.0
         visible = visible and mean2d[0] + radius_x > 0.0 and mean2d[0] - radius_x < w
         visible = visible and mean2d[1] + radius_y > 0.0 and mean2d[1] - radius_y < h
-        # The sum of what is finite and positive is finite unless a term is not.
+        # The sum is finite only if every term is.
         visible = visible and wp.isfinite(conic[0] + conic[2] + xx + yy) and wp.isfinite(conic[1])
         visible = visible and wp.isfinite(mean2d[0]) and wp.isfinite(mean2d[1]) and wp.isfinite(z)
         if visible:
@@ -266,7 +266,7 @@ def project_adjoint(
     if has_view != 0:
         v_rotation = wp.outer(v_point, mean) + v_axes * wp.transpose(quat_matrix(unit))
 
-    # Where usable gradients become others (an overflow), none is passed; what came in as NaN goes out as NaN.
+    # If usable incoming gradients overflow here, pass zeros; an incoming NaN stays NaN.
     given = beyond(v_mean2d[0]) + beyond(v_mean2d[1]) + beyond(v_depth) + beyond(v_opacities_in[i])
     given += beyond(v_conics_in[i])
     made = beyond(v_opacity) + beyond(v_mean) + beyond(v_scale) + beyond(v_quat) + beyond(v_point)

@@ -1,8 +1,8 @@
 """Quaternion functions for other kernels, ``wxyz`` in a ``wp.vec4`` (``wp.quat`` is xyzw), and their adjoints.
 
 An adjoint takes the inputs of its function and the gradient of its result, and returns the gradients of the inputs.
-``quat_matrix`` and ``quat_rotate`` are polynomials that are rotations for unit quaternions only; their adjoints are
-those of the polynomials, so the chain through ``quat_normalise_adjoint`` is exact.
+``quat_matrix`` and ``quat_rotate`` are polynomials, which give rotations for unit quaternions only. Their adjoints are
+exact derivatives of these polynomials, so chaining them with ``quat_normalise_adjoint`` is exact, too.
 """
 
 import warp as wp
@@ -32,7 +32,7 @@ def quat_normalise(q: wp.vec4) -> wp.vec4:
 
 @wp.func
 def quat_normalise_adjoint(q: wp.vec4, v_unit: wp.vec4) -> wp.vec4:
-    """Return the gradient of q; it is 0 for a quaternion of norm 0, whose normalised value is constant."""
+    """Return the gradient of q; it is 0 for a quaternion of norm 0, which normalises to a constant."""
     inverse = quat_inverse_norm(q)
     unit = inverse * q
     return inverse * (v_unit - wp.dot(unit, v_unit) * unit)
@@ -40,7 +40,7 @@ def quat_normalise_adjoint(q: wp.vec4, v_unit: wp.vec4) -> wp.vec4:
 
 @wp.func
 def quat_multiply(a: wp.vec4, b: wp.vec4) -> wp.vec4:
-    """Return the Hamilton product, which rotates by b, then by a."""
+    """Return the Hamilton product a b, which rotates by b, then by a."""
     return wp.vec4(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -56,7 +56,7 @@ def quat_conjugate(q: wp.vec4) -> wp.vec4:
 
 @wp.func
 def quat_multiply_adjoint(a: wp.vec4, b: wp.vec4, v_product: wp.vec4):
-    """Return v_a and v_b. The product is linear in each factor; its transpose is the product with the conjugate."""
+    """Return v_a and v_b, each a product with a conjugate: transposing a multiplication conjugates its factor."""
     return quat_multiply(v_product, quat_conjugate(b)), quat_multiply(quat_conjugate(a), v_product)
 
 

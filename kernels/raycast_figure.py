@@ -1,6 +1,6 @@
 """Ray casting of a small textured triangle mesh, for the built-in synthetic scene. Forward only.
 
-The textures are solid: functions of the position in the part's own rest frame, so they travel with the surface.
+The textures are solid: functions of the position in the rest frame of a body part, so they move with the surface.
 ``visible`` and ``light_vertices`` serve every mesh; ``albedo`` draws the patterns of the figure in
 ``scgs_warp/data/synthetic/figure.py``.
 """
@@ -27,7 +27,7 @@ GOLDEN = wp.constant(2.399963229728653)
 
 @wp.func
 def fractal_noise(p: wp.vec3, seed: int):
-    """Return two octaves of gradient noise, about [-1, 1]."""
+    """Return the sum of two octaves of gradient noise, about [-1, 1]."""
     state = wp.rand_init(seed)
     return wp.noise(state, p) + 0.5 * wp.noise(state, p * 2.17)
 
@@ -99,7 +99,7 @@ def face(p: wp.vec3, shell: wp.vec3, visor: wp.vec3, glow: wp.vec3):
 
 
 SOFTNESS = wp.constant(0.3)
-"""Share of the ground colour in a pattern's other colours: enough contrast to see motion by, learnable in minutes."""
+"""Fraction of the ground colour mixed into a pattern's other colours: motion stays visible, and training is short."""
 
 
 @wp.func
@@ -173,7 +173,7 @@ def sphere_direction(index: int, count: int, rotation: float):
 
 @wp.func
 def blocked(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, reach: float):
-    """Return whether the ray meets the front of a triangle first; a ray from inside another part (a joint) does not."""
+    """Return whether the ray first hits a front face; a ray that starts inside another part (a joint) does not."""
     query = wp.mesh_query_ray(mesh, origin, direction, reach)
     return query.result and query.sign > 0.0
 
@@ -195,7 +195,7 @@ def light_vertices(
 ):
     """Compute sky light with ambient occlusion and a broad key light with a soft shadow. Grid: P.
 
-    Light is computed per vertex, so it has no sampling noise between pixels.
+    Light is computed per vertex and interpolated, so pixels show no sampling noise.
     """
     i = first + wp.tid()
     normal = normals_in[i]

@@ -1,8 +1,8 @@
 """Ray casting of a textured triangle mesh, for scenes made from glTF files. Forward only.
 
 A ray passes through the back of a single-sided triangle, through a texel under the alpha cutoff, and partly through a
-translucent surface. Colour is looked up and lit in linear light and encoded as sRGB; samples are averaged in stored
-values, as splats are composited.
+translucent surface. Texture lookup and lighting are linear, then the colour is encoded as sRGB. Samples are averaged
+after encoding, because splats are composited in encoded values as well.
 """
 
 import warp as wp
@@ -21,7 +21,7 @@ BLEND = wp.constant(2)
 LAYERS = wp.constant(32)
 """Maximum number of surfaces along one ray."""
 CLEAR = wp.constant(1.0e-3)
-"""Share of light below which a ray ends."""
+"""Transmittance below which a ray ends."""
 
 
 @wp.func
@@ -121,7 +121,7 @@ def surface(
 
 @wp.func
 def opacity(alpha: float, sign: float, mode: int, double_sided: int, cutoff: float):
-    """Return the share of a ray that a surface stops."""
+    """Return the fraction of a ray's light that a surface stops."""
     if sign < 0.0 and double_sided == 0:
         return float(0.0)
     if mode == OPAQUE:

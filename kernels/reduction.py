@@ -1,4 +1,4 @@
-"""Sums in an order that depends on the data's shape alone."""
+"""Column sums, added up in an order that depends on the data's shape alone."""
 
 import warp as wp
 
@@ -15,7 +15,7 @@ def sum_rows(
     # Out:
     sums_out: wp.array2d[float],  # [ceil(N / ROWS), C]
 ):
-    """Add up groups of ``ROWS`` rows, column by column. Grid: ceil(N / ROWS) x C."""
+    """Sum each column over groups of ``ROWS`` consecutive rows. Grid: ceil(N / ROWS) x C."""
     i = first + wp.tid()
     columns = values_in.shape[1]
     group = i // columns

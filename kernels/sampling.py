@@ -6,7 +6,7 @@ wp.set_module_options({"enable_backward": False})
 
 CHOSEN = wp.constant(-1.0)
 NOT_FINITE = wp.constant(-0.5)
-"""Distances that mark points: already chosen, and to be chosen only when no finite point is left."""
+"""Distances that mark two kinds of points: those already chosen, and non-finite ones, which are chosen last."""
 
 
 @wp.kernel
@@ -43,7 +43,7 @@ def farthest_step(
 ):
     """Choose the farthest point, then update a chunk's distances to it. Grid: chunks.
 
-    Every chunk chooses for itself, from the same numbers, so that one launch does both.
+    Every chunk finds the farthest point itself, from the same numbers, so that one launch does both steps.
     """
     chunk = first + wp.tid()
     chosen = int(best_index_in[0])

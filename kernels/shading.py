@@ -1,8 +1,8 @@
 """Shading: each Gaussian's brightness as a function of its own rotation.
 
 To first order the light that a diffuse surface reflects is linear in its normal (an environment's irradiance up to
-degree 1). While a surface turns by R, its brightness therefore changes by the share ``x = <G, R - I>``, where G
-combines light and normal. A lamp's light is cut off at grazing angles, which a quadratic term of x approximates.
+degree 1). If a surface turns by R, its brightness therefore changes by the relative amount ``x = <G, R - I>``, where G
+combines light and normal. A term quadratic in x approximates the cut-off of a lamp's light at grazing angles.
 """
 
 import warp as wp
@@ -14,9 +14,9 @@ wp.set_module_options({"enable_backward": False})
 GAIN_MAX = wp.constant(4.0)
 """Upper limit of a Gaussian's brightness, relative to its brightness at rest."""
 BEND = wp.constant(5.0)
-"""Scale of the quadratic term's coefficient, chosen so that it learns about as fast as G."""
+"""Scale of the quadratic term's coefficient, chosen so that the coefficient learns about as fast as G."""
 GREY = wp.constant(1.7724538509055159)
-"""0.5 / C0, as the coefficient of degree 0 is (colour - 0.5) / C0."""
+"""Constant 0.5 / C0: the coefficient of degree 0 is (colour - 0.5) / C0."""
 
 
 @wp.func
@@ -38,7 +38,7 @@ def response(i: int, shading: wp.array2d[float], turn: wp.mat33) -> float:
 
 @wp.func
 def gain(x: float, bend: float) -> float:
-    """Return 1 + x + 5 b x^2, neither limited nor checked."""
+    """Return the gain 1 + x + 5 b x^2 before limits and checks."""
     return 1.0 + x + BEND * bend * x * x
 
 
@@ -82,7 +82,7 @@ def shade_adjoint(
     v_sh_dc_out: wp.array[wp.vec3],  # [N]
     v_shading_out: wp.array2d[float],  # [N, 10]
 ):
-    """Compute the gradients of colour, G and b; a limited or replaced gain passes none to G and b. Grid: N."""
+    """Compute the gradients of colour, G and b; a limited or replaced gain passes no gradient to G and b. Grid: N."""
     i = first + wp.tid()
     turn = turned(quats_in[i], quats_t_in[i])
     x = response(i, shading_in, turn)

@@ -1,9 +1,12 @@
 """Linear blend skinning of Gaussians by their control points (SC-GS, Eq. 6 and 7).
 
-The adjoint runs in three launches: one thread per Gaussian for its own gradients, then the sums over each node's
-Gaussians (by chunks of Gaussians on a CPU, by segments of all pairs in ``cuda/node_sums.py``), then one thread per
-node. The rotation's gradient is summed as the matrix ``G = sum w v (x - p)^T``, which is turned into the quaternion's
-once per node.
+On a CPU the kernels of ``cpu/skinning*.py`` run instead, except for sizes beyond their limits and for gradients with
+respect to given weights.
+
+The adjoint runs in three steps: ``skin_adjoint`` computes each Gaussian's own gradients, the second step sums over each
+node's Gaussians (by chunks of Gaussians on a CPU, by segments of all pairs in ``cuda/node_sums.py``), and
+``skin_finish`` computes each node's gradients from its sums. The rotation's gradient is summed as the matrix
+``G = sum w v (x - p)^T`` and converted to the quaternion's gradient once per node.
 """
 
 import warp as wp
@@ -21,12 +24,12 @@ from .quaternion import (
 wp.set_module_options({"enable_backward": False})
 
 SUMS = 16
-"""Columns of the node sums: G (9), w v (3), w s v_blend (4), then w v_log_scales (3) if there are log scales."""
+"""Number of columns of the node sums: G (9), w v (3), w s v_blend (4); with log scales 3 more, w v_log_scales."""
 
 
 @wp.func
 def aligned(q: wp.vec4, reference: wp.vec4):
-    """Return q or -q, whichever lies on the side of the reference."""
+    """Return q or -q, whichever has a non-negative dot product with the reference."""
     if wp.dot(q, reference) < 0.0:
         return -q
     return q
@@ -150,7 +153,7 @@ def skin_adjoint(
             lost += 1
         lost += beyond(v_w)
     lost += beyond(v_mean)
-    if lost > 0 and beyond(v) + beyond(v_q) == 0:  # what comes in as NaN goes out as NaN
+    if lost > 0 and beyond(v) + beyond(v_q) == 0:  # an incoming NaN stays NaN
         v_mean = wp.vec3(0.0)
         v_quat = wp.vec4(0.0)
         v_blend = wp.vec4(wp.nan)
@@ -178,7 +181,7 @@ def _add(
     has_log_scales: int,
     sums: wp.array2d[float],
 ):
-    """Add pair (i, k) to its node's sums."""
+    """Add the pair of Gaussian i and its k-th neighbour to that node's sums."""
     x = means[i]
     if not finite(v_blends[i]):
         return
@@ -219,7 +222,7 @@ def skin_reduce_chunks(
     # Out:
     sums_out: wp.array2d[float],  # [chunks * M, SUMS (+ 3)] zero on entry
 ):
-    """Sum one chunk of Gaussians for every node, on a CPU; its size does not depend on the number of threads."""
+    """Sum one chunk of Gaussians for every node, on a CPU. Chunk sizes do not depend on the number of threads."""
     chunk = first + wp.tid()
     M = nodes_in.shape[0]
     for i in range(chunk * size, wp.min((chunk + 1) * size, means_in.shape[0])):

@@ -1,14 +1,14 @@
 """Photometric loss: L1 and SSIM of two planar images, forward and adjoint.
 
-SSIM (Wang et al. 2004, equation 13) with an 11 x 11 Gaussian of sigma 1.5 and zero padding. Four blurred maps give a
-window's statistics, because the two variances occur only as their sum: ``x``, ``y``, ``x^2 + y^2`` and ``x y``.
-The forward pass leaves the three partial derivatives of each SSIM value (with respect to blurred ``x``, ``x^2 + y^2``
-and ``x y``); a blur is its own adjoint, so the gradient is three more blurs::
+SSIM is that of Wang et al. 2004 (equation 13), with an 11 x 11 Gaussian of sigma 1.5 and zero padding. The statistics
+of a window follow from four blurred maps, ``x``, ``y``, ``x^2 + y^2`` and ``x y``, because the two variances occur only
+as their sum. The forward pass stores the three partial derivatives of each SSIM value (with respect to blurred ``x``,
+``x^2 + y^2`` and ``x y``). A blur is its own adjoint, so the gradient takes three more blurs::
 
     d/dx = G * d_mean + 2 x (G * d_squares) + y (G * d_product)
 
-This form takes one pixel or one row per grid index and runs on any device; ``cpu/ssim.py`` is the SIMD form. Where
-``mask`` is false the image counts as equal to the truth, and the pixel's own L1 and SSIM are left out.
+This form computes one pixel or one row per grid index and runs on any device; ``cpu/ssim.py`` is the SIMD form. Where
+``mask`` is false, the image counts as equal to the truth, and the pixel's own L1 and SSIM are left out.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SSIM_C2 = 0.03**2
 
 _taps = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(RADIUS + 1)]
 TAPS = [tap / (_taps[0] + 2.0 * sum(_taps[1:])) for tap in _taps]
-"""One half of the window, centre first; the whole window sums to 1."""
+"""Weights of one half of the window, centre first; the whole window sums to 1."""
 
 Taps = wp.types.vector(length=RADIUS + 1, dtype=wp.float32)
 _WINDOW = wp.constant(Taps(*TAPS))
@@ -130,7 +130,7 @@ def sum_rows(
     # Out:
     sums_out: wp.array[float],  # [R]
 ):
-    """Add along rows, left to right. Grid: R."""
+    """Sum each row from left to right. Grid: R."""
     i = first + wp.tid()
     total = float(0.0)
     for column in range(values_in.shape[1]):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import warp as wp
 
 LOG2_E = 1.4426950408889634
-"""log2(e): exponentials are taken to base 2."""
+"""Constant log2(e), since exponentials are taken to base 2."""
 
 TILE_SIZE = 16
-"""Side of a tile in pixels: one row of it is one 512-bit SIMD register, its 256 pixels are one CUDA block."""
+"""Side of a tile in pixels: a row of a tile fills one 512-bit SIMD register, and a tile's 256 pixels one CUDA block."""
 
 LANES = 16
-"""Floats of a vector in the CPU's kernels, one AVX-512 register."""
+"""Number of floats in a vector of the CPU's kernels, one AVX-512 register."""
 
 ALPHA_MIN = wp.constant(1.0 / 255.0)
 """Smallest alpha of a splat at a pixel; a smaller one could not change an 8-bit image and is skipped."""
@@ -20,53 +20,54 @@ ALPHA_MAX = wp.constant(0.999)
 """Upper clamp of alpha, so that the adjoint can divide by 1 - alpha; a clamped alpha passes no gradient."""
 
 TRANSMITTANCE_MIN = wp.constant(1.0e-4)
-"""Smallest transmittance of a pixel: it ends for good before the splat that would leave no more than this."""
+"""Smallest transmittance of a pixel: blending ends before the splat that would reduce it to this value or less."""
 
 CHANNEL_MAX = wp.constant(1.0e18)
-"""Largest channel of a splat; a splat beyond this or with a NaN is left out. The square of this is still a float32,
-and so are the gradients of the splats behind."""
+"""Largest magnitude of a splat's channel; a splat with a larger one or a NaN is left out. The square of the limit and
+the gradients of the splats behind still fit into float32."""
 
 GRADIENT_MAX = wp.constant(1.0e30)
-"""Largest gradient of one Gaussian; one beyond this counts as 0. Sums over a hundred million Gaussians stay finite."""
+"""Largest gradient of one Gaussian; a larger one becomes 0, so that sums over 100 million Gaussians stay finite."""
 
 POSITION_MAX = wp.constant(1.0e18)
-"""Largest coordinate of a Gaussian that passes gradients to its control points: products beyond it would overflow."""
+"""Largest coordinate of a Gaussian that passes gradients to its control points: larger ones would overflow."""
 
 SLOT_GEOMETRY = 8
-"""Leading columns of a gradient slot: 2D mean (2), conic (3), opacity (1), absolute 2D mean (2); channels follow."""
+"""Number of columns before the channels in a gradient slot: 2D mean (2), conic (3), opacity (1), absolute 2D mean (2)."""
 
 PACKED_GEOMETRY = 8
-"""Leading columns of a splat packed for the CPU: mean 2, scaled conic 3, log2 of the opacity, its inverse, -B / A."""
+"""Number of columns before the channels in a splat packed for the CPU: mean (2), scaled conic (3), log2 of the opacity,
+its inverse, -B / A."""
 
 CHANNEL_GROUP = 8
-"""Granularity of a packed splat's channels on the CPU, which are padded with zeros to a multiple of this."""
+"""A packed splat's channels on the CPU are padded with zeros to a multiple of this number."""
 
 ADAM_CHUNK = 4096
-"""Elements of a chunk, the share of a tensor that one grid index of the CPU's Adam updates."""
+"""Number of elements in a chunk, the part of a tensor that one grid index of the CPU's Adam updates."""
 
 ADAM_GRADIENT_MAX = wp.constant(1.0e19)
-"""Clamp of finite gradients in Adam: beyond it their square would overflow, and the value would never move again."""
+"""Limit to which Adam clamps finite gradients: a square that overflows would freeze the value for good."""
 
 ROOFLINE_CHAINS = 12
-"""Independent sums of a thread: enough to hide the latency of a multiply-add, few enough to stay in registers."""
+"""Number of independent sums per thread: enough to hide a multiply-add's latency, few enough for the registers."""
 
 ROOFLINE_BLOCK = 1 << 18
-"""Floats that one grid index copies: 1 MiB."""
+"""Number of floats that one grid index copies: 1 MiB."""
 
 NETWORK_PANEL = 32
-"""Columns of a panel of the network's matrices on a CPU. Widths of hidden layers are multiples of it."""
+"""Number of columns in a panel of the network's matrices on a CPU. Widths of hidden layers are multiples of it."""
 
 NETWORK_BLOCK = 32
-"""Rows that one grid index takes through all layers on a CPU; matrices have a multiple of 8 rows."""
+"""Number of rows that one grid index takes through all layers on a CPU; matrices have a multiple of 8 rows."""
 
 SSIM_BAND = 64
-"""Rows that one grid index of the CPU's photometric loss computes; 10 more rows are blurred horizontally per band."""
+"""Number of rows in a band, which one grid index of the CPU's photometric loss computes; 10 more are blurred for it."""
 
 SSIM_BLOCK = 128
-"""Columns that it works on at once: 4 maps x 11 rows x 128 columns are 22 KiB."""
+"""Number of columns of a band processed at once: 4 maps x 11 rows x 128 columns take 22 KiB."""
 
 MAX_DIMENSIONS = 64
-"""Most dimensions of points that the SIMD search for neighbours takes: it keeps a block's coordinates on the stack."""
+"""Largest number of dimensions in the SIMD search for neighbours, which keeps a block's coordinates on the stack."""
 
 MAX_HYPER = 8
-"""Most hyper-coordinates of a Gaussian that SIMD skinning takes: the room for them in a control point's row."""
+"""Largest number of hyper-coordinates in SIMD skinning: a control point's row has room for this many."""

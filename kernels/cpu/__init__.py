@@ -1,1 +1,1 @@
-"""SIMD forms of the stages for the CPU, under the file names of their portable forms."""
+"""SIMD forms of the stages for the CPU; file names match the portable forms."""

@@ -1,4 +1,4 @@
-"""Adam in SIMD, one chunk per grid index, and the search for non-finite values. Tables as in ``adam``."""
+"""Adam in SIMD, one chunk per grid index, and the search for non-finite values. The tables are those of ``adam``."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def adam_step(
     one_beta2: float,  # 1 - beta2
     eps: float,
 ):
-    """Take one step, changing values and moments in place. Grid: C."""
+    """Update one chunk and its moments in place. Grid: C."""
     adam_chunk(first + wp.tid(), addresses_in, factors_in, sizes_in, chunks_in, one_beta1, beta2, one_beta2, eps)
 
 
@@ -52,5 +52,5 @@ def find_non_finite(
     # Out:
     found_out: wp.array[int],  # [C] 1 where the chunk holds a non-finite value, else 0
 ):
-    """Mark the chunks that hold an infinity or a NaN. Grid: C."""
+    """Mark the chunk if it holds an infinity or a NaN. Grid: C."""
     find_non_finite_in_chunk(first + wp.tid(), addresses_in, sizes_in, chunks_in, found_out)

@@ -1,17 +1,17 @@
-"""Binning on a CPU: splats are dealt to rows of tiles, and each row is sorted by itself.
+"""Binning on a CPU: splats are distributed to rows of tiles, and each row is sorted separately.
 
-A *band* is a row of tiles; a *stretch* is the interval of its columns that one splat touches. Splats are turned into
-stretches in index order, which walks memory from front to back, and dealt to their bands. The stretches of one band fit
-into a core's own cache, where they are sorted by depth and laid out tile by tile. There are four launches, of which all
+A *band* is a row of tiles; a *stretch* is the interval of a band's columns that one splat touches. Splats are turned
+into stretches in index order, which reads memory sequentially, and distributed to their bands. The stretches of one
+band fit into a core's own cache, where they are sorted by depth and written tile by tile. There are four launches; all
 but the second are shared among threads:
 
 1. ``count_chunks`` finds the tiles that each splat touches, 16 splats at a time, and counts the stretches that a chunk
    of splats has in each band.
-2. ``place_chunks`` turns these counts into running sums, the places where each chunk writes.
+2. ``place_chunks`` turns these counts into running sums, the positions at which each chunk writes.
 3. ``deal_chunks`` writes the stretches by band, within a band in the order of the splats' indices.
 4. ``sort_bands`` sorts each band by depth with a stable radix sort, then fills its tiles' lists by counting.
 
-Lists sorted by tile, depth and index are unique, so nothing depends on the number of chunks or threads. The native code
+The order by tile, depth and index is unique, so results do not depend on the number of chunks or threads. Native code
 repeats the arithmetic of ``binning`` operation by operation, so that a CPU and a GPU find the same tiles.
 """
 
@@ -90,7 +90,7 @@ def place_chunks(
     pairs_out: wp.array[wp.int64],  # [chunks + 2] counts, becomes: pairs before the chunk; all pairs; all stretches
     band_begins_out: wp.array[int],  # [bands + 1]
 ):
-    """Turn counts into running sums, in one grid index: there is little to add up."""
+    """Turn counts into running sums. One grid index does it all, since there is little to add up."""
     chunks = stretches_out.shape[0]
     stretches = wp.int64(0)
     for band in range(band_begins_out.shape[0]):

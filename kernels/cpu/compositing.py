@@ -1,15 +1,16 @@
 """Alpha compositing on a CPU: one tile per grid index, a row of 16 pixels in one SIMD register.
 
-The meaning is that of ``compositing``; the work is laid out as follows:
+The kernels compute what ``compositing`` computes; the work is laid out as follows:
 
-- Splats come packed (``pack_splats``): one gather of a cache line or two per pair, logarithm and divisions done once.
+- Splats are packed beforehand (``pack_splats``): a pair reads one or two cache lines, and the logarithm and the
+  divisions are done once per splat.
 - Exponentials are taken to base 2: ``alpha = 2^(power + log2 o)``, where the factor of ``power = -q / (2 ln 2)`` is
   folded into the conic.
 - One vector operation finds which of a tile's 16 rows a splat reaches; only those are visited.
-- The sign of its transmittance marks a pixel that has ended: the next transmittance is then never > 1e-4.
-- The adjoint contracts the channels with the incoming gradient first, so one running sum per pixel suffices. It keeps
-  the sums of a (tile, splat) pair in registers, a column of pixels per lane, and adds up the lanes at the end, 16 sums
-  at a time.
+- A pixel that has ended gets a negative transmittance, so the test of the next transmittance, > 1e-4, always fails.
+- The adjoint first contracts a splat's channels with the incoming gradient, so one running sum per pixel suffices. The
+  sums of a (tile, splat) pair stay in registers, one column of pixels per lane; at the end the lanes are added up, for
+  16 sums at a time.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from ..types import CHANNEL_MAX, LOG2_E, PACKED_GEOMETRY
 wp.set_module_options({"enable_backward": False})
 
 TILE_SIDE = 16
-"""Side of the tiles that this form serves, in pixels: a row is a register."""
+"""Side in pixels of the tiles that this form supports: one row of pixels fills a register."""
 
 
 @wp.kernel

@@ -1,4 +1,4 @@
-"""``harmonics`` on a CPU: 16 Gaussians at a time, their coefficients read and written as whole vectors."""
+"""Colour from spherical harmonics on a CPU: 16 Gaussians at a time, with coefficients handled as whole vectors."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def spherical_harmonics(
     # Out:
     colors_out: wp.array[wp.vec3],  # [N] >= 0, or non-finite where a coefficient is
 ):
-    """Grid: ceil(N / 16)."""
+    """Compute the colours of 16 Gaussians. Grid: ceil(N / 16)."""
     begin = (first + wp.tid()) * _LANES
     harmonics_block(begin, sh_dc_in, sh_rest_in, rest, means_in, camera_in, degree, colors_out)
 
@@ -65,7 +65,7 @@ def spherical_harmonics_adjoint(
     v_sh_rest_out: wp.array[wp.vec3],  # [N * R]
     v_means_out: wp.array[wp.vec3],  # [N]; the camera's is minus their sum
 ):
-    """Grid: ceil(N / 16)."""
+    """Compute the gradients of 16 Gaussians. Grid: ceil(N / 16)."""
     harmonics_block_adjoint(
         (first + wp.tid()) * _LANES, sh_rest_in, rest, means_in, camera_in, degree, colors_in, v_colors_in, has_rest,
         has_means, v_sh_dc_out, v_sh_rest_out, v_means_out,

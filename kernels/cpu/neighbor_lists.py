@@ -1,4 +1,4 @@
-"""Lists of the nodes that each block of sixteen points close together has within reach, for ``nearest_listed``."""
+"""Candidate nodes for ``nearest_listed``: for each block of sixteen nearby points, a list of the nodes within reach."""
 
 import warp as wp
 
@@ -8,10 +8,10 @@ from ..types import LANES
 wp.set_module_options({"enable_backward": False})
 
 LIST_SIZE = wp.constant(128)
-"""Largest number of nodes in a block's list. A block that has more within reach is searched in full."""
+"""Largest number of nodes in a block's list. A block with more nodes within reach is searched in full."""
 
 MARGIN = wp.constant(0.35)
-"""Extra reach of a list, in units of the distance to the block's farthest neighbour."""
+"""Extra reach of a list, in units of the distance to the block's farthest neighbour; it leaves room for movements."""
 
 
 @wp.kernel
@@ -23,8 +23,11 @@ def largest_shift(
     # Out:
     shift_out: wp.array[float],  # [1]
 ):
-    """Compute the largest distance that a node has moved, in one grid index. A node that is non-finite now is nobody's
-    neighbour and does not count; one that was non-finite before gives infinity."""
+    """Compute the largest distance that any node has moved, in one grid index.
+
+    Nodes that are non-finite now do not count, because they are never neighbours. A node that was non-finite before and
+    is finite now gives infinity.
+    """
     most = float(0.0)
     for m in range(nodes_in.shape[0]):
         poison = float(0.0)
@@ -67,7 +70,7 @@ def morton_codes(
     # Out:
     codes_out: wp.array[wp.int32],  # [N]
 ):
-    """Compute the Morton code of point ``i`` in the first three dimensions; any code if the point is non-finite."""
+    """Compute the Morton code of point ``i`` from its first three coordinates; arbitrary if the point is non-finite."""
     i = first + wp.tid()
     code = int(0)
     for d in range(wp.min(points_in.shape[1], 3)):
@@ -90,7 +93,7 @@ def list_blocks(
     counts_out: wp.array[wp.int32],  # [blocks]
     lists_out: wp.array2d[wp.int32],  # [blocks, LIST_SIZE]
 ):
-    """Compute centre, reach and list of block ``i``."""
+    """Compute the centre, the reach and the list of nodes of block ``i``."""
     block = first + wp.tid()
     D = points_in.shape[1]
     last = distances_in.shape[1] - 1
@@ -104,7 +107,7 @@ def list_blocks(
             if distances_in[i, last] < wp.inf:
                 low = wp.min(low, points_in[i, d])
                 high = wp.max(high, points_in[i, d])
-        centres_out[block, d] = 0.5 * low + 0.5 * high  # NaN where no point counts: nothing is listed
+        centres_out[block, d] = 0.5 * low + 0.5 * high  # NaN if no point is finite: nothing is listed
     reach = float(0.0)
     farthest = float(0.0)
     for at in range(begin, end):

@@ -1,11 +1,12 @@
 """Search for the K nearest control points on a CPU: a block of sixteen points per grid index, a point per SIMD lane.
 
-``nearest`` searches every node. ``nearest_listed`` searches the nodes that a block of sixteen Gaussians close together
-had within reach when ``list_blocks`` ran, and proves that no other node matters: a node outside the list was at least
-``reach`` from the block's centre c, and has come closer by no more than the largest shift of any node since. If
-``|x - c| + d_K + shift < reach``, the K nearest are therefore in the list. A block with a lane for which this does not
-hold is searched in full. Both kernels visit nodes in ascending order, compute distances by the same expression and
-insert on a strict ``<``, so they give the same indices, ties included, whatever the lists.
+``nearest`` searches all nodes. ``nearest_listed`` searches only a list of nodes: those that were within ``reach`` of
+the block's centre c when ``list_blocks`` ran, for blocks of sixteen Gaussians that lie close together. It also proves
+that no other node matters. Every node outside the list was at least ``reach`` away from c, and has come closer by at
+most ``shift``, the largest movement of any node since. Therefore, if ``|x - c| + d_K + shift < reach`` for point x and
+its K-th distance d_K, its K nearest nodes are in the list. If this fails for any lane, the block is searched in full.
+Both kernels visit nodes in ascending order, compute distances by the same expression and insert on a strict ``<``, so
+their indices are the same, ties included, whatever the lists.
 """
 
 import warp as wp

@@ -1,8 +1,8 @@
-"""A small multilayer perceptron on a CPU: every layer for a block of rows in one go.
+"""A small multilayer perceptron on a CPU: each block of rows passes through all layers at once.
 
-Matrices lie in panels of 32 columns (``native/network_panels.h``). Layer l reads the ``inputs`` (where any of its
-columns are theirs), then the output of layer l - 1; every layer but the last is followed by a ReLU. The table of layers
-has the columns that ``network_panels.h`` lists. On other devices torch runs the network.
+Matrices are stored in panels of 32 columns (``native/network_panels.h``). Layer l reads the ``inputs`` (if the table
+gives it input columns), then the output of layer l - 1. A ReLU follows every layer but the last. The columns of the
+table of layers are listed in ``network_panels.h``. On other devices torch runs the network.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def pack_weights(
     # Out:
     packed_out: wp.array[float],
 ):
-    """Pack weights in panels, as each product of a layer reads them. Grid: L x panels."""
+    """Pack weights into panels, in the layout that each matrix product of a layer reads. Grid: L x panels."""
     task = first + wp.tid()
     pack_panel(task // panels, task % panels, table_in, packed_out)
 
@@ -58,7 +58,7 @@ def pack_inputs(
     # Out:
     inputs_out: wp.array3d[float],  # [panels, R, 32], R >= T M; rows t M + m; zero elsewhere
 ):
-    """Write every position at every time, side by side. Grid: R."""
+    """Write one input row: the columns of a position, then those of a time, for every pair of both. Grid: R."""
     pack_row(first + wp.tid(), where_in, when_in, inputs_out)
 
 

@@ -1,4 +1,4 @@
-"""Adjoint of a small multilayer perceptron on a CPU: of its hidden values, its inputs and its weights.
+"""Adjoint of a small multilayer perceptron on a CPU: gradients of its hidden values, inputs and weights.
 
 The network, its matrices and its table are those of ``network``.
 """
@@ -48,7 +48,7 @@ def network_adjoint(
     # Out:
     v_hidden_out: wp.array3d[float],  # [L, V, width] gradient before each layer's ReLU, in panels
 ):
-    """Take gradients back through all layers for a block of rows. Grid: blocks."""
+    """Propagate gradients back through all layers for a block of rows. Grid: blocks."""
     network_block_adjoint(first + wp.tid(), size, begin, table_in, packed_in, hidden_in, v_values_in, v_hidden_out)
 
 
@@ -82,7 +82,7 @@ def network_weights_adjoint(
     hidden_in: wp.array3d[float],  # [L, R, width]
     v_hidden_in: wp.array3d[float],  # [L, V, width]
 ):
-    """Write gradients of weights and biases where the table says; add to them from the second V rows on.
+    """Write gradients of weights and biases to the table's addresses; add to them for all rows after the first V.
 
     Grid: L x panels x parts.
     """

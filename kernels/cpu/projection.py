@@ -1,4 +1,4 @@
-"""Projection on a CPU: sixteen Gaussians at a time, a Gaussian in each SIMD lane, by the formulas of ``projection``."""
+"""Projection on a CPU: sixteen Gaussians at a time, one in each SIMD lane, by the formulas of ``projection``."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def project_adjoint(
     v_scales_out: wp.array[wp.vec3],  # [N]
     v_opacities_out: wp.array[float],  # [N]
 ):
-    """Compute the gradients of Gaussians ``16 i .. 16 i + 15``; ``projection.project_adjoint`` has the camera's."""
+    """Compute the gradients of Gaussians ``16 i .. 16 i + 15``. The portable adjoint computes the camera's."""
     _project_adjoint(
         (first + wp.tid()) * LANES, means_in, quats_in, scales_in, opacities_in, viewmat_in, K_in, width, height,
         eps2d, antialiased, radii_in, v_means2d_in, v_conics_in, v_depths_in, v_opacities_in, v_means_out, v_quats_out,

@@ -1,4 +1,4 @@
-"""Loops that reach a CPU's limits, to hold times against: fused multiply-adds in registers, and copying memory."""
+"""Loops that reach a CPU's limits, for comparison with measured times: multiply-adds in registers, and copies."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ def copy(
     # Out:
     target_out: wp.array[float],  # [B * ROOFLINE_BLOCK] aligned to 64 bytes
 ):
-    """Copy 1 MiB. Grid: B."""
+    """Copy one block of 1 MiB. Grid: B."""
     copy_block(first + wp.tid(), source_in, target_out)

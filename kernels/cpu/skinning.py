@@ -1,9 +1,9 @@
 """Skinning on a CPU, with known weights (``skin``) or with RBF weights in the same pass (``skin_rbf``).
 
-Sixteen Gaussians are moved at a time, a Gaussian in each SIMD lane. The formulas are those of ``neighbors.rbf_weights``
-and ``skinning.skin``. Control points are the rows of ``skinning_palette.py``, so blending takes one multiply-add of a
-whole row per neighbour. Known weights are used to render a scene; the adjoint of ``skin_rbf`` stands in
-``skinning_adjoint.py``.
+Sixteen Gaussians are moved at a time, one in each SIMD lane. The formulas are those of ``neighbors.rbf_weights`` and
+``skinning.skin``. Control points are stored as the rows of ``skinning_palette.py``, so blending takes one multiply-add
+of a whole row per neighbour. Rendering a trained scene uses known weights, without an adjoint; the adjoint of
+``skin_rbf`` is in ``skinning_adjoint.py``.
 """
 
 import warp as wp

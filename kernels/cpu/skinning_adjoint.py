@@ -1,7 +1,7 @@
 """Adjoint of ``skinning.skin_rbf``: a chunk of Gaussians per grid index, sixteen at a time.
 
-A Gaussian's gradient is added to its node by one multiply-add of a row: the outer product ``v (x, 1)^T`` and the
-gradient of the blended rotation are laid out as the palette's motion row.
+A Gaussian's contribution to a node takes one multiply-add of a row, because it is laid out as the palette's motion row:
+the outer product ``v (x, 1)^T`` and the gradient of the blended rotation.
 """
 
 import warp as wp
@@ -47,7 +47,7 @@ def skin_rbf_adjoint(
     v_motion_out: wp.array2d[float],  # [chunks * M, 16]
     v_reach_out: wp.array2d[float],  # [chunks * M, 16]: as reach; v e, v d^2, v, w v_log_scales of the exponents' v
 ):
-    """Compute the gradients of one chunk of Gaussians, and their sums for every node."""
+    """Compute the gradients of one chunk of Gaussians, and this chunk's sums for every node."""
     chunk = first + wp.tid()
     _skin_rbf_adjoint(
         chunk, size, means_in, quats_in, hyper_in, has_hyper, motion_in, reach_in, aligned, has_strengths,

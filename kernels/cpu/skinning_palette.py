@@ -1,4 +1,4 @@
-"""Palette of the control points for ``cpu/skinning.py``: two rows of sixteen floats per node, a register each.
+"""Palette for ``cpu/skinning.py``: two rows of sixteen floats per control point (node), each row one register.
 
 - ``motion``: the affine map ``[R | p + T - R p]`` (12, row by row), then the unit shape rotation (4);
 - ``reach``: position (3), ``-1 / (2 r^2)``, ``log s``, log scales (3), hyper-coordinates (MAX_HYPER, zero-padded).
@@ -66,7 +66,7 @@ def palette(
 
 @wp.func
 def _sum_rows(m: int, parts: wp.array2d[row]):  # type: ignore[valid-type]
-    """Add row m of every chunk, in order."""
+    """Return the sum of row m over all chunks, in order."""
     total = row()
     for chunk in range(parts.shape[0]):
         total += parts[chunk, m]
@@ -98,7 +98,7 @@ def palette_adjoint(
     v_shape_rotations_out: wp.array[wp.vec4],  # [M], touched only with has_shape_rotations
     v_log_scales_out: wp.array[wp.vec3],  # [M], touched only with has_log_scales
 ):
-    """Compute the gradients of one node from those of its two rows."""
+    """Compute the gradients of one node from the gradients of its two rows."""
     m = first + wp.tid()
     motion = _sum_rows(m, v_motion_in)
     reach = _sum_rows(m, v_reach_in)

@@ -1,7 +1,7 @@
-"""Photometric loss in SIMD: one grid index takes a band of rows of one channel. Meaning and sums as in ``ssim``.
+"""Photometric loss in SIMD: one grid index processes a band of rows of one channel. ``ssim`` defines the loss.
 
-A band is walked downwards. Each row is blurred horizontally into a ring of 11 rows, which stays in the first-level
-cache; as soon as the ring is full the row in its middle is blurred vertically and finished. A vector holds 16
+A band is processed from top to bottom. Each row is blurred horizontally into a ring of 11 rows, which stays in the
+first-level cache. As soon as the ring is full, its middle row is blurred vertically and finished. A vector holds 16
 neighbouring pixels.
 """
 

@@ -1,1 +1,1 @@
-"""Forms of the stages for CUDA, by warps or blocks of threads, under the file names of their portable forms."""
+"""CUDA forms of the stages, which work by warps or blocks of threads; file names match the portable forms."""

@@ -1,12 +1,12 @@
-"""Binning on CUDA: the pairs of tile and splat by two radix sorts, which a GPU shares among its threads.
+"""Binning on CUDA: two radix sorts, parallel on a GPU, order the pairs of tile and splat.
 
-The first sort orders the N splats by depth, with keys of 32 bits. Their P pairs are listed in that order, and the
-second sort orders them by tile alone, with keys of a dozen bits. The sort is stable, so both together sort by tile,
-then depth, then index, with a third of the traffic of sorting P keys of both.
+The first sort orders the N splats by depth, with keys of 32 bits. Their pairs are listed in that order, and the second
+sort orders the pairs by tile alone, with keys of a dozen bits. Radix sort is stable, so the pairs end up sorted by
+tile, then depth, then index. This takes a third of the memory traffic of one sort by keys of tile and depth.
 
-Nothing here depends on a count that the host would have to know. Lists have room for P pairs; spare room is filled with
-a tile beyond the last, and pairs that do not fit are left out. The caller compares the room with the true total
-afterwards. The kernels are plain Warp and run on a CPU too.
+No kernel waits for a count to reach the host. Lists have room for P pairs; spare room is filled with a tile beyond the
+last, and pairs that do not fit are left out. The caller compares the room with the true total afterwards. The kernels
+are plain Warp and run on a CPU too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import warp as wp
 
 from ..binning import DEPTH_CULLED, columns_within, rows_within, splat_ellipse, touched_columns, touched_rows
 
-# Counting and emitting must find the same tiles, but fused multiplications and additions may differ between kernels.
+# Counting and emitting must find the same tiles, but the compiler may fuse multiply-adds differently in each kernel.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
@@ -116,12 +116,12 @@ def emit_by_depth(
                 tiles_out[at] = row * columns + column
                 value = i
                 if with_slots:
-                    value = wp.min(slot, most)  # only where there is too little room do two pairs share a slot
+                    value = wp.min(slot, most)  # pairs share a slot only if there is too little room
                     owners_out[value] = i
                 values_out[at] = value
             at += 1
             slot += 1
-    while at < end:  # Both passes find the same tiles, so this never runs; but no place may stay unwritten.
+    while at < end:  # Never runs if both passes find the same tiles; guards against unwritten entries.
         tiles_out[at] = 0
         values_out[at] = i
         if with_slots:
@@ -142,7 +142,7 @@ def fill_rest(
     values_out: wp.array[int],  # [2 P]
     owners_out: wp.array[int],  # [P] or empty
 ):
-    """Fill spare room with a key that sorts last."""
+    """Fill entry ``p`` with a key that sorts last if no pair occupies it."""
     p = first + wp.tid()
     if wp.int64(p) >= places_in[places_in.shape[0] - 1]:
         tiles_out[p] = beyond
@@ -167,7 +167,7 @@ def gather_owners(
 
 @wp.func
 def first_of_tile(tiles: wp.array[int], count: int, tile: int) -> int:
-    """Return where the sorted pairs of a tile, or of a later one, begin."""
+    """Return the index of the first sorted pair whose tile is at least ``tile``; ``count`` if there is none."""
     low = int(0)
     high = int(count)
     while low < high:

@@ -1,15 +1,16 @@
 """Alpha compositing on CUDA, in native code: one block of 256 threads per tile of 16 x 16, one thread per pixel.
 
-The meaning is that of ``compositing``; the work is laid out as follows:
+The kernels compute what ``compositing`` computes; the work is laid out as follows:
 
-- A warp holds 8 x 4 pixels. Splats are staged through shared memory in batches. The thread that stages a splat finds
-  which of the tile's eight such parts its ellipse may reach, and each warp walks only its own splats, by the bits of a
-  ballot.
+- A warp holds 8 x 4 pixels, one of the tile's eight parts. Splats are staged through shared memory in batches. The
+  thread that stages a splat determines which parts its ellipse may reach. A ballot collects these bits, so that each
+  warp visits only splats that may reach its own part.
 - Exponentials are taken to base 2: ``alpha = o 2^power``, where the factor of ``power = -q / (2 ln 2)`` is folded into
   the staged conic.
-- The adjoint adds up a warp's 16 sums of a pair (the columns of a slot) in 16 shuffles, each of which halves the sums
-  that a lane holds, instead of 5 per sum. The partial sums of the eight warps meet in shared memory, 32 pairs at a
-  time, and are added in the order of the warps into the pair's own slot: no atomics, the same bits every time.
+- The adjoint needs 16 sums over a warp for each pair (the columns of a slot). Every step halves the number of sums that
+  a lane holds, so all of them take 16 shuffles together instead of 5 each. The partial sums of the eight warps are
+  gathered in shared memory, 32 pairs at a time, and added in the order of the warps into the pair's own slot. Without
+  atomics the results are reproducible bit by bit.
 
 On a CPU the native functions are empty; tests compile them with a shim that runs a block's threads as fibres.
 """
@@ -29,7 +30,7 @@ MAX_CHANNELS = SLOT_WIDTH - SLOT_GEOMETRY
 """Largest number of channels that fit into a slot; the forward pass has no such bound."""
 
 _BOUNDS = (BLOCK_DIM, 4)
-"""Four blocks per multiprocessor: 64 registers per thread, of which next to nothing is spilled."""
+"""Threads per block and blocks per multiprocessor: threads get 64 registers each and spill next to nothing."""
 
 
 # fmt: off
@@ -73,7 +74,7 @@ def composite(
     transmittance_out: wp.array2d[float],  # [H, W] final transmittance; empty: not wanted
     last_out: wp.array2d[int],  # [H, W] index in the sorted list of the last contributor, + 1; 0: none; empty too
 ):
-    """Grid: T x 256."""
+    """Composite one tile per block, front to back. Grid: T x 256."""
     block, _lane = wp.tid()
     composite_tile(
         first + block, means2d_in, conics_in, opacities_in, channels_in, background_in, ranges_in, splats_in,
@@ -103,7 +104,7 @@ def composite_adjoint(
     # Out:
     v_slots_out: wp.array2d[float],  # [P, 16] row: mean 2, conic 3, opacity 1, |mean| 2, channels C, zeros
 ):
-    """Grid: T x 256."""
+    """Compute the gradients of one tile's pairs, back to front, into their slots. Grid: T x 256."""
     block, _lane = wp.tid()
     composite_tile_adjoint(
         first + block, means2d_in, conics_in, opacities_in, channels_in, background_in, ranges_in, splats_in, slots_in,

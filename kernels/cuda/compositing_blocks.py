@@ -1,13 +1,13 @@
 """Alpha compositing by blocks of threads through Warp's tile API: one block per tile, one thread per pixel.
 
-It serves any number of channels, with the meaning and arguments of ``compositing``; ``tile_size`` is 16. The block
-fetches a tile's splats into shared memory in batches of 256, one per thread, and every thread walks the batch for its
-own pixel. Nothing here is CUDA only: with ``wp.config.enable_cpu_blocks`` the same kernels run (slowly) on a CPU, where
-they are tested.
+These kernels blend any number of channels; meaning and arguments are those of ``compositing``, with a ``tile_size`` of
+16. The block fetches a tile's splats into shared memory in batches of 256, one per thread, and every thread walks the
+batch for its own pixel. Nothing here is specific to CUDA: with ``wp.config.enable_cpu_blocks`` the same kernels run
+(slowly) on a CPU, where they are tested.
 
-The whole block must reach ``tile_max``, ``tile_sum``, ``tile_scatter_masked`` and reads of their results together, so
-loops around them have bounds that all threads share. Reading a shared tile is no such call. ``tile_max`` at the head of
-a batch is also the barrier that keeps the next batch from overwriting the last one early.
+All threads of a block must reach ``tile_max``, ``tile_sum``, ``tile_scatter_masked`` and reads of their results
+together, so loops around them have bounds that all threads share. Reads of a shared tile are exempt. ``tile_max`` at
+the head of a batch is also the barrier that keeps the next batch from overwriting the current one early.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ wp.set_module_options({"enable_backward": False})
 BLOCK_DIM = TILE_SIZE * TILE_SIZE
 _LANES = wp.constant(BLOCK_DIM)
 GROUP = wp.constant(4)
-"""Channels composited in one walk (colour and depth). More channels take further walks, four at a time."""
+"""Number of channels composited in one pass over the splats (colour and depth). Further channels take more passes."""
 _SUMS = wp.constant(SLOT_GEOMETRY + 4)
 
 Splat = wp.types.vector(length=6, dtype=wp.float32)
-"""Mean (2), conic (3), opacity (1)."""
+"""Geometry of a splat in shared memory: mean (2), conic (3), opacity (1)."""
 Sums = wp.types.vector(length=SLOT_GEOMETRY + 4, dtype=wp.float32)
-"""The leading columns of a gradient slot."""
+"""Values of the leading columns of a gradient slot."""
 
 
 @wp.func
@@ -43,7 +43,7 @@ def squared_distance_of(splat: Splat, d: wp.vec2) -> float:
 
 @wp.func
 def group_of(channels: wp.array2d[float], i: int, base: int) -> wp.vec4:
-    """Four channels of a splat, zero beyond the last."""
+    """Return four channels of a splat, zero beyond the last."""
     values = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for c in range(4):
         if base + c < channels.shape[1]:
@@ -53,7 +53,7 @@ def group_of(channels: wp.array2d[float], i: int, base: int) -> wp.vec4:
 
 @wp.func
 def pixel_group(image: wp.array3d[float], y: int, x: int, base: int) -> wp.vec4:
-    """Four channels of a pixel, zero beyond the last."""
+    """Return four channels of a pixel, zero beyond the last."""
     values = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for c in range(4):
         if base + c < image.shape[0]:
@@ -82,7 +82,7 @@ def composite(
     transmittance_out: wp.array2d[float],  # [H, W] final transmittance; empty: not wanted
     last_out: wp.array2d[int],  # [H, W] index in the sorted list of the last contributor, + 1; 0: none; empty too
 ):
-    """Grid: T x 256."""
+    """Composite one tile front to back, four channels at a time. Grid: T x 256."""
     block, lane = wp.tid()
     tile = first + block
     x = (tile % columns) * tile_size + lane % tile_size
@@ -142,7 +142,7 @@ def composite(
 
 @wp.func
 def geometry_sums(own: Splat, d: wp.vec2, falloff: float, v_alpha: float) -> Sums:
-    """Turn a gradient to one pixel's alpha into those to the splat's mean, conic and opacity; zero where clamped."""
+    """Return the gradients of a splat's mean, conic and opacity from that of its alpha at a pixel; 0 where clamped."""
     sums = Sums()
     if own[5] * falloff <= ALPHA_MAX:
         g = v_alpha * own[5] * falloff  # gradient to -q / 2
@@ -181,7 +181,10 @@ def composite_adjoint(
     # Out:
     v_slots_out: wp.array2d[float],  # [P, S], S >= 8 + C; row: mean 2, conic 3, opacity 1, |mean| 2, channels C, rest
 ):
-    """Back to front from the tile's last contributor; a pair's gradient is summed over the block. Grid: T x 256."""
+    """Walk one tile back to front from its last contributor, summing each pair's gradients over the block.
+
+    Grid: T x 256.
+    """
     block, lane = wp.tid()
     tile = first + block
     x = (tile % columns) * tile_size + lane % tile_size
@@ -191,7 +194,7 @@ def composite_adjoint(
     count = channels_in.shape[1]
     transmittance = float(1.0)
     last = int(0)
-    behind = float(0.0)  # what lies behind the current splat, weighted by v_image
+    behind = float(0.0)  # colour behind the current splat, weighted by v_image
     v_pixel = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if x < width and y < height:
         last = last_in[y, x]

@@ -1,9 +1,9 @@
 """Sums over the pairs of every control point on CUDA, where a node may have hundreds or thousands of pairs.
 
 The list of pairs, sorted by node, is cut into segments of equal length, one per thread. Where the node changes within a
-segment, the thread stores its sums and starts new ones. Segment s and node m share row ``s + m``: along the list one of
-the two grows at every change, so no row is used twice, and ``segments + nodes`` rows suffice for any list. A second
-pass adds up each node's rows in order, which gives the same bits every time.
+segment, the thread stores its sums and starts new ones. The sums of segment s for node m go to row ``s + m``. From one
+stored sum to the next, s or m grows and neither shrinks, so no row is used twice, and ``segments + nodes`` rows suffice
+for any list. A second pass adds up each node's rows in order, so results are reproducible bit by bit.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from ..skinning import finite
 wp.set_module_options({"enable_backward": False})
 
 SEGMENT = 32
-"""Pairs per thread: enough threads for a GPU at 40,000 Gaussians, few enough rows for the second pass."""
+"""Number of pairs per thread: small enough to fill a GPU at 40,000 Gaussians, large enough for a short second pass."""
 LANES = 8
-"""Coordinates of the points that one thread sums."""
+"""Number of coordinates of a point that one thread sums."""
 
 Lane = wp.types.vector(length=8, dtype=wp.float32)
 
@@ -115,7 +115,7 @@ def rbf_segments(
     # Out:
     rows_out: wp.array2d[float],  # [segments + M, 2 + D] columns as in neighbors.rbf_finish: v, v d^2, v (x - p)
 ):
-    """Grid: segments x parts."""
+    """Sum one segment of pairs for the adjoint of the RBF weights. Grid: segments x parts."""
     t = first + wp.tid()
     segment = t // parts
     part = t - segment * parts
@@ -161,7 +161,7 @@ def sum_segments(
     # Out:
     sums_out: wp.array2d[float],  # [M, W]
 ):
-    """Grid: M x W."""
+    """Add up one column of a node's rows, in the order of the segments. Grid: M x W."""
     t = first + wp.tid()
     m = t // rows_in.shape[1]
     column = t - m * rows_in.shape[1]

@@ -25,7 +25,7 @@ def sum_slots(
     v_channels_out: wp.array2d[float],  # [N, C], C <= 8
     absgrad_out: wp.array2d[float],  # [N, 2]; empty: not wanted
 ):
-    """Sum as ``compositing.sum_slots`` does, with a thread per column, for coalesced reads. Grid: 16 N."""
+    """Sum each splat's slots as ``compositing.sum_slots`` does, one column per thread to coalesce reads. Grid: 16 N."""
     t = first + wp.tid()
     i = t // SLOT_WIDTH
     column = t - i * SLOT_WIDTH

@@ -1,12 +1,12 @@
 """C++ bodies of kernels: headers in this folder that become Warp functions.
 
 A header holds ``static inline`` functions, structures and enumerations. Warp compiles a native function from a text
-that becomes the function's body, so :func:`native_function` puts a header and its includes into a local structure there
-and calls the function of the same name. This sets three rules:
+that becomes the function's body. :func:`native_function` makes this text: it puts a header and its includes into a
+local structure and calls the function of the same name. Three rules follow:
 
-- Write results to arrays: Warp sees a return type under its own decorator alone.
+- Write results to arrays: functions made in this way cannot declare a return type to Warp.
 - Use no templates and no static data members, which local structures may not have. Use generic lambdas inside
-  functions, functions that return one, and functions or enumerations for constants.
+  functions, functions that return generic lambdas, and functions or enumerations for constants.
 - Include other headers of this folder with ``#include "name.h"`` alone on a line.
 
 Warp hashes the text, so it compiles an edited header again. ``CONSTANTS`` holds the constants that Python and C++
@@ -58,14 +58,14 @@ CONSTANTS: dict[str, int | float] = {
     "POSITION_MAX": types.POSITION_MAX,
     "RADIUS_MAX": projection.RADIUS_MAX,
 }
-"""Values of macros by name; a header gets those that its text names."""
+"""Values of the shared macros by name; a header gets those that occur in its text."""
 
 _INCLUDE = re.compile(r'^#include "([\w./]+)"\n', re.MULTILINE)
 _GUARDS = {"cpu": "#if !defined(__CUDA_ARCH__)", "cuda": "#if defined(__CUDA_ARCH__)"}
 
 
 def header_text(name: str, folder: Path = FOLDER) -> str:
-    """Return a header of ``folder``, with each included header in place of its first ``#include``."""
+    """Return the text of a header of ``folder``, with each included header in place of its first ``#include``."""
     seen: set[str] = set()
 
     def read(file: str) -> str:
@@ -79,7 +79,7 @@ def header_text(name: str, folder: Path = FOLDER) -> str:
 
 
 def constant_macros(text: str) -> dict[str, str]:
-    """Return the shared constants that ``text`` names, as macro names and C++ literals."""
+    """Return the shared constants that occur in ``text``, as macro names and C++ literals."""
     return {
         name: f"{value!r}f" if isinstance(value, float) else str(int(value))
         for name, value in CONSTANTS.items()
@@ -88,10 +88,10 @@ def constant_macros(text: str) -> dict[str, str]:
 
 
 def snippet(header: str, call: str, device: Literal["cpu", "cuda"], folder: Path = FOLDER) -> str:
-    """Return the body of a native function that runs ``call``, a call of a function of ``header``.
+    """Return the body of a native function that runs ``call``, a call to a function of ``header``.
 
     Args:
-        device: device that the header is compiled for; on the other one the body is empty.
+        device: device for which the header is compiled; for the other device the body is empty.
     """
     text = header_text(header, folder)
     macros = constant_macros(text)
@@ -113,7 +113,7 @@ def native_function(
 
     Args:
         header: file name in ``folder``.
-        device: device that the function runs on; on the other one it compiles, but does nothing.
+        device: device on which the function runs; on the other device it compiles but does nothing.
     """
 
     def decorate(function: Callable[..., Any]) -> wp.Function:

@@ -35,6 +35,7 @@ static inline vf most(vf a, vf b) { return b > a ? b : a; }
 static inline vf floats(vi v) { return __builtin_convertvector(v, vf); }
 
 static inline Ellipse ellipse_of(vf x, vf y, vf a, vf b, vf c, vf opacity, vf depth, vi radius_x, vi radius_y) {
+    NO_FUSING
     const float coefficients[] = {LOG2_0, LOG2_1, LOG2_2, LOG2_3, LOG2_4, LOG2_5, LOG2_6};
     Ellipse e;
     const vf sum = x + y + a + b + c + opacity + depth;
@@ -61,6 +62,7 @@ static inline Ellipse ellipse_of(vf x, vf y, vf a, vf b, vf c, vf opacity, vf de
 }
 
 static inline Span touched(vf low, vf high, int tile_size, int tiles, int extent) {
+    NO_FUSING
     const vf ZERO = {};
     const vi NONE = {};
     const vi meets = (high >= 0.5f) & (low <= (float)extent - 0.5f);
@@ -76,6 +78,7 @@ static inline Span touched(vf low, vf high, int tile_size, int tiles, int extent
 }
 
 static inline Span touched_rows(const TileGrid& grid, const Ellipse& e) {
+    NO_FUSING
     const vi NONE = {};
     Span span = touched(e.y - e.half_height, e.y + e.half_height, grid.tile_size, grid.rows, grid.height);
     if (grid.part) {
@@ -88,6 +91,7 @@ static inline Span touched_rows(const TileGrid& grid, const Ellipse& e) {
 }
 
 static inline Span touched_columns(const TileGrid& grid, const Ellipse& e, vi row) {
+    NO_FUSING
     const vf ZERO = {};
     const vi below = (row + 1) * grid.tile_size, height = vi{} + grid.height;
     const vf low = most(-e.half_height, floats(row * grid.tile_size) + 0.5f - e.y);

@@ -13,6 +13,9 @@ typedef bool vb32 __attribute__((ext_vector_type(32)));
 // that the same source rounds alike everywhere.
 #define FUSE_WITHIN_EXPRESSIONS _Pragma("clang fp contract(on)")
 
+// Instead of it: nothing is fused, as in the portable form.
+#define NO_FUSING _Pragma("clang fp contract(off)")
+
 // 0, 1, ... 15.
 static inline vf lane_numbers() { return vf{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}; }
 

@@ -1,7 +1,8 @@
-"""The settings of a training run: frozen dataclasses, nested by who uses them, with bounds and help beside each field.
+"""The settings of a training run: frozen dataclasses, one per component that uses them, with bounds and help for each
+field.
 
-Step counts that scale with the length of a run are made by :func:`milestone`: ``presets.with_steps`` scales them all.
-``config/presets.py`` makes, reads and writes presets; ``config/validation.py`` checks the bounds.
+Step counts that scale with the length of a run are declared with :func:`milestone`; ``presets.with_steps`` scales them
+all. ``config/presets.py`` makes, reads and writes presets; ``config/validation.py`` checks the bounds.
 """
 
 from __future__ import annotations
@@ -16,15 +17,16 @@ CACHE_MIB = 2048
 
 
 def bounded(default: float, least: float | None = None, most: float | None = None, **more: Any) -> Any:
-    """A number with bounds, inclusive. ``most`` is for sizes that take memory: a configuration may come from anywhere.
+    """A number with inclusive bounds. ``most`` limits sizes that take memory, because a configuration may come from an
+    untrusted file.
 
-    Without ``least``, the field is checked by a rule of its own in ``validation.py`` or may be any number.
+    Without ``least``, the field is checked by a separate rule in ``validation.py`` or may be any number.
     """
     return field(default=default, metadata={"least": least, "most": most, **more})
 
 
 def chosen(default: int, least: int, most: int) -> Any:
-    """A whole number with a short range of choices, inclusive."""
+    """A whole number between two inclusive bounds that are close together."""
     return field(default=default, metadata={"choices": (least, most)})
 
 
@@ -40,11 +42,12 @@ class DataConfig:
     downscale: int = bounded(1, 1, 1_000)
     """Divide the images' width and height by this."""
     resample: Literal["area", "bicubic"] = "area"
-    """Filter of the reduction; bicubic (through Pillow, 8 bit) makes the truth as the official code does."""
+    """Filter of the reduction. bicubic (Pillow, 8 bits) reduces the images as the official code does."""
     background: Literal["black", "white", "random"] = "black"
-    """Colour behind transparent pixels; random: another colour every step, black for evaluation."""
+    """Colour behind transparent pixels. random: a new colour in every step, and black for evaluation."""
     cache_mib: int = bounded(CACHE_MIB, 0)
-    """Decoded images kept in memory; the others are decoded whenever they are needed. Changes no bit of the result."""
+    """Size of the cache of decoded images, MiB. Images beyond it are decoded at each use. The result is bit-identical
+    for every size."""
 
 
 @dataclass(frozen=True)
@@ -55,42 +58,43 @@ class MotionConfig:
     nodes: int = bounded(512, most=1_000_000)
     """Number of control points, N_p."""
     neighbors: int = chosen(4, 1, 16)
-    """Number of control points that move a Gaussian, K."""
+    """Number of control points that move each Gaussian, K."""
     layers: int = bounded(8, 1, 64)
     width: int = bounded(256, 1, 2_048)
     skip: int = 4
-    """The layer whose output is concatenated with the network's input."""
+    """Index of the layer whose output is concatenated with the network's input."""
     position_frequencies: int = bounded(10, 1, 32)
     time_frequencies: int = bounded(6, 1, 32)
     train_positions: bool = True
-    """Control points' rest positions learn in the joint phase (paper); the official code never moves them."""
+    """Learn the rest positions of the control points in the joint phase (paper); the official code never moves them."""
     hyper_dim: int = bounded(0, 0, 64)
-    """Hyper-coordinates appended to the neighbour search (the official code uses 8)."""
+    """Number of hyper-coordinates appended to positions in the neighbour search (8 in the official code)."""
     hyper_dim_filled: int = bounded(4, 0, 64)
-    """Minimum of hyper_dim where no image has alpha: hyper-coordinates part moving surfaces from resting ones beside
+    """Minimum of hyper_dim if no image has alpha: hyper-coordinates separate moving surfaces from static ones beside
     them."""
     node_weight: bool = False
-    """A learned weight per control point in the RBF (official code)."""
+    """Learn a weight per control point in the RBF (official code)."""
     shape_rotation: bool = False
-    """A second rotation head for the Gaussians' shape (official code); else one rotation does both (paper Eq. 7)."""
+    """Use a second rotation head for the Gaussians' shape (official code); otherwise one rotation serves positions and
+    shape (paper Eq. 7)."""
     scale_residual: bool = False
-    """The network also changes the Gaussians' scales (official code); ours changes their logarithm."""
+    """Let the network also change the Gaussians' scales (official code); here it changes their logarithm."""
     shading: bool = True
-    """A Gaussian's brightness follows the rotation of its surface (ours): the effect of light and normal, to first
-    order."""
+    """Let a Gaussian's brightness follow the rotation of its surface (not in the paper): the first-order effect of the
+    angle between light and normal."""
     mask: bool = False
-    """A learned share of the motion per Gaussian (an option of the official code); hyper-coordinates work better."""
+    """Learn a share of the motion per Gaussian (an option of the official code); hyper-coordinates work better."""
     time_noise: float = bounded(0.0, 0, 1e6)
-    """Standard deviation of the noise on a step's time, in intervals between frames; it fades until ``network_until``
-    (official code, for real video)."""
+    """Standard deviation of the noise on each step's time, in intervals between frames; the noise fades until
+    ``network_until`` (official code, for real video)."""
     bfloat16: bool = False
-    """Hidden layers in bfloat16 while training."""
+    """Compute the hidden layers in bfloat16 while training."""
     plane_times: int = 0
-    """Texels along t of feature planes; 0: half as many as there are training times (4D-GS)."""
+    """Number of texels of the feature planes along t; 0: half the number of training times (4D-GS)."""
 
     @property
     def has_shading(self) -> bool:
-        """True for control points only: the rival models have no shading."""
+        """True if shading is on and the model is control-points: the rival models have no shading."""
         return self.shading and self.model == "control-points"
 
 
@@ -100,26 +104,30 @@ class PretrainConfig:
 
     steps: int = milestone(10_000, 0)
     with_points: bool = False
-    """Keep stage 1 where the data brings points; else control points then begin as a sample of those, and learn with
+    """Keep stage 1 if the data has points. Otherwise control points start as a sample of these points and learn with
     the Gaussians from the first step."""
     densify_until: int = milestone(7_500)
-    """Step until which spheres are densified and pruned; then farthest-point sampling of trajectories reduces them to
-    N_p."""
+    """Step at which spheres are no longer densified and pruned; farthest-point sampling of trajectories then reduces
+    them to N_p."""
     warm_up: int = milestone(500, 0)
-    """Steps before the network starts to move the spheres."""
+    """Number of steps before the network starts to move the spheres."""
     densify_every: int = bounded(100, 1)
     clone_share: float = bounded(0.2, 0, 1)
-    """Share of the spheres that is cloned each time, those with the largest gradients, until the cap."""
+    """Share of the spheres cloned in each round, until the cap: those with the largest gradients."""
     start_ratio: float = bounded(8.0, 1, 1e4)
-    """Spheres per control point (at least 256 points are assumed) at the start; while at rest they cost little."""
+    """Number of spheres per control point (at least 256 control points are assumed) at the start; spheres at rest cost
+    little."""
     max_ratio: float = bounded(2.0, 1, 1e4)
-    """Cap of the spheres per control point (at least 256 are assumed) once they move: each queries the network."""
+    """Largest number of spheres per control point (at least 256 control points are assumed) once they move: the network
+    is then evaluated at each sphere."""
     opacity_rate: float = 0.02
-    """Learning rates of the spheres; with the Gaussians' own they turn transparent before they find their colour."""
+    """Learning rate of the spheres' opacities; ``color_rate`` is that of their colours. With the rates of the
+    Gaussians, spheres turn transparent before they find their colour."""
     color_rate: float = 1e-2
     arap_weight: float = bounded(1e-3, 0)
     random_background: bool = True
-    """Where the data has alpha, use another background every step, so that black cloth is not mistaken for nothing."""
+    """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
+    space."""
     progressive: bool = False
     """Begin with the first 20 % of the frames and add 20 % every ``progressive_every`` steps."""
     progressive_every: int = milestone(1_000, 1)
@@ -127,7 +135,7 @@ class PretrainConfig:
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Learning rates; ``_end`` where they decay log-linearly (official values, normalised scene)."""
+    """Learning rates. ``NAME_end`` is the final rate of a log-linear decay (official values, normalised scene)."""
 
     means: float = 8e-4
     means_end: float = 8e-6
@@ -143,14 +151,16 @@ class OptimConfig:
     network_end: float = 1.6e-6
     network_until: int = milestone(66_000, 1)
     nodes: float = 8e-4
-    """Radii, weights and hyper-coordinates of the control points."""
+    """Learning rate of the radii, weights and hyper-coordinates of the control points."""
     node_positions: float = 8e-5
     settle: float = bounded(0.15, 0)
-    """Last share of the main stage in which the constant rates of the Gaussians fall, too: to a twentieth."""
+    """Share of the main stage, at its end, over which the otherwise constant rates of the Gaussians decay to a
+    twentieth."""
     cameras: float = bounded(0.0, 0)
-    """Corrections of the training cameras' poses (radians, normalised units), from the end of ``freeze``; 0: none."""
+    """Learning rate of the corrections to the training cameras' poses (radians, normalised units) after ``freeze``; 0:
+    no corrections."""
     planes: float = 8e-3
-    """Feature planes of the hexplane model."""
+    """Learning rate of the feature planes of the hexplane model."""
 
 
 @dataclass(frozen=True)
@@ -160,32 +170,35 @@ class DensifyConfig:
     start: int = milestone(500, 0)
     until: int = milestone(40_000, 0)
     every: int = bounded(100, 1)
-    """Least number of steps between two rounds: fewer see too few of the views to judge by."""
+    """Smallest number of steps between two rounds: fewer steps see too few views to decide by."""
     rounds: int = bounded(132, 1)
-    """Largest number of rounds in all: three times as many make twice the Gaussians, not better images."""
+    """Largest number of rounds in total: three times as many double the number of Gaussians without improving the
+    images."""
     grad_threshold: float = bounded(1.4e-4, 0)
-    """Gradient of the loss to the 2D mean in normalised device coordinates, at 800 pixels (official code: 2e-4 at any
-    size)."""
+    """Gradient of the loss with respect to the 2D mean above which Gaussians are densified, in normalised device
+    coordinates, at 800 pixels (official code: 2e-4 at any size)."""
     resolution_exponent: float = 0.66
-    """The threshold grows by (800 / image size) to this power: small images have larger gradients per Gaussian."""
+    """Exponent of (800 / image size), by which the threshold is multiplied: in small images, each Gaussian has larger
+    gradients."""
     absolute_grad: bool = False
-    """Judge by the sum of absolute per-pixel gradients."""
+    """Densify by the sum of absolute per-pixel gradients."""
     percent_dense: float = 0.01
-    """Gaussians larger than this share of the extent are split, smaller ones cloned."""
+    """Split Gaussians larger than this share of the extent, and clone smaller ones."""
     min_opacity: float = bounded(0.005, 0)
     min_contribution: float = bounded(0.05, 0)
     """Visibility pruning, before each opacity reset and at the end of densification: remove Gaussians that contribute
-    less than this many pixels (sum of blending weights, at the size of the training images) to every sampled view; 0:
+    less than this many pixels to every sampled view (sum of blending weights, at the size of the training images). 0:
     off."""
     prune_large: Literal["auto", "always", "never"] = "auto"
-    """Apply max_screen and max_scale; auto: where the images have alpha. Filled images show bare walls."""
+    """Apply max_screen and max_scale. auto: only if the images have alpha, because images without alpha show bare
+    walls, which need large Gaussians."""
     max_screen: float = 0.05
     """Prune Gaussians that cover more than this share of the image (after the first opacity reset)."""
     max_scale: float = 0.1
     """Prune Gaussians larger than this share of the extent (after the first opacity reset)."""
     opacity_reset_every: int = milestone(10_000, 1)
     sh_every: int = milestone(1_500, 1)
-    """Main steps between two degrees of spherical harmonics."""
+    """Number of main steps between two degrees of spherical harmonics."""
     nodes_every: int = milestone(5_000, 1)
     nodes_until: int = milestone(25_000)
     node_grad_threshold: float = 2e-4
@@ -193,60 +206,63 @@ class DensifyConfig:
 
     @property
     def interval(self) -> int:
-        """Steps from one round to the next."""
+        """Number of steps from one round to the next."""
         return max(self.every, -(-(self.until - self.start) // self.rounds))
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10; seed S4)."""
+    """Weights of the losses: L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10; seed S4)."""
 
     ssim: float = bounded(0.2, 0)
     arap: float = bounded(1e-2, 0)
     arap_end: float = bounded(1e-2, 0)
     arap_until: int = milestone(80_000)
-    """The ARAP weight goes exponentially from the first value to the second until this main step, then the term is
+    """Main step until which the ARAP weight changes exponentially from ``arap`` to ``arap_end``; afterwards the term is
     off (paper: from 1e-4 to 1e-7 over 10,000 steps)."""
     arap_every: int = bounded(5, 1)
-    """Apply the term every so many steps with as many times the weight."""
+    """Apply the ARAP term in every n-th step only, with n times the weight."""
     arap_pair: Literal["frame", "random"] = "frame"
-    """The two instants that are compared. frame: the step's own and a random one, so that the network is queried for
-    one more instant only; random: two random ones."""
+    """Pair of instants that ARAP compares. frame: the step's own and a random one, so that the network is evaluated at
+    only one additional instant. random: two random ones."""
     arap_times: int = bounded(8, 1, 10_000)
-    """Sampled times N_t whose trajectories define the neighbours."""
+    """Number of sampled times, N_t; the trajectories over them define the neighbours."""
     arap_neighbors: int = chosen(8, 1, 15)
     arap_refresh: int = bounded(200, 1)
     hexplane_tv: float = bounded(1e-4, 0)
     hexplane_smooth: float = bounded(1e-2, 0)
     hexplane_rest: float = bounded(1e-4, 0)
-    """Feature planes (4D-GS): differences in space, second differences in time, distance of time planes from 1."""
+    """Weight of the distance of time planes from 1. ``hexplane_tv`` weighs differences in space, ``hexplane_smooth``
+    second differences in time (feature planes, 4D-GS)."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A complete run. ``steps`` is the total of both stages; every milestone is in steps."""
+    """A complete run. ``steps`` is the total of both stages; every milestone is a number of steps."""
 
     preset: PresetName = "paper"
     steps: int = bounded(80_000, most=100_000_000)
     freeze: int = milestone(3_000, 0)
-    """Main steps during which control points and network stay as stage 1 left them."""
+    """Number of main steps at the beginning in which control points and network stay as stage 1 left them."""
     coarse: int = milestone(6_000, 0)
-    """The same for models without stage 1: a static scene comes first."""
+    """Number of main steps at the beginning in which models without stage 1 learn a static scene."""
     init_points: int = bounded(20_000, 1, 10_000_000)
-    """Gaussians to start with, and no more where the data brings more points; filled images get points behind theirs up
-    to this total."""
+    """Number of initial Gaussians, which also limits the data's points. For images without alpha, points behind the
+    data's points are added up to this number."""
     init_from: Literal["points", "spheres"] = "spheres"
-    """points: at the data's points, else at random where the images' alpha allows something to be; spheres: around the
-    control points that stage 1 found."""
+    """Placement of the initial Gaussians. points: at the data's points or, without any, at random where the images'
+    alpha shows an object. spheres: around the control points that stage 1 found."""
     sh_degree: int = chosen(3, 0, 3)
     antialiased: bool = False
     seed: int = bounded(0, 0)
     batch: int = bounded(1, 1)
-    """Views per step: their gradients are averaged. Several processes share them (docs/scaling.md)."""
+    """Number of views per step; their gradients are averaged. Several processes can share the views
+    (docs/scaling.md)."""
     half_size: int = milestone(0, 0)
-    """Steps of both stages that use the images at half their size: coarse first, and twice as fast."""
+    """Number of steps, over both stages, that use the images at half their size: coarse first, and twice as fast."""
     evaluate_every: int = milestone(5_000, 1)
-    """Steps between two evaluations on a few test images, for the curve only: nothing is selected by it."""
+    """Number of steps between two evaluations on a few test images, for the curve only: they do not influence the
+    training."""
     checkpoint_seconds: float = bounded(60.0, 0)
     data: DataConfig = field(default_factory=DataConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
@@ -257,19 +273,20 @@ class TrainConfig:
 
     @property
     def pretrain_steps(self) -> int:
-        """Steps of stage 1, which exists for control points alone."""
+        """Number of steps of stage 1, which exists only for control points."""
         return self.pretrain.steps if self.motion.model == "control-points" else 0
 
     @property
     def rest_steps(self) -> int:
-        """First main steps in which only the Gaussians learn: ``freeze`` or ``coarse``."""
+        """Number of main steps at the beginning in which only the Gaussians learn: ``freeze`` or ``coarse``."""
         return self.freeze if self.motion.model == "control-points" else self.coarse
 
     @property
     def main_steps(self) -> int:
-        """Steps after stage 1."""
+        """Number of steps after stage 1."""
         return self.steps - self.pretrain_steps
 
 
 BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
-"""Colours behind RGBA images when they are read. With ``random`` the trainer composites, once per step."""
+"""Colours behind RGBA images when they are read. With ``random``, images are read on black, and the trainer composites
+them on a new colour in every step."""

@@ -1,4 +1,4 @@
-"""The three presets, and reading and writing of configurations.
+"""The three presets, and functions to read and write configurations.
 
 ``with_steps`` scales the milestones when ``--steps`` changes the total. ``config.json`` of a run directory holds
 ``to_dict`` of the configuration and can be read back.
@@ -43,7 +43,8 @@ PRESETS: tuple[str, ...] = get_args(PresetName)
 
 
 def preset(name: PresetName) -> TrainConfig:
-    """Make a configuration. ``quick``: the built-in scene; ``cpu``: minutes on two cores; ``paper``: seed S4."""
+    """Make a configuration. ``quick`` suits the built-in scene, ``cpu`` takes minutes on two cores, ``paper`` is seed
+    S4."""
     if name == "paper":
         return TrainConfig()
     cpu = TrainConfig(
@@ -83,7 +84,7 @@ def preset(name: PresetName) -> TrainConfig:
 
 
 def with_steps(config: TrainConfig, steps: int) -> TrainConfig:
-    """Compress or stretch a run to ``steps`` in all; every milestone scales with it.
+    """Compress or stretch a run to a total of ``steps``; every milestone scales with it.
 
     Raises:
         UserError: ``steps`` is below 10.
@@ -112,11 +113,12 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 
 
 FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds", "data.cache_mib")
-"""Settings that change no bit of the result: left out of checkpoints, and free when a run is resumed."""
+"""Settings that do not affect the result (it stays bit-identical): left out of checkpoints, and free to change when a
+run is resumed."""
 
 
 def lasting(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Drop the settings that are free to change from the result of :func:`to_dict`."""
+    """Drop the settings in ``FREE_TO_CHANGE`` from the result of :func:`to_dict`."""
     return {
         name: lasting(value, f"{prefix}{name}.") if isinstance(value, dict) else value
         for name, value in values.items()
@@ -196,7 +198,7 @@ def whole_number(value: Any, label: str) -> int:
 
 
 def parse_value(text: str) -> Any:
-    """Parse a JSON value; return any other text itself."""
+    """Parse a JSON value; return any other text unchanged."""
     try:
         return parse_json(text)
     except ValueError:

@@ -11,7 +11,7 @@ from ..errors import UserError
 from .presets import TrainConfig
 
 MAGNITUDE = 1e9
-"""Largest magnitude of any number."""
+"""Largest magnitude of any number in a configuration."""
 
 
 def check(config: TrainConfig) -> TrainConfig:
@@ -50,8 +50,8 @@ def _check_rules(config: TrainConfig) -> None:
 
 
 def check_sizes(config: TrainConfig, place: str = "") -> None:
-    """Refuse numbers that are too large for any run, before arrays of that size are made. Also applies to the
-    configuration inside a file.
+    """Refuse numbers that are too large for any run, before arrays of that size are allocated. Also applies to a
+    configuration stored in a file.
 
     Args:
         place: prefix of the message.
@@ -72,7 +72,7 @@ def check_sizes(config: TrainConfig, place: str = "") -> None:
 
 
 def _numbers(config: Any, prefix: str = "") -> Iterator[tuple[str, int | float, Mapping[str, Any]]]:
-    """Yield dotted name, value and bounds of every number."""
+    """Yield the dotted name, value and bounds of every number."""
     for item in dataclasses.fields(config):
         value = getattr(config, item.name)
         if dataclasses.is_dataclass(value):

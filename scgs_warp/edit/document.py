@@ -1,4 +1,4 @@
-"""An edit as a frozen value: everything done to a scene, and the film to make of it. Undo is a list of such values."""
+"""An edit as a frozen value: all changes to a scene, and the film that shows them. Undo restores an earlier value."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from .playback import Exaggerate, Hold, Playback
 
 @dataclass(frozen=True)
 class View:
-    """Film camera at one moment, on a sphere around its target. Fields that are None follow the training cameras."""
+    """Film camera at one moment, on a sphere around its target. A field that is None takes its value from the training
+    cameras."""
 
     at: float = 0.0
     """Time in the film, seconds."""
@@ -61,8 +62,8 @@ class Film:
 
 @functools.lru_cache(maxsize=16)
 def frame_reach(film: Film, playback: Playback) -> float:
-    """Return the scene time on either side of a handle's own within which an edit of one frame shows: half the median
-    step between two frames of the film, so that exactly one of them shows it."""
+    """Return half the width, in scene time, of the interval in which an edit of one frame shows: half the median step
+    between two frames of the film, so that exactly one frame shows the edit."""
     times = playback.times_at(np.arange(film.frames) / film.fps, film.seconds)
     steps = np.abs(np.diff(times))
     moving = steps[steps > 0]
@@ -71,12 +72,12 @@ def frame_reach(film: Film, playback: Playback) -> float:
 
 @dataclass(frozen=True)
 class Edit:
-    """Everything done to a scene."""
+    """All changes to a scene, and the film that shows them."""
 
     handles: tuple[Handle, ...] = ()
     """In order of precedence: where two handles hold one node, the later one wins."""
     pins: tuple[int, ...] = ()
-    """Control points that follow the motion alone, ascending."""
+    """Indices of pinned control points, which follow the motion alone; ascending."""
     targets: Mapping[str, Target] = field(default_factory=dict)
     """Present targets by handle. A handle that no keyframe names stays there for the whole film."""
     keyframes: tuple[Keyframe, ...] = ()
@@ -88,7 +89,7 @@ class Edit:
 
     @property
     def reach(self) -> float:
-        """Scene time on either side of its own within which an edit of one frame shows."""
+        """Half the width, in scene time, of the interval in which an edit of one frame shows."""
         return frame_reach(self.film, self.playback)
 
     def handle(self, name: str) -> Handle | None:

@@ -1,4 +1,4 @@
-"""Edits as JSON: readable, versioned, checked, without paths or code. Numbers survive to the bit."""
+"""Edits as JSON: readable, versioned, checked, without paths or code. Numbers are stored without rounding."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def to_json(edit: Edit, engine: Engine) -> str:
 
 
 def checked(edit: Edit, engine: Engine) -> Edit:
-    """Return an edit as a file would hold it.
+    """Convert an edit to the JSON object that a file holds.
 
     Raises:
         UserError: naming a field that no file may hold.

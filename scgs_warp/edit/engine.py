@@ -1,7 +1,7 @@
 """The engine applies an edit to control points at any time, and to the Gaussians that follow them.
 
-Results depend on the edit and the time alone, to the bit, in whatever order they are requested. Live results are the
-exception: each starts from the previous one.
+For the same edit and time, results are bit-identical in whatever order they are requested. Live results are the
+exception: each is computed from the previous one.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .rotations import from_matrix, slerp, unit
 from .solver import STEP_ITERATIONS, ArapSolver, Shape, count_steps
 
 CACHED_INSTANTS = 64
-"""Entries that each cache of control points keeps."""
+"""Largest number of entries in each cache of control points."""
 LIVE_STEPS = 4
 """Largest number of sub-steps in one drag update; a longer drag catches up during the next updates."""
 LIVE_ITERATIONS = 8
@@ -46,7 +46,7 @@ class _Problem(NamedTuple):
     goals: list[Goal]
     pins: np.ndarray
     stay: np.ndarray
-    """[M] bool: control points that are pinned or held, and so follow no leader."""
+    """[M] bool: control points that follow no leader, because they are pinned or a handle acts on their component."""
 
 
 class _Live(NamedTuple):
@@ -116,14 +116,14 @@ class Engine:
         return {handle.name: led.get(handle.name, edit.targets.get(handle.name, STAY)) for handle in edit.handles}
 
     def bend(self, edit: Edit, time: float, at: float | None = None, *, frame: float = ONE_FRAME) -> NodePose | None:
-        """Return the edited control points at a scene time, as a function of the arguments alone.
+        """Return the edited control points at a scene time. The result depends on the arguments alone.
 
         Args:
             at: moment of the film in seconds, for keyframes. None: the handles' present targets.
-            frame: scene time on either side of its own within which an edit of one frame shows.
+            frame: half the width, in scene time, of the interval in which an edit of one frame shows.
 
         Returns:
-            None where the edit changes nothing; the scene then keeps its bits.
+            The pose, or None where the edit changes nothing, so that results are bit-identical to the unedited scene's.
         """
         targets = self.targets(edit, at)
         said = tuple((name, target.translation, target.rotation) for name, target in targets.items())
@@ -142,7 +142,8 @@ class Engine:
         return _remember(self._bent, key, solve)
 
     def bend_live(self, edit: Edit, time: float, *, frame: float = ONE_FRAME) -> NodePose | None:
-        """Do as ``bend`` with the present targets, but start from the previous live solution: fast enough for drags."""
+        """Return the edited control points for the present targets, starting from the previous live solution, which is
+        fast enough for drags."""
         targets = self.targets(edit, None)
         problem = self._problem(edit, time, targets, frame)
         if problem is None:
@@ -181,7 +182,7 @@ class Engine:
         )  # fmt: skip
 
     def normalised(self, time: float, bent: NodePose | None) -> Gaussians:
-        """Do as ``gaussians``, but in normalised units, for rendering."""
+        """Return activated Gaussians in normalised units, for rendering."""
         if bent is None:
             with torch.no_grad():
                 return self.scene.motion.gaussians_at(self.scene.gaussians, time)
@@ -197,8 +198,9 @@ class Engine:
         return None if np.array_equal(base.positions, motion) and not base.turns[:, 1:].any() else base
 
     def _problem(self, edit: Edit, time: float, targets: Mapping[str, Target], frame: float) -> _Problem | None:
-        """Turn handles into goals at this time; return None if nothing moves. Handles without strength now, and
-        components of the graph in which nothing moves, are left out, so that they keep their bits."""
+        """Turn handles into goals at this time; return None if nothing moves. Handles whose strength is 0 at this time,
+        and components of the graph in which nothing moves, are left out, so that their control points stay
+        bit-identical."""
         base = self.base_at(edit, time)
         goals = []
         for handle in edit.handles:
@@ -264,7 +266,7 @@ def _between(before: Mapping[str, Target], after: Mapping[str, Target], share: f
 
 
 def _remember(cache: OrderedDict[Any, Value], key: Any, make: Callable[[], Value]) -> Value:
-    """Return the cached value of ``key``, made if it is missing; evict the least recently used ones."""
+    """Return the cached value of ``key``; compute it if it is missing, and evict the least recently used values."""
     if key in cache:
         cache.move_to_end(key)
         return cache[key]

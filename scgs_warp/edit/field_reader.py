@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ..errors import UserError
 from ..storage.json_files import parse_json
 
 MAX_BYTES = 64 << 20
-"""Size of the largest edit file."""
+"""Largest size of an edit file in bytes."""
 MAX_NUMBER = 1e9
-"""Limit of numbers that have no limit of their own: beyond it float32 resolves no scene."""
+"""Largest magnitude of numbers without a limit of their own; beyond it float32 cannot resolve a scene."""
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -86,7 +88,7 @@ class FieldReader:
         return UserError(f"{self.source}: {field or 'the file'} {what}; {remedy}")
 
     def _inside(self, name: str) -> str:
-        """Return the path of a field in one line, as its name may be any text."""
+        """Return the path of a field on one line; the field's name may be any text."""
         return ".".join(part for part in (self.path, one_line(name)) if part)
 
     def __contains__(self, name: str) -> bool:
@@ -177,6 +179,17 @@ class FieldReader:
                 yield key, reader
 
 
+def plain_values(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields with NumPy's numbers and arrays as Python's, also inside lists and tuples."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, (np.generic, np.ndarray)):
+            return value.tolist()
+        return [plain(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+    return {name: plain(value) for name, value in fields.items()}
+
+
 def _is_number(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
@@ -189,7 +202,7 @@ def _is_number(value: Any) -> bool:
 def show_value(value: Any) -> str:
     """Quote a JSON value in at most 60 characters of one line."""
     try:
-        text = json.dumps(value) if value is not None else "missing"
+        text = json.dumps(value, default=repr) if value is not None else "missing"
     except RecursionError:
         return "nested too deeply"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -42,7 +42,8 @@ def film_camera(session: EditSession, at: float, size: int | None = None) -> Cam
 
 
 def _view_at(views: tuple[View, ...], at: float, overview: cameras.Overview) -> dict[str, np.ndarray]:
-    """Interpolate each quantity by itself, smoothly and without overshoot; the overview fills in missing ones."""
+    """Interpolate each quantity of the camera separately, smoothly and without overshoot; quantities that no view sets
+    come from the overview."""
     usual = {"azimuth": overview.azimuth, "elevation": overview.elevation, "distance": overview.radius}
     rows = {
         name: np.array([[usual[name] if getattr(view, name) is None else getattr(view, name)] for view in views])

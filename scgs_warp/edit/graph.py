@@ -15,11 +15,13 @@ from ..ops.arap import trajectory_graph
 from .rotations import rotate
 
 NEIGHBORS = 7
-"""Neighbours that each control point requests; the union of both directions gives about nine."""
+"""Number of neighbours that each control point requests. Requests in both directions count, so that a control point has
+about nine neighbours."""
 MAX_EDGE_RATIO = 3.0
-"""Length, in median edges, beyond which an edge is dropped."""
+"""Length, relative to the median edge, beyond which an edge is dropped."""
 MIN_COMPONENT_SIZE = 4
-"""Size below which an isolated component consists of strays, which follow the nearest larger component."""
+"""Number of control points below which an isolated component counts as strays, which follow the nearest larger
+component."""
 SAMPLE_COUNT = 16
 """Number of instants at which trajectories are compared."""
 
@@ -58,7 +60,7 @@ class ControlGraph:
         return csr_matrix((self.weights, self.neighbors, self.begin), shape=(len(self), len(self)))
 
     def ring(self, nodes: Iterable[int], count: int = 1) -> tuple[int, ...]:
-        """Return the nodes and all that are at most ``count`` edges away, ascending."""
+        """Return the nodes and all nodes at most ``count`` edges away from them, ascending."""
         inside = np.zeros(len(self), bool)
         inside[list(nodes)] = True
         matrix = self.matrix
@@ -90,8 +92,8 @@ class ControlGraph:
     def follow(
         self, rest: np.ndarray, positions: np.ndarray, turns: np.ndarray, stay: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Move strays rigidly with their leaders. Those in ``stay`` [M] bool, and those whose leader stays, keep
-        their bits.
+        """Move strays rigidly with their leaders. Strays in ``stay`` [M] bool, and strays whose leader has not moved,
+        stay bit-identical.
 
         Returns:
             Positions [M, 3] and turns [M, 4] of all nodes.
@@ -117,10 +119,10 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.nda
 
     Args:
         trajectories: [T, M, 3] control points at T times (one is enough for a static scene).
-        neighbors: number that each control point requests, 1 .. 15.
-        shared: [N, K] control points that have a Gaussian in common, row by row. Neighbours are then connected only if
-            they share a Gaussian (Martinetz & Schulten 1994) directly or through one more control point, so that gaps
-            stay open and control points that move no Gaussian connect nothing.
+        neighbors: number of neighbours that each control point requests, 1 .. 15.
+        shared: [N, K] control points of which each row shares a Gaussian. Neighbours are then connected only if they
+            share a Gaussian (Martinetz & Schulten 1994) directly or through one more control point, so that gaps stay
+            open and control points that move no Gaussian connect nothing.
     """
     nodes = trajectories.shape[1]
     nearest, _ = trajectory_graph(trajectories.float().cpu().contiguous(), neighbors)
@@ -147,7 +149,8 @@ def build_graph(trajectories: Tensor, neighbors: int = NEIGHBORS, shared: np.nda
 
 
 def _near(shared: np.ndarray, nodes: int) -> csr_matrix:
-    """Return [M, M] bool: control points with a Gaussian in common, or with one such neighbour in common."""
+    """Return [M, M] bool: pairs of control points that share a Gaussian, or that both share one with a third control
+    point."""
     rows, columns = (shared[:, pick].reshape(-1) for pick in np.triu_indices(shared.shape[1], 1))
     ones = np.ones(2 * len(rows), bool)
     ends = np.concatenate([rows, columns]), np.concatenate([columns, rows])

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from ..errors import UserError
-from .field_reader import MAX_NUMBER, FieldReader
+from .field_reader import MAX_NUMBER, FieldReader, plain_values
 from .graph import ControlGraph
 from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
 from .solver import Anchors
@@ -20,10 +20,10 @@ Quaternion = tuple[float, float, float, float]
 Lasting = Literal["motion", "frame", "fade"]
 
 ONE_FRAME = 5e-3
-"""Scene time on either side of its own within which an edit of one frame shows, if the film's step is unknown."""
+"""Half the width, in scene time, of the interval in which an edit of one frame shows, if the film's step is unknown."""
 HALFWAY_STIFFNESS = 10.0
-"""Stiffness of a fading handle at half strength. It releases its nodes as its strength goes to 0, so that nothing
-jumps."""
+"""Stiffness of a fading handle at half strength. The handle holds its nodes less firmly as its strength goes to 0, so
+that they do not jump when it releases them."""
 MIN_STIFFNESS, MAX_STIFFNESS = 1e-6, 1e6
 """Limits of a stiffness."""
 MIN_NODES_FOR_FRAME = 4
@@ -73,18 +73,19 @@ class Handle:
     nodes: tuple[int, ...]
     """Ascending, at least one."""
     time: float = 0.0
-    """Scene time at which it was made; pivot and targets refer to it."""
+    """Scene time at which the handle was made, and to which its pivot and targets refer."""
     pivot: Vector3 | None = None
-    """Centre of rotation, world units; None: the mean of its nodes."""
+    """Centre of rotation, world units; None: the mean of the nodes."""
     stiffness: float | None = None
-    """None: nodes go exactly to the target. A number: nodes are pulled there, relative to their edges' stiffness 1."""
+    """None: nodes go exactly to the target. A number: nodes are pulled there with this stiffness; their edges have
+    1."""
     turns: bool | None = None
-    """True: it also fixes its nodes' rotations. None: it does so if it has more than one node."""
+    """True: the handle also fixes its nodes' rotations. None: it does so if it has more than one node."""
     lasts: Lasting = "motion"
-    """motion: throughout, carried along by its nodes; frame: one frame; fade: fading out over ``window`` around its
-    time."""
+    """motion: the edit shows throughout, carried along by the nodes; frame: it shows in one frame; fade: it fades out
+    over ``window`` on either side of the handle's time."""
     window: float = 0.1
-    """Scene time after which a fading handle has no effect."""
+    """Distance in scene time from the handle's own time at which a fading handle's effect ends."""
 
     def __post_init__(self) -> None:
         """Check and convert all fields but the nodes, whose range depends on the scene.
@@ -92,7 +93,7 @@ class Handle:
         Raises:
             UserError: naming the field.
         """
-        for name, value in handle_fields(FieldReader(vars(self), f"handle {self.name!r}")).items():
+        for name, value in handle_fields(FieldReader(plain_values(vars(self)), f"handle {self.name!r}")).items():
             object.__setattr__(self, name, value)
 
     @property
@@ -100,7 +101,7 @@ class Handle:
         return len(self.nodes) > 1 if self.turns is None else self.turns
 
     def strength(self, time: float, frame: float = ONE_FRAME) -> float:
-        """Return the share of its target that applies at a scene time: 0 to 1, smooth for a fading handle."""
+        """Return the share of the handle's target that applies at a scene time: 0 to 1, smooth for a fading handle."""
         away = abs(time - self.time)
         if self.lasts == "motion" or away == 0.0:
             return 1.0
@@ -168,7 +169,7 @@ class Goal(NamedTuple):
         return positions, to_matrix(turns)
 
     def sweep(self, rest: np.ndarray) -> tuple[float, float]:
-        """Return the angle in radians and the distance that it covers, which decide the number of sub-steps."""
+        """Return the angle in radians and the distance that the goal covers, which decide the number of sub-steps."""
         distance = float(np.linalg.norm(self.translation))
         if self.residual is not None:
             distance += float(np.linalg.norm(self.residual, axis=1).max(initial=0.0))
@@ -187,7 +188,8 @@ def carried_goal(
     """Carry a handle's target from its own time to another instant by the rigid motion of its nodes.
 
     Args:
-        share: share of the target that applies, above 0; below 1 it also holds its nodes less firmly.
+        share: share of the target that applies, above 0. With a share below 1 the handle also holds its nodes less
+            firmly.
         then, now: [M, 3] control points at the handle's time and at the requested instant, normalised units; the same
             object if the two are equal.
         to_units: (centre, scale) of the normalised scene.
@@ -220,11 +222,11 @@ def _clamp_stiffness(stiffness: float) -> float:
 
 
 def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share: float) -> Anchors:
-    """Return what is held at ``share`` of the path. Later goals override earlier ones on the same node, and all of them
-    override pins.
+    """Return the constraints at ``share`` of the path. Later goals override earlier ones on the same node, and all of
+    them override pins.
 
     Args:
-        pins: nodes that stay, unturned.
+        pins: nodes that keep their base positions and are not turned.
         rest: [M, 3] base positions.
     """
     count = len(rest)

@@ -10,14 +10,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from .field_reader import FieldReader
+from .field_reader import FieldReader, plain_values
 from .handles import Target
 from .rotations import IDENTITY, conjugate, exponential, logarithm, multiply, power, slerp, unit
 
 Easing = Literal["smooth", "linear", "ease", "step"]
 
 MAX_SECONDS = 3600.0
-"""Limit of times in a film."""
+"""Largest time in a film, seconds."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Keyframe:
     at: float
     """Time in the film, seconds."""
     targets: Mapping[str, Target] = field(default_factory=dict)
-    """Targets by handle; the other keyframes lead handles that are missing here."""
+    """Targets by handle. A handle that is missing here is interpolated between the other keyframes."""
     easing: Easing = "smooth"
     """Interpolation to the next keyframe. smooth: without stopping at keyframes or overshooting them; linear: at
     constant speed; ease: from rest to rest; step: constant, then a jump."""
@@ -38,7 +38,7 @@ class Keyframe:
         Raises:
             UserError: naming the field.
         """
-        for name, value in keyframe_fields(FieldReader(vars(self), "keyframe")).items():
+        for name, value in keyframe_fields(FieldReader(plain_values(vars(self)), "keyframe")).items():
             object.__setattr__(self, name, value)
 
 

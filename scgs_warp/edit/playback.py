@@ -15,7 +15,7 @@ class Playback:
     seconds: float | None = None
     """Duration of the whole motion at speed 1; None: that of the film."""
     speed: float = 1.0
-    """Negative: backwards."""
+    """Speed relative to ``seconds``; negative: backwards."""
     start: float = 0.0
     """Scene time at which the film begins (``1 - start`` if it plays backwards)."""
     repeat: Literal["once", "loop", "swing"] = "once"
@@ -30,7 +30,7 @@ class Playback:
         return float(self.times_at(np.array([at]), film_seconds)[0])
 
     def times_at(self, at: np.ndarray, film_seconds: float) -> np.ndarray:
-        """Do as ``time_at`` for moments [F]."""
+        """Return the scene times [F] in [0, 1] at moments [F] of the film."""
         if self.freeze is not None:
             return np.full(len(at), self.freeze)
         if self.map:
@@ -47,24 +47,24 @@ class Playback:
 
 @dataclass(frozen=True)
 class Hold:
-    """Region that keeps its pose of one moment while the rest moves."""
+    """Region that keeps the pose it has at one moment while the rest moves."""
 
     nodes: tuple[int, ...]
     time: float = 0.0
-    """Scene time of the pose that it keeps."""
+    """Scene time of the pose that the region keeps."""
     frame: Literal["body", "world"] = "body"
-    """body: still follow the surrounding body; world: stay in place."""
+    """body: the region still follows the surrounding body; world: it stays in place."""
     rings: int = 2
-    """Number of neighbour rings that bend to compensate."""
+    """Number of rings of neighbours around the region that bend to join it to the rest."""
 
 
 @dataclass(frozen=True)
 class Exaggerate:
-    """Motion whose turns are scaled."""
+    """Exaggeration or damping of the motion: all turns are scaled."""
 
     factor: float = 1.5
     """1 leaves the motion unchanged, 0 gives the pose that ``about`` names."""
     about: float | None = None
     """Scene time of the pose that stays unchanged; None: the mean over time."""
     nodes: tuple[int, ...] = ()
-    """Control points to which it applies; empty: all."""
+    """Control points to which the factor applies; empty: all."""

@@ -51,7 +51,8 @@ class NodePose:
     """[M, 4] wxyz turns of the Gaussians' colours. They differ from ``turns`` for regions held at another instant,
     because colours do not turn with the trained motion."""
     base: NodePose | None = None
-    """Pose under holds and exaggeration alone, before any handle, which a mask weakens. None: there is no handle."""
+    """Pose under holds and exaggeration alone, before any handle; a mask weakens this part only. None: there is no
+    handle."""
 
     @staticmethod
     def of(positions: np.ndarray) -> NodePose:
@@ -78,7 +79,8 @@ def motion_pose(rig: Rig, time: float) -> MotionPose:
 
 
 def compose(motion: MotionPose, bent: NodePose) -> Pose:
-    """Compose motion and edit into the pose that skinning takes. Unedited control points keep the motion's bits."""
+    """Compose motion and edit into the pose that skinning takes. The pose of unedited control points is bit-identical
+    to the motion's."""
     own = motion.pose
     device = own.translations.device
     shift = torch.from_numpy(bent.positions - motion.positions).float().to(device)
@@ -147,7 +149,7 @@ def _on_top(
     posed: Gaussians, gaussians: GaussianParameters, bent: NodePose, base: NodePose, binding: tuple[Tensor, Tensor]
 ) -> Gaussians:
     """Move posed Gaussians with their control points from ``base`` to ``bent``. Gaussians whose control points have not
-    moved keep their bits."""
+    moved stay bit-identical."""
     device = posed.means.device
     further = multiply(bent.turns, conjugate(base.turns))
     still = (bent.turns == base.turns).all(1)

@@ -34,14 +34,14 @@ HISTORY = 1000
 
 
 class EditSession:
-    """Holds a scene, its graph of control points, an :class:`Edit`, and the thousand edits before it.
+    """Holds a scene, its graph of control points, an :class:`Edit`, and the last thousand edits for undo.
 
     All points, cameras and lengths are in world units; ``time`` is scene time in [0, 1]; ``at`` is a moment of the film
     in seconds, at which keyframes place the handles. If it is None, handles are at their present targets.
 
     Every change of the edit can be undone; a drag counts as one change from its first ``drag`` to ``release``. Results
-    depend on the edit alone, except those with ``live=True``, which are previews during a drag. ``frame`` is the scene
-    time on either side of its own within which an edit of one frame shows; None: as in the edit's film.
+    depend on the edit alone, except those with ``live=True``, which are previews during a drag. ``frame`` is half the
+    width, in scene time, of the interval in which an edit of one frame shows; None: as in the edit's film.
 
     Attributes: ``scene``, ``graph``, ``edit`` (replace it with :meth:`apply`).
     """
@@ -116,7 +116,7 @@ class EditSession:
         return int(np.linalg.norm(self.node_positions(time, at) - np.asarray(point, np.float64), axis=1).argmin())
 
     def ring(self, nodes: Iterable[int], count: int = 1) -> tuple[int, ...]:
-        """Return the nodes and all that are at most ``count`` edges away."""
+        """Return the nodes and all nodes at most ``count`` edges away from them."""
         return self.graph.ring(self._nodes(nodes), count)
 
     def within(self, point: Sequence[float], radius: float, time: float, at: float | None = None) -> tuple[int, ...]:
@@ -194,7 +194,7 @@ class EditSession:
         self._change(pins=tuple(node for node in self.edit.pins if node not in gone))
 
     def pin_rest(self, rings: int = 2) -> None:
-        """Pin everything more than ``rings`` edges away from any handle."""
+        """Pin every control point that is more than ``rings`` edges away from all handles."""
         held = {node for handle in self.edit.handles for node in handle.nodes}
         self._change(pins=self.graph.beyond(held, rings))
 
@@ -211,7 +211,8 @@ class EditSession:
         self, name: str, translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None
     ) -> Target:
         """Set a handle's target: turn it by ``rotation`` (wxyz) about its pivot, then shift it, both relative to the
-        motion. A part that is None stays. Nothing is solved until a result is requested.
+        motion. An argument that is None leaves that part of the target unchanged. Nothing is solved until a result is
+        requested.
 
         Raises:
             UserError: there is no such handle, or a number is not finite; the edit stays unchanged.
@@ -225,7 +226,7 @@ class EditSession:
         return target
 
     def preview(self, edit: Edit) -> None:
-        """Replace the edit as part of a drag, all of which ``release`` turns into one step for undo."""
+        """Replace the edit as part of a drag; ``release`` makes the whole drag one step for undo."""
         if self._before_drag is None:
             self._before_drag = self.edit
         self.edit = edit
@@ -301,7 +302,8 @@ class EditSession:
     def gaussians_at(
         self, time: float, at: float | None = None, *, live: bool = False, frame: float | None = None
     ) -> Gaussians:
-        """Return activated Gaussians under the edit, world units; the scene's own bits if the edit changes nothing."""
+        """Return activated Gaussians under the edit, world units; bit-identical to the scene's if the edit changes
+        nothing."""
         bent = self._bend(time, at, live, frame)
         return self.engine.gaussians(min(max(float(time), 0.0), 1.0), bent)
 
@@ -316,7 +318,7 @@ class EditSession:
         live: bool = False,
         frame: float | None = None,
     ) -> Image:
-        """Render the edited scene as ``Scene.render`` does; the same bits if the edit changes nothing."""
+        """Render the edited scene; bit-identical to ``Scene.render`` if the edit changes nothing."""
         bent = self._bend(time, at, live, frame)
         time = min(max(float(time), 0.0), 1.0)
         scene = self.scene
@@ -340,7 +342,7 @@ class EditSession:
         write_atomically(Path(path), edit_file.to_json(self.edit, self.engine).encode())
 
     def load(self, path: str | Path) -> None:
-        """Replace the edit with that of a file; can be undone.
+        """Replace the edit with the one in a file, as a step that can be undone.
 
         Raises:
             UserError: the file is missing, or a field is wrong; the edit stays unchanged.

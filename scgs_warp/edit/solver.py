@@ -39,7 +39,7 @@ STEP_ITERATIONS = 6
 FINAL_ITERATIONS = 60
 TURN_ITERATIONS = 8
 TOLERANCE = 1e-4
-"""Largest motion in an iteration, in edge lengths, at which iterations stop."""
+"""Convergence threshold in edge lengths: iterations stop when no node moves further in one iteration."""
 CACHED_FACTORS = 16
 """Number of cached factorisations."""
 
@@ -54,9 +54,9 @@ class Anchors(NamedTuple):
     turned: np.ndarray
     """[M] bool: the rotation is fixed."""
     positions: np.ndarray
-    """[M, 3], read where hard or soft."""
+    """[M, 3], read only where ``hard`` or ``soft`` is set."""
     rotations: np.ndarray
-    """[M, 3, 3], read where turned or leaning."""
+    """[M, 3, 3], read only where ``turned`` or ``leaning`` is set."""
     leaning: np.ndarray
     """[M] >= 0 weight that pulls a node to its rotation, as ``soft`` does for positions."""
 
@@ -93,7 +93,8 @@ class _System(NamedTuple):
 
 
 class ArapSolver:
-    """Solves for one graph and caches factorisations. Float64 on the CPU; the same arguments give the same bits."""
+    """Solves for one graph and caches factorisations. Float64 on the CPU; the same arguments give bit-identical
+    results."""
 
     def __init__(self, graph: ControlGraph, smoothness: float = SMOOTHNESS, stretch: float = STRETCH) -> None:
         self.graph = graph
@@ -185,8 +186,8 @@ class ArapSolver:
         return torch.from_numpy(weights), torch.from_numpy(np.ascontiguousarray(anchors.rotations))
 
     def _guess(self, system: _System, anchors: Anchors, shape: Shape) -> np.ndarray:
-        """Guess rotations [M, 3, 3]: fixed ones as given; the others from ``shape``, turned by the harmonic
-        interpolation of the anchors' turns since then."""
+        """Guess rotations [M, 3, 3]. Fixed rotations are those of the anchors; the others are those of ``shape``,
+        turned by the harmonic interpolation of the anchors' turns since ``shape``."""
         turns = np.where(anchors.turned[:, None, None], anchors.rotations, shape.rotations)
         further = np.zeros((len(turns), 3))
         given = np.flatnonzero(anchors.turned)
@@ -205,7 +206,8 @@ class ArapSolver:
         return turns
 
     def solve(self, rest: np.ndarray, path: Callable[[float], Anchors], steps: int) -> Shape:
-        """Follow a path of anchors from rest and return the deformation at its end, a function of the arguments alone.
+        """Follow a path of anchors from rest and return the deformation at its end. The result depends on the arguments
+        alone.
 
         Args:
             rest: [M, 3] float64, normalised units.

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 MOVING_SECONDS, STILL_SECONDS = 0.11, 0.8
-"""Target time of a picture in seconds, while something moves and while all is still."""
+"""Target times for drawing a picture, in seconds: while something moves, and while all is still."""
 MAX_SCREENSHOT_SIZE = 4096
-"""Largest longer side of a screenshot in pixels, whatever window size a page reports."""
+"""Upper limit for the longer side of a screenshot in pixels, whatever window size a page reports."""
 REPEAT_SECONDS = 1.5
 """Seconds during which the same message is not repeated."""
 
@@ -61,8 +61,8 @@ class Editor:
         session: scene and edit.
         folder: folder of edits, films and exports.
         port: port on 127.0.0.1; if it is taken, the next free one is used. 0: any.
-        size: largest longer side of a picture in pixels.
-        key: secret of the proxy in front of it, if there is one.
+        size: upper limit for the longer side of a picture in pixels.
+        key: secret of the proxy in front of the editor, if there is one.
 
     Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``gizmo_frame`` (frame of the visible gizmo and
     the target at which its drag begins), ``latency`` (seconds from a drag to its picture, the latest hundred).
@@ -189,12 +189,13 @@ class Editor:
         return callback
 
     def _failed(self, client: viser.ClientHandle | None, error: Exception) -> None:
-        """Report an internal error inside its ``except`` block."""
+        """Report an internal error; call it inside the ``except`` block."""
         traceback.print_exc(file=sys.stderr)
         self.say(client, "Internal error", f"{type(error).__name__}: {error}")
 
     def picture_failed(self, number: int, error: Exception) -> None:
-        """Report that a client's picture could not be drawn; on the worker's thread, inside the ``except`` block."""
+        """Report that a client's picture could not be drawn; called on the worker's thread, inside the ``except``
+        block."""
         client = self.server.get_clients().get(number)
         if client is None:
             return
@@ -341,7 +342,7 @@ class Editor:
             self.panel.show()
 
     def put(self, target: Target) -> None:
-        """Move the chosen handle to a target in one step, as the panel's numbers do."""
+        """Move the chosen handle to a target in one step, for the number fields of the panel."""
         self.model.grab(STAY if self.gizmo_frame is None else self.gizmo_frame[1])
         try:
             self.model.drag(target)

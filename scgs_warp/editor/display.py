@@ -1,4 +1,5 @@
-"""Conversion to the browser's units, in which scenes of any size have the same size, because its depth ends at 167."""
+"""Conversion to browser units, in which all scenes have the same size, because pictures encode depths up to 167
+only."""
 
 from __future__ import annotations
 
@@ -34,8 +35,7 @@ class Display:
         return np.asarray(points, np.float64) / self.scale + self.centre
 
     def depth(self, depth: np.ndarray, behind: float, stride: int = 1) -> np.ndarray:
-        """Convert depth [H, W], float32 world units, to browser units, ``behind`` further away and at most
-        ``FARTHEST``."""
+        """Convert depth [H, W], float32 world units, to browser units, add ``behind``, and limit it to ``FARTHEST``."""
         return np.minimum(depth[::stride, ::stride] * np.float32(self.scale) + np.float32(behind), FARTHEST)
 
     @property

@@ -11,8 +11,8 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,99}")
 
 
 def output_path(folder: Path, name: str, suffix: str) -> Path:
-    """Return the path of a file in the folder, which is made. Names come from browsers anywhere, so no name may lead
-    out of the folder.
+    """Return the path of a file in the folder, and make the folder if it is missing. Names come from browsers, so no
+    name may lead out of the folder.
 
     Args:
         name: file name with or without its suffix.

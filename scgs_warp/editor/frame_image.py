@@ -14,7 +14,7 @@ from .model import Moment
 from .views import ClientCamera
 
 QUALITY, FINE_QUALITY = 75, 90
-"""JPEG quality while something moves, and while all is still."""
+"""JPEG qualities: while something moves, and while all is still."""
 
 
 class Picture(NamedTuple):

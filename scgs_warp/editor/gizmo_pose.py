@@ -17,17 +17,17 @@ from .views import ClientCamera
 
 PICK_SIZE = 512
 NOISE = 1e-7
-"""Half the angle in radians below which a turn that the browser reports is noise of a shift."""
+"""Half the angle in radians below which a turn that the browser reports counts as noise in a shift."""
 
 
 @dataclass(frozen=True)
 class GizmoFrame:
-    """Frame of an unmoved handle at the moment shown, world units, relative to which targets place the gizmo."""
+    """Frame of an unmoved handle at the moment shown, world units; targets place the gizmo relative to it."""
 
     pivot: np.ndarray
     """[3]"""
     rotation: np.ndarray
-    """[4] wxyz rotation of its surroundings since the handle's own time."""
+    """[4] wxyz rotation of the handle's surroundings since the handle's own time."""
 
     def pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:
         """Return position [3] and wxyz [4] of the gizmo for a target."""

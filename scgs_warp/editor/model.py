@@ -74,7 +74,7 @@ class EditorModel:
         self._led = False
         """True if keyframes placed the handles before ``grab``."""
         self._automatic: deque[tuple[int, ...]] = deque(maxlen=100)
-        """Sets of pins that ``grab`` made by itself."""
+        """Sets of pins that ``grab`` made automatically."""
         self._following = False
         self._played_from: tuple[float, float] | None = None
 

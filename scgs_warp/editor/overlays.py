@@ -16,7 +16,8 @@ GIZMO = 0.16
 
 
 def node_colors(count: int, chosen: Any, held: Any, pins: Any) -> np.ndarray:
-    """Return colours [count, 3] uint8: pinned nodes dark red, held by handles blue, chosen yellow."""
+    """Return colours [count, 3] uint8: dark red for pinned nodes, blue for nodes of handles, yellow for chosen
+    nodes."""
     colors = np.tile(np.array(PLAIN, np.uint8), (count, 1))
     for nodes, color in ((pins, PINNED), (held, HELD), (chosen, CHOSEN)):
         colors[list(nodes)] = color
@@ -50,7 +51,7 @@ class Overlays:
         )  # fmt: skip
 
     def move(self, points: np.ndarray) -> None:
-        """Move control points to [M, 3]; those that are not finite stay."""
+        """Move control points to positions [M, 3]; skip those whose new position is not finite."""
         points = np.where(np.isfinite(points), points, self._points)
         if not np.array_equal(points, self._points):
             self._points = points

@@ -1,5 +1,5 @@
 """Access control of the editor. viser checks neither the origin of a request nor its sender, so any page could drive an
-editor on its visitor's machine. There are two entrances, both of which check:
+editor on its visitor's machine. The editor has two entrances, and both check requests:
 
 ``guarded`` refuses foreign pages at the editor's own port, which listens on 127.0.0.1 only. ``Proxy`` listens where
 other machines reach it, requires a token, checks the origin of pages and WebSockets, and forwards everything; while it
@@ -25,7 +25,7 @@ KEY_HEADER = "x-editor-key"
 COOKIE = "scgs_editor_"
 """Prefix of the cookie's name. The port follows, because cookies belong to hosts and a host may run several editors."""
 MAX_HEAD_BYTES = 32 << 10
-"""Largest head of a request."""
+"""Largest size of a request's head in bytes."""
 PATIENCE = 10.0
 """Seconds within which a request's head must arrive."""
 MAX_PENDING = 200
@@ -118,7 +118,7 @@ def guarded(key: str | None) -> Iterator[None]:
     function of ``websockets`` that starts its server is replaced.
 
     Raises:
-        UserError: the server was started in another way, and so would be open.
+        UserError: the server was started in another way, and so would accept any request.
     """
     import websockets.asyncio.server as module
 

@@ -106,7 +106,7 @@ class Worker:
         return future.result()
 
     def _run(self) -> None:
-        torch.set_flush_denormal(True)  # a setting of the thread; without it bits differ from a script's
+        torch.set_flush_denormal(True)  # set per thread; without it results differ from a script's
         while True:
             with self._condition:
                 task = self.next_task()

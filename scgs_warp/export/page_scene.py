@@ -18,10 +18,10 @@ from ..scene.scene import Scene
 from .page_data import Column, common_size, integers, quantise
 
 MIN_SAMPLES, MAX_SAMPLES = 33, 257
-"""Number of times at which control points are sampled; it doubles until the error is below ``COARSE_ERROR``."""
+"""Smallest and largest number of times at which control points are sampled; see ``COARSE_ERROR``."""
 COARSE_ERROR = 8e-4
-"""Largest error (root mean square, normalised units and radians) halfway between two times before the last doubling,
-after which about a quarter of it remains."""
+"""Error of interpolation halfway between two times (root mean square, normalised units and radians) at which the number
+of times is doubled once more and then kept; the last doubling leaves about a quarter of the error."""
 POSE_PARTS = ("translation", "rotation", "shape", "log_scale")
 QUATERNIONS = ("rotation", "shape")
 TIMES_AT_ONCE = 16
@@ -223,8 +223,8 @@ def _one_sided(quats: np.ndarray) -> np.ndarray:
 
 
 def _error(values: np.ndarray, between: np.ndarray) -> float:
-    """Return the root mean square distance of the rows halfway between two times from the mean of the two; signs of
-    quaternions do not matter."""
+    """Return the root mean square distance between the rows halfway between two times and the mean of the rows at these
+    times; signs of quaternions do not matter."""
     before, after = values[:-1], values[1:]
     if values.shape[2] == 4:
         before, after = (np.where((x * between).sum(2, keepdims=True) < 0, -x, x) for x in (before, after))

@@ -21,7 +21,7 @@ SUFFIXES: dict[Format, str] = {
     "graph": ".glb",
     "ply-sequence": "",
 }
-"""Suffix of each format's output; a suffix alone stands for its first format."""
+"""Suffix of each format's output. Formats may share a suffix, which then selects the first of them."""
 OTHER_SUFFIXES = {".htm": ".html"}
 """Alternative suffixes."""
 STILL_FORMATS = ("ply", "splat", "spz", "glb")

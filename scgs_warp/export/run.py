@@ -114,13 +114,13 @@ def write_still(
 
     Args:
         up: unit vector, used by .glb alone.
-        antialiased: whether they were trained with the antialiasing compensation, which .spz alone records.
+        antialiased: whether the Gaussians were trained with the antialiasing compensation, which .spz alone records.
 
     Returns:
         Number of values clipped to the range of .spz.
 
     Raises:
-        UserError: the suffix is another one, or the file cannot be written.
+        UserError: the suffix is none of these, or the file cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix == ".ply":

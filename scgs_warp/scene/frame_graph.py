@@ -27,9 +27,9 @@ from ..runtime.cuda_graph import CudaGraph
 from ..types import Camera, Image, Splats, Tiles
 
 CAPACITY_FACTOR = 1.25
-"""Capacity relative to the pairs of the frame that exceeded it."""
+"""Factor from the number of pairs of a frame that exceeded the capacity to the new capacity."""
 CAPACITY_STEP = 1 << 16
-"""Granularity of the capacity, so that it seldom changes."""
+"""Number of pairs of which the capacity is a multiple, so that it seldom changes."""
 RECORD_AFTER = 2
 """Number of frames drawn step by step before one is recorded, since recording does not pay for a single picture."""
 

@@ -1,4 +1,5 @@
-"""Initial points for bare walls and the far background: sparse points of a reconstruction lie on texture alone."""
+"""Initial points for bare walls and the far background, because a reconstruction's sparse points lie only on
+texture."""
 
 from __future__ import annotations
 
@@ -15,15 +16,16 @@ from ..seeding import generator
 from ..types import Camera, Frame
 
 MOST_VIEWS = 100
-"""Frames through which rays are cast, at most."""
+"""Largest number of frames through which rays are cast."""
 NEAREST = 3
-"""Number of projected points whose median depth is taken for a pixel."""
+"""Number of projected points nearest to a pixel; their median depth is the pixel's."""
 FARTHEST = 1.5
-"""Largest ratio of a point's depth to that of nearby texture: surfaces without texture lie behind it."""
+"""Largest ratio of a point's depth to that of nearby texture. The ratio is at least 1, because surfaces without texture
+lie behind texture."""
 
 
 def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return pixels [Q, 2] and depths [Q] of those points [P, 3] that the camera has in its image."""
+    """Project points [P, 3]: return the pixels [Q, 2] and depths [Q] of those inside the camera's image."""
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     local = local[local[:, 2] > 1e-3]
     pixels = local @ camera.K.T
@@ -33,7 +35,8 @@ def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _valid_cells(count: int, frame: Frame, random: torch.Generator) -> Tensor:
-    """Draw valid pixels [count], row times width plus column, with repetition; [0] where the mask is empty."""
+    """Draw ``count`` valid pixels with repetition; return row times width plus column [count], or [0] if the mask is
+    empty."""
     # torch.multinomial takes at most 2^24 pixels; integers have no such limit.
     if frame.mask is None:
         return torch.randint(frame.camera.width * frame.camera.height, (count,), generator=random)
@@ -49,12 +52,13 @@ def background_points(
     The depth is that of the nearest sparse points in the image, times a random factor between 1 and ``FARTHEST``.
 
     Args:
-        count: number of points, at most: a frame that sees no sparse point, or has no valid pixel, omits its share.
+        count: largest number of points. Frames that see no sparse point or have no valid pixel yield none, so fewer may
+            result.
         points: [P, 3] sparse points of the data, normalised.
 
     Returns:
-        points [B, 3], normalised, and colours [B, 3], B <= ``count``, in random order: any number of the first ones is
-        spread over all frames.
+        points [B, 3], normalised, and colours [B, 3], B <= ``count``, in random order, so that any leading part of them
+        is spread over all frames.
     """
     chosen = spread(len(data), MOST_VIEWS)
     found, colors = [], []

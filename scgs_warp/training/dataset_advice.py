@@ -1,6 +1,6 @@
-"""Advice on a data set in two lines before training: its properties, the expected result, and the most useful setting.
+"""Two lines of advice on a data set before training: its properties, the expected result, and the most useful setting.
 
-Thresholds are angles and shares that a user can check in the pictures; the gains of the settings are in
+Thresholds are angles and shares that a user can check in the pictures. The gains of the settings come from
 ``docs/quality.md`` and ``docs/design.md``.
 """
 
@@ -19,21 +19,24 @@ from ..types import Frame
 
 MOST_PAIRS = 12
 FEWEST_PAIRS = 6
-"""Numbers of pairs of neighbouring frames, seen from nearly the same place, whose brightness is compared."""
+"""Largest and smallest number of pairs of neighbouring frames, seen from nearly the same place, whose brightness is
+compared."""
 SAME_PLACE = 5.0
-"""Largest angle in degrees between cameras that see the same light."""
+"""Largest angle in degrees between two cameras that see a surface in the same light."""
 LITTLE_PARALLAX = 5.0
-"""Angle in degrees, seen from the scene, within which all cameras lie where depth is a guess."""
+"""Angle in degrees, seen from the scene. If all cameras lie within it, depth cannot be determined reliably."""
 JUMPS = 10.0
-"""Angle in degrees between neighbours in time beyond which the camera jumps at every instant, as in D-NeRF."""
+"""Angle in degrees between the cameras of neighbouring instants. Beyond it, the camera jumps at every instant, as in
+D-NeRF."""
 GAP = 5.0
-"""Ratio to the usual distance between instants, beyond which the motion in between is unknown."""
+"""Ratio of a time without frames to the usual distance between instants. Beyond it, the motion in between is
+unknown."""
 UNSTEADY = 0.08
 """Relative change of brightness between neighbouring frames that indicates a change of exposure."""
 FEW_VISITS = 20
-"""Steps per frame below which frames are hardly learnt."""
+"""Number of steps per frame below which frames are hardly learnt."""
 LARGE_IMAGE = 1_000_000
-"""Pixels per image beyond which training is slow on a CPU."""
+"""Number of pixels per image beyond which training is slow on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -45,19 +48,20 @@ class Survey:
     height: int
     instants: int
     views: int
-    """Largest number of frames of one instant."""
+    """Largest number of frames that share an instant."""
     arc: float
     """Largest angle in degrees between two cameras, seen from the centre of the scene."""
     turn: float
     """Median angle in degrees between the cameras of neighbouring instants."""
     gap: tuple[float, float]
-    """Beginning and end of the longest time without a frame."""
+    """Beginning and end of the longest interval without a frame."""
     typical_gap: float
-    """Median distance between neighbouring instants."""
+    """Median interval between neighbouring instants."""
     cut_out: bool
     """True where alpha separates objects from the background."""
     flicker: float
-    """Relative change of brightness from frame to frame (the ninth decile), where the camera hardly moves."""
+    """Relative change of brightness between successive frames (the ninth decile), measured where the camera hardly
+    moves."""
     points: int
     """Number of initial points in the data."""
 
@@ -98,7 +102,7 @@ def _directions(data: Dataset) -> np.ndarray:
 
 
 def _flicker(data: Dataset, pairs: list[tuple[int, int]]) -> float:
-    """Measure the change of exposure between successive frames seen from nearly the same place."""
+    """Measure the change of exposure between successive frames that are seen from nearly the same place."""
     changes = []
     if len(pairs) < FEWEST_PAIRS:
         return 0.0
@@ -110,7 +114,8 @@ def _flicker(data: Dataset, pairs: list[tuple[int, int]]) -> float:
 
 
 def _brightness(frame: Frame, on_white: bool) -> float:
-    """Mean over opaque valid pixels: a figure that fills more of the image is no brighter."""
+    """Return the mean brightness of opaque valid pixels only, so that a figure that fills more of the image does not
+    count as brighter."""
     image = frame.image.mean(dim=2).double()
     weight = torch.ones_like(image) if frame.alpha is None else frame.alpha.double()
     if frame.alpha is not None and on_white:
@@ -152,7 +157,7 @@ def _expectation(found: Survey) -> str:
 
 
 def _help(found: Survey, config: TrainConfig, device: str) -> str:
-    """Name the setting that gains most."""
+    """Name the setting that improves the result most."""
     if found.instants < 2 and config.motion.model != "static":
         return "--motion static is all it needs"
     if found.width * found.height > LARGE_IMAGE and device == "cpu":

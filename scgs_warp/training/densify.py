@@ -16,12 +16,12 @@ from ..optim import Adam
 from ..types import Stats
 
 SPLIT_SHRINK = 1.6
-"""Ratio of a split Gaussian's scales to those of its two halves (3D-GS)."""
+"""Ratio of a split Gaussian's scales to those of each of its two halves (3D-GS)."""
 RESET_OPACITY = 0.01
 
 
 def mean_gradient(stats: Stats) -> Tensor:
-    """[N] mean norm of the screen-space gradient over the images that saw the Gaussian."""
+    """Return the [N] mean norm of the screen-space gradient over the images in which the Gaussian was drawn."""
     return torch.nan_to_num(stats.grad_norm / stats.count.clamp(min=1.0), nan=0.0, posinf=0.0)
 
 
@@ -32,10 +32,10 @@ def clone_and_split(
 
     Args:
         clone, split: [N] bool, disjoint.
-        random: draws the positions of the halves.
+        random: generator for the positions of the halves.
 
     Returns:
-        the row [M] that each Gaussian came from, and [M] bool, the new rows: they are last, with zero moments.
+        The source row [M] of each Gaussian, and [M] bool, True for new rows, which come last and have zero moments.
     """
     pieces = [torch.where(~split)[0], torch.where(clone)[0], torch.where(split)[0].repeat(2)]
     index = torch.cat(pieces)
@@ -47,7 +47,8 @@ def clone_and_split(
 
 
 def _spread_halves(gaussians: GaussianParameters, count: int, random: torch.Generator) -> None:
-    """Sample the last ``count`` rows, copies of split Gaussians, from their parents, and shrink them."""
+    """Sample the positions of the last ``count`` rows, copies of split Gaussians, from their parents, and shrink
+    them."""
     if count == 0:
         return
     tail = slice(len(gaussians) - count, None)
@@ -58,10 +59,10 @@ def _spread_halves(gaussians: GaussianParameters, count: int, random: torch.Gene
 
 
 def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> Tensor:
-    """Remove the rows not marked in ``keep`` [N] bool; where none is marked, keep the most opaque one.
+    """Remove the rows not marked in ``keep`` [N] bool; if no row is marked, keep the most opaque one.
 
     Returns:
-        the rows [M] that were kept.
+        Indices [M] of the rows that were kept.
     """
     if not bool(keep.any()):
         keep = keep.clone()
@@ -75,7 +76,7 @@ def prune(gaussians: GaussianParameters, optimizer: Adam, keep: Tensor) -> Tenso
 
 
 def reset_opacities(gaussians: GaussianParameters, optimizer: Adam) -> None:
-    """Limit all opacities to 0.01: Gaussians that the images need recover, floaters do not."""
+    """Limit all opacities to 0.01. Gaussians that the images need become opaque again; floaters do not."""
     with torch.no_grad():
         gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     optimizer.reset_moments("opacity_logits")

@@ -1,6 +1,6 @@
 """Adaptive density control: the schedule by which Gaussians, spheres and control points are added, removed and reset.
 
-``done`` is the number of steps of the present stage that are complete. After a main step, in this order:
+``done`` is the number of completed steps of the present stage. After a main step, in this order:
 
 1. visibility pruning: Gaussians that contribute to no sampled view are removed;
 2. a densification round: control points are cloned and pruned where due; Gaussians with large gradients are cloned or
@@ -40,11 +40,13 @@ STEPS_PER_VIEW = 20
 """Visibility pruning renders at most one view per this many steps since the last pruning. A view takes about half as
 long as a step, so the share of the time is a few percent."""
 MOST_VIEWS, FEWEST_VIEWS = 300, 50
-"""More views are not needed to see every side; fewer, where the data has more, are not enough to judge by."""
+"""Largest number of rendered views, enough to see every side, and smallest number of views to judge by if the data has
+that many."""
 NUMBERS_PER_PARAMETER = 6
-"""float32 values in memory per parameter: value, gradient, two moments, posed value and its gradient."""
+"""Number of float32 values in memory per parameter: value, gradient, two moments, posed value and its gradient."""
 NUMBERS_PER_GAUSSIAN = 220
-"""float32 values in memory per Gaussian during a step: its splat, its gradients, four pairs of splat and tile."""
+"""Number of float32 values in memory per Gaussian during a step: its splat, its gradients, four pairs of splat and
+tile."""
 
 
 # Schedule
@@ -56,15 +58,16 @@ def round_due(config: DensifyConfig, done: int) -> bool:
 
 
 def opacity_reset_due(config: DensifyConfig, done: int) -> bool:
-    """Decide whether opacities are reset after ``done`` main steps. A reset needs half an interval to heal before
-    densification ends."""
+    """Decide whether opacities are reset after ``done`` main steps. The last reset is at least half an interval before
+    the end of densification, so that opacities can recover."""
     every = config.opacity_reset_every
     return done % every == 0 and done + every // 2 <= config.until
 
 
 def visibility_pruning_due(config: DensifyConfig, done: int) -> bool:
-    """Decide whether hidden Gaussians are removed after ``done`` main steps: before each opacity reset and when
-    densification ends. A reset would spare them: all surfaces are transparent then, and the inside learns colour."""
+    """Decide whether visibility pruning is due after ``done`` main steps: before each opacity reset and at the end of
+    densification. After a reset it would come too late: all surfaces are transparent then, so hidden Gaussians
+    contribute and learn colours."""
     return config.min_contribution > 0.0 and (done == config.until or opacity_reset_due(config, done))
 
 
@@ -86,13 +89,13 @@ def spheres_due(config: PretrainConfig, done: int) -> bool:
 
 
 def gradient_threshold(config: DensifyConfig, width: int, height: int) -> float:
-    """Gradient threshold at this image size, normalised device coordinates."""
+    """Return the gradient threshold for this image size, normalised device coordinates."""
     return config.grad_threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent
 
 
 def affordable_count(gaussians: GaussianParameters, wanted: int) -> int:
-    """Number of Gaussians that fit in memory, at most ``wanted``. Counts parameters, gradients, Adam's moments and the
-    intermediate values of a step."""
+    """Return the number of Gaussians that fit in memory, at most ``wanted``. Counts parameters, gradients, Adam's
+    moments and the intermediate values of a step."""
     count = len(gaussians)
     numbers = sum(parameter.numel() for parameter in gaussians.parameters()) / max(count, 1)
     each = round(4 * (NUMBERS_PER_PARAMETER * numbers + NUMBERS_PER_GAUSSIAN))
@@ -106,13 +109,13 @@ def affordable_count(gaussians: GaussianParameters, wanted: int) -> int:
 
 
 def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
-    """Measure which Gaussians contribute at least ``densify.min_contribution`` pixels to one of a few sampled views.
+    """Find the Gaussians that contribute at least ``densify.min_contribution`` pixels to one of a few sampled views.
 
-    Views are drawn at random, others each time.
+    The views are drawn at random, different ones each time.
 
     Returns:
-        [N] bool, the rows to keep when the present step is done; None where visibility pruning is not due, or the run
-        is too short for enough views.
+        [N] bool, the rows to keep after the present step; None if visibility pruning is not due, or if the run is too
+        short to render enough views.
     """
     config = state.config.densify
     done = state.stage_step + 1
@@ -130,15 +133,15 @@ def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
 
 
 def control_density(state: TrainState, size: tuple[int, int], visible: Tensor | None = None) -> str | None:
-    """Add, remove and reset what the schedule asks for after the present step, which ``state.step`` does not count yet.
+    """Add, remove and reset what the schedule requires after the present step, which ``state.step`` does not yet count.
 
     Args:
         size: width and height of the step's image in pixels.
-        visible: [N] bool from :func:`visible_gaussians`; the other rows are pruned. None: visibility pruning is not
-            due.
+        visible: [N] bool from :func:`visible_gaussians`; rows that are False are pruned. None: visibility pruning is
+            not due.
 
     Returns:
-        a note for the user where memory limits growth, else None.
+        A note for the user if memory limits the growth, else None.
     """
     if state.stage == "pretrain":
         _control_spheres(state)
@@ -216,11 +219,12 @@ def grow_and_prune(
 
     Args:
         gaussians, optimizer: changed in place; new rows start with zero moments.
-        stats: accumulated since the last round; the caller resets them.
+        stats: statistics accumulated since the last round; the caller resets them.
         grad_threshold: norm of the screen-space gradient, normalised device coordinates.
         extent: radius of the cameras, normalised units.
-        prune_large: also remove Gaussians that are too large on screen or in space (after the first opacity reset).
-        random: draws the positions of split halves.
+        prune_large: also remove Gaussians that are too large on screen or in space ; True only after the first opacity
+            reset.
+        random: generator for the positions of split halves.
     """
     with torch.no_grad():
         # Grow, within the budget.
@@ -234,14 +238,14 @@ def grow_and_prune(
         if prune_large:
             keep &= (stats.max_radii[index] <= config.max_screen) | fresh
             keep &= scales.amax(1) <= config.max_scale * extent
-        # A non-finite Gaussian is never drawn, so no gradient could mend it.
+        # A non-finite Gaussian is never drawn, so no gradient could correct it.
         for values in (*(getattr(gaussians, name) for name in GaussianParameters.NAMES), scales):
             keep &= torch.isfinite(values).flatten(1).all(dim=1) if values.ndim > 1 else torch.isfinite(values)
     prune(gaussians, optimizer, keep)
 
 
 def _within_budget(gradient: Tensor, chosen: Tensor, budget: int) -> Tensor:
-    """Reduce ``chosen`` [N] bool to ``budget`` rows, those with the largest gradients."""
+    """Reduce ``chosen`` [N] bool to at most ``budget`` rows, those with the largest gradients."""
     if int(chosen.sum()) <= budget:
         return chosen
     best = torch.where(chosen, gradient, gradient.new_tensor(-1.0)).argsort(descending=True, stable=True)

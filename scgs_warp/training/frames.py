@@ -1,4 +1,4 @@
-"""Training views: normalised cameras, planar images on the device, and their random order."""
+"""Training views: normalised cameras, planar images on the device, and the random order of the frames."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ..seeding import generator
 from ..types import Camera, Frame
 
 PROGRESSIVE_SHARE = 0.2
-"""Share of the frames that progressive pre-training begins with, and adds each time."""
+"""Share of the frames with which progressive pre-training begins and by which it grows."""
 LEAST_HALVED_SIDE = 64
-"""Images with a shorter side than this, in pixels, are not halved."""
+"""Shorter side in pixels below which images are not halved."""
 
 
 def first_frames(data: Dataset) -> Dataset:
@@ -27,7 +27,7 @@ def first_frames(data: Dataset) -> Dataset:
 
 
 def view_number(step: int, config: TrainConfig, view: int) -> int:
-    """Number the views of all steps. The order of frames and a view's random draws depend on this number, and so not on
+    """Number the views of all steps. The order of frames and a view's random draws depend only on this number, not on
     the process that renders the view."""
     return step * config.batch + view
 
@@ -45,7 +45,8 @@ def _half(frame: Frame) -> Pixels:
 
 
 class Frames:
-    """Training frames in a random order without replacement: the same for the same seed, another in every epoch."""
+    """Training frames in random order without replacement: the order is the same for the same seed and differs between
+    epochs."""
 
     def __init__(self, data: Dataset, normalisation: Normalisation, config: TrainConfig, device: str) -> None:
         self.frames = data
@@ -60,12 +61,12 @@ class Frames:
         return len(self.frames)
 
     def index_at(self, step: int, progressive: bool, view: int = 0) -> int:
-        """Index of the frame of this step's ``view``.
+        """Return the index of the frame of this step's ``view``.
 
         Args:
-            progressive: draw from the first 20 % of the frames by time at first, and from 20 % more every
-                ``progressive_every`` steps (seed S4), added one by one. Every other view is then one of the newest
-                20 %, so that a moving limb is followed before its earlier positions make it transparent.
+            progressive: draw from the first 20 % of the frames by time at first; every ``progressive_every`` steps
+                another 20 % is added (seed S4), one frame at a time. Every other view is then one of the newest 20 %,
+                so that the spheres follow a moving limb before views of its earlier positions make them transparent.
         """
         first, allowed, number = 0, len(self.frames), view_number(step, self.config, view)
         if progressive:
@@ -81,7 +82,7 @@ class Frames:
         return self.by_time[first + self._order[1][place]]
 
     def halved(self, index: int) -> tuple[Frame, Camera]:
-        """Return frame and normalised camera at half the size, each pixel the mean of four."""
+        """Return the frame and its normalised camera at half the size; each pixel is the mean of four."""
         entry, camera = self.frames.entries[index], self.cameras[index]
         half = self.frames.cache.get((self, index), lambda: _half(self.frames[index]))
         intrinsics = camera.K * camera.K.new_tensor([0.5, 0.5, 1.0])[:, None]
@@ -89,7 +90,7 @@ class Frames:
         return Frame(entry.camera, entry.time, *half, name=entry.name), small
 
     def expect(self, step: int, progressive: bool, view: int = 0) -> None:
-        """Start reading the frame of this step's ``view``, unless it is in memory."""
+        """Start to read the frame of this step's ``view`` in the background, unless it is in memory."""
         index = self.index_at(step, progressive, view)
         if (self, index) not in self.frames.cache:
             self.frames.expect(index)
@@ -100,11 +101,11 @@ class Frames:
         """Load the frame of this step's ``view``.
 
         Returns:
-            frame, normalised camera, truth [3, H, W] on the view's background, that background [3], and the mask
-            [H, W] bool or None.
+            Frame, normalised camera, truth [3, H, W] composited on the view's background, background [3], and mask [H,
+            W] bool or None.
 
         Raises:
-            FrameError: the frame's file cannot be read any more.
+            FrameError: the frame's file is no longer readable.
         """
         camera = self.cameras[index]
         try:

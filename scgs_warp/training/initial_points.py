@@ -1,4 +1,4 @@
-"""Initial points for data that brings none: random, preferably where the images' alpha is covered."""
+"""Random initial points for data sets without points, drawn where the images' alpha shows an object."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from ..seeding import generator
 from ..types import Camera
 
 HALF_SIZE = 1.3
-"""Half the edge of the cube in which random points lie, normalised units."""
+"""Half the edge of the cube in which random points are drawn, normalised units."""
 CANDIDATES = 100_000
-"""Random points from which the initial ones are drawn, at least."""
+"""Smallest number of candidates from which the initial points are drawn."""
 MOST_VIEWS = 100
-"""Frames in which candidates are looked up, at most."""
+"""Largest number of frames in which a candidate is looked up."""
 SHARPNESS = 3.0
-"""Points are drawn with probability (share of views in which they are covered) to this power. A moving limb covers each
-of its positions only part of the time, so carving would remove it."""
+"""Exponent of the share of views in which a candidate is covered; the power is its probability of being drawn. Points
+covered in only some views must remain possible, because a moving limb covers each of its positions only part of the
+time."""
 
 
 def random_points(count: int, seed: int, key: int) -> Tensor:
@@ -29,16 +30,16 @@ def random_points(count: int, seed: int, key: int) -> Tensor:
 
 
 class Coverage(NamedTuple):
-    """Coverage of each point in the views."""
+    """Coverage of points by the alpha of the views."""
 
     share: Tensor
-    """[P] share of views with alpha above one half at the point, among those that have it in the image."""
+    """[P] share of the views with alpha above one half at the point, among the views that contain it."""
     colors: Tensor
-    """[P, 3] mean colour in the covered views; grey where there are none."""
+    """[P, 3] mean colour in the views that cover the point; grey if no view covers it."""
 
 
 def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Coverage | None:
-    """Look up every point in up to 100 frames; None where no frame has alpha. ``points`` [P, 3] normalised."""
+    """Measure the coverage of ``points`` [P, 3], normalised, in up to 100 frames; return None if no frame has alpha."""
     chosen = data.with_alpha
     if not chosen:
         return None
@@ -56,7 +57,7 @@ def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Cov
 
 
 def _pixels(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row and column [P] of the pixels that the points [P, 3] project to, and [P] bool: inside the image."""
+    """Project points [P, 3] to pixels: return their rows [P] and columns [P], and [P] bool: inside the image."""
     camera = camera.to("cpu")
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     pixels = local @ camera.K.T
@@ -67,7 +68,7 @@ def _pixels(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def common_view(points: Tensor, data: Dataset, normalisation: Normalisation) -> Tensor:
-    """Share [P] of up to 100 views that have the point in the image. ``points`` [P, 3] normalised."""
+    """Return the share [P] of up to 100 views that contain each of ``points`` [P, 3], normalised."""
     chosen = spread(len(data), MOST_VIEWS)
     seen = torch.zeros(len(points))
     for index in chosen:
@@ -78,10 +79,10 @@ def common_view(points: Tensor, data: Dataset, normalisation: Normalisation) -> 
 def sample_initial_points(
     count: int, data: Dataset, normalisation: Normalisation, seed: int, key: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Draw random points where the images are covered; where no frame has alpha, in the cameras' common view.
+    """Draw random points where the images are covered or, if no frame has alpha, where the cameras' views overlap.
 
     Returns:
-        points [count, 3], normalised, and colours [count, 3]; None without alpha.
+        points [count, 3], normalised, and colours [count, 3]; the colours are None if no frame has alpha.
     """
     candidates = random_points(max(CANDIDATES, count), seed, key)
     covered = coverage(candidates, data, normalisation)

@@ -27,9 +27,9 @@ from .state import TrainState
 from .step import training_step
 
 MOST_FAILURES = 20
-"""Consecutive non-finite steps after which training stops at the last good state."""
+"""Number of consecutive non-finite steps after which training stops at the last good state."""
 COMPARE_EVERY = 500
-"""Steps between two comparisons of the scenes that the processes of a group hold."""
+"""Number of steps between two comparisons of the scenes that the processes of a group hold."""
 
 
 def fit(
@@ -50,26 +50,26 @@ def fit(
         config: the complete configuration: a ``config.preset``, possibly changed by ``config.with_steps`` and
             ``from_dict``.
         data: training frames in world units (``data.load``).
-        output: run directory; made if needed.
-        device: ``cpu`` or ``cuda``; everything is computed there.
-        test: held-out frames for the curve and the previews; they select nothing.
-        resume: continue from the checkpoint in ``output``, to the same bits as an uninterrupted run. Where it is
-            damaged, the previous one is used; where the run was killed before its first checkpoint, training starts
-            from step 0.
+        output: run directory; created if it does not exist.
+        device: ``cpu`` or ``cuda``, for all computation.
+        test: held-out frames for the curve and the previews; they do not influence the training.
+        resume: continue from the checkpoint in ``output``; the result is bit-identical to that of an uninterrupted run.
+            If the checkpoint is damaged, the previous one is used; if the run was killed before its first checkpoint,
+            training starts from step 0.
         settings: content of ``config.json``; default: the configuration.
-        tensorboard: also write event files for TensorBoard to ``output``; changes no bit of the scene.
+        tensorboard: also write event files for TensorBoard to ``output``; the scene stays bit-identical.
         group: the processes that share each step's views (``process_group.join_processes``); ``config.batch`` must be a
-            multiple of their number. The first one writes to ``output``, all read from it.
+            multiple of their number. The first process writes to ``output``; all read from it.
 
     Returns:
         the scene after the last step, in every process.
 
     Raises:
-        UserError: the configuration cannot run, a checkpoint does not fit or cannot be written, an image is gone, the
-            loss was non-finite repeatedly, TensorBoard is missing, or a process was lost. The last checkpoint is
+        UserError: the configuration cannot run, a checkpoint does not fit or cannot be written, an image is missing,
+            the loss was non-finite repeatedly, TensorBoard is missing, or a process was lost. The last checkpoint is
             intact.
-        NotEnoughMemory: one tile of an image needs more memory than there is; the checkpoint is saved.
-        KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal; the checkpoint is saved.
+        NotEnoughMemory: one tile of an image needs more memory than is available; the checkpoint is saved.
+        KeyboardInterrupt: after Ctrl-C, SIGTERM or the closing of the terminal; the checkpoint is saved.
     """
     # 1. Refuse what cannot run.
     check(config)
@@ -177,8 +177,8 @@ def _train(
 
 
 def _process_lost(state: TrainState, folder: RunFolder, lost: ProcessLost) -> UserError:
-    """Save what can be saved after another process is gone. No further step can be finished, but mostly none has begun:
-    parameters change only when all views are there."""
+    """Save the state, if it is consistent, after another process is lost. No further step can be completed, but usually
+    none has begun: parameters change only when the gradients of all views are available."""
     assert state.group is not None
     if state.step == 0:
         return UserError(f"{folder.path}: {lost}; no step was done yet")

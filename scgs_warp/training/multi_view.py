@@ -1,7 +1,7 @@
-"""Steps of more than one view: one after the other, or shared by several processes, to the same bits.
+"""Steps of several views, processed in sequence or shared by several processes, with bit-identical results.
 
-Gradients and statistics are added view by view in order. Process ``r`` of ``W`` takes the views ``r``, ``r + W``
-and so on: after each round the next ``W`` views are complete.
+Gradients and statistics are added view by view in order. Process ``r`` of ``W`` takes the views ``r``, ``r + W`` and so
+on, so each round completes the next ``W`` views.
 """
 
 from __future__ import annotations
@@ -20,25 +20,27 @@ from .process_group import OrderedReduction, ProcessGroup
 from .state import StepResult, TrainState
 
 TERMS = ("image loss", "regulariser")
-"""Terms of the loss whose non-finite value drops a view, before it has gradients."""
+"""Terms of the loss. A non-finite term ends the step before the view has gradients."""
 DIFFER = "the processes no longer hold the same scene; are the data, the packages and the kind of processor the same?"
 
 
 def all_views(
     state: TrainState, frames: Frames, one_view: Callable[[TrainState, Frames, int, Stats], StepResult]
 ) -> StepResult:
-    """Render and compare all views of a step, shared with the other processes if there are any.
+    """Render and compare all views of a step, sharing them with the other processes if there are any.
 
     Args:
-        one_view: forward and backward pass of one view; adds to the gradients and to the statistics it is given.
+        one_view: runs the forward and backward pass of one view; adds to the parameters' gradients and to the given
+            statistics.
 
     Returns:
-        the first view of this process, with the mean losses over all views, the size of the first view of all, and the
-        first failure of all. Without a failure, the parameters have the mean gradient, and ``state.stats`` has grown.
+        The result of this process's first view, but with the mean losses over all views, the size of the step's first
+        view, and the first failure in any view. Without a failure, the parameters hold the mean gradient and
+        ``state.stats`` includes the step.
 
     Raises:
-        UserError: the processes are not at the same point.
-        ProcessLost: another process is gone.
+        UserError: the processes are not at the same step.
+        ProcessLost: another process has ended or hangs.
     """
     group, batch = state.group, state.config.batch
     size, rank = (1, 0) if group is None else (group.size, group.rank)
@@ -47,7 +49,7 @@ def all_views(
     totals = None if group is None else (OrderedReduction(group), OrderedReduction(group, torch.maximum))
     stats = _empty(state)
     for first in range(0, batch, size):
-        if group is not None:  # gradients of a round are those of one view
+        if group is not None:  # each round reduces the gradients of one view per process
             _drop_gradients(state)
             stats = _empty(state)
         result = one_view(state, frames, first + rank, stats)
@@ -89,7 +91,8 @@ def _drop_gradients(state: TrainState) -> None:
 
 
 def _row(result: StepResult, length: int) -> list[float]:
-    """Encode a view in numbers: index of the failed term (-1: success), losses, size, elements to reduce."""
+    """Encode a view's result in numbers: index of the failed term (-1: success), losses, image size, and the number of
+    elements to reduce."""
     code = -1 if result.failed is None else TERMS.index(result.failed)
     losses = float(result.loss), float(result.l1), float(result.ssim), result.regulariser
     return [code, *losses, *result.size, length]
@@ -106,7 +109,7 @@ def check_share(config: TrainConfig, group: ProcessGroup | None) -> None:
     """Refuse a batch that the processes cannot share evenly.
 
     Raises:
-        UserError: names both numbers.
+        UserError: the number of views is not a multiple of the number of processes; names both.
     """
     if group is not None and config.batch % group.size:
         raise UserError(
@@ -116,7 +119,7 @@ def check_share(config: TrainConfig, group: ProcessGroup | None) -> None:
 
 
 def check_replicas(state: TrainState) -> None:
-    """Compare the parameters of all processes, which are equal by construction unless processors round differently.
+    """Compare the parameters of all processes, which are equal by construction unless the processors round differently.
 
     Raises:
         UserError: they differ.

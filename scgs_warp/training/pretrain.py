@@ -1,4 +1,4 @@
-"""Initial models of both stages, and the spheres of stage 1: grown, pruned, thinned to N_p control points."""
+"""Initial models of both stages, and the spheres of stage 1: densified, pruned, and reduced to N_p control points."""
 
 from __future__ import annotations
 
@@ -19,31 +19,32 @@ from ..types import Stats
 from .densify import mean_gradient
 
 TRAJECTORY_TIMES = 16
-"""Number of instants whose positions span the space in which farthest-point sampling chooses control points."""
+"""Number of instants in a trajectory. Farthest-point sampling chooses control points in the space of trajectories."""
 START_RADIUS = 0.5
 """Radius of the spheres at the start of progressive pre-training, as a share of their spacing."""
 DEAD_OPACITY = 0.01
-"""Spheres of less opacity are removed."""
+"""Opacity below which a sphere is removed."""
 SOLID_OPACITY = 0.1
-"""Neither control points nor Gaussians begin at spheres of less opacity while there are others."""
+"""Opacity below which a sphere is not used to place control points or Gaussians, if there are enough others."""
 FEWEST_SPHERES = 256
-"""Least number of control points that sphere counts are derived from: fewer spheres cannot represent a figure."""
+"""Smallest number of control points from which sphere counts are derived: fewer spheres cannot represent a figure."""
 
 
 def sphere_unit(config: TrainConfig) -> int:
-    """Unit of the sphere counts in stage 1: N_p, but at least ``FEWEST_SPHERES``."""
+    """Return the number of control points from which sphere counts are derived: N_p, but at least
+    ``FEWEST_SPHERES``."""
     return max(config.motion.nodes, FEWEST_SPHERES)
 
 
 def initial_spheres(
     config: TrainConfig, points: Tensor, colors: Tensor, device: str
 ) -> tuple[GaussianParameters, Spheres]:
-    """Make spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and the
-    network at rest.
+    """Make spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and a
+    network without motion.
 
-    The sample is spread evenly, since with all frames at once a limb may be anywhere. Progressive pre-training knows
-    the first pose: there the spheres stay as dense as the points, and start smaller than their spacing, because one
-    that sticks out of a thin limb turns transparent before it has shrunk.
+    The sample is spread evenly, because over all frames a limb may be anywhere. Progressive pre-training starts with
+    the first pose: there the sample is as dense as the points, and the spheres are smaller than their spacing, because
+    a sphere that sticks out of a thin limb would turn transparent before it shrinks.
     """
     count = min(round(sphere_unit(config) * config.pretrain.start_ratio), len(points))
     index = torch.arange(count, device=points.device)
@@ -58,10 +59,11 @@ def initial_spheres(
 
 
 def initial_motion(config: TrainConfig, points: Tensor, times: int = 0) -> Motion:
-    """Make a motion model for a run without stage 1; control points are a sample of ``points`` [P, 3], at rest.
+    """Make a motion model for a run without stage 1; its control points are a sample of ``points`` [P, 3], without
+    motion.
 
     Args:
-        times: number of distinct training times, which sizes feature planes.
+        times: number of distinct training times, which determines the size of feature planes.
     """
     if config.motion.model == "hexplane":
         return HexPlane(config.seed, config.motion.plane_times or max(2, times // 2))
@@ -83,9 +85,9 @@ def densify_spheres(
 ) -> None:
     """Remove transparent spheres and clone those with the largest gradients, keeping between N_p and the cap.
 
-    A threshold on the gradient does not carry over from Gaussians to large spheres, so the cloned share is fixed. A
-    clone lands within a radius of its parent. Where too few are left (a short stage 1 can fall to a dozen), more are
-    cloned.
+    The gradient threshold for Gaussians does not suit large spheres, so a fixed share is cloned. Each clone is
+    displaced at random, by about one radius. If fewer than N_p spheres are left (a short stage 1 can leave a dozen),
+    more are cloned.
     """
     with torch.no_grad():
         opacities = gaussians.opacities()
@@ -111,9 +113,10 @@ def densify_spheres(
 
 
 def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Spheres, nodes: int) -> None:
-    """Reduce spheres to N_p by farthest-point sampling in trajectory space, so that parts that move apart both stay.
+    """Reduce spheres to N_p by farthest-point sampling in trajectory space, so that parts that move apart are both
+    sampled.
 
-    Sample solid spheres only, if there are enough: the farthest of all are strays in empty space.
+    Only solid spheres are sampled if there are enough, because the farthest spheres are often strays in empty space.
     """
     if len(gaussians) <= nodes:
         return
@@ -130,8 +133,8 @@ def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Sphere
 
 
 def control_points_from_spheres(gaussians: GaussianParameters, spheres: Spheres, config: TrainConfig) -> ControlPoints:
-    """Make control points at the spheres' centres. All start with one radius (seed S4: o_i is shared): the spheres',
-    but no less than their typical spacing, so that neighbours blend."""
+    """Make control points at the spheres' centres, all with the same initial radius (seed S4: o_i is shared): that of
+    the spheres, but at least their typical spacing, so that neighbours blend."""
     positions = gaussians.means.detach()
     spacing = float(neighbor_distance(positions).median())
     radius = max(float(spheres.log_radius.detach().exp()), spacing)
@@ -142,7 +145,7 @@ def control_points_from_spheres(gaussians: GaussianParameters, spheres: Spheres,
 def initial_gaussians(
     config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None = None
 ) -> GaussianParameters:
-    """Make the Gaussians of stage 2: at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
+    """Make the Gaussians of stage 2 at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
     options: dict[str, Any] = {
         "sh_degree": config.sh_degree,
         "hyper_dim": config.motion.hyper_dim + config.motion.mask,

@@ -1,8 +1,8 @@
 """The process group: several processes that train one scene together.
 
 ``torchrun`` starts the processes (``runtime/torchrun.py``). Every process holds the whole scene and takes its share of
-a step's views (``training/multi_view.py``). Sums over processes are taken element by element in rank order, whatever
-the network does: only collectives that move data are used.
+a step's views (``training/multi_view.py``). Sums over processes are computed here, element by element in rank order;
+the collectives of the network library only move data, so the network does not affect the result.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from ..errors import UserError
 from ..runtime.torchrun import ProcessRank
 
 PATIENCE = timedelta(minutes=10)
-"""Silence after which a process counts as lost. Ended processes are noticed at once; this limit is for those that hang.
-It leaves time for compiling kernels and for the work of the first process alone."""
+"""Duration of silence after which a process counts as lost. The end of a process is noticed at once; this limit is for
+processes that hang. It leaves time for compiling kernels and for work that only the first process does."""
 PIECE = 1 << 22
-"""Elements moved at once, 16 MiB. Buffers of this size are used again, in gloo as here; larger ones come from the
-system page by page each time, which takes longer than moving them."""
+"""Number of elements moved at once (16 MiB). Buffers of this size are reused, by gloo as well as here. Larger ones are
+allocated by the system page by page each time, which takes longer than moving the data."""
 
 T = TypeVar("T")
 
@@ -37,12 +37,12 @@ class ProcessLost(UserError):
 
 @contextlib.contextmanager
 def join_processes(where: ProcessRank | None, device: str) -> Iterator[ProcessGroup | None]:
-    """Join the processes that ``torchrun`` started, for the time of the context; yield None without ``torchrun``.
+    """Join the processes that ``torchrun`` started, for the duration of the context; yield None without ``torchrun``.
 
-    Processes other than the first print nothing to standard output meanwhile.
+    In that context, processes other than the first print nothing to standard output.
 
     Args:
-        where: from ``process_rank()``; None for a process on its own.
+        where: result of ``process_rank()``; None for a single process.
         device: ``cpu`` or ``cuda``; on CUDA each process takes the GPU of its local rank.
 
     Raises:
@@ -77,8 +77,8 @@ def join_processes(where: ProcessRank | None, device: str) -> Iterator[ProcessGr
 
 
 def _choose_network(where: ProcessRank) -> None:
-    """Choose the loopback interface for processes on one machine: nothing listens on a network, and the machine's name
-    need not resolve. The user's choice wins."""
+    """Choose the loopback interface if all processes are on one machine: then no port is open to a network, and the
+    machine's name need not resolve. A choice made by the user takes precedence."""
     if where.local_size == where.size and hasattr(socket, "if_nameindex"):
         loopback = [name for _, name in socket.if_nameindex() if name.startswith("lo")]
         if loopback:
@@ -101,10 +101,10 @@ def _choose_gpu(where: ProcessRank) -> None:
 
 
 class ProcessGroup:
-    """Collective operations of the processes of a job. All processes call every method, in the same order.
+    """Collective operations of the processes of a job. Every process must call the same methods in the same order.
 
-    Attributes: ``waited`` and ``moved``, seconds that this process spent waiting for the others at the end of views,
-    and on sums; ``bytes`` received for sums.
+    Attributes: ``waited``, seconds spent waiting for other processes at the end of views; ``moved``, seconds spent on
+    moving data for sums; ``bytes``, number of bytes received for sums.
 
     Raises:
         ProcessLost: (all methods) another process ended, or was silent for ``PATIENCE``.
@@ -134,7 +134,7 @@ class ProcessGroup:
         return any(row[0] for row in self.gather_rows([float(flag)]))
 
     def minimum(self, number: int) -> int:
-        """Return the smallest number of all processes, of at most 53 bits."""
+        """Return the smallest of the numbers passed by all processes; numbers have at most 53 bits."""
         return int(min(row[0] for row in self.gather_rows([float(number)])))
 
     def barrier(self) -> None:
@@ -142,11 +142,11 @@ class ProcessGroup:
         self.gather_rows([0.0])
 
     def agree(self, number: int) -> bool:
-        """Return True if all processes pass the same number, of at most 53 bits."""
+        """Return True if all processes pass the same number; numbers have at most 53 bits."""
         return len({row[0] for row in self.gather_rows([float(number)])}) == 1
 
     def in_turn(self, work: Callable[[], T]) -> T:
-        """Run ``work`` in one process after the other, so that each finds what the one before has made."""
+        """Run ``work`` in one process after another, so that each can use the results of the previous ones."""
         done: list[T] = []
         for rank in range(self.size):
             if rank == self.rank:
@@ -155,15 +155,15 @@ class ProcessGroup:
         return done[0]
 
     def summary(self) -> str:
-        """Describe the cost of sharing in one line, for the terminal."""
+        """Describe the cost of communication in one line, for the terminal."""
         return (
             f"{self.size} processes: this one waited {self.waited:.1f} s for the others, "
             f"and moved {self.bytes / 1e9:.2f} GB for sums in {self.moved:.1f} s"
         )
 
     def all_to_all(self, values: Tensor) -> Tensor:
-        """Return this process's part of every process's ``values`` [n], in rank order: [size, n / size]. ``size``
-        divides n."""
+        """Return this process's part of every process's ``values`` [n], in rank order: [size, n / size]. ``n`` must be
+        a multiple of ``size``."""
         import torch.distributed as dist
 
         parts = torch.empty_like(values)
@@ -171,7 +171,7 @@ class ProcessGroup:
         return parts.view(self.size, -1)
 
     def all_gather(self, part: Tensor) -> Tensor:
-        """Concatenate the parts [m] of all processes in rank order: [size m]."""
+        """Concatenate the parts [m] of all processes in rank order: [size * m]."""
         whole = part.new_empty(self.size * len(part))
         self._timed(lambda: self._gather(whole, part), whole)
         return whole
@@ -193,7 +193,7 @@ class ProcessGroup:
 def _or_lost(call: Callable[[], Any]) -> None:
     try:
         call()
-    except RuntimeError as error:  # gloo's messages differ between systems and name addresses only
+    except RuntimeError as error:  # gloo's messages differ between systems and contain only addresses
         raise ProcessLost(
             "another process of this job has ended (its own message, if any, says why) or was silent for "
             f"{PATIENCE.total_seconds():.0f} seconds"
@@ -201,8 +201,8 @@ def _or_lost(call: Callable[[], Any]) -> None:
 
 
 def pieces(vectors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
-    """Deal out the contiguous ``vectors``, of any shape, as flat views to lists of ``PIECE`` elements in all; the last
-    list may have fewer."""
+    """Distribute the contiguous ``vectors``, of any shape, as flat views over lists of ``PIECE`` elements in total; the
+    last list may have fewer."""
     piece: list[Tensor] = []
     room = PIECE
     for vector in vectors:
@@ -218,20 +218,21 @@ def pieces(vectors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
 
 
 class OrderedReduction:
-    """A sum, or a maximum, over processes and over calls of :meth:`add`, in a fixed order.
+    """Sum or maximum over processes and over calls of :meth:`add`, in a fixed order.
 
-    Each process reduces one part of the vectors, and the parts are gathered at the end: every element is reduced in the
-    same order in one place, and the bytes that a process receives do not grow with the number of processes.
+    Each process reduces one part of the vectors, and the parts are gathered at the end. Every element is thus reduced
+    by one process in a fixed order, and the number of bytes that a process receives does not grow with the number of
+    processes.
     """
 
     def __init__(self, group: ProcessGroup, combine: Callable[..., Tensor] = torch.add) -> None:
-        """``combine``: ``torch.add`` or ``torch.maximum``."""
+        """Make an empty reduction; ``combine`` is ``torch.add`` or ``torch.maximum``."""
         self.group, self.combine = group, combine
         self._parts: list[Tensor] = []
 
     def add(self, vectors: Sequence[Tensor]) -> None:
-        """Reduce the vectors of all processes in rank order: contiguous tensors, of the same shapes in all processes
-        and at every call."""
+        """Reduce the vectors of all processes in rank order. The vectors are contiguous tensors whose shapes are the
+        same in all processes and at every call."""
         for index, piece in enumerate(pieces(vectors)):
             rest = -sum(map(len, piece)) % self.group.size
             theirs = self.group.all_to_all(torch.cat([*piece, piece[0].new_zeros(rest)]))
@@ -242,7 +243,7 @@ class OrderedReduction:
                 self.combine(self._parts[index], part, out=self._parts[index])
 
     def write(self, vectors: Sequence[Tensor]) -> None:
-        """Overwrite tensors of the same shapes with the result: the same bits in all processes."""
+        """Overwrite tensors of the same shapes with the result, which is bit-identical in all processes."""
         for part, piece in zip(self._parts, pieces(vectors)):
             whole = self.group.all_gather(part)
             for target in piece:

@@ -30,11 +30,11 @@ FILM_FRAMES = 120
 FILM_SIZE = 400
 FPS = 30.0
 QUIET_SECONDS = 2.0
-"""Seconds of reading after which a progress bar appears."""
+"""Seconds of loading after which a progress bar appears."""
 
 
 def settings_of(config: TrainConfig, folder: Path) -> dict[str, Any]:
-    """Content of ``config.json`` for a run on the data in ``folder``."""
+    """Make the content of ``config.json`` for a run on the data in ``folder``."""
     settings = to_dict(config)
     settings["data"]["folder"] = str(folder.resolve())
     return settings

@@ -210,6 +210,7 @@ class RunFolder:
         """Advance the progress bar; log every 50 steps, write a preview every 15 seconds. ``state.step`` counts this
         step."""
         due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
+        # A run that resumes after the last such step before a row logs 0.0 in that row.
         if result.failed is None and result.regulariser:
             self._regulariser = result.regulariser
         if due and result.failed is None:

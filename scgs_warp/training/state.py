@@ -1,4 +1,4 @@
-"""The state of a training run at one step, saved and resumed to the same bits."""
+"""State of a training run at one step; it can be saved and resumed with bit-identical results."""
 
 from __future__ import annotations
 
@@ -41,25 +41,26 @@ Stage = Literal["pretrain", "main"]
 
 
 class StepResult(NamedTuple):
-    """Report of a step: detached scalars, the mean over its views, and a picture for previews."""
+    """Report of a step: detached scalars averaged over its views, and a picture for previews."""
 
     loss: Tensor
     l1: Tensor
     ssim: Tensor
     regulariser: float
-    """Weighted; 0 in steps without the term."""
+    """Weighted regulariser; 0 in steps without the term."""
     render: Tensor
     truth: Tensor
     mask: Tensor | None
-    """[H, W] bool, True where the pixel is valid; None: everywhere."""
+    """[H, W] bool, True where the pixel is valid; None: all pixels are valid."""
     failed: str | None
-    """Name of the non-finite term for which the step was dropped, if any."""
+    """Name of the non-finite term because of which the step was dropped, if any."""
     size: tuple[int, int]
     """Width and height of the step's first view in pixels."""
 
 
 class TrainState:
-    """Parameters, optimisers, statistics and step. ``step`` counts both stages, ``stage_step`` the present one."""
+    """Parameters, optimisers, statistics and step counts: ``step`` counts both stages, ``stage_step`` the present
+    one."""
 
     def __init__(
         self,
@@ -83,9 +84,9 @@ class TrainState:
         self.step, self.fingerprint = step, fingerprint
         self.failures = 0
         self.group: ProcessGroup | None = None
-        """The processes that share each step's views; no part of a checkpoint."""
+        """Processes that share each step's views; not part of a checkpoint."""
         self.consistent = True
-        """False between an update of the parameters and the increment of ``step``: not to be saved."""
+        """False between an update of the parameters and the increment of ``step``; such a state must not be saved."""
         self.cameras = CameraRefinement(frames if config.optim.cameras > 0 else 0).to(gaussians.means.device)
         self.camera_optimizer = self.cameras.optimizer()
         self.enter(gaussians, motion)
@@ -103,7 +104,7 @@ class TrainState:
         normalisation = Normalisation.fit(data.cameras, data.points)
         config = resolve_auto(config, data)
         points, colors = (tensor.to(device) for tensor in _initial_points(config, data, normalisation))
-        # A camera that stands still has no extent; then that of the content is used.
+        # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
         rest = (normalisation, overview(data.cameras), extent, points, colors)
         identity = {"fingerprint": data.fingerprint, "frames": len(data)}
@@ -146,7 +147,7 @@ class TrainState:
         self.stats = Stats.zeros(len(self.gaussians), self.device, absolute)
 
     def gaussian_rates(self) -> dict[str, float]:
-        """Learning rates of the Gaussians: the constant ones, and the initial values of the others."""
+        """Return the learning rates of the Gaussians: constant rates, and the initial values of the decaying ones."""
         rates, spheres = self.config.optim, self.stage == "pretrain"
         return {
             "means": rates.means,
@@ -160,11 +161,11 @@ class TrainState:
         }
 
     def scene(self) -> Scene:
-        """The present scene, for evaluation and pictures; shares the parameters."""
+        """Return the present scene for evaluation and pictures; it shares the parameters."""
         return Scene(self.gaussians, self.motion, self.normalisation, self.config, self.overview, step=self.step)
 
     def save(self, folder: Path) -> None:
-        """Write the checkpoint, in the first process only."""
+        """Write the checkpoint; only the first process does."""
         if self.group is not None and not self.group.first:
             return
         tensors = dict(self.scene().tensors())
@@ -177,7 +178,7 @@ class TrainState:
         tensors.update({f"extra.{name}": value for name, value in self.motion.extra_state().items()})
         for name in ("grad_norm", "count", "max_radii"):
             tensors[f"stats.{name}"] = getattr(self.stats, name)
-        if self.stage == "pretrain":  # stage 2 starts from them
+        if self.stage == "pretrain":  # stage 2 starts from the spheres
             tensors["points"], tensors["colors"] = self.points, self.colors
         metadata = {
             **self.scene().metadata(),
@@ -243,19 +244,20 @@ class TrainState:
 
 
 def has_initial_points(data: Dataset, config: TrainConfig) -> bool:
-    """Decide whether the data brings enough initial points to locate the scene and to sample control points from.
-    Fewer are noise of a failed reconstruction."""
+    """Decide whether the data has enough initial points to locate the scene and to sample control points from. Fewer
+    points are noise of a failed reconstruction."""
     fewest = max(FEWEST_POINTS, config.motion.neighbors + 1)
     return data.points is not None and len(data.points) >= fewest
 
 
 def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
-    """Replace ``auto`` values by those that suit the data. Figures are of a hand over a shelf, 128 x 96.
+    """Replace ``auto`` values by those that suit the data. The gains below are for a hand over a shelf, 128 x 96
+    pixels.
 
-    Images without alpha are filled: bare walls need large Gaussians (not pruning them gains 1.9 dB), and much of the
-    image rests beside moving surfaces (hyper-coordinates gain 0.55 dB; a motion mask 0.2 dB, and nothing on top).
-    Where the data brings points, control points begin as a sample of them, and Gaussians at them (2 dB better than
-    spheres that have to find both).
+    Images without alpha show a full background. Its bare walls need large Gaussians (not pruning them gains 1.9 dB),
+    and much of it is static beside moving surfaces (hyper-coordinates gain 0.55 dB; a motion mask gains 0.2 dB alone,
+    and nothing in addition to them). If the data has points, control points start as a sample of them and Gaussians
+    start at them (2 dB better than finding both with spheres).
     """
     filled = not data.with_alpha
     motion, growth = config.motion, config.densify
@@ -270,8 +272,9 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
 
 
 def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
-    """Choose points [P, 3], normalised, and colours [P, 3]: the data's own in a random order, with points behind them
-    for surfaces without texture; else points sampled where the images are covered."""
+    """Choose initial points [P, 3], normalised, and colours [P, 3]: the data's own in random order, followed by points
+    behind them for surfaces without texture; without points in the data, points sampled where the images are
+    covered."""
     count = max(config.init_points, round(sphere_unit(config) * config.pretrain.start_ratio))
     if data.points is None or not has_initial_points(data, config):
         # Progressive pre-training starts from the pose of the first frames, so only they are sampled.
@@ -281,14 +284,14 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
     points = normalisation.apply(data.points)[order].float().contiguous()
     colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
-    if data.with_alpha:  # nothing lies behind the points
+    if data.with_alpha:  # with alpha, no background lies behind the points
         return points, colors
     behind = background_points(count - len(points), points, data, normalisation, config.seed, 35)
     return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]])
 
 
 def _check_same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
-    """Refuse to resume with other settings than the checkpoint's."""
+    """Refuse to resume with settings other than the checkpoint's."""
     for name, value in wanted.items():
         if f"{prefix}{name}" in FREE_TO_CHANGE:
             continue

@@ -1,4 +1,4 @@
-"""One training step: views, poses, renders and losses in order, then the update of the parameters."""
+"""One training step: render and compare each view, then update the parameters."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from .multi_view import all_views
 from .state import StepResult, TrainState
 
 SETTLED = 0.05
-"""Factor of the constant learning rates at the last step."""
+"""Factor on the constant learning rates at the last step."""
 
 
 def training_step(state: TrainState, frames: Frames) -> StepResult:
     """Render and compare each view of the batch, then update the parameters.
 
-    Changes ``state``, except its ``step``. A non-finite loss or gradient leaves all parameters as they are.
+    Changes ``state``, except its ``step``. If a loss or gradient is non-finite, all parameters stay unchanged.
     """
     # 1. Learning rates, and the gradients of all views.
     set_rates(state)
@@ -50,9 +50,9 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
 
 
 def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> StepResult:
-    """Pose, render and compare one frame, and propagate gradients back.
+    """Pose, render and compare one frame, and backpropagate the loss.
 
-    Adds to the parameters' gradients and to ``stats``; a non-finite loss adds no gradients.
+    Adds to the parameters' gradients and to ``stats``. If the loss is non-finite, no gradients are added.
 
     Args:
         view: index of the view in the step's batch.
@@ -89,7 +89,7 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim)
     total = loss if regulariser is None else loss + regulariser
 
-    # 5. Propagate back, unless the loss is non-finite.
+    # 5. Backpropagate, unless the loss is non-finite.
     failed = _non_finite_term(loss, regulariser)
     if failed is None:
         total.backward()
@@ -99,17 +99,18 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
 
 
 def sh_degree(state: TrainState, step: int) -> int:
-    """Degree of spherical harmonics at this step of the stage: one more every ``densify.sh_every`` steps."""
+    """Return the degree of spherical harmonics at this step of the stage; it grows by one every ``densify.sh_every``
+    steps."""
     return min(state.gaussians.sh_degree, step // state.config.densify.sh_every)
 
 
 def motion_frozen(state: TrainState) -> bool:
-    """True for the first main steps, in which only the Gaussians learn (seed S4)."""
+    """Return True during the main steps at the beginning in which only the Gaussians learn (seed S4)."""
     return state.stage == "main" and state.stage_step < state.config.rest_steps
 
 
 def set_rates(state: TrainState) -> None:
-    """Set every learning rate, each a function of the step."""
+    """Set every learning rate for this step."""
     config, step = state.config, state.stage_step
     means = log_linear(config.optim.means, config.optim.means_end, step, config.optim.means_until)
     settled = settling(step, config)
@@ -124,16 +125,16 @@ def set_rates(state: TrainState) -> None:
 
 
 def settling(step: int, config: TrainConfig) -> float:
-    """Factor of the constant rates: 1, then log-linearly to ``SETTLED`` over the last share of the main stage. Steps
-    that stay large shake every colour about its best value."""
+    """Return the factor on the constant rates: 1, then decaying log-linearly to ``SETTLED`` over the last share of the
+    main stage. Without the decay, each colour would keep oscillating about its optimum."""
     length = round(config.optim.settle * config.main_steps)
     passed = step - (config.main_steps - length)
     return log_linear(1.0, SETTLED, passed, length) if length > 0 and passed > 0 else 1.0
 
 
 def noisy_time(time: float, state: TrainState, frames: int, view: int = 0) -> float:
-    """Add noise to a view's time, for data whose cameras stand elsewhere at every time: it keeps the motion from
-    jumping from frame to frame. The noise fades until ``optim.network_until``."""
+    """Add noise to a view's time, for data in which the cameras move between instants. The noise keeps the motion from
+    jumping from frame to frame; it fades until ``optim.network_until``."""
     config = state.config
     fade = max(0.0, 1.0 - state.stage_step / config.optim.network_until)
     spread = config.motion.time_noise * fade / max(frames - 1, 1)

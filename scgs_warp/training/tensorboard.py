@@ -1,4 +1,4 @@
-"""A run's curves for TensorBoard (extra ``tensorboard``): event files beside ``log.jsonl``, of the same entries."""
+"""A run's curves for TensorBoard (extra ``tensorboard``): event files with the entries of ``log.jsonl``, beside it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LONGEST_SIDE = 1024
 
 
 def check_installed() -> None:
-    """Refuse ``--tensorboard`` without its package, before anything is computed.
+    """Refuse ``--tensorboard`` if its package is missing, before anything is computed.
 
     Raises:
         UserError: the package is missing.
@@ -40,10 +40,10 @@ def check_installed() -> None:
 
 
 class TensorBoard:
-    """The event files of one run directory.
+    """Event files of one run directory.
 
-    A resumed run continues in a file of its own, which withdraws the earlier file's values of steps to be repeated.
-    Log entries that the files lack (after a kill, or a part of the run without TensorBoard) are written again.
+    A resumed run writes a new file, which withdraws the earlier file's values for the steps to be repeated. Log entries
+    missing from the files (because the run was killed, or partly ran without TensorBoard) are added.
 
     Args:
         folder: the run directory.
@@ -52,7 +52,7 @@ class TensorBoard:
         seconds: seconds of training so far.
 
     Raises:
-        OSError: (all methods) the files cannot be written; the board cannot be used any further.
+        OSError: (all methods) the files cannot be written; the object must not be used any further.
     """
 
     def __init__(self, folder: Path, entries: list[dict[str, Any]], step: int, seconds: float) -> None:
@@ -68,7 +68,7 @@ class TensorBoard:
         self._writer.flush()
 
     def record(self, entry: dict[str, Any]) -> None:
-        """Write a log entry to disk: a kill loses no more here than in the log."""
+        """Write a log entry to disk immediately, so that a killed run loses no more here than in the log."""
         self._write(entry, time.time(), {})
         self._writer.flush()
 
@@ -80,7 +80,7 @@ class TensorBoard:
                 self._writer.add_scalar(tag, float(value), step, walltime=moment)
 
     def show(self, name: str, truth: Tensor, render: Tensor, step: int) -> None:
-        """Write a picture of truth beside render.
+        """Write a picture of the truth beside the render.
 
         Args:
             name: name of the series of pictures, one per step.
@@ -98,7 +98,7 @@ class TensorBoard:
         self._writer.close()
 
     def _thread_ended(self, ended: threading.ExceptHookArgs) -> None:
-        """Silence the package's writer thread, which prints a traceback of errors that the next call raises as well."""
+        """Silence the package's writer thread, which prints a traceback of an error that the next call also raises."""
         if not issubclass(ended.exc_type, OSError) or not type(ended.thread).__module__.startswith("tensorboard."):
             self._loud(ended)
 

@@ -1,4 +1,4 @@
-"""Contributions of Gaussians to training views, by which visibility pruning judges them."""
+"""Contribution of each Gaussian to the training views, the criterion of visibility pruning."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from .state import TrainState
 
 
 def contributions(state: TrainState, frames: Frames, indices: list[int]) -> Tensor:
-    """Each Gaussian's largest contribution to any of these frames.
+    """Measure each Gaussian's largest contribution to any of these frames.
 
     Returns:
-        [N] pixels (:func:`view_contributions`); infinite where a Gaussian is drawn in none of the frames, hidden or
-        not: the views say nothing about it.
+        [N] pixels (:func:`view_contributions`); infinite for Gaussians outside all of the frames, which therefore
+        cannot judge them.
     """
     most = torch.zeros(len(state.gaussians), device=state.device)
     ever = torch.zeros_like(most, dtype=torch.bool)
@@ -39,7 +39,7 @@ def view_contributions(gaussians: Gaussians, camera: Camera, antialiased: bool =
     Compositing is linear in the channels, so the weights are the gradients of an image of ones.
 
     Returns:
-        [N] pixels, and [N] bool: whether the Gaussian is drawn, hidden or not.
+        [N] pixels, and [N] bool: True if the Gaussian projects into the image, even if others hide it.
     """
     shape = gaussians.quats, gaussians.scales, gaussians.opacities
     size = camera.width, camera.height

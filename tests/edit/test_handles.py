@@ -92,6 +92,17 @@ def test_a_handle_refuses_fields_that_no_file_may_hold(field, value):
         Handle(**fields)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_handle_takes_numpy_values(kind):
+    array = np.array([0.25, 1.0, 2.0], kind)
+    for pivot in (array, tuple(array)):
+        handle = Handle("a", (1,), time=kind(0.5), pivot=pivot, window=kind(0.25))
+        assert handle == Handle("a", (1,), time=0.5, pivot=(0.25, 1.0, 2.0), window=0.25)
+        assert type(handle.time) is float and all(type(x) is float for x in handle.pivot)
+    with pytest.raises(UserError, match="pivot"):
+        Handle("a", (1,), pivot=np.array([0.0, np.nan, 1.0], kind))
+
+
 def test_a_handle_holds_plain_numbers():
     handle = Handle("a", (1,), time=1, pivot=[1, 2, 3], stiffness=np.float64(2.0))
     assert handle == Handle("a", (1,), 1.0, (1.0, 2.0, 3.0), 2.0) and hash(handle)

@@ -29,8 +29,9 @@ def _own_kernels(module: ModuleType) -> list[wp.Kernel]:
 
 
 def test_kernels_are_discovered():
-    found = [kernel.key for name in MODULES for kernel in _own_kernels(_import(name))]
-    assert {"photometric", "composite"} <= set(found)
+    found = {(name, kernel.key) for name in MODULES for kernel in _own_kernels(_import(name))}
+    forms = ("compositing", "cpu.compositing", "cuda.compositing", "cuda.compositing_blocks")
+    assert {("ssim", "photometric"), ("cpu.ssim", "photometric"), *((form, "composite") for form in forms)} <= found
 
 
 @pytest.mark.parametrize("name", MODULES)

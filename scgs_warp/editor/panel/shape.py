@@ -109,7 +109,7 @@ class ShapeSection:
         self.host.put(Target.of(self.model.target.translation, turn.tolist()))
 
     def _set(self, **fields: Any) -> None:
-        """Change fields of the active handle and of later ones."""
+        """Change fields of the active handle and of handles made later."""
         self.model.set(**fields)
         if self.model.active is not None:
             self.model.change_handle(**fields)
@@ -178,5 +178,5 @@ class ShapeSection:
 
 
 def _round(length: float) -> float:
-    """Return the power of ten below a length, a step that suits the scene."""
+    """Return the largest power of ten up to a length, as a step that suits the scene's size."""
     return 10.0 ** math.floor(math.log10(length)) if length > 0 else 0.01
