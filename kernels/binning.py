@@ -41,7 +41,7 @@ class Ellipse:
 
 @wp.func
 def reach_of(opacity: float) -> float:
-    """Compute ``2 ln(255 o)``, at least 0, plus slack, avoiding library logarithms, which round differently per device."""
+    """Compute ``2 ln(255 o)``, at least 0, plus slack. Library logarithms would round differently on each device."""
     bits = wp.cast(opacity / ALPHA_MIN, wp.uint32)
     m = wp.cast((bits & wp.uint32(0x7FFFFF)) | wp.uint32(0x3F800000), float) - 1.0
     log2 = float(LOG2_6)

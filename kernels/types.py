@@ -33,7 +33,7 @@ POSITION_MAX = wp.constant(1.0e18)
 """Largest coordinate of a Gaussian that passes gradients to its control points: larger ones would overflow."""
 
 SLOT_GEOMETRY = 8
-"""Number of columns before the channels in a gradient slot: 2D mean (2), conic (3), opacity (1), absolute 2D mean (2)."""
+"""Number of columns before the channels in a gradient slot: 2D mean (2), conic (3), opacity, absolute 2D mean (2)."""
 
 PACKED_GEOMETRY = 8
 """Number of columns before the channels in a splat packed for the CPU: mean (2), scaled conic (3), log2 of the opacity,

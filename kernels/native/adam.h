@@ -2,7 +2,7 @@
 #pragma once
 #include "simd.h"
 
-// Elements of a tensor that one grid index works on. A row of chunks names the tensor and the chunk's first element.
+// Elements of a tensor that one grid index updates. A row of `chunks` gives the tensor and the first element.
 struct Chunk {
     long long tensor, begin, end;
 
@@ -29,7 +29,7 @@ static inline void adam_chunk(
 
     auto step = [&](long long at, int n) __attribute__((always_inline)) {
         vf g = load(gradient + at, n), m = load(average + at, n), v = load(square + at, n);
-        const vi finite = __builtin_elementwise_abs(g) < __builtin_inff();  // a NaN stays: the caller looks for it
+        const vi finite = __builtin_elementwise_abs(g) < __builtin_inff();  // NaN is kept, because the caller searches for it
         g = (finite & (g > limit)) ? vf{} + limit : g;
         g = (finite & (g < -limit)) ? vf{} - limit : g;
         m = m + one_beta1 * (g - m);
@@ -45,7 +45,7 @@ static inline void adam_chunk(
     if (at < own.end) step(at, (int)(own.end - at));
 }
 
-// Write 1 where a value of the chunk is infinite or NaN, else 0: as integers, their magnitudes exceed all finite ones.
+// Write 1 if a value of the chunk is infinite or NaN, else 0. As integers, such magnitudes exceed all finite ones.
 static inline void find_non_finite_in_chunk(
     int chunk, const wp::array_t<wp::int64>& addresses, const wp::array_t<wp::int64>& sizes,
     const wp::array_t<wp::int64>& chunks, wp::array_t<int>& found

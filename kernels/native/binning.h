@@ -1,4 +1,4 @@
-// Splats to tiles on a CPU, band by band; a band is a row of tiles, a stretch what one splat touches of one band.
+// Binning on a CPU, band by band. A band is a row of tiles; a stretch is the part of a band that one splat touches.
 #pragma once
 #include "ellipse.h"
 
@@ -7,7 +7,7 @@
 #define LOW_HALVES 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23
 #define HIGH_HALVES 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31
 
-// Copy 16 elements of some bytes each; write zeros for those behind the n-th.
+// Copy 16 elements of equal size; write zeros for those past the n-th.
 static inline void first_lanes(const void* from, void* to, int n, int size) {
     __builtin_memcpy(to, from, n * size);
     __builtin_memset((char*)to + n * size, 0, (16 - n) * size);
@@ -36,7 +36,7 @@ static inline void count_chunk(
         first_lanes(opacities.data + i, &opacity, n, 4);
         first_lanes(depths.data + i, &depth, n, 4);
         first_lanes(radii.data + i, r, n, 8);
-        // Fields that lie side by side, each into its own vector.
+        // Split interleaved fields into one vector each.
         const vf x = __builtin_shufflevector(m[0], m[1], EVEN_LANES),
                  y = __builtin_shufflevector(m[0], m[1], ODD_LANES);
         const vi rx = __builtin_shufflevector(r[0], r[1], EVEN_LANES),
@@ -61,7 +61,7 @@ static inline void count_chunk(
             top = (some & (found == 0)) ? row : top;
             bottom = some ? row : bottom;
             found += length;
-            // A byte of the window for each row of tiles, a bit for each column.
+            // The window has a byte for each row of tiles and a bit for each column.
             const vi shift = reach.begin - left, line = row - top;
             outside |= some & ((shift < 0) | (shift + length > 8) | (line > 7));
             const vi byte = some ? (((ZEROS + 1) << (length & 15)) - 1) << (shift & 7) : ZEROS;
@@ -69,7 +69,7 @@ static inline void count_chunk(
             upper |= line < 4 ? byte << place : ZEROS;
             lower |= line < 4 ? ZEROS : byte << place;
         }
-        // Where the window is too small, it holds the last row instead, and the first column is -1.
+        // For a splat too large for the window, the window holds the last row instead, and the first column is -1.
         const vi column = outside ? ZEROS - 1 : left;
         upper = outside ? bottom : upper;
         lower = outside ? ZEROS : lower;
@@ -115,7 +115,7 @@ static inline void deal_chunk(
         unsigned long long window = windows.data[i];
         const int top = corners.data[i].c[0], left = corners.data[i].c[1];
         if (window == 0 && left >= 0) continue;
-        // The bits of the depth, turned so that they sort as unsigned numbers; + 0: minus zero becomes zero.
+        // Transform the depth's bits so that they sort as unsigned numbers. Adding 0 turns minus zero into zero.
         const float depth = depths.data[i] + 0.0f;
         const unsigned word = __builtin_bit_cast(unsigned, depth);
         const unsigned long long key = (unsigned long long)(word ^ ((unsigned)((int)word >> 31) | 0x80000000u)) << 32;
@@ -167,12 +167,12 @@ static inline void sort_band(
     for (int chunk = 0; chunk < pairs_before.shape.dims[0]; ++chunk)
         pair += pairs_before.data[(long long)chunk * pairs_before.shape.dims[1] + band];
 
-    // How many pairs each tile has: +1 where a stretch begins, -1 behind its end, and running sums.
+    // Count the pairs of each tile: add 1 where a stretch begins and -1 behind its end, then take running sums.
     int* cursor = cursors.data + (long long)band * columns;
     __builtin_memset(cursor, 0, columns * sizeof(int));
     for (int k = begin; k < begin + n; ++k) {
         const int* stretch = stretches.data + 4ll * k;
-        if (stretch[2] == stretch[3]) continue;  // a row between others that the splat's pixels leave out
+        if (stretch[2] == stretch[3]) continue;  // the splat reaches no pixel centre of this row
         ++cursor[stretch[2]];
         if (stretch[3] < columns) --cursor[stretch[3]];
     }
@@ -185,7 +185,7 @@ static inline void sort_band(
         ranges.data[(long long)band * columns + column].c[1] = pair;
     }
 
-    // Radix sort by depth, the lowest digit first; only the bits in which a band's depths differ.
+    // Radix sort by depth, lowest digit first, over the bits in which the band's depths differ.
     u64 *from = (u64*)keys.data + begin, *to = (u64*)spare.data + begin;
     unsigned low = ~0u, high = 0;
     for (int k = 0; k < n; ++k) {

@@ -17,7 +17,7 @@ struct Splat {
     vf dy, bdy, cdy2;
 };
 
-// Where a tile lies in the image and in the list of pairs.
+// Position of a tile in the image and in the list of pairs.
 struct Tile {
     int begin, end;       // its pairs
     int wide, tall;       // its pixels inside the image
@@ -53,7 +53,7 @@ static inline Splat read_splat(const float* s, const Tile& tile) {
     return g;
 }
 
-// One bit for each row in which the ellipse meets the tile: q at the row's point nearest to the ellipse's axis.
+// Return one bit per row, set if the ellipse meets it: q is evaluated at the row's point nearest to the ellipse's axis.
 static inline unsigned reached_rows(const Splat& g, float slope) {
     FUSE_WITHIN_EXPRESSIONS
     vf x = slope * g.dy;
@@ -63,7 +63,7 @@ static inline unsigned reached_rows(const Splat& g, float slope) {
     return bits((g.a * x + g.bdy) * x + g.cdy2 >= g.floor - 1e-3f);
 }
 
-// The exponent at a row's pixels; forward and adjoint must round alike, or they disagree on who contributed.
+// Return the exponent at a row's pixels. Forward pass and adjoint must round alike to agree on the contributing splats.
 static inline vf power_of(vf dx, float a, float bdy, float cdy2) {
     FUSE_WITHIN_EXPRESSIONS
     return (a * dx + bdy) * dx + cdy2;
@@ -96,8 +96,9 @@ static inline void composite_tile(
     };
     const bool keep = last.shape.dims[0] > 0;
 
-    // One pass over the tile's splats for the channels from c0 on; only the first pass stores what has no channels.
-    // By chunks of 32 splats, row by row: a row's state stays in registers while it walks those that reach it.
+    // One pass over the tile's splats for `count` channels from c0 on; only the first pass stores alpha and the like.
+    // For each chunk of 32 splats and each row, the row's state stays in registers while the splats that reach it are
+    // visited.
     auto pass = [&](auto group, auto keeping, int c0, int count) {
         constexpr int C = decltype(group)::value;
         constexpr bool KEEP = decltype(keeping)::value;
@@ -133,7 +134,7 @@ static inline void composite_tile(
                     const int k = __builtin_ctz(hits);
                     const Splat& g = chunk[k];
                     const vf power = power_of(LANE - g.mx, g.a, ((const float*)&g.bdy)[r], ((const float*)&g.cdy2)[r]);
-                    const vi skip = ~((power <= 0.0f) & (power >= g.floor));  // NaN too: infinities may cancel
+                    const vi skip = ~((power <= 0.0f) & (power >= g.floor));  // skips NaN too: infinities may cancel
                     vf alpha = exp2v(power + g.log2_opacity);
                     alpha = alpha > ALPHA_MAX ? ZERO + ALPHA_MAX : alpha;
                     alpha = skip ? ZERO : alpha;
@@ -234,7 +235,7 @@ static inline void composite_tile_adjoint(
                 __builtin_memset(out, 0, row_size * sizeof(float));
                 continue;
             }
-            const float to_conic = -1.3862943611198906f;  // undoes the factor folded into the packed conic
+            const float to_conic = -1.3862943611198906f;  // removes the factor folded into the packed conic
             const float A = to_conic * s[2], B = 0.5f * to_conic * s[3], D = to_conic * s[4];
             const vf dx = LANE - g.mx, adx = A * dx, bdx = B * dx;
             const float *dys = (const float*)&g.dy, *bdy = (const float*)&g.bdy, *cdy2 = (const float*)&g.cdy2;

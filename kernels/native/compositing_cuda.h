@@ -1,14 +1,14 @@
-// Alpha compositing of one tile on CUDA: a block of 256 threads, a thread a pixel, a warp 8 x 4 pixels.
+// Alpha compositing of one tile on CUDA: a block of 256 threads, one pixel per thread, 8 x 4 pixels per warp.
 #pragma once
 
 #define ALL_LANES 0xffffffffu
 
-// A thread's place in its tile.
+// Position of a thread in its tile.
 struct TileThread {
     int thread, lane, warp;
     int corner_x, corner_y;  // the tile's first pixel
     int x, y;                // the thread's pixel
-    bool inside;             // whether that lies in the image
+    bool inside;             // whether the thread's pixel lies in the image
     int begin, end;          // the tile's pairs
 };
 
@@ -28,12 +28,13 @@ tile_thread(int tile, const wp::array_t<wp::vec2i>& ranges, int width, int heigh
     return at;
 }
 
-// The parts of the tile (a bit each, in the order of the warps) where alpha may be 1/255 or more; rather one too many.
+// Return the parts of the tile (a bit each, in the order of the warps) where alpha may be 1/255 or more. The bound is
+// conservative.
 static inline __device__ unsigned parts_reached(
     const TileThread& at, float mx, float my, float a, float b, float c, float opacity
 ) {
     if (!(opacity >= ALPHA_MIN)) return 0u;
-    const float squared = b * b;  // a c - b b, exact to the last bit: of a needle's little else is left
+    const float squared = b * b;  // makes a c - b b exact, which cancels for needles
     const float determinant = fmaf(a, c, -squared) + fmaf(-b, b, squared);
     if (!(determinant > 0.0f)) return 255u;
     const float reach = fmaxf(2.0f * logf(opacity * 255.0f), 0.0f) + 1.0e-3f;
@@ -56,8 +57,8 @@ static inline __device__ void composite_tile(
     wp::array_t<float>& image, wp::array_t<float>& alpha_image, wp::array_t<float>& transmittance_image,
     wp::array_t<int>& last_image
 ) {
-    __shared__ float4 shape[256];  // mean, then the first two of the scaled conic
-    __shared__ float4 rest[256];   // its third, the opacity
+    __shared__ float4 shape[256];  // mean, then the first two values of the scaled conic
+    __shared__ float4 rest[256];   // third value of the scaled conic, opacity
     __shared__ float4 color[256];
     __shared__ unsigned reached[256];
     const TileThread at = tile_thread(tile, ranges, width, height, columns);
@@ -75,7 +76,7 @@ static inline __device__ void composite_tile(
         int last = 0;
         bool open = inside;
         for (int first = begin; first < end; first += 256) {
-            // Also the barrier after which nobody reads the batch before.
+            // This is also the barrier after which no thread reads the previous batch.
             if (__syncthreads_count(open) == 0) break;
             unsigned parts = 0u;
             if (first + thread < end) {
@@ -161,7 +162,7 @@ static inline __device__ void composite_tile_adjoint(
     __shared__ float color[128][8];
     __shared__ unsigned reached[128];
     __shared__ int slot_of[128];
-    __shared__ float partial[8][32][16];  // of each warp: the sums of each pair it hit
+    __shared__ float partial[8][32][16];  // sums of each warp for each pair that it hit
     __shared__ unsigned hits[8];
     __shared__ int deepest[8];
     const TileThread at = tile_thread(tile, ranges, width, height, columns);
@@ -178,7 +179,7 @@ static inline __device__ void composite_tile_adjoint(
     if (inside) {
         last = last_image.data[pixel];
         transmittance = transmittance_image.data[pixel];
-        behind = -v_alpha.data[pixel];  // what lies behind the current splat, weighted by v_image
+        behind = -v_alpha.data[pixel];  // colour behind the current splat, weighted by v_image
         for (int c = 0; c < 8; ++c)
             if (c < count) behind += v_pixel[c] * background.data[c];
         behind *= transmittance;
@@ -215,7 +216,7 @@ static inline __device__ void composite_tile_adjoint(
         __syncthreads();
         for (int group = (size - 1) >> 5; group >= 0; --group) {
             unsigned left = __ballot_sync(ALL_LANES, (reached[32 * group + lane] >> warp) & 1u);
-            const int over = start + 32 * group + 32 - warp_last;  // pairs behind the last that this warp used
+            const int over = start + 32 * group + 32 - warp_last;  // number of pairs behind the last one used by this warp
             if (over > 0) left = over >= 32 ? 0u : left & (ALL_LANES >> over);
             unsigned hit = 0u;
             while (left) {
@@ -266,8 +267,8 @@ static inline __device__ void composite_tile_adjoint(
                         v[7] = fabsf(v[1]);
                     }
                 }
-                // Each step halves the sums a lane holds and doubles the lanes a sum has seen: in the end sum k lies
-                // in the lanes 2 k and 2 k + 1.
+                // Each step halves the number of sums per lane and doubles the lanes that each sum covers. In the end
+                // lanes 2 k and 2 k + 1 hold sum k.
                 fold(Eight());
                 fold(Four());
                 fold(Two());

@@ -70,7 +70,7 @@ static inline Span touched(vf low, vf high, int tile_size, int tiles, int extent
     low = meets ? low : ZERO;
     high = meets ? high : ZERO;
     vi begin = __builtin_convertvector((most(ZERO + 0.5f, low) - 0.5f) * scale, vi);
-    begin -= low > floats((begin + 1) * tile_size) - 0.5f;  // a true lane is -1
+    begin -= low > floats((begin + 1) * tile_size) - 0.5f;  // true is -1 in a lane
     vi end = __builtin_convertvector((least(ZERO + (float)extent, high) - 0.5f) * scale, vi) + 1;
     end = end < begin ? begin : end;
     end = end > tiles ? NONE + tiles : end;

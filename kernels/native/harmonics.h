@@ -1,18 +1,18 @@
 // Colours from spherical harmonics of 16 Gaussians, and their adjoint.
 //
-// A Gaussian's 45 coefficients are 15 triples of red, green, blue. They pass through vectors of 15 (the 16th lane is
-// left over), so that a lane always belongs to the same channel; the basis is computed for 16 Gaussians in lanes and
-// then turned so that each Gaussian has its own in a vector.
+// A Gaussian's 45 coefficients are 15 triples of red, green, blue. They are processed in vectors of 15 (the 16th lane
+// is unused), so that a lane always belongs to the same channel. The basis is computed with one Gaussian per lane and
+// then transposed, so that each Gaussian's basis is one vector.
 #pragma once
 #include "shuffles.h"
 #include "simd.h"
 
-// Directions of view and basis of Gaussians ``begin`` to ``begin + 15``; lanes past the end are zero.
+// View directions and basis values of Gaussians ``begin`` to ``begin + 15``; lanes past the end are zero.
 struct Basis {
     int begin, total, n;
-    int used;        // floats of a Gaussian's coefficients that count
-    int row;         // floats of a Gaussian's coefficients
-    long long size;  // floats of all coefficients
+    int used;        // number of floats of a Gaussian's coefficients that are used
+    int row;         // number of floats of a Gaussian's coefficients
+    long long size;  // number of floats of all coefficients
     const float* coefficients;
     vf inverse, x, y, z, xx, yy, zz, value[16];
 
@@ -78,7 +78,7 @@ struct Basis {
         __builtin_memcpy((float*)data + 3ll * begin, a, 12 * n);
     }
 
-    // 16 floats of a Gaussian's coefficients; what lies behind the array's end is zero.
+    // Return 16 floats of a Gaussian's coefficients, zeros past the array's end.
     __attribute__((always_inline)) vf coefficients_of(int lane, int offset) const {
         const long long at = (long long)(begin + lane) * row + offset;
         const float* from = coefficients + at;
@@ -123,7 +123,7 @@ static inline void harmonics_block(
         transpose(sums);
         for (int c = 0; c < 3; ++c) color[c] += sums[c] + sums[3 + c] + sums[6 + c] + sums[9 + c] + sums[12 + c];
     }
-    for (int c = 0; c < 3; ++c) color[c] = color[c] > 0.0f ? color[c] : color[c] - color[c];  // 0; a NaN stays
+    for (int c = 0; c < 3; ++c) color[c] = color[c] > 0.0f ? color[c] : color[c] - color[c];  // 0, or NaN for NaN
     basis.write(colors.data, color);
 }
 
@@ -147,7 +147,7 @@ static inline void harmonics_block_adjoint(
         v_dc[c] = SH_C0 * v[c];
     }
     basis.write(v_sh_dc.data, v_dc);
-    // Culled or clamped: its coefficients count for nothing, and a NaN among them stays there.
+    // Coefficients of a culled or clamped Gaussian are not read, so that a NaN among them cannot spread.
     const vi live = (v[0] != 0.0f) | (v[1] != 0.0f) | (v[2] != 0.0f);
     int alive[16];
     __builtin_memcpy(alive, &live, sizeof(alive));
@@ -189,12 +189,12 @@ static inline void harmonics_block_adjoint(
                   2.0f * s14 * y * z + 2.0f * s15 * x * y;
     const vf gz = SH_C1 * s[1] + s6 * z - s5 * y - s7 * x + s10 * x * y - 10.0f * z * (s11 * y + s13 * x) +
                   s12 * (5.0f * zz - 1.0f) + s14 * (xx - yy);
-    // The direction is normalised: only what is perpendicular to it moves it.
+    // Only a gradient's component perpendicular to the direction counts, because the direction is normalised.
     const vf along = gx * x + gy * y + gz * z;
     v_mean[0] = live ? inverse * (gx - along * x) : ZERO;
     v_mean[1] = live ? inverse * (gy - along * y) : ZERO;
     v_mean[2] = live ? inverse * (gz - along * z) : ZERO;
-    const vi whole = usable(v_mean[0]) & usable(v_mean[1]) & usable(v_mean[2]);  // else it overflows and is left out
+    const vi whole = usable(v_mean[0]) & usable(v_mean[1]) & usable(v_mean[2]);  // false if it overflows
     for (int c = 0; c < 3; ++c) v_mean[c] = whole ? v_mean[c] : ZERO;
     basis.write(v_means.data, v_mean);
 }

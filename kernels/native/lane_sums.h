@@ -2,7 +2,7 @@
 #pragma once
 #include "simd.h"
 
-// Halves are folded together pair by pair, four times.
+// Four steps each fold the halves of vectors together, pair by pair.
 static inline vf fold8(vf a, vf b) {
     return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
            __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
@@ -22,7 +22,7 @@ static inline vf fold1(vf a, vf b) {
 
 // Lane k of the result is the sum of v[k]'s lanes.
 static inline vf lane_sums(const vf* v) {
-    vf part[4];  // the k-th holds 0 + k, 4 + k, ... so that the sums come out in order
+    vf part[4];  // part[k] holds sums k, 4 + k, 8 + k, 12 + k, so that the result is in order
     for (int k = 0; k < 4; ++k) part[k] = fold4(fold8(v[k], v[4 + k]), fold8(v[8 + k], v[12 + k]));
     return fold1(fold2(part[0], part[1]), fold2(part[2], part[3]));
 }

@@ -1,8 +1,8 @@
-// The nodes that a block of points has within reach.
+// Lists of the nodes within reach of a block of points.
 #pragma once
 #include "simd.h"
 
-// Write the nodes within `reach` of the block's centre, ascending, and their number, -1 if there are too many.
+// Write the nodes within `reach` of the block's centre, ascending, and their number (-1 if there are too many).
 static inline void list_within(
     int block, float reach, const wp::array_t<float>& centres, const wp::array_t<float>& columns,
     wp::array_t<int>& counts, wp::array_t<int>& lists

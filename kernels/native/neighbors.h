@@ -1,17 +1,17 @@
-// The K nearest nodes of 16 points, a lane each: of all nodes, or of a list if that provably suffices.
+// Search for the K nearest nodes of 16 points, one per lane, among all nodes or in a list that provably suffices.
 #pragma once
 #include "simd.h"
 
-// Nodes that a block of points needs to look at.
+// Candidate nodes of a block of points.
 struct NodeList {
     const int* nodes;     // ascending
-    int count;            // -1: there is no list
-    const float* centre;  // of the block; behind its coordinates, how far the list reaches
+    int count;            // -1: no list
+    const float* centre;  // coordinates of the block's centre, then the list's reach
     float shift;          // largest shift of a node since the list was made
 };
 
-// Write the neighbours of `count` points, whose numbers are `rows`; `distances` may be null. Return false where `list`
-// did not suffice, so that every node was searched. Without a list, every node is searched and false is returned.
+// Write the neighbours of `count` points, whose indices are `rows`; `distances` may be null. Return false if every node
+// was searched, because there was no list or `list` did not suffice.
 static inline bool search(
     int K, const wp::array_t<float>& points, const wp::array_t<float>& nodes, const int* rows, int count,
     const NodeList* list, int* indices, float* distances
@@ -36,7 +36,7 @@ static inline bool search(
     const float* source = points.data;
     const float* node_data = nodes.data;
     const float infinity = __builtin_inff();
-    // A template argument of 3 means three dimensions, 2 any number.
+    // A `dc` of 3 means three dimensions; 2 means any number.
     auto squared = [&](auto dc, const vf* x, const float* node) -> vf {
         vf e = x[0] - node[0];
         vf s = e * e;
@@ -66,7 +66,7 @@ static inline bool search(
             index[j] = (vi){} + (j < M ? j : 0);
         }
     };
-    auto insert = [&](auto kc, vf* best, vi* index, vf s, int m) {  // a NaN is never inserted
+    auto insert = [&](auto kc, vf* best, vi* index, vf s, int m) {  // NaN is never inserted
         constexpr int S = decltype(kc)::value;
         const vi number = (vi){} + m;
 #pragma clang loop unroll(full)
@@ -85,7 +85,7 @@ static inline bool search(
         begin_list(kc, best, index);
         for (int start = 0; start < M; start += 256) {
             const int stop = start + 256 < M ? start + 256 : M;
-            // All distances of this batch, and the least of every sixteen nodes.
+            // Compute all distances of this batch, and the smallest of every sixteen nodes.
             vf d2[256], least[16];
             const int groups = (stop - start + 15) / 16;
             for (int g = 0; g < groups; ++g) {
@@ -105,7 +105,7 @@ static inline bool search(
                     for (int m = 0; m < end - start - 16 * g; ++m) distance(m);
                 least[g] = low;
             }
-            // K groups hold a node within the K-th least of these: nothing beyond it can be among the K nearest.
+            // K groups hold a node within the K-th smallest of these minima, so no farther node is among the K nearest.
             vf bound[S];
             for (int j = 0; j < S; ++j) bound[j] = best[j];
             for (int g = 0; g < groups; ++g) {
@@ -152,7 +152,7 @@ static inline bool search(
             // Slack for rounding: a few units in the last place of every term, and for squares that underflow.
             vf need =
                 (__builtin_elementwise_sqrt(last) + __builtin_elementwise_sqrt(off) + list->shift) * 1.00002f + 1e-15f;
-            // A point that is not finite is no distance from any node, in the list or not.
+            // Non-finite points are exempt: their distances are non-finite for every node, in the list or not.
             proven = __builtin_reduce_and((need < list->centre[D]) | ~(poison == 0.0f));
         }
         if (!proven) scan(kc, dc, x, best, index);
@@ -183,7 +183,7 @@ static inline bool search(
     return proven;
 }
 
-// Points begin to begin + 15, and every node.
+// Find the K nearest of all nodes for points begin to begin + 15.
 static inline void nearest(
     int begin, int K, const wp::array_t<float>& points, const wp::array_t<float>& nodes, wp::array_t<int>& indices,
     wp::array_t<float>& distances
@@ -194,7 +194,7 @@ static inline void nearest(
     search(K, points, nodes, rows, count, nullptr, indices.data, distances.data);
 }
 
-// Points of a block, and the nodes of its list.
+// Find the K nearest nodes for the points of a block, from the block's list if it suffices.
 static inline void nearest_listed(
     int block, int K, const wp::array_t<float>& points, const wp::array_t<float>& nodes, const wp::array_t<int>& order,
     const wp::array_t<float>& centres, const wp::array_t<int>& counts, const wp::array_t<int>& lists,

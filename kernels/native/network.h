@@ -1,8 +1,8 @@
-// A small multilayer perceptron: packing of its weights and inputs, and its values.
+// A small multilayer perceptron: packing of its weights and inputs, and its evaluation.
 #pragma once
 #include "network_panels.h"
 
-// Pack one panel of a layer's weights, as each of its products reads them.
+// Pack one panel of a layer's weights, in the layout that each of its products reads.
 static inline void pack_panel(int layer, int panel, const wp::array_t<wp::int64>& table, wp::array_t<float>& packed) {
     const long long* own = (const long long*)table.data + (long long)layer * TABLE_COLUMNS;
     const float* weights = (const float*)own[WEIGHTS];
@@ -34,7 +34,7 @@ static inline void pack_row(
 ) {
     const int positions = where.shape.dims[0], wide = where.shape.dims[1], narrow = when.shape.dims[1];
     const int t = row / positions, rows = inputs.shape.dims[1];
-    const bool there = t < when.shape.dims[0];  // else it only fills up the last block
+    const bool there = t < when.shape.dims[0];  // false: padding of the last block
     const float* a = where.data + (long long)(row - t * positions) * wide;
     const float* b = when.data + (long long)t * narrow;
     for (int p = 0; p < inputs.shape.dims[0]; ++p) {
@@ -66,7 +66,7 @@ static inline void network_block(
     struct Half {
         enum { value = 1 };
     };
-    // A strip of one or two vectors of a layer's outputs, for the rows of the block.
+    // Compute a strip of one or two vectors of a layer's outputs, for the rows of the block.
     auto tile = [&](auto vectors, int l, int p, int c) {
         constexpr int V = decltype(vectors)::value;
         const long long* own = (const long long*)table.data + (long long)l * TABLE_COLUMNS;
@@ -98,7 +98,7 @@ static inline void network_block(
             if (l + 1 < layers) {
                 float* to = after + (long long)p * PANEL * rows + (long long)i * PANEL + c;
                 for (int r = 0; r < ROWS; ++r)
-                    for (int v = 0; v < V; ++v)  // a NaN stays
+                    for (int v = 0; v < V; ++v)  // NaN is kept
                         *(vnu*)(to + r * PANEL + v * LANES) = acc[r][v] < 0.0f ? vn{} : acc[r][v];
                 continue;
             }

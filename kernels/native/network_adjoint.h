@@ -1,6 +1,6 @@
-// Adjoint of a small multilayer perceptron: of its hidden values, its inputs and its weights.
+// Adjoint of a small multilayer perceptron: gradients of its hidden values, inputs and weights.
 //
-// v_hidden[l] is the gradient before the ReLU of layer l, in panels, of the rows from ``first`` on.
+// v_hidden[l] is the gradient of layer l's values before the ReLU, in panels, for the rows from ``first`` on.
 #pragma once
 #include "network_panels.h"
 
@@ -50,7 +50,7 @@ static inline void network_block_adjoint(
     }
 }
 
-// Gradient of the inputs: over all layers that read them, first to last.
+// Sum the gradient of the inputs over all layers that read them, first to last.
 static inline void network_inputs_block_adjoint(
     int block, int size, int first, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
     const wp::array_t<float>& v_hidden, wp::array_t<float>& v_inputs
@@ -90,8 +90,8 @@ static inline void network_inputs_block_adjoint(
             }
 }
 
-// Gradients of one panel of a layer's outputs: those rows of its weights [out, in], and of its bias behind them. The
-// sums over the rows of ``v_hidden`` go on where those over the rows before ``first`` ended.
+// Compute the weight gradients [out, in] and the bias gradients of one panel of a layer's outputs. The sums over the
+// rows of ``v_hidden`` continue those over the rows before ``first``.
 static inline void network_panel_adjoint(
     int layer, int panel, int part, int parts, int first, int count, const wp::array_t<wp::int64>& table,
     const wp::array_t<float>& inputs, const wp::array_t<float>& hidden, const wp::array_t<float>& v_hidden

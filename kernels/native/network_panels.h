@@ -1,10 +1,10 @@
 // Matrices in panels of 32 columns, and the loop that multiplies them.
 //
 // Element (i, j) of a matrix with R rows is at ((j / 32) R + i) 32 + j % 32. All products (values, adjoint of values,
-// adjoint of weights) then stream through memory in one direction, and all are the same loop: a tile of rows x columns
-// of the result stays in registers while one column of the left factor at a time meets one row of the right factor.
-// Each sum is taken in the order of its index, by one thread: the bits depend neither on the number of threads nor on
-// how the rows are cut into blocks.
+// adjoint of weights) then stream through memory in one direction, and all use the same loop: a tile of rows x columns
+// of the result stays in registers, and each step adds the product of one column of the left factor with one row of the
+// right factor. One thread computes each sum in the order of its index, so results depend neither on the number of
+// threads nor on how the rows are cut into blocks.
 #pragma once
 #include "simd.h"
 
@@ -15,16 +15,16 @@ enum {
     INPUTS,           // columns read from the inputs
     HIDDEN,           // columns read from the layer before
     OUTPUTS,          // columns written
-    PACKED,           // where the layer's packed weights begin: for values,
+    PACKED,           // offset of the layer's packed weights: for values,
     PACKED_ADJOINT,   // for the adjoint of the layer before (-1: not wanted),
     PACKED_INPUTS,    // for the adjoint of the inputs (-1: not wanted)
-    WEIGHTS_ADJOINT,  // address of the gradient of the weights; that of the bias follows it
+    WEIGHTS_ADJOINT,  // address of the gradient of the weights, which that of the bias follows
     TABLE_COLUMNS,
 };
 
 enum { PANEL = NETWORK_PANEL };  // columns of a panel
 
-// The tile of a result that fits into the registers: 16 accumulators hide the latency of a fused multiply-add.
+// Size of the tile of a result kept in registers: 16 accumulators hide the latency of a fused multiply-add.
 #if defined(__AVX512F__)
 enum { LANES = 16, ROWS = 8, VECTORS = 2 };
 #elif defined(__AVX__)
@@ -34,7 +34,7 @@ enum { LANES = 4, ROWS = 8, VECTORS = 2 };
 #endif
 enum { STRIP = LANES * VECTORS };  // columns of a tile
 
-// One register of the CPU, and the same at any address.
+// One register of the CPU, and the same type without alignment.
 typedef float vn __attribute__((vector_size(LANES * 4)));
 typedef float vnu __attribute__((vector_size(LANES * 4), aligned(4)));
 
@@ -49,7 +49,7 @@ struct Panel {
 static inline int panels(long long columns) { return (int)((columns + PANEL - 1) / PANEL); }
 
 // Return a function: sums[r][v] += sum over k < n of left(r, k) right(k, v), where left(r, k) is at
-// left[r * row + k * step]. The copy of the sums stays in registers, whatever the caller does with its own.
+// left[r * row + k * step]. It works on a copy of the sums, which stays in registers.
 static inline auto accumulation() {
     FUSE_WITHIN_EXPRESSIONS
     return [](auto& sums, const float* left, auto row, auto step, const float* right, int n) {

@@ -1,4 +1,4 @@
-// Projection of 16 Gaussians, a lane each, and its adjoint: the formulas of kernels/projection.py.
+// Projection of 16 Gaussians, one per lane, and its adjoint, by the formulas of kernels/projection.py.
 #pragma once
 #include "simd.h"
 
@@ -150,7 +150,7 @@ static inline void project(
     const vf z = f.point[2];
     vf seen = f.opacity;
     if (antialiased) seen = seen * root(f.raw_determinant / f.determinant);
-    // A comparison with NaN is false: written as what must hold, the conditions cull it.
+    // Comparisons with NaN are false. Each condition states what must hold, so that NaN is culled.
     vi visible = (z > 0.0f) & (z >= near_plane) & (z <= far_plane) & (seen >= ALPHA_MIN) & finite(seen);
     visible = visible & (f.determinant > 0.0f) & (f.inverse_norm > 0.0f);
     const vf ratio = visible ? seen / ALPHA_MIN : ONE;
@@ -254,7 +254,7 @@ static inline void project_adjoint(
                    f.inverse_z * (v_x * f.point[0] + v_y * f.point[1] + dot(v_row_x, f.row_x) + dot(v_row_y, f.row_y));
     vf v_mean[3];
     for (int k = 0; k < 3; ++k) v_mean[k] = f.view[k] * v_x + f.view[4 + k] * v_y + f.view[8 + k] * v_z;
-    // Where usable gradients become others (an overflow), none is passed; what came in as NaN goes out as NaN.
+    // If usable incoming gradients overflow here, pass zeros; an incoming NaN stays NaN.
     vi given = usable(v_mean2d[0]) & usable(v_mean2d[1]) & usable(v_depth[0]) & usable(v_seen[0]);
     vi made = usable(v_opacity);
     for (int k = 0; k < 3; ++k) {

@@ -1,4 +1,4 @@
-// Loops that reach a CPU's limits: fused multiply-adds in registers, and copying memory.
+// Loops that reach a CPU's limits: fused multiply-adds in registers, and memory copies.
 #pragma once
 #include "simd.h"
 
@@ -19,6 +19,6 @@ static inline void multiply_add_chains(int index, int rounds, wp::array_t<float>
 static inline void copy_block(int index, const wp::array_t<float>& source, wp::array_t<float>& target) {
     const vf* from = (const vf*)(source.data + (long long)index * ROOFLINE_BLOCK);
     vf* to = (vf*)(target.data + (long long)index * ROOFLINE_BLOCK);
-    // Around the cache: an ordinary store would read the line first, a third of the traffic.
+    // Bypass the cache: an ordinary store would first read the line, a third of the traffic.
     for (int i = 0; i < ROOFLINE_BLOCK / 16; ++i) __builtin_nontemporal_store(from[i], to + i);
 }

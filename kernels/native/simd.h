@@ -9,8 +9,8 @@ typedef short vs __attribute__((vector_size(64)));
 typedef bool vb __attribute__((ext_vector_type(16)));
 typedef bool vb32 __attribute__((ext_vector_type(32)));
 
-// First statement of every function that computes: multiply and add are fused within an expression, and only there, so
-// that the same source rounds alike everywhere.
+// First statement of every function that computes. Multiplications and additions are fused within an expression only,
+// so that the same source rounds alike everywhere.
 #define FUSE_WITHIN_EXPRESSIONS _Pragma("clang fp contract(on)")
 
 // Instead of it: nothing is fused, as in the portable form.
@@ -19,10 +19,10 @@ typedef bool vb32 __attribute__((ext_vector_type(32)));
 // 0, 1, ... 15.
 static inline vf lane_numbers() { return vf{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}; }
 
-// One bit for each lane of a comparison's result.
+// Return one bit for each lane of a comparison's result.
 static inline unsigned bits(vi mask) { return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask, vb)); }
 
-// The first n floats, zeros behind them.
+// Load the first n floats, with zeros behind them.
 static inline vf load(const float* from, int n) {
     vf v = {};
     if (n == 16)
@@ -32,7 +32,7 @@ static inline vf load(const float* from, int n) {
     return v;
 }
 
-// Write the first n lanes.
+// Store the first n lanes.
 static inline void store(float* to, vf v, int n) {
     if (n == 16)
         __builtin_memcpy(to, &v, 64);
@@ -40,8 +40,8 @@ static inline void store(float* to, vf v, int n) {
         for (int k = 0; k < n; ++k) to[k] = v[k];
 }
 
-// 2^e for e in [-8, 0]; garbage below, which the caller masks. Nearest integer by the magic number, then a polynomial
-// on [-1/2, 1/2] of relative error 9e-8.
+// Return 2^e for e in [-8, 0]; smaller e give garbage, which the caller masks. A magic number splits off the nearest
+// integer; a polynomial on [-1/2, 1/2], of relative error 9e-8, does the rest.
 static inline vf exp2v(vf e) {
     FUSE_WITHIN_EXPRESSIONS
     vf t = e + 12582912.0f;
@@ -54,6 +54,6 @@ static inline vf exp2v(vf e) {
     return (vf)((vu)r + ((vu)t << 23));
 }
 
-// For functions that loop over one of their arguments, such as a number of columns: the loop is unrolled where the call
-// is inlined.
+// Attribute for functions that loop up to one of their arguments, such as a number of columns: inlined calls unroll the
+// loop.
 #define ALWAYS_INLINE __attribute__((always_inline)) static inline

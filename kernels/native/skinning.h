@@ -1,8 +1,8 @@
-// Skinning of 16 Gaussians, a lane each: the formulas of kernels/skinning.py.
+// Skinning of 16 Gaussians, one per lane, by the formulas of kernels/skinning.py.
 #pragma once
 #include "skinning_block.h"
 
-// e^x of x <= 0; 0 below -87.
+// Return e^x for x <= 0; 0 below -87.
 ALWAYS_INLINE vf exponential(vf x) {
     FUSE_WITHIN_EXPRESSIONS
     vf y = x < -87.0f ? vf{} - 87.0f : x;
@@ -48,7 +48,7 @@ ALWAYS_INLINE void move(
     }
 }
 
-// With weights that are known.
+// Skin with known weights.
 static inline void skin(
     int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<wp::vec4>& quats, const wp::array_t<float>& motion,
     const wp::array_t<float>& reach, int aligned, int has_log_scales, const wp::array_t<int>& indices,
@@ -85,7 +85,7 @@ static inline void skin(
         run(Any{});
 }
 
-// With RBF weights, which are written too.
+// Compute RBF weights, write them, and skin with them.
 static inline void skin_rbf(
     int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<wp::vec4>& quats, const wp::array_t<float>& hyper,
     int has_hyper, const wp::array_t<float>& motion, const wp::array_t<float>& reach, int aligned, int has_strengths,

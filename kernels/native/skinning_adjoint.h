@@ -1,4 +1,4 @@
-// Adjoint of skinning with RBF weights, 16 Gaussians at a time, a chunk of them one after the other.
+// Adjoint of skinning with RBF weights, for the blocks of 16 Gaussians of a chunk, one after the other.
 #pragma once
 #include "lane_sums.h"
 #include "skinning_block.h"
@@ -60,7 +60,7 @@ static inline void skin_rbf_adjoint(
         if (has_log_scales) read_vectors(v_log_scales_t.data, begin, rows, 3, v_scales);
         vf B[16], side[MAX_NEIGHBORS], b[4], u[4], v_x[3], rows_of[16];
         blend(motion.data, pick, weight, w, K, aligned, side, B);
-        // Gaussians that are non-finite, or that a broken control point moves, and lanes past the end, pass nothing:
+        // Non-finite Gaussians, Gaussians moved by a non-finite control point, and lanes past the end pass no gradient:
         // they become zeros with zero weights.
         vf probe = q[0] * 0.0f + q[1] * 0.0f + q[2] * 0.0f + q[3] * 0.0f;
         for (int d = 0; d < H; ++d) probe = probe + hyper_point[d] * 0.0f;
@@ -109,12 +109,12 @@ static inline void skin_rbf_adjoint(
             v_u[c] = (v_u[c] - u[c] * along_u) * nq;
             rows_of[12 + c] = (v_b[c] - b[c] * along_b) * nb;
         }
-        // What overflows becomes 0; what came in as NaN goes out as NaN.
+        // A gradient that overflows becomes 0; an incoming NaN stays NaN.
         const vi given =
             usable(v[0]) & usable(v[1]) & usable(v[2]) & usable(t[0]) & usable(t[1]) & usable(t[2]) & usable(t[3]);
         for (int c = 0; c < 4; ++c) v_u[c] = (usable(v_u[c]) | ~given) ? v_u[c] : vf{};
         write_vectors(v_quats.data, begin, rows, 4, v_u);
-        transpose(rows_of);  // row l: what Gaussian l's blended motion row receives
+        transpose(rows_of);  // row l: gradient of Gaussian l's blended motion row
         vf v_weight[MAX_NEIGHBORS], mean = vf{};
         for (int k = 0; k < K; ++k) {
             vf products[16];
@@ -140,7 +140,7 @@ static inline void skin_rbf_adjoint(
             vf e[4 + MAX_HYPER], part[4];
             vf d2 = offset(reach.data, pick, K, k, x, hyper_point, H, e);
             const vf v_logit = w[k] * (v_weight[k] - mean);
-            const vi moves = v_logit != 0.0f;  // elsewhere the distance need not be finite
+            const vi moves = v_logit != 0.0f;  // in other lanes the distance may be non-finite
             vf factor = moves ? 2.0f * e[3] * v_logit : vf{};
             for (int c = 0; c < 3; ++c) {
                 e[c] = moves ? e[c] : vf{};

@@ -1,7 +1,7 @@
-// What skinning and its adjoint share: a block of 16 Gaussians as lanes, and their control points as rows of memory.
+// Code shared by skinning and its adjoint, for blocks of 16 Gaussians in lanes, with control points as rows of memory.
 //
-// Control points are the rows of cpu/skinning_palette.py: two tables, `motion` and `reach`, 16 floats a node. `pick` is
-// the nodes' numbers, [16, K]. Lanes past the last Gaussian are zero and look at node 0.
+// Control points (nodes) are the rows of cpu/skinning_palette.py: two tables, `motion` and `reach`, with 16 floats per
+// node. `pick` holds node indices, [16, K]. Lanes past the last Gaussian are zero and refer to node 0.
 #pragma once
 #include "shuffles.h"
 
@@ -17,7 +17,7 @@ ALWAYS_INLINE const void* read_rows(const void* from, int rows, int row_bytes, v
     return spare;
 }
 
-// Rows begin to begin + rows - 1 of an array of vectors of `width` floats (3 or 4), as columns.
+// Load rows begin to begin + rows - 1 of an array of vectors of `width` floats (3 or 4) as columns.
 ALWAYS_INLINE void read_vectors(const void* data, int begin, int rows, int width, vf* to) {
     float spare[64];
     const float* first = (const float*)data + (long long)begin * width;
@@ -39,7 +39,7 @@ ALWAYS_INLINE void write_vectors(void* data, int begin, int rows, int width, con
     __builtin_memcpy((float*)data + (long long)begin * width, a, rows == 16 ? 64 * width : 4 * width * rows);
 }
 
-// One column for each hyper-coordinate; zeros behind the last.
+// Load one column for each hyper-coordinate, with zeros behind the last.
 ALWAYS_INLINE void read_hyper(const wp::array_t<float>& hyper, int H, int begin, int rows, vf* to) {
     if (!H) return;
     for (int d = 0; d < MAX_HYPER; ++d) {
@@ -49,7 +49,7 @@ ALWAYS_INLINE void read_hyper(const wp::array_t<float>& hyper, int H, int begin,
     }
 }
 
-// Four floats of the rows of neighbour k, as columns; `table` points at the first of them in node 0's row.
+// Load four floats of the rows of neighbour k as columns; `table` points at the first of the four in node 0's row.
 ALWAYS_INLINE void gather4(const float* table, const int* pick, int K, int k, vf* to) {
     vf a[4];  // quarter l of a[i]: lane 4 l + i
     for (int i = 0; i < 4; ++i) {
@@ -62,7 +62,7 @@ ALWAYS_INLINE void gather4(const float* table, const int* pick, int K, int k, vf
     quads(a, to);
 }
 
-// Turn columns of weights into rows of memory, [16, K].
+// Store columns of weights as rows of memory, [16, K].
 ALWAYS_INLINE void weight_rows(const vf* columns, int K, float* to) {
     if (K == 4) {
         vf a[4];
@@ -91,9 +91,9 @@ ALWAYS_INLINE void weight_columns(const float* from, int K, vf* to) {
         }
 }
 
-// Blend the motion rows: affine map (12 columns), rotation (4). A rotation counts on the side of the first neighbour's:
-// `side` is -1 where it must be turned; `aligned` says that none must. `weight` and `weights_of` are the same weights,
-// as rows and as columns.
+// Blend the motion rows: affine map (12 columns), rotation (4). A quaternion on the other side of the first neighbour's
+// is negated: its `side` is -1. If `aligned`, all are on one side. `weight` and `weights_of` are the same weights, as
+// rows and as columns.
 ALWAYS_INLINE void blend(
     const float* motion, const int* pick, const float* weight, const vf* weights_of, int K, int aligned, vf* side,
     vf* columns
@@ -120,7 +120,7 @@ ALWAYS_INLINE void blend(
     }
 }
 
-// Write e = x - p of neighbour k, -1 / (2 r^2) behind it, hyper-coordinates from e[4] on. Return the squared distance.
+// Write e = x - p of neighbour k, then -1 / (2 r^2), then hyper-coordinates from e[4] on. Return the squared distance.
 ALWAYS_INLINE vf
 offset(const float* reach, const int* pick, int K, int k, const vf* x, const vf* hyper_point, int H, vf* e) {
     FUSE_WITHIN_EXPRESSIONS
@@ -140,14 +140,14 @@ offset(const float* reach, const int* pick, int K, int k, const vf* x, const vf*
     return d2;
 }
 
-// Inverse norm of a quaternion; 0 where the norm is 0 or non-finite.
+// Return the inverse norm of a quaternion; 0 where the norm is 0 or non-finite.
 ALWAYS_INLINE vf inverse_norm(vf a, vf b, vf c, vf d) {
     FUSE_WITHIN_EXPRESSIONS
     vf n = a * a + b * b + c * c + d * d;
     return ((n > 0.0f) & (n < __builtin_inff())) ? 1.0f / __builtin_elementwise_sqrt(n) : vf{};
 }
 
-// Unit quaternion from its inverse norm; the identity where that is 0.
+// Return the unit quaternion, given the inverse norm; the identity where that is 0.
 ALWAYS_INLINE void normalise(const vf* q, vf inverse, vf* unit) {
     for (int c = 0; c < 4; ++c) {
         vf identity = vf{} + (c == 0 ? 1.0f : 0.0f);

@@ -2,7 +2,7 @@
 #pragma once
 #include "simd.h"
 
-// 16 neighbours of the 32 in two vectors, from number s on.
+// Return lanes s to s + 15 of the 32 in two vectors.
 #define NEIGHBOURS(a, b, s)                                                                                     \
     __builtin_shufflevector(                                                                                    \
         a, b, s, s + 1, s + 2, s + 3, s + 4, s + 5, s + 6, s + 7, s + 8, s + 9, s + 10, s + 11, s + 12, s + 13, \
@@ -13,8 +13,8 @@ typedef unsigned char vbytes __attribute__((vector_size(16)));
 
 enum { BAND = SSIM_BAND, BLOCK = SSIM_BLOCK };
 
-// Where a band lies: rows ``top`` to ``bottom`` of a channel, in blocks of columns of about equal width, whole vectors
-// except at the right edge.
+// Position of a band: rows ``top`` to ``bottom`` of a channel, in blocks of columns of about equal width, which are
+// whole vectors except at the right edge.
 struct Band {
     int channels, height, width, channel, top, bottom, block;
     long long plane;
@@ -40,7 +40,7 @@ struct Band {
     }
 };
 
-// Pixels of image and truth. Where one lies outside or the mask is false it is not valid, and both are equal.
+// Pixels of image and truth. Pixels outside the image or the mask are invalid; there both values are equal.
 struct Pixels {
     vf x, y;
     vi valid;
@@ -72,9 +72,9 @@ static inline Pixels read_pixels(const Band& band, long long at, int column, boo
     return p;
 }
 
-// Return a function that walks down a band. ``read(maps, at, column, whole)`` gives the maps of 16 pixels; each row is
-// blurred horizontally into a ring of 11 rows, which stays in the first-level cache. As soon as the ring is full,
-// ``finish(row, left, vectors, blur)`` ends the row in its middle, where ``blur(v, maps)`` blurs vertically.
+// Return a function that processes a band downwards. ``read(maps, at, column, whole)`` gives the maps of 16 pixels; each
+// row is blurred horizontally into a ring of 11 rows, which stays in the first-level cache. As soon as the ring is full,
+// ``finish(row, left, vectors, blur)`` finishes the ring's middle row; in it ``blur(v, maps)`` blurs vertically.
 static inline auto band_walk() {
     FUSE_WITHIN_EXPRESSIONS
     return [](auto map_count, const Band& band, auto read, auto finish) __attribute__((always_inline)) {
@@ -97,8 +97,8 @@ static inline auto band_walk() {
                         vf fresh[MAPS] = {};
                         if (column > -16 && column < width)
                             read(fresh, (long long)row * width + column, column, column >= 0 && column + 16 <= width);
-                        // Blur the vector before the last one. Shifts in registers: a load from two cache lines costs
-                        // as much as two.
+                        // Blur the vector before the last one. Neighbours are shifted in registers, because a load that
+                        // crosses a cache line costs as much as two.
                         if (v >= 2)
                             for (int map = 0; map < MAPS; ++map) {
                                 const vf a = past[0][map], b = past[1][map], c = fresh[map];

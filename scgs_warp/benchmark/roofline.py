@@ -92,7 +92,7 @@ def measure_limits(threads: int, blocks: int | None = None) -> Limits:
 
 def _copying(blocks: int) -> float:
     """Return the seconds for copying ``blocks`` blocks."""
-    source, target = torch.ones(blocks * ROOFLINE_BLOCK), torch.zeros(blocks * kernels.BLOCK)
+    source, target = torch.ones(blocks * ROOFLINE_BLOCK), torch.zeros(blocks * ROOFLINE_BLOCK)
     return _best(lambda: launch(kernels.copy, blocks, source, target, grain=1))
 
 

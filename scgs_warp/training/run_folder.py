@@ -1,4 +1,4 @@
-"""A run directory: config.json, log.jsonl, previews/, and the lock that admits one trainer."""
+"""A run directory: config.json, log.jsonl, previews/, and a lock that admits only one trainer."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from .state import StepResult, TrainState
 from .tensorboard import TensorBoard, check_installed
 
 LOG_EVERY = 50
-"""Steps between two log lines."""
+"""Number of steps between two log lines."""
 PREVIEW_SECONDS = 15.0
 LOCK = ".lock"
 TEST_IMAGES = 4
-"""Held-out images that the curve is measured on, about."""
+"""Approximate number of held-out images on which the curve is measured."""
 BOARD_IMAGES = 20
 """Number of training pictures per run in TensorBoard."""
 
@@ -40,7 +40,7 @@ def read_seconds(folder: Path) -> float | None:
     """Read the seconds of training from the log; None without a log."""
     newest: float | None = None
     for entry in _entries(folder):
-        with suppress(ValueError, KeyError, TypeError):  # a damaged line
+        with suppress(ValueError, KeyError, TypeError):  # skip a damaged line
             newest = float(entry["seconds"])
     return newest
 
@@ -61,14 +61,15 @@ def refuse_existing(path: Path, resume: bool) -> None:
 
 
 class RunFolder:
-    """The run directory of a trainer; a context manager that holds a lock, so that two trainers cannot share it.
+    """Run directory of a trainer: a context manager that holds a lock, so that two trainers cannot share the directory.
 
-    With ``tensorboard`` the log's entries, and a picture now and then, also go to event files. Log, previews, event
-    files and the scores of held-out frames are optional: where they fail, training warns once and goes on.
+    With ``tensorboard``, the log's entries and occasional pictures are also written to event files. Log, previews,
+    event files and the scores of held-out frames are optional: if writing one of them fails, training warns once and
+    continues.
 
     Raises:
         UserError: the directory is not writable, in use, or holds a run while ``resume`` is False; ``tensorboard`` is
-            asked for without its package.
+            requested but its package is not installed.
     """
 
     def __init__(
@@ -92,12 +93,13 @@ class RunFolder:
         self._shown_at = 0.0
         self._psnr: float | None = None
         self._regulariser = 0.0
-        """Weighted term of the last step that carried it since the last log line: one step in a few carries ARAP."""
+        """Last weighted regulariser since the previous log line; steps without the term do not count, because only one
+        step in a few includes ARAP."""
         self._told: set[str] = set()
         self._torn = False
-        """True while the log may end in the middle of a line."""
+        """True if the log may end in the middle of a line."""
         self.tell: Callable[[str], None] = say
-        """Prints a line that is no error."""
+        """Callback that prints a line that is not an error."""
 
     def __enter__(self) -> RunFolder:
         if self.resume and not self.path.is_dir():
@@ -127,7 +129,7 @@ class RunFolder:
 
     @contextmanager
     def _optional(self, what: str) -> Iterator[None]:
-        """Turn a failure of an optional output into one warning."""
+        """Turn the failure of an optional output into a single warning."""
         try:
             yield
         except (OSError, UserError) as error:
@@ -139,7 +141,7 @@ class RunFolder:
         self._lock_file = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             import fcntl
-        except ImportError:  # Windows has no fcntl: there the user must not start a second trainer
+        except ImportError:  # Windows has no fcntl: the user must not start a second trainer there
             return
         try:
             fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -149,24 +151,24 @@ class RunFolder:
                 f"{self.path}: another trainer is running here; wait for it or choose another --output"
             ) from error
         except OSError:
-            pass  # a file system without locks: the same
+            pass  # likewise on a file system without locks
 
     @property
     def has_no_checkpoint(self) -> bool:
-        """True where a run has begun but has not written a checkpoint."""
+        """True if a run has begun but has not written a checkpoint."""
         names = (FILE, PREVIOUS)
         return (self.path / "config.json").is_file() and not any((self.path / name).exists() for name in names)
 
     def start(self, step: int) -> None:
-        """Write the configuration, drop log lines after ``step``, which a resumed run writes again, and remove files
-        that a killed process left half written."""
+        """Write the configuration; drop the log lines after ``step``, which a resumed run writes again; remove partial
+        files left by a killed process."""
         for left in self.path.glob(".*.tmp"):
             with suppress(OSError):
                 left.unlink()
         self._write_settings()
         entries: list[dict[str, Any]] = []
         for entry in _entries(self.path) if self.resume else []:
-            with suppress(ValueError, TypeError):  # a damaged line
+            with suppress(ValueError, TypeError):  # skip a damaged line
                 if int(entry.get("step", 0)) <= step:
                     self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
                     entries.append(entry)
@@ -182,7 +184,7 @@ class RunFolder:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of training, including those before a resume."""
+        """Total seconds of training, including those before a resume."""
         return self.seconds + time.perf_counter() - self._began
 
     def log(self, entry: dict[str, Any]) -> None:
@@ -196,8 +198,8 @@ class RunFolder:
         self._on_board(lambda board: board.record(entry))
 
     def _on_board(self, action: Callable[[TensorBoard], None]) -> None:
-        """Write to the event files, if there are any."""
-        board, self._board = self._board, None  # a board that failed once fails always, or waits for ever
+        """Write to the event files, if TensorBoard is in use."""
+        board, self._board = self._board, None  # a board that failed once would fail again or block forever
         if board is not None:
             with self._optional("the event files for TensorBoard"):
                 action(board)
@@ -207,14 +209,14 @@ class RunFolder:
         self._on_board(lambda board: board.show(name, truth, render, step))
 
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
-        """Advance the progress bar; log every 50 steps, write a preview every 15 seconds. ``state.step`` counts this
-        step."""
+        """Advance the progress bar, add a log line every 50 steps, and write a preview every 15 seconds. ``state.step``
+        already counts this step."""
         due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
         # A run that resumes after the last such step before a row logs 0.0 in that row.
         if result.failed is None and result.regulariser:
             self._regulariser = result.regulariser
         if due and result.failed is None:
-            valid = slice(None) if result.mask is None else result.mask  # as in the loss and the score of the test
+            valid = slice(None) if result.mask is None else result.mask  # as in the loss and the test score
             now = float(psnr(result.render[:, valid], result.truth[:, valid]))
             if math.isfinite(now):  # the PSNR of equal images is infinite
                 self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
@@ -245,7 +247,7 @@ class RunFolder:
                 self.show(result)
 
     def show(self, result: StepResult) -> None:
-        """Write ``previews/latest.png``: truth beside render."""
+        """Write ``previews/latest.png``: the truth beside the render."""
         import cv2
 
         pair = torch.cat([result.truth, result.render], dim=2).clamp(0.0, 1.0)
@@ -277,7 +279,7 @@ class RunFolder:
 
 
 class ReadOnlyRunFolder(RunFolder):
-    """The run directory in processes other than the first: nothing is written."""
+    """Run directory in processes other than the first: writes nothing."""
 
     def __enter__(self) -> ReadOnlyRunFolder:
         return self
