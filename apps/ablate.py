@@ -37,8 +37,9 @@ class SweepOptions:
     jobs: int = 1
     """Cells to train at a time, each in its own process with a share of the threads; with --ray, on each machine."""
     ray: str | None = None
-    """Ray cluster to train on: local (one on this machine, for this command only), auto (the one that runs here),
-    HOST:PORT, or ray://HOST:PORT from outside of it. --threads then counts for each machine. By default no cluster."""
+    """Ray cluster to train on: local (started on this machine for this command only), auto (the one that already runs
+    on this machine), HOST:PORT, or ray://HOST:PORT from a machine outside the cluster. --threads then counts for each
+    machine. By default no cluster."""
     lpips_weights: Path | None = None
     """File with VGG16 and LPIPS weights; without it LPIPS is not measured."""
     table_only: bool = False

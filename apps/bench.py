@@ -17,15 +17,15 @@ class Common:
     """Options of every benchmark."""
 
     gaussians: int | None = None
-    """Gaussians of the synthetic scene; 49,000 by default, the mean of the paper's D-NeRF scenes."""
+    """Number of Gaussians of the synthetic scene; 49,000 by default, the mean of the paper's D-NeRF scenes."""
     nodes: int | None = None
-    """Control points of the synthetic scene; 512 by default."""
+    """Number of control points of the synthetic scene; 512 by default."""
     size: str = "800"
     """Longer side of the images in pixels, or WIDTHxHEIGHT."""
     motion: str | None = None
     """Motion models, separated by commas: control-points (the default), per-gaussian, hexplane, static."""
     seconds: float = 2.0
-    """Time to measure each row; slow rows take longer, for at least five repeats."""
+    """Seconds to spend on each row; slow rows take longer, because each is repeated at least five times."""
     json: Path | None = None
     """Write all rows to this file, with command, date, commit and machine."""
     device: Device = "auto"
@@ -33,8 +33,8 @@ class Common:
     threads: int | None = None
     """CPU threads; by default everything is measured on one thread and on all."""
     memory_gib: float | None = None
-    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
-    refused with the size. By default what is free on the machine."""
+    """Limit on memory in GiB (on a GPU, on the memory of the GPU); by default all free memory. Large images are drawn
+    in bands, and what does not fit is refused with an error that names its size."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ class Options:
     output: Path
     """Folder to make. The same command continues an interrupted one; finished work is never overwritten."""
     frames: int | None = None
-    """Most frames to pick: the sharpest, spread over time and motion. By default 150 of a video and all of a folder."""
+    """Largest number of frames to pick: the sharpest, spread over time and motion. By default 150 of a video and all of
+    a folder."""
     start: float | None = None
     """Second of the video to begin at."""
     end: float | None = None
@@ -29,21 +30,21 @@ class Options:
     size: int = 1280
     """Longer side of the images in pixels; smaller ones are not enlarged."""
     masks: str = "auto"
-    """Parts that take no part in finding the cameras. auto: what moves is found; none; or a folder or video of masks,
-    black where something moves."""
+    """Masks of image regions to ignore when finding the cameras. auto: moving regions are detected; none: nothing is
+    ignored; otherwise a folder or video of masks, black where something moves."""
     matching: Literal["auto", "sequential", "exhaustive"] = "auto"
-    """Compare frames with their neighbours, or each with each; auto: by their number."""
+    """Frames to compare. sequential: neighbours in time; exhaustive: each with each; auto: depends on their number."""
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
         "SIMPLE_RADIAL"
     )
-    """COLMAP's model of the one camera of all frames, found with the poses: OPENCV for wide angles, OPENCV_FISHEYE for
-    wider ones."""
+    """COLMAP's camera model, whose parameters all frames share and which are found with the poses: OPENCV for wide
+    angles, OPENCV_FISHEYE for wider ones."""
     fov: float | None = None
-    """Horizontal field of view in degrees to begin with, if it is known."""
+    """Initial value of the horizontal field of view in degrees, if it is known."""
     features: int = 4096
-    """Most features of a frame."""
+    """Largest number of features per frame."""
     least: float = 0.5
-    """Least share of the frames that must get a camera; below it the command fails and says what to do."""
+    """Smallest share of the frames whose cameras must be found; with fewer the command fails and says what to do."""
     seed: int = 0
     """Random seed; the same video and seed give the same frames and cameras."""
     device: Device = "auto"

@@ -26,17 +26,17 @@ class Options:
     script: Path | None = None
     """Edit to load, as JSON (docs/editing.md). Without an output, the editor opens with it."""
     output: Path | None = None
-    """Film of the script to write: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
+    """Film to write of the script's edit: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     export: Path | None = None
-    """File to write the edited scene to, a .ply, as the scene is at the second --at of the film."""
+    """File (.ply) to write the edited scene to, as it is at the moment --at of the film."""
     at: float = 0.0
     """Second of the film that --export writes."""
     nodes: int = 512
-    """Control points for a scene without motion."""
+    """Number of control points to make for a scene without motion."""
     size: int | None = None
     """Longer side of the film in pixels, instead of the script's."""
     port: int = 8080
-    """Port of the editor on 127.0.0.1, or the next free one. With --share, the port for other machines."""
+    """Port of the editor on 127.0.0.1; if it is taken, the next free one. With --share, the port for other machines."""
     share: bool = False
     """Serve the editor to other machines: on all interfaces, behind a proxy that asks for a token."""
     folder: Path | None = None
@@ -46,8 +46,8 @@ class Options:
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
-    refused with the size. By default what is free on the machine."""
+    """Limit on memory in GiB (on a GPU, on the memory of the GPU); by default all free memory. Large images are drawn
+    in bands, and what does not fit is refused with an error that names its size."""
 
 
 def check(options: Options) -> None:

@@ -33,8 +33,8 @@ class Options:
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
-    refused with the size. By default what is free on the machine."""
+    """Limit on memory in GiB (on a GPU, on the memory of the GPU); by default all free memory. Large images are drawn
+    in bands, and what does not fit is refused with an error that names its size."""
 
 
 def load_data(scene: Scene, options: Options) -> Dataset:
@@ -57,7 +57,7 @@ def load_data(scene: Scene, options: Options) -> Dataset:
 
 
 def training_seconds(folder: Path) -> float | None:
-    """What ``metrics.json`` of the run says; None if it does not."""
+    """Return the training time in ``metrics.json`` of the run; None if it is missing."""
     from scgs_warp.storage.json_files import as_number, parse_json
 
     try:

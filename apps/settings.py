@@ -41,7 +41,7 @@ class Settings:
     progressive: bool = False
     """Pre-train on the first fifth of the frames, then on more and more; for large motions."""
     max_gaussians: int | None = None
-    """Most Gaussians at any time, which bounds memory."""
+    """Largest number of Gaussians at any time, which bounds memory."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Any other field of the configuration as NAME=VALUE; may be repeated: --set motion.hyper_dim=8 --set freeze=0."""
     device: Device = "auto"
@@ -49,8 +49,8 @@ class Settings:
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Limit on memory in GiB (on a GPU, of its own memory): large images are drawn in bands, and what does not fit is
-    refused with the size. By default what is free on the machine."""
+    """Limit on memory in GiB (on a GPU, on the memory of the GPU); by default all free memory. Large images are drawn
+    in bands, and what does not fit is refused with an error that names its size."""
 
 
 def configuration(

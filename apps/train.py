@@ -38,7 +38,7 @@ class Options(Settings, RunFolders):
     motion: MotionName | None = None
     """Motion model: control points (SC-GS), one network query per Gaussian, feature planes, or no motion."""
     seed: int | None = None
-    """Random seed; the same seed gives the same bits on the same machine."""
+    """Random seed; the same seed gives bit-identical results on the same machine."""
     resume: bool = False
     """Continue the run in --output."""
     tensorboard: bool = False

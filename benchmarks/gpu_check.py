@@ -53,21 +53,21 @@ from scgs_warp.types import Camera, Image, Splats
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES_A_SECOND = 1000.0
 MOTION_MS = 0.15
-"""Aims on a GPU: frames per second of the dynamic frame, and the time of its motion."""
+"""Targets on a GPU: frames per second of the moving scene, and milliseconds for its motion."""
 TESTS_SECONDS = 500.0
 SLOWEST_FORM = 50_000
-"""Most Gaussians for which the slow forms of compositing are timed."""
+"""Largest number of Gaussians for which the slow forms of compositing are timed."""
 
 
 class Setting(NamedTuple):
     device: str
     quick: bool
     scenes: dict[str, tuple[int, tuple[int, int]]]
-    """Gaussians and size of the image, by name; the first is that of the moving scene."""
+    """Number of Gaussians and image size, by name; the first entry is that of the moving scene."""
     nodes: int
     repeats: int
     seconds: float
-    """Time for every row of the step and stage timings."""
+    """Seconds to spend on every row of the step and stage timings."""
 
 
 Report = dict[str, Any]
@@ -81,7 +81,7 @@ def setting(device: str, quick: bool) -> Setting:
 
 
 def leaves_of(count: int, size: tuple[int, int], device: str) -> Leaves:
-    """Make the synthetic figure at rest, as leaves."""
+    """Make the synthetic figure at rest, as leaf tensors."""
     return Leaves(*posed(synthetic_scene("static", count, 0, device), size, MIDDLE))
 
 
@@ -107,7 +107,7 @@ def compare(results: list[Tensor], truth: list[Tensor], names: list[str]) -> Rep
 
 
 def agreement(s: Setting) -> Report:
-    """Compare the device's fastest form with the CPU's (on a CPU, with the readable one), and two runs bit by bit."""
+    """Compare the device's fastest form with the CPU's (on a CPU, with the pixel form), and two runs bit by bit."""
     count, size = next(iter(s.scenes.values()))
     leaves = leaves_of(count, size, s.device)
     ours, again = drawn(leaves, "auto"), drawn(leaves, "auto")
@@ -132,7 +132,7 @@ def forms(s: Setting) -> Report:
 
 
 def form_times(leaves: Leaves, form: str, s: Setting) -> Report:
-    """Time compositing of three channels alone."""
+    """Time only the compositing of three channels."""
     own, camera = leaves.gaussians, leaves.camera
     with torch.no_grad():
         splats = project(*leaves.geometry, camera.viewmat, camera.K, camera.width, camera.height)
@@ -163,7 +163,7 @@ def stepwise(scene: Scene, camera: Camera, at: float) -> Image:
 def frames(s: Setting) -> Report:
     """Compare recorded frames with frames drawn step by step (``same_bits``: equal to the last bit) and with the CPU's.
 
-    Every motion model that can be recorded draws five frames, the last of which has too little room for its pairs.
+    Every motion model that can be recorded draws five frames, the last with too small a capacity for its pairs.
     """
     report: Report = {"passed": True}
     for motion in MOTIONS:
@@ -211,7 +211,7 @@ def raster_of(leaves: Leaves, rasterization: Callable[..., Any], s: Setting) -> 
 
 
 def raster(s: Setting) -> Report:
-    """Time ``rasterization``, and its forward stages alone."""
+    """Time ``rasterization`` as a whole, and its forward stages one by one."""
     report: Report = {}
     for name, (count, size) in s.scenes.items():
         leaves = leaves_of(count, size, s.device)
@@ -279,7 +279,7 @@ def motion_ms(scene: Scene, s: Setting) -> float:
 
 
 def two_under_way(graph: FrameGraph, scene: Scene, camera: Camera, repeats: int) -> float:
-    """Return milliseconds per frame if each frame starts before the one before it is finished."""
+    """Return milliseconds per frame if each frame is submitted before the previous one is finished."""
     view, color = scene.normalisation.apply_camera(camera), torch.tensor(scene.background_color)
     start, last = time.perf_counter(), graph.submit(view, 0.1, color)
     for index in range(repeats):

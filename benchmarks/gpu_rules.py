@@ -20,7 +20,8 @@ def time_of(function: Callable[[], Any], device: str, repeats: int) -> dict[str,
     """Time calls after three to warm up, in milliseconds.
 
     Returns:
-        ``ms_median`` and ``ms_min`` of calls that are waited for one by one; ``ms_in_a_row``, the mean in a row.
+        ``ms_median`` and ``ms_min`` of calls that are waited for one by one; ``ms_in_a_row``, the mean of calls without
+        waiting between them.
     """
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
     for _ in range(3):

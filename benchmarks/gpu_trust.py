@@ -18,7 +18,7 @@ from scgs_warp.types import Camera, Gaussians
 ROOT = Path(__file__).resolve().parent.parent
 FUZZ_SECONDS = 240.0
 TRAINING = "--downscale 2 --steps 60 --nodes 40 --max-gaussians 2000 --batch 2 --threads 1".split()
-"""Options of a run of seconds with two views per step."""
+"""Options of a run that takes seconds, with two views per step."""
 
 
 def run(command: list[str], seconds: float) -> None:
@@ -39,7 +39,7 @@ def fuzz(device: str, quick: bool) -> dict[str, Any]:
 
 
 def crowded(device: str, quick: bool) -> dict[str, Any]:
-    """Draw Gaussians that all fill the screen in little memory, in bands."""
+    """Draw, in bands that need little memory, Gaussians that all fill the screen."""
     count, width, height, gib = (1000, 320, 240, 4.0) if quick else (1_000_000, 1920, 1080, 4.0)
     g = torch.Generator().manual_seed(0)
     means = torch.randn(count, 3, generator=g) * 0.05 + torch.tensor([0.0, 0.0, 4.0])

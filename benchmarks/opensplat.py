@@ -8,8 +8,8 @@ the installed torch, with the flags of its release build; that needs a C++ compi
 
 Both sides get the same projected splats of the synthetic scene. OpenSplat's forward pass sorts splats by depth, so ours
 is timed with binning, which sorts, too; compositing alone is given beside it. OpenSplat ends a splat at three standard
-deviations, this project where alpha falls under 1/255. With its boxes widened to that the images must agree; it is
-timed unchanged, and the difference that its own boxes make is stated.
+deviations, this project where alpha falls under 1/255. With OpenSplat's boxes widened to the same distance, the images
+must agree. OpenSplat is timed unchanged, and the difference that its own boxes make is stated.
 """
 
 from __future__ import annotations

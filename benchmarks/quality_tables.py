@@ -2,7 +2,7 @@
 
 A file in ``results/quality/`` holds one run, or fields that several runs share and a list ``runs``. A run has
 ``table``, ``row``, ``scene``, ``provenance`` (``measured``, ``reported`` or ``published``), ``commit``, ``command``,
-``processor`` and the figures of ``metrics.json``; ``label`` is the text of a row that the writer does not know. A
+``processor`` and the figures of ``metrics.json``; ``label`` is the text of a row for which the writer has none. A
 measured run replaces the reported one of the same table, row and scene. A run of the scene ``mean`` holds the reported
 mean of a row whose runs are not known to more digits; it counts until all scenes of the row are measured.
 """
@@ -109,7 +109,7 @@ def cost(run: Run) -> str:
 
 
 def beside_published(source: Source) -> str:
-    """Write the scenes of D-NeRF beside published figures, and under each own row its cost."""
+    """Write the scenes of D-NeRF beside published figures, with the cost of each measured row below it."""
     lines = []
     for row, text in (
         ("sc-gs", "SC-GS, published (80,000 steps)"),
@@ -130,7 +130,7 @@ def beside_published(source: Source) -> str:
 
 
 def node_counts(source: Source) -> str:
-    """Write the numbers of control points beside the supplement's Table S1."""
+    """Write the quality for each number of control points beside the supplement's Table S1."""
     lines = []
     for count in ("64", "128", "256", "512", "1024", "2048", "4096"):
         own, before = source.run(count, "mean"), source.run(f"{count}-before", "mean")

@@ -1,4 +1,5 @@
-"""Tables of docs/scaling.md and docs/editing.md whose results can be measured again with committed scripts.
+"""Writers of the tables in docs/scaling.md and docs/editing.md whose results can be measured again with committed
+scripts.
 
 Until all results of a table are there, the reported table stands in its place. A column NAME of the tables of sharing
 comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharing-NAME-alone.json``:
@@ -30,7 +31,7 @@ Results = dict[str, dict[str, Any]]
 
 
 def processor_ms(result: dict[str, Any], *names: str) -> float:
-    """Sum up the processor time of some parts of a step."""
+    """Add up the processor time of some parts of a step."""
     return sum(row["cpu_ms"] for row in result["rows"] if row["name"] in names)
 
 

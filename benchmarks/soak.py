@@ -5,9 +5,10 @@
     python benchmarks/soak.py --minutes 60 --run runs/figure-quick # the editor on a trained scene
     python benchmarks/soak.py --minutes 60 --json soak.json
 
-Memory, open handles and threads are sampled all the time. The first quarter of a part is warm-up. After it allocated
-memory may grow by ``STEEPEST`` and resident memory by ``HIGHEST`` (the process keeps freed memory, so it follows the
-largest film so far); the numbers of handles and threads may not grow. Otherwise the exit status is 1.
+Memory, open handles and threads are sampled all the time. The first quarter of a part is warm-up. After the warm-up,
+allocated memory may grow by ``STEEPEST`` and resident memory by ``HIGHEST`` (the process keeps freed memory, so
+resident memory follows the largest film so far); the numbers of handles and threads may not grow. Otherwise the exit
+status is 1.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ HIGHEST = 128.0
 """Allowed growth of resident memory from a part's second quarter to its last, MiB."""
 WARM_UP = 0.25
 SAMPLES = 40
-"""About the number of samples in a part."""
+"""Approximate number of samples in a part."""
 PAGE = os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
@@ -82,7 +83,8 @@ class Watch:
         return time.monotonic() - self.began
 
     def sample(self, rest: Callable[[], object] = lambda: None) -> bool:
-        """Take a sample if one is due, after calling ``rest`` to finish running work; tell whether the part is over."""
+        """Take a sample if one is due, after calling ``rest`` to finish running work; return whether the part is
+        over."""
         if self.elapsed >= self._due:
             rest()
             self._due = self.elapsed + self._every

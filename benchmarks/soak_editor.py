@@ -188,7 +188,7 @@ class RandomUser:
             self.folder.mkdir()
 
     def nonsense(self) -> None:
-        """Send values of a broken page."""
+        """Send values that only a broken page would send."""
         self.model.seek(math.nan)
         self.model.drag(Target((math.nan, 0.0, 0.0)))
 

@@ -190,11 +190,11 @@ def speed_overview(results: Path) -> str:
 
 
 class Benchmark(NamedTuple):
-    """A table of timings."""
+    """Writer of a table of timings, and the source of its results."""
 
     write: Callable[[Report], str]
     command: str
-    """Command that measures it, without ``--json``."""
+    """Command that measures the results, without ``--json``."""
     measures: tuple[str, ...] = RENDERING
     """Folders with the code that is timed."""
 
@@ -212,7 +212,7 @@ BENCHMARKS = {
 
 
 def timing_table(name: str, results: Path) -> str:
-    """Write a result below the command that gave it; where there is no result, the command that would."""
+    """Write a result below the command that produced it; without a result, write the command to run."""
     benchmark, path = BENCHMARKS[name], results / f"{name}.json"
     if not path.is_file():
         return f"Not measured yet: `python {benchmark.command} --json benchmarks/results/{name}.json`"

@@ -1,9 +1,9 @@
-"""Errors of the user's input, told in one line; apps turn them into exit status 2."""
+"""Errors in the user's input, reported in one line; apps turn them into exit status 2."""
 
 from __future__ import annotations
 
 MAX_MESSAGE = 1000
-"""Largest length of a message: names and reasons in it may come from any file."""
+"""Largest length of a message, limited because names and reasons in it may come from any file."""
 
 
 class UserError(Exception):
@@ -26,16 +26,16 @@ def printable(text: object) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """Describe an error in one line; for an error of the system, name the file and the reason."""
+    """Describe an error in one line; an operating system's error is described by file and reason."""
     if isinstance(error, OSError):
         return printable(f"{error.filename or 'input or output'}: {error.strerror or error}")
     return printable(error)
 
 
 class FrameError(UserError):
-    """The pixels of a frame can no longer be read. The step that asked for them has changed nothing."""
+    """A frame's pixels can no longer be read. The training step that requested them has changed nothing."""
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Return whether an error means that memory ran out: Python and NumPy have a type for it, PyTorch has a text."""
+    """Return whether an error means that memory ran out: by its type (Python, NumPy) or its message (PyTorch)."""
     return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)

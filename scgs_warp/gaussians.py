@@ -15,7 +15,7 @@ SH_C0 = 0.28209479177387814
 
 
 def fixed_exp(values: Tensor) -> Tensor:
-    """Return exp of the values, to the same bits on any number of threads."""
+    """Return exp of the values; the result is bit-identical for any number of threads."""
     with one_piece():
         return values.exp()
 
@@ -50,7 +50,7 @@ class GaussianParameters(nn.Module):
         self.opacity_logits = nn.Parameter(torch.full((count,), opacity, device=device).logit())
         self.sh_dc = nn.Parameter(sh_dc.clone())
         self.sh_rest = nn.Parameter(torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device=device))
-        # Unlike the control points' initial +1e-2, as in the official code, so that the distance has a gradient.
+        # As in the official code, this differs from the control points' +1e-2, so that the distance has a gradient.
         self.hyper = nn.Parameter(torch.full((count, hyper_dim), -1e-2, device=device))
         self.shading = nn.Parameter(torch.zeros(count, SHADING_COLUMNS if shaded else 0, device=device))
 
@@ -58,7 +58,7 @@ class GaussianParameters(nn.Module):
     def empty(
         count: int, sh_count: int, hyper_dim: int, shaded: bool, device: torch.device | str
     ) -> GaussianParameters:
-        """Allocate ``count`` Gaussians, to be filled from a checkpoint."""
+        """Allocate ``count`` Gaussians to be filled from a checkpoint."""
         zeros = torch.zeros(count, 3, device=device)
         made = GaussianParameters(zeros, zeros, zeros, sh_degree=0, hyper_dim=hyper_dim, shaded=shaded)
         made.sh_rest = nn.Parameter(torch.zeros(count, sh_count, 3, device=device))
@@ -89,7 +89,7 @@ class GaussianParameters(nn.Module):
 def neighbor_distance(points: Tensor) -> Tensor:
     """Return the root mean squared distance of each point to its three nearest neighbours, [N].
 
-    Distances are at least 1e-3; that of a lone point is 1e-2.
+    The result is at least 1e-3, and 1e-2 for a single point.
     """
     total = points.shape[0]
     if total <= 1:

@@ -16,7 +16,7 @@ ADAM_EPS = 1e-15
 
 
 def log_linear(start: float, end: float, step: int, until: int) -> float:
-    """Interpolate log-linearly from ``start`` at step 0 to ``end`` at step ``until``, constant afterwards."""
+    """Interpolate log-linearly from ``start`` at step 0 to ``end`` at step ``until``, and stay constant afterwards."""
     if step >= until:
         return end
     if start <= 0.0 or end <= 0.0:  # no logarithm exists: interpolate linearly
@@ -32,7 +32,7 @@ class Group:
     rate: float
     steps: int = 0
     exp_avg: Tensor | None = None
-    """First moment; like the second, None before the first step with a gradient."""
+    """First moment. Both moments are None before the first step with a gradient."""
     exp_avg_sq: Tensor | None = None
 
 
@@ -40,7 +40,7 @@ class Adam:
     """Adam with bias correction as in ``torch.optim.Adam``, on named parameters, in one kernel launch.
 
     Attributes: ``groups``, name to :class:`Group`. Rates are read at every step. A parameter without a gradient does
-    not change; the moments of one whose gradient is zero still decay.
+    not change. If a gradient is zero, the moments still decay.
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], rates: Mapping[str, float]) -> None:
@@ -73,12 +73,12 @@ class Adam:
             group.parameter.grad = None
 
     def regather(self, owner: nn.Module, names: tuple[str, ...], index: Tensor, fresh: Tensor) -> None:
-        """Rebuild rows: row i of every named parameter becomes its old row ``index[i]``.
+        """Rebuild rows: row i of every named parameter becomes the former row ``index[i]``.
 
         Args:
             owner: module that holds the parameters as attributes.
             names: parameters whose first dimension is gathered anew.
-            index: [N'] int64 source rows; repeated to clone, omitted to prune.
+            index: [N'] int64 source rows. Repeated rows are cloned, missing rows are pruned.
             fresh: [N'] bool, True for rows that start with zero moments.
         """
         for name in names:
@@ -110,7 +110,7 @@ class Adam:
         return tensors
 
     def load_tensors(self, prefix: str, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what :meth:`tensors` returned; a parameter that had no state stays without.
+        """Restore the result of :meth:`tensors`. Parameters missing from it stay without state.
 
         Raises:
             KeyError: a part of a parameter's state is missing.

@@ -1,4 +1,4 @@
-"""Values passed along the pipeline: frozen, with the shape beside each field.
+"""Frozen dataclasses passed along the pipeline, with each field's shape.
 
 ``Frame -> motion -> Pose [M] -> skin -> Gaussians at t [N] -> project -> Splats [N] -> bin -> Tiles -> composite ->
 Image``
@@ -40,7 +40,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Frame:
-    """One observation: a camera, a time in [0, 1] and an image. Images are stored planar; [H, W, 3] is a view."""
+    """One observation: a camera, a time in [0, 1] and an image. Images are stored planar and viewed as [H, W, 3]."""
 
     camera: Camera
     """Camera of the image, world."""
@@ -49,7 +49,7 @@ class Frame:
     image: Tensor
     """[H, W, 3] float32 in [0, 1], on the data set's background; ``image.permute(2, 0, 1)`` is contiguous."""
     alpha: Tensor | None = None
-    """[H, W] float32 coverage. None: the data has none."""
+    """[H, W] float32 coverage. None: the data has no coverage."""
     mask: Tensor | None = None
     """[H, W] bool, True for valid pixels. None: all are valid."""
     name: str = ""
@@ -65,7 +65,7 @@ class Pose:
     rotations: Tensor
     """[M, 4] wxyz, unit."""
     shape_rotations: Tensor | None = None
-    """[M, 4] wxyz, unit; rotations of the Gaussians' shapes alone. None: ``rotations`` turn shapes, too."""
+    """[M, 4] wxyz, unit; separate rotations for the Gaussians' shapes. None: ``rotations`` turn shapes, too."""
     log_scales: Tensor | None = None
     """[M, 3] change of the Gaussians' log scales. None: no change."""
 
@@ -99,7 +99,7 @@ class Splats:
     depths: Tensor
     """[N] camera z."""
     opacities: Tensor
-    """[N] after the antialiasing compensation, if any."""
+    """[N] opacities, after the antialiasing compensation if it is used."""
     radii: Tensor
     """[N, 2] int32 half extents in pixels along x and y; (0, 0) where culled."""
     width: int
@@ -117,15 +117,15 @@ class Tiles:
     slots: Tensor
     """[P] int32, emission index of each pair: the slot that its gradient is written to."""
     offsets: Tensor
-    """[N + 1] int64, the pairs of splat i have the slots ``offsets[i] .. offsets[i + 1]``."""
+    """[N + 1] int64, splat i owns the slots from ``offsets[i]`` up to ``offsets[i + 1]``."""
     width: int
     height: int
     columns: int
     rows: int
     tile_size: int = 16
     windows: tuple[tuple[int, int], ...] = ()
-    """Windows of tiles, from begin to end, that compositing lists and draws one after the other when the lists do not
-    fit into memory together; the lists above are then empty."""
+    """Windows of tiles (begin, end). If the lists of all tiles do not fit into memory together, the lists above are
+    empty, and compositing lists and draws the windows one after the other."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class Stats:
     max_radii: Tensor
     """[N] largest screen radius seen, as a fraction of the longer image side."""
     absolute: bool = False
-    """Whether absolute gradients are summed over pixels, which do not cancel."""
+    """Flag that absolute gradients are summed over pixels, so that opposite ones do not cancel."""
 
     @staticmethod
     def zeros(count: int, device: torch.device | str, absolute: bool = False) -> Stats:

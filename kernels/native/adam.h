@@ -29,7 +29,7 @@ static inline void adam_chunk(
 
     auto step = [&](long long at, int n) __attribute__((always_inline)) {
         vf g = load(gradient + at, n), m = load(average + at, n), v = load(square + at, n);
-        const vi finite = __builtin_elementwise_abs(g) < __builtin_inff();  // NaN is kept, because the caller searches for it
+        const vi finite = __builtin_elementwise_abs(g) < __builtin_inff();  // NaN is kept: the caller searches for it
         g = (finite & (g > limit)) ? vf{} + limit : g;
         g = (finite & (g < -limit)) ? vf{} - limit : g;
         m = m + one_beta1 * (g - m);

@@ -216,7 +216,7 @@ static inline __device__ void composite_tile_adjoint(
         __syncthreads();
         for (int group = (size - 1) >> 5; group >= 0; --group) {
             unsigned left = __ballot_sync(ALL_LANES, (reached[32 * group + lane] >> warp) & 1u);
-            const int over = start + 32 * group + 32 - warp_last;  // number of pairs behind the last one used by this warp
+            const int over = start + 32 * group + 32 - warp_last;  // number of pairs behind this warp's last one
             if (over > 0) left = over >= 32 ? 0u : left & (ALL_LANES >> over);
             unsigned hit = 0u;
             while (left) {

@@ -61,7 +61,7 @@ ALWAYS_INLINE void join4(const vf* a, vf* to) {
     to[3] = __builtin_shufflevector(u01, u11, 8, 9, 24, 25, 10, 11, 26, 27, 12, 13, 28, 29, 14, 15, 30, 31);
 }
 
-// Transpose the four 4 x 4 matrices that the quarters of four registers form; shuffles within quarters are the cheapest.
+// Transpose the 4 x 4 matrices that the quarters of four registers form: shuffles within quarters are the cheapest.
 ALWAYS_INLINE void quads(const vf* a, vf* to) {
     vf low0 = __builtin_shufflevector(a[0], a[1], 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
     vf high0 = __builtin_shufflevector(a[0], a[1], 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);

@@ -72,9 +72,9 @@ static inline Pixels read_pixels(const Band& band, long long at, int column, boo
     return p;
 }
 
-// Return a function that processes a band downwards. ``read(maps, at, column, whole)`` gives the maps of 16 pixels; each
-// row is blurred horizontally into a ring of 11 rows, which stays in the first-level cache. As soon as the ring is full,
-// ``finish(row, left, vectors, blur)`` finishes the ring's middle row; in it ``blur(v, maps)`` blurs vertically.
+// Return a function that processes a band downwards. ``read(maps, at, column, whole)`` gives the maps of 16 pixels.
+// Each row is blurred horizontally into a ring of 11 rows, which stays in the first-level cache. As soon as the ring is
+// full, ``finish(row, left, vectors, blur)`` finishes its middle row; in it ``blur(v, maps)`` blurs vertically.
 static inline auto band_walk() {
     FUSE_WITHIN_EXPRESSIONS
     return [](auto map_count, const Band& band, auto read, auto finish) __attribute__((always_inline)) {

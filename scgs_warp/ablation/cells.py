@@ -39,11 +39,11 @@ VARIED = {
 NUMBERS = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds")
 """Metrics of ``metrics.json`` that tables show."""
 NUMBER_LIMIT = 1e12
-"""Magnitude that no sound metric reaches."""
+"""Magnitude from which on a metric counts as damaged."""
 ERROR = "error.txt"
-"""File in a cell's folder that says why the cell failed."""
+"""File in a cell's folder with the reason why the cell failed."""
 LOG = "train.log"
-"""File in a cell's folder with the output of training, if that had a process of its own."""
+"""File in a cell's folder with the output of training, if training ran in a process of its own."""
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,8 @@ def recorded_settings(folder: Path) -> dict[str, Any] | None:
     """Read the complete settings from ``config.json`` in ``folder``; None without that file.
 
     Raises:
-        UserError: the file is not a configuration, or a version that lacked a field wrote it: today's default may
-            differ from what that version did.
+        UserError: the file is not a configuration, or another version wrote it without a field of this one: the field's
+            default may differ from what that version did.
     """
     path = folder / "config.json"
     if not path.is_file():
@@ -165,7 +165,7 @@ def recorded_settings(folder: Path) -> dict[str, Any] | None:
 def first_difference(
     actual: dict[str, Any], wanted: dict[str, Any], ignored: Sequence[str] = FREE_TO_CHANGE
 ) -> tuple[str, Any, Any] | None:
-    """Find the first field in which two complete settings differ: its name and both values."""
+    """Return the first field in which two complete settings differ, as its name and both values; None if they agree."""
     there = dict(flatten(actual))
     for name, value in flatten(wanted):
         if name not in ignored and there.get(name) != value:
@@ -177,7 +177,8 @@ def check_cell(cell: Cell) -> None:
     """Check that the results in the cell's folder were made with the cell's settings.
 
     Raises:
-        UserError: they were not; names the cell and the field.
+        UserError: the results were made with other settings, or without a recorded configuration; names the folder and
+            the field.
     """
     folder = Path(cell.folder)
     if not any((folder / name).is_file() for name in ("metrics.json", CHECKPOINT, PREVIOUS)):
@@ -194,7 +195,7 @@ def check_cell(cell: Cell) -> None:
 
 
 def read_metrics(folder: Path) -> dict[str, Any] | None:
-    """Read a cell's ``metrics.json``; None if there is none yet.
+    """Read a cell's ``metrics.json``; return None if the file is missing.
 
     Raises:
         UserError: the file is damaged.
@@ -301,7 +302,7 @@ def attempt(cell: Cell, run: Callable[[Cell], Path] = run_cell) -> str | None:
 
 
 def discover(output: Path, ablation: str) -> list[tuple[str, str, int]]:
-    """List (scene, value, seed) of every cell of the ablation that was begun in ``output``."""
+    """List (scene, value, seed) of all cells of the ablation that have a configuration in ``output``."""
     begun = []
     for config in sorted(output.glob("*/*/config.json")):
         match = re.fullmatch(r"(.+?)(?:-seed([1-9]\d*))?", config.parent.name)
@@ -328,11 +329,11 @@ def plan(
     Args:
         config: Settings that the cells share.
         scenes: Data folders by the scenes' names in the table.
-        values: Rows; all by default, but for the per-Gaussian baseline of ``arap`` where the motion is not known.
-        seeds: The configuration's by default.
+        values: Rows; by default all, except the per-Gaussian baseline of ``arap`` for scenes without known motion.
+        seeds: Seeds; by default the configuration's seed alone.
 
     Raises:
-        UserError: a cell cannot be trained, or its folder holds one with other settings.
+        UserError: a cell cannot be trained, or its folder holds results with other settings.
     """
     from ..evaluation.motion_metrics import FILE as GROUND_TRUTH
     from ..training.run import settings_of

@@ -41,7 +41,8 @@ def run_cells(
     """Run all cells that are not done.
 
     Args:
-        jobs: Cells at a time; with more than one, each has its own process and its share of the threads.
+        jobs: Number of cells to run at a time; with more than one, each has its own process and its share of the
+            threads.
         threads: CPU threads of all jobs together; all cores by default.
         report: Receives one line when a cell begins and one when it ends.
         finished: Called after each cell.
@@ -115,7 +116,7 @@ def _start(label: str, cell: Cell, threads: int, jobs: int, report: ReportLine) 
 
 
 def _failure(job: _Job) -> str | None:
-    """Say why an ended process did not finish its cell; None if it did."""
+    """Return the reason why an ended process did not finish its cell, or None if it did."""
     status = job.process.returncode
     if status == 0:
         return None

@@ -21,15 +21,16 @@ from typing import Any
 from ..errors import UserError
 
 CONNECT_SECONDS = 5.0
-"""Time for a connection to be accepted."""
+"""Longest wait for a connection to be accepted."""
 ANSWER_SECONDS = 45.0
-"""Time for Ray to be imported and to answer."""
+"""Longest wait for Ray to be imported and to answer."""
 PULSE_SECONDS = 2.0
-"""Time between two questions to the head."""
+"""Time between two checks of the head."""
 GONE_SECONDS = 20.0
-"""Silence of the head after which the sweep ends with one line; Ray ends the process after 60 s without any."""
+"""Time without an answer from the head after which the sweep ends with a one-line error; Ray would end the process
+after 60 s."""
 STORE_BYTES = 100 << 20
-"""Shared memory for a local cluster's objects, which are lines of text here."""
+"""Shared memory for the objects of a local cluster; an ablation's objects are lines of text."""
 START_HINT = "start a cluster with 'ray start --head', or give --ray local"
 
 
@@ -136,13 +137,14 @@ def _ask(address: str) -> None:
 
 
 def last_error_line(text: str) -> str:
-    """Return the last line with text: the error of a traceback."""
+    """Return the last line that is not blank, which in a traceback is the error."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return re.sub(r"^[\w.]+Error: ", "", lines[-1]) if lines else "Ray gave no reason"
 
 
 class HeadMonitor:
-    """Watches whether the cluster's head answers; not from outside, where the connection ends with the head."""
+    """Watches whether the cluster's head answers. Connections from outside (``ray://``) need no watching, since they
+    end with the head."""
 
     def __init__(self, ray: Any, address: str) -> None:
         self.address = address
@@ -196,10 +198,10 @@ def usable_machines(found: Sequence[Machine], cuda: bool) -> list[Machine]:
 
 
 def threads_of_a_cell(useful: Sequence[Machine], jobs: int, threads: int | None, cuda: bool) -> int:
-    """Compute the threads of one cell so that ``jobs`` cells fit on every machine; larger ones then run more.
+    """Compute the threads of one cell so that ``jobs`` cells fit on every machine; larger machines then run more cells.
 
     Args:
-        threads: CPU threads of a machine's cells together; all that it offers by default.
+        threads: CPU threads of all cells on a machine together; by default all that the machine offers.
     """
     shares = []
     for machine in useful:
@@ -209,7 +211,7 @@ def threads_of_a_cell(useful: Sequence[Machine], jobs: int, threads: int | None,
 
 
 def cells_at_a_time(useful: Sequence[Machine], threads: int, cuda: bool) -> int:
-    """Count the cells that the machines can run at a time."""
+    """Count the cells that all machines together can run at a time."""
     return sum(int(min(m.cpus // threads, m.gpus if cuda else m.cpus)) for m in useful)
 
 

@@ -1,8 +1,8 @@
 """Run the cells of an ablation as tasks of a Ray cluster; continue a cell whose worker was lost on another one.
 
-Ray starts the processes and notices when one dies. Its own retries stay off, because they count deaths where progress
-matters: a cell on machines that come and go may lose many workers, as long as its checkpoint advances, while one that
-takes too much memory would kill workers without end (Ray repeats what ran out of memory for ever by default).
+Ray starts the processes and notices when one dies. Tasks are submitted with ``max_retries=0``, because Ray's retries
+count deaths and not progress. A cell on machines that come and go may lose many workers, and is submitted again as long
+as its checkpoint advances; after ``MOST_LOSSES`` losses without progress it fails.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from .ray_worker import (
 )
 
 MOST_LOSSES = 3
-"""Losses without progress after which a cell fails, since it may be what kills its workers."""
+"""Number of workers lost without progress after which a cell fails, since the cell itself may be what kills them."""
 POLL_SECONDS = 0.5
 INSPECT_SECONDS = 60.0
-"""Time for a machine to import the package and answer."""
+"""Longest wait for a machine to import the package and answer."""
 STOP_SECONDS = 30.0
-"""Time for running cells to save their checkpoints."""
+"""Longest wait for running cells to save their checkpoints."""
 VISIBLE_SECONDS = 60.0
-"""Time for another machine's file to appear here: network file systems cache that a file is absent."""
+"""Longest wait for another machine's file to appear on this one: network file systems cache that a file is absent."""
 TAIL = 4096
 
 
@@ -58,8 +58,8 @@ def on_cluster(
     Args:
         address: As ``ray_cluster.check_address`` takes it.
         output: Folder of all cells, which all machines must share.
-        jobs: Cells at a time on each machine.
-        threads: CPU threads on each machine; all that it offers by default.
+        jobs: Number of cells to run at a time on each machine.
+        threads: CPU threads on each machine; by default all that the machine offers.
         device: ``cpu``, ``cuda``, or ``auto``: GPUs if the cluster has some.
 
     Raises:
@@ -99,7 +99,7 @@ def _inspect_machines(
         The identity that all of them share, and the models of their processors.
 
     Raises:
-        UserError: a machine cannot; names it and the reason.
+        UserError: a machine cannot train the cells; names the machine and the reason.
     """
     ours = identity()
     folders = {str(cell.settings["data"]["folder"]) for cell in cells}
@@ -205,9 +205,9 @@ class Task:
     mark: int = 0
     """Modification time of the checkpoint, ns, when a worker was last lost."""
     seen: bool = False
-    """Whether the report has said where it runs."""
+    """True if the machine that runs this attempt has been reported."""
     done: int = 0
-    """Steps."""
+    """Number of trained steps that the progress bar shows."""
 
     @property
     def folder(self) -> Path:
@@ -220,7 +220,7 @@ class Task:
 
 @dataclass
 class Sweep:
-    """All cells of one call, from submission to their ends."""
+    """All cells of one call, from submission to completion or failure."""
 
     ray: Any
     expected: dict[str, str]
@@ -231,10 +231,10 @@ class Sweep:
     check: Callable[[], None] = lambda: None
     """Raises a UserError if the cluster is lost."""
     jobs: int = 1
-    """Cells at a time on each machine."""
+    """Number of cells to run at a time on each machine."""
     sweep: str = field(default_factory=lambda: uuid.uuid4().hex)
     running: dict[Any, Task] = field(default_factory=dict)
-    """Tasks by Ray's references to their results."""
+    """Submitted tasks, by Ray's references to their results."""
     ended: int = 0
 
     def __post_init__(self) -> None:
@@ -243,7 +243,7 @@ class Sweep:
         self._work = self.ray.remote(**options)(train_cell)
 
     def run(self, waiting: Sequence[tuple[str, Cell]]) -> None:
-        """Run all cells to their ends.
+        """Run all cells until each is done or has failed.
 
         Raises:
             KeyboardInterrupt: Ctrl-C or SIGTERM came; the running cells save their checkpoints.
@@ -306,7 +306,8 @@ class Sweep:
         self.end(task.label, task.cell, failure)
 
     def _outcome(self, ref: Any) -> tuple[str | None, str | None]:
-        """Say why the worker was lost, or why the cell failed; (None, None) if the cell is trained."""
+        """Return (reason, None) if the worker was lost, (None, reason) if the cell failed, (None, None) if it is
+        trained."""
         errors = self.ray.exceptions
         try:
             answer = self.ray.get(ref)
@@ -344,7 +345,7 @@ class Sweep:
 
 
 def _loss(error: Exception) -> str:
-    """Say why a worker was lost."""
+    """Return the reason of a lost worker."""
     known = {
         "WorkerCrashedError": "its worker was killed",
         "NodeDiedError": "its machine was lost",
@@ -372,7 +373,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def steps_done(folder: Path) -> int:
-    """Read the last step from the log; 0 without one."""
+    """Read the last step from the log; return 0 if there is none."""
     try:
         with open(folder / "log.jsonl", "rb") as file:
             file.seek(max(0, file.seek(0, 2) - TAIL))
@@ -388,7 +389,7 @@ def steps_done(folder: Path) -> int:
 
 
 def appears(path: Path, seconds: float = VISIBLE_SECONDS) -> bool:
-    """Wait for a file of another machine; False if it does not appear in time."""
+    """Wait for a file of another machine; return False if it does not appear in time."""
     until = time.monotonic() + seconds
     while not path.is_file():
         if time.monotonic() > until:

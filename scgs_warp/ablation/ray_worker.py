@@ -26,13 +26,14 @@ from ..training.run_folder import LOCK
 from .cells import LOG, attempt, cell_from_json
 
 WORKER = "worker.json"
-"""File in a cell's folder that names the machine and the process that train it, or did last."""
+"""File in a cell's folder with the machine and the process that train the cell, or trained it last."""
 PACKAGES = ("torch", "warp-lang", "numpy")
 """Packages whose versions must agree, since others may round differently."""
 LOCK_SECONDS = 150.0
-"""Wait for a lost worker's lock: a file server releases the locks of a dead machine after its lease, NFS after 90 s."""
+"""Longest wait for a lost worker's lock: a file server releases a dead machine's locks after a lease, NFS after 90
+s."""
 SMALL = 1 << 22
-"""Largest file, in bytes, whose content is part of a fingerprint; larger ones count by their size."""
+"""Largest size in bytes of a file whose content is part of a fingerprint; a larger file contributes its size only."""
 
 
 def source_hash() -> str:
@@ -45,7 +46,7 @@ def source_hash() -> str:
         files = {path.relative_to(root).as_posix(): path for path in root.rglob("*.py")}
         for relative, path in sorted(files.items()):
             if name == "scgs_warp" and relative.partition("/")[0] in ("kernels", "apps"):
-                continue  # An installed package holds these; a clone has them elsewhere.
+                continue  # An installed package contains these folders; in a clone they lie elsewhere.
             content = path.read_bytes().replace(b"\r\n", b"\n")
             digest.update(f"{name}/{relative} {len(content)}\n".encode())
             digest.update(content)
@@ -53,13 +54,13 @@ def source_hash() -> str:
 
 
 def identity() -> dict[str, str]:
-    """Return what two machines must have in common: the version, the code and the packages that compute."""
+    """Return the properties that two machines must share: the version, the code and the packages that compute."""
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {"scgs_warp": __version__, "code": source_hash()[:12], **versions}
 
 
 def identity_difference(actual: dict[str, str], wanted: dict[str, str]) -> str | None:
-    """Say in what two identities differ first: ``torch 2.8.0, not 2.9.0``."""
+    """Return the first difference of two identities, such as ``torch 2.8.0, not 2.9.0``; None if they agree."""
     for name, value in wanted.items():
         if actual.get(name) != value:
             return f"{name} {actual.get(name)}, not {value}"
@@ -137,7 +138,7 @@ def _folder_problem(file: Path, token: str) -> str | None:
 
 
 def is_unlocked(file: Path) -> bool:
-    """Tell whether no process holds a lock on ``file``; True where there are no such locks (Windows).
+    """Return whether ``file`` is free of locks of all processes; True where there are no such locks (Windows).
 
     Raises:
         OSError: the file cannot be opened, or the file system has no locks.
@@ -208,7 +209,7 @@ def train_cell(order: dict[str, Any]) -> dict[str, Any]:
 
 
 def _wait_for_lock(file: Path, seconds: float) -> None:
-    """Wait until a lost worker, or its lock, is gone."""
+    """Wait, for at most ``seconds``, until a lost worker's lock is released."""
     until = time.monotonic() + seconds
     if seconds <= 0.0 or not file.is_file() or is_unlocked(file):
         return

@@ -106,9 +106,10 @@ def statistics(values: Sequence[float]) -> dict[str, Any] | None:
 
 
 def _over_scenes(cells: list[Row], scenes: list[str], key: str) -> dict[str, Any] | None:
-    """Compute the mean over scenes of their means over seeds, and the deviation of the seeds that every scene has.
+    """Average each scene over its seeds and the results over scenes; compute the deviation over the seeds that every
+    scene has.
 
-    None unless every scene has a cell, since a mean over fewer scenes is not comparable.
+    Return None unless every scene has a cell, since a mean over fewer scenes is not comparable.
     """
     known: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
     for cell in cells:

@@ -25,7 +25,7 @@ from .workloads import draw_stages
 
 HANDLES = 3
 STEP = 0.25
-"""Motion of a handle from one picture to the next, in edges of the graph."""
+"""Motion of a handle from one picture to the next, in edge lengths of the graph."""
 
 
 def edit_rows(case: BenchCase) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from .workloads import Leaves
 TOLERANCE = 1e-4
 LARGEST_DIFFERENCE = 8e-3
 AGREEING = 0.999
-"""Share of pixels within TOLERANCE for two renderers to agree; no pixel may differ by more than LARGEST_DIFFERENCE."""
+"""Share of pixels that must agree within TOLERANCE; no pixel may differ by more than LARGEST_DIFFERENCE."""
 
 
 class Peers:
@@ -71,7 +71,7 @@ def check_agreement(ours: Tensor, theirs: Tensor, name: str = "--against gsplat"
         name: Beginning of the message.
 
     Raises:
-        UserError: they do not, by ``AGREEING`` and ``LARGEST_DIFFERENCE``.
+        UserError: the images differ by more than ``AGREEING`` and ``LARGEST_DIFFERENCE`` allow.
     """
     difference = (ours - theirs).abs().amax(0)
     within, largest = float((difference <= TOLERANCE).double().mean()), float(difference.max())

@@ -27,7 +27,7 @@ def _status(key: str) -> float | None:
 
 
 def hand_back() -> None:
-    """Return freed memory to the system, so that resident memory is used memory (glibc keeps it otherwise)."""
+    """Return freed memory to the system (glibc would keep it), so that resident memory is memory in use."""
     gc.collect()
     memory.hand_back()
 
@@ -68,5 +68,5 @@ def peak_mib(device: str) -> float | None:
 
 
 def extra_mib(peak: float | None, before: float | None) -> float | None:
-    """Return the memory that measuring took beyond ``before``, the use before the first frame; None if unknown."""
+    """Return the memory that measuring took beyond the use ``before`` the first frame; None if unknown."""
     return None if peak is None or before is None else max(peak - before, 0.0)

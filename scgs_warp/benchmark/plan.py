@@ -1,4 +1,4 @@
-"""What a benchmark measures, and the rows that it makes."""
+"""Plan of a benchmark, and the measurement of its rows."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class BenchCase:
     load: Load
     threads: int
     before_mib: float | None = None
-    """Memory in use before the first frame, the scene loaded."""
+    """Memory in use after the scene was loaded and before the first frame."""
 
     def rows(
         self,
@@ -66,7 +66,7 @@ class BenchCase:
         renderer: str = "scgs_warp",
         staged: Callable[[int], Any] | None = None,
     ) -> list[dict[str, Any]]:
-        """Time the whole, undisturbed, then its stages, in separate calls (of ``staged`` where that differs)."""
+        """Time the whole undisturbed, then its stages in separate calls (of ``staged`` if it is given)."""
         plan, device = self.plan, self.plan.device
         plan.report(f"{name}, {self.scene.motion_name}, {self.threads} threads")
         scaling = two_thread_scaling()

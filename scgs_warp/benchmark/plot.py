@@ -113,7 +113,7 @@ def _short(value: float) -> str:
 
 
 def _title(name: str, entries: list[dict[str, Any]], report: dict[str, Any]) -> str:
-    """Name the quantities that stay the same along the sweep, and the machine."""
+    """Describe the quantities that stay the same along the sweep, and the machine."""
     row = entries[0]["rows"][0]
     parts = {
         "gaussians": f"{row['gaussians']:,} Gaussians",

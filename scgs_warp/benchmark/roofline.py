@@ -25,9 +25,10 @@ from .scenes import Load
 TURNS = 10
 CHUNKS = 64
 ROUNDS = 40_000
-"""Rounds of multiply-adds in a chunk: well under a millisecond, far above the cost of handing it to a thread."""
+"""Rounds of multiply-adds in a chunk, which takes well under a millisecond but far longer than handing it to a
+thread."""
 BLOCKS = 256
-"""MiB that are copied, beyond every cache."""
+"""MiB to copy, more than any cache holds."""
 FLOAT = 4
 GEOMETRY = 12 + 16 + 12 + 4
 """Bytes of a Gaussian's mean, quaternion, scales and opacity."""
@@ -51,9 +52,9 @@ class Limits(NamedTuple):
 
     threads: int
     gigabytes: float
-    """Bandwidth of copying per second; reading and writing both count."""
+    """Bandwidth of copying in GB/s; bytes read and bytes written both count."""
     gigaflops: float
-    """Single precision; a multiply-add counts as two."""
+    """Arithmetic in single precision in Gflop/s; a multiply-add counts as two."""
 
     def milliseconds(self, work: Work) -> float:
         """Return the least time for ``work`` if moving and computing overlap."""
@@ -77,7 +78,7 @@ def _best(function: Callable[[], None]) -> float:
 
 
 def measure_limits(threads: int, blocks: int | None = None) -> Limits:
-    """Measure bandwidth and arithmetic on ``threads`` threads; the best turn counts."""
+    """Measure bandwidth and arithmetic on ``threads`` threads; the best of several turns counts."""
     before = environment.thread_count()
     environment.configure(threads)
     values = torch.empty(CHUNKS)
@@ -97,7 +98,8 @@ def _copying(blocks: int) -> float:
 
 
 def _network(layers: list[nn.Linear], rows: int) -> Work:
-    """Count a multiply-add per weight and row; weights once, every layer's input and output once."""
+    """Count the work of a network: a multiply-add per weight and row, weights moved once, every layer's input and
+    output moved once."""
     weights = sum(layer.weight.numel() + layer.out_features for layer in layers)
     activations = sum(layer.in_features + layer.out_features for layer in layers)
     products = sum(layer.weight.numel() for layer in layers)
@@ -105,7 +107,8 @@ def _network(layers: list[nn.Linear], rows: int) -> Work:
 
 
 def frame_work(scene: Scene, load: Load, width: int, height: int) -> dict[str, Work]:
-    """Count each stage of a frame: colour and depth, harmonics of degree 3, cached neighbours and weights."""
+    """Count the work of each stage of a frame, with colour and depth, harmonics of degree 3, cached neighbours and
+    weights."""
     count = scene.gaussian_count
     work = {}
     if scene.motion.moves:
@@ -121,7 +124,7 @@ def frame_work(scene: Scene, load: Load, width: int, height: int) -> dict[str, W
 
 
 def draw_work(count: int, load: Load, width: int, height: int, channels: int) -> dict[str, Work]:
-    """Count projection, harmonics, binning and compositing of one image."""
+    """Count the work of projection, harmonics, binning and compositing of one image."""
     blended = load.contributors * load.covered
     coefficients = 48
     image = FLOAT * width * height * (channels + 1)
@@ -135,7 +138,8 @@ def draw_work(count: int, load: Load, width: int, height: int, channels: int) ->
 
 
 def backward_work(count: int, load: Load, width: int, height: int) -> Work:
-    """Count the adjoint of a three-channel image to all parameters; gradients of pairs are written and read once."""
+    """Count the work of the adjoint from a three-channel image to all parameters; gradients of pairs are written and
+    read once."""
     channels, coefficients = 3, 48
     blended = load.contributors * load.covered
     pair = 4 + 24 + FLOAT * channels + 2 * FLOAT * (2 + 3 + 1 + channels)

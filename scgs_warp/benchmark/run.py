@@ -24,7 +24,8 @@ What = Literal["frame", "raster", "step", "edit"]
 
 
 def thread_counts(threads: int | None, device: str) -> tuple[int, ...]:
-    """Return one thread and all of them, unless a number is given; on a GPU the CPU's threads hardly matter."""
+    """Return the thread counts to measure: the given one, otherwise one thread and all; on a GPU, where the CPU's
+    threads hardly matter, the present one."""
     if threads is not None or device == "cuda":
         return (environment.thread_count() if threads is None else threads,)
     return tuple(sorted({1, environment.available_threads()}))
@@ -35,7 +36,7 @@ def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
 
     Returns:
         ``date``, ``commit``, ``machine``, ``what`` and ``rows``, dictionaries with ``KEYS``; for frames also
-        ``motion``, what moving the scene costs, and ``compared``, several motion models in turns. Ready for JSON.
+        ``motion``, the cost of moving the scene, and ``compared``, several motion models in turns. Ready for JSON.
 
     Raises:
         UserError: the run cannot be read, gsplat is asked for and not usable, or the renderers disagree.

@@ -89,7 +89,8 @@ class Sweeps:
             raise UserError(f"--sweeps {name}:{point}: give at least one thread")
 
     def measure_limits(self, threads: int) -> None:
-        """Measure a CPU's limits again and keep the best: called at every point, so that no disturbance lowers them."""
+        """Measure a CPU's limits again and keep the best. This is called at every point, so that a single disturbance
+        does not lower them."""
         if self.plan.device == "cpu":
             best = self.limits.get(threads, Limits(threads, 0.0, 0.0))
             now = measure_limits(threads)
@@ -107,7 +108,8 @@ def scaling(plan: BenchPlan, points: dict[str, tuple[int, ...]]) -> dict[str, An
     """Measure all sweeps.
 
     Args:
-        plan: Quantities that a sweep does not vary; the first of its motions and the last of its threads count.
+        plan: Quantities that a sweep does not vary, of which the first motion model and the last number of threads are
+            used.
         points: Values by sweep.
 
     Returns:
@@ -179,7 +181,7 @@ def _weight(plan: BenchPlan) -> float:
 
 
 class _Clock:
-    """Estimate of the remaining time, from the time of what is done."""
+    """Estimate of the remaining time, from the time that the finished points took."""
 
     def __init__(self, weights: list[float]) -> None:
         self.weights, self.finished, self.began = weights, 0, time.perf_counter()

@@ -40,24 +40,25 @@ PARTS = (  # centre, half axes, share of the Gaussians
     ((-0.19, 0.0, -0.66), (0.15, 0.16, 0.57), 0.14),
 )
 SHELL = 0.35
-"""Thickness of the shell of Gaussians, as a share of a part's half axes; trained ones lie below the surface, too."""
+"""Thickness of the shell of Gaussians, as a share of a part's half axes; trained Gaussians also lie below the
+surface."""
 SIZE = 2.0
-"""Median standard deviation of N Gaussians times sqrt(N), so that the area they cover does not depend on N."""
+"""Median scale of N Gaussians times sqrt(N), so that the area they cover does not depend on N."""
 SIZE_SPREAD = 0.5
-"""Standard deviation of the logarithm of an axis' length."""
+"""Standard deviation of the logarithm of a scale."""
 OPACITY_POWER = 0.45
-"""Exponent of a uniform number that gives opacities between ``OPACITIES``."""
+"""Exponent of uniform random numbers, from which opacities between ``OPACITIES`` are made."""
 OPACITIES = (0.02, 0.95)
 OVERVIEW = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0311, math.degrees(0.6911), 15.0, 60.0)
 """Distance and field of view of D-NeRF's cameras."""
 HEAD_WEIGHT = 2e-3
 """Standard deviation of the last layer's weights: control points move by some hundredths of the figure's height."""
 PLANE_HEAD_WEIGHT = 5e-2
-"""The same for the small network of ``hexplane``, whose features are small."""
+"""Standard deviation of the last layer's weights in the small network of ``hexplane``, whose features are small."""
 HYPER_SPREAD = 0.02
 FRAMES = 4
 RATES = 1e-6
-"""Factor on learning rates: Adam does all its work, and the scene stays the same from step to step."""
+"""Factor on learning rates, so small that the scene hardly changes from step to step while Adam does all its work."""
 
 
 def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> GaussianParameters:
@@ -146,7 +147,7 @@ def camera_size(text: str) -> Size:
 def scene_camera(scene: Scene, size: Size, turn: float = 0.0) -> Camera:
     """Place a camera, in world units, on the rig of the training cameras, ``turn`` degrees from where a film starts.
 
-    Its horizontal field of view is theirs for any proportions of the image.
+    Its horizontal field of view is that of the training cameras, whatever the proportions of the image.
     """
     azimuth = scene.overview.azimuth + turn
     if isinstance(size, int):
@@ -162,11 +163,12 @@ class Load(NamedTuple):
     """Amount of compositing that an image takes."""
 
     pairs: int
-    """Pairs of splat and tile."""
+    """Number of pairs of splat and tile."""
     contributors: float
-    """Mean over covered pixels of the splats blended there: alpha at least 1/255, before the pixel ends."""
+    """Mean number of splats blended into a covered pixel: those with an alpha of at least 1/255, before the pixel's
+    compositing ends."""
     covered: int = 0
-    """Pixels with at least one of them."""
+    """Number of pixels into which at least one splat is blended."""
 
 
 @torch.no_grad()
@@ -186,7 +188,8 @@ def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
 
 
 def training_data(scene: Scene, size: Size, seed: int = SEED) -> Dataset:
-    """Render images of the scene from around and add noise, so that the gradient of the loss reaches everything."""
+    """Render images of the scene from several sides and add noise, so that the gradient of the loss reaches all
+    parameters."""
     frames = []
     for index in range(FRAMES):
         time = index / max(FRAMES - 1, 1)
@@ -200,15 +203,15 @@ def training_data(scene: Scene, size: Size, seed: int = SEED) -> Dataset:
 
 
 def _background(scene: Scene) -> str:
-    """Return the background for evaluation, since random backgrounds need alpha."""
+    """Return the scene's background, or black for a random one, which would need images with alpha."""
     return "black" if scene.config.data.background == "random" else scene.config.data.background
 
 
 def training_state(scene: Scene, arap: bool) -> TrainState:
     """Put the scene into the joint phase of training: full harmonics, densification statistics, rates near 0.
 
-    With ``arap`` every step carries that term (in training every fifth does), since a median over a mixture would show
-    neither kind. The scene's motion stays in training mode.
+    With ``arap`` every step has the ARAP term (in training every fifth has it), since a median over steps with and
+    without the term would show neither kind. The scene's motion stays in training mode.
     """
     own = scene.config
     base = TrainConfig(seed=own.seed, data=own.data, motion=own.motion, antialiased=own.antialiased)

@@ -25,7 +25,7 @@ def compare_frames(scenes: dict[str, Callable[[int], Any]], threads: int, second
 
     Returns:
         By model ``ms_median``, ``ms_min``, ``fps`` by the median, and ``ratios``: the speed relative to every model, as
-        the median over turns of the other's time divided by the own one.
+        the median over turns of the other model's time divided by this model's.
     """
     times = dict(zip(scenes, turns(list(scenes.values()), seconds, device)))
     rows = []
@@ -38,7 +38,7 @@ def compare_frames(scenes: dict[str, Callable[[int], Any]], threads: int, second
 
 
 def motion_costs(rows: Rows, compared: Rows) -> Rows:
-    """Sum up network and skinning for every moving model and number of threads.
+    """Add up the times of network and skinning for every moving model and number of threads.
 
     Returns:
         ``ms_median``, ``ms_min``, and ``ratio_to_static``: frames per second relative to Gaussians at rest, None unless
@@ -59,7 +59,7 @@ def motion_costs(rows: Rows, compared: Rows) -> Rows:
 def table_s2(compared: Rows) -> Rows:
     """Compute speeds relative to ``static`` and to ``per-gaussian``, here and in the paper.
 
-    The machines differ, so only the ratios compare.
+    The machines differ, so only the ratios are comparable.
     """
     return [
         {

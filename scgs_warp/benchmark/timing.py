@@ -1,4 +1,4 @@
-"""Timing for benchmarks: repeats under a time budget, stages of the code in use, and where they were measured."""
+"""Timing for benchmarks: repeats under a time budget, stages of the code in use, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MIN_REPEATS = 5
 """Least number of repeats, however slow they are."""
 MAX_REPEATS = 300
 ROUNDS = 100_000
-"""Steps of the arithmetic loop in one chunk: some 0.2 ms, far above the cost of handing it to a thread."""
+"""Steps of the arithmetic loop in one chunk, which takes about 0.2 ms, far longer than handing it to a thread."""
 CHUNKS = 32
 TURNS = 7
 
@@ -103,7 +103,7 @@ class Stages:
     """
 
     def __init__(self, device: str, targets: Mapping[str, list[tuple[Any, str]]]) -> None:
-        """``targets`` holds, by stage, the (owner, attribute) pairs whose calls belong to it."""
+        """``targets`` holds, by stage, the (owner, attribute) pairs of the functions that belong to the stage."""
         self.device, self.targets = device, targets
         self._spent: dict[str, float] = {}
         self._inside = False

@@ -1,4 +1,4 @@
-"""Diagnosis of a capture in which too few frames got a camera: the likeliest reason and its remedy."""
+"""Diagnosis of a capture in which too few frames got a camera: the likeliest cause and its remedy."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ MIN_FEATURES = 150
 MIN_INLIERS = 40
 """Smallest useful number of inlier matches between consecutive frames."""
 MIN_LINKED = 0.8
-"""Smallest useful share of consecutive frames that match at all."""
+"""Smallest useful share of the pairs of consecutive frames that have matches."""
 MAX_PLANAR = 0.97
-"""Share of frame pairs explained by one homography beyond which the camera is taken to rotate only."""
+"""Share of frame pairs explained by one homography; above it, the camera probably rotates without moving."""
 MIN_ARC = 2.0
-"""Smallest useful angle between the rays to a point, degrees; below it, depth is unreliable."""
+"""Smallest useful angle between the rays to a point, degrees; at smaller angles, depth is unreliable."""
 GOOD_SHARE = 0.9
-"""Share of registered frames above which no note is given."""
+"""Share of registered frames above which the user gets no note."""
 
 
 class Outcome(NamedTuple):
@@ -29,11 +29,11 @@ class Outcome(NamedTuple):
     """Median angle between the rays to a point, degrees; 0 without a model."""
     links: Links
     masked: float
-    """Share of the pixels that are masked."""
+    """Share of pixels that are masked."""
 
 
 def likely_reason(outcome: Outcome) -> str:
-    """Return the likeliest reason for missing cameras, and its remedy."""
+    """Return the likeliest cause of missing cameras, and its remedy."""
     links = outcome.links
     if links.features < MIN_FEATURES:
         return (
@@ -67,7 +67,7 @@ def too_few(folder: str, outcome: Outcome) -> str:
 
 
 def notes(outcome: Outcome) -> list[str]:
-    """Return notes on a capture that succeeded."""
+    """Return notes on a successful capture."""
     lines = []
     if outcome.registered < GOOD_SHARE * outcome.picked:
         lines.append(f"note: {outcome.picked - outcome.registered} frames have no camera; {likely_reason(outcome)}")

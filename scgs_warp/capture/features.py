@@ -1,8 +1,8 @@
 """Features of the picked frames and their matches, in COLMAP's database. Interrupted work is resumed.
 
-pycolmap extracts the features (SIFT) and estimates two-view geometry. Descriptors are matched here, exhaustively: they
-are bytes, whose products are exact in float32, so that matches depend neither on the device nor on the number of
-threads, unlike those of COLMAP's own CPU matcher, which uses search trees.
+pycolmap extracts the features (SIFT) and estimates two-view geometry. Descriptors are matched here, exhaustively. They
+are bytes, whose products are exact in float32, so matches depend neither on the device nor on the number of threads.
+COLMAP's own CPU matcher uses search trees and lacks this property.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ Tensor = torch.Tensor
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Matching = Literal["auto", "sequential", "exhaustive"]
 MAX_ANGLE_RATIO = 0.8
-"""Largest ratio of the angles to the best and the second-best descriptor (Lowe 2004)."""
+"""Largest ratio of the angle to the best descriptor to the angle to the second-best one (Lowe 2004)."""
 MAX_ANGLE = 0.7
 """Largest angle between matching descriptors, radians."""
 DESCRIPTOR_LENGTH = 512.0
 """Euclidean length of a descriptor of bytes."""
 EXHAUSTIVE_VIDEO = 40
-"""Largest number of video frames that are all compared with each other."""
+"""Largest number of video frames up to which every pair of frames is compared."""
 EXHAUSTIVE_FOLDER = 120
-"""The same for images of a folder, which need not be in order."""
+"""Largest number of images of a folder up to which every pair is compared; the images need not be in order."""
 NEXT_FRAMES = 8
-"""Number of following frames that a frame is compared with, besides those 16, 32, 64 ... later."""
+"""Number of following frames with which a frame is compared, in addition to the frames 16, 32, 64 ... later."""
 LOOP_STRIDE = 10
-"""Stride of the frames that are all compared with each other, because the camera may return."""
+"""Stride of the frames among which every pair is compared, because the camera may return to a place."""
 INITIAL_FOCAL = 1.2
-"""Initial focal length over the longer side if the field of view is unknown: 45 degrees."""
+"""Ratio of the initial focal length to the longer side if the field of view is unknown: 45 degrees."""
 
 
 class FrameFiles(NamedTuple):
@@ -48,14 +48,14 @@ class FrameFiles(NamedTuple):
     folder: Path
     """Folder of the frames."""
     names: list[str]
-    """Names in the folder, in order of time; all frames have one size and one camera."""
+    """Names in the folder, in order of time; all frames have the same size and the same camera."""
     masks: Path | None
     """Folder of masks with the same names, black on moving pixels; None without masks."""
 
 
 @contextmanager
 def quiet() -> Iterator[Any]:
-    """Provide pycolmap with its log silenced.
+    """Provide pycolmap, with its log silenced for the duration of the context.
 
     Raises:
         UserError: pycolmap is too old.
@@ -93,7 +93,7 @@ def begin(database: Path, frame_files: FrameFiles, model: CameraModel, focal: fl
 
 
 def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[], object]) -> None:
-    """Extract features of every frame that has none yet, outside of its mask.
+    """Extract features of every frame that has none yet, except on masked pixels.
 
     Args:
         most: largest number of features per frame.
@@ -118,14 +118,14 @@ def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[
 
 
 def _masked(file: Path, pixels: np.ndarray) -> np.ndarray:
-    """Return [N] bool: which of the pixels [N, 2] are masked."""
+    """Return [N] bool, True for pixels [N, 2] that are masked."""
     mask = read_rgb(file)[..., 0] < 128
     columns, rows = np.floor(pixels).astype(int).T
     return mask[rows.clip(0, mask.shape[0] - 1), columns.clip(0, mask.shape[1] - 1)]
 
 
 def pairs(count: int, matching: Matching, video: bool) -> list[tuple[int, int]]:
-    """Return the pairs of ``count`` frames to compare, in ascending order."""
+    """Return the pairs of frames to compare among ``count`` frames, in ascending order."""
     if matching == "auto":
         matching = "exhaustive" if count <= (EXHAUSTIVE_VIDEO if video else EXHAUSTIVE_FOLDER) else "sequential"
     if matching == "exhaustive":
@@ -146,7 +146,7 @@ def match(
     device: str,
     done: Callable[..., object],
 ) -> None:
-    """Match every pair of frames that has no matches yet, and estimate its two-view geometry.
+    """Match every pair of frames that has no matches yet, and estimate the pair's two-view geometry.
 
     Args:
         chosen: pairs of frame numbers, ascending.
@@ -196,7 +196,7 @@ def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
 
 
 def _distinct(cosines: Tensor) -> tuple[Tensor, Tensor]:
-    """Return for each row whether its best column passes the angle and ratio tests, and which column it is."""
+    """Return, for each row, whether its best column passes the angle and ratio tests, and the index of that column."""
     best, where = cosines.topk(2, dim=1)
     angles = best.clamp(-1.0, 1.0).acos()
     return (angles[:, 0] <= MAX_ANGLE) & (angles[:, 0] <= MAX_ANGLE_RATIO * angles[:, 1]), where[:, 0]
@@ -210,7 +210,7 @@ class Links(NamedTuple):
     inliers: int
     """Median number of inlier matches between consecutive frames."""
     linked: float
-    """Share of consecutive frames with inlier matches."""
+    """Share of pairs of consecutive frames with inlier matches."""
     planar: float
     """Share of matched pairs explained by one homography: the camera only rotated, or saw a plane."""
 

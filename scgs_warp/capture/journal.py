@@ -1,4 +1,4 @@
-"""Journal of the finished stages of a capture: interrupted work is resumed, finished work and other files are kept."""
+"""Journal of the finished stages of a capture. Interrupted work is resumed; finished work and other files are kept."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from ..storage.json_files import parse_json
 from .writing import FILE, write_text
 
 WORK = "work"
-"""Folder of intermediate files; it may be deleted when the data set is finished."""
+"""Folder of intermediate files; it may be deleted when the data set is complete."""
 JOURNAL = "journal.json"
 
 
 class Journal:
-    """A chain of stages. A result is reused if the settings of its stage and of all earlier stages are unchanged."""
+    """Chain of stages. A stage's result is reused if the settings of the stage and of all earlier stages are
+    unchanged."""
 
     def __init__(self, folder: Path, source: str) -> None:
         """
@@ -58,10 +59,10 @@ class Journal:
             ) from None
 
     def stage(self, name: str, settings: Any, make: Callable[[], Any], clear: Callable[[], None]) -> Any:
-        """Return the result of a stage, stored or newly made.
+        """Return the result of a stage: the stored result, or a new one.
 
         Args:
-            settings: JSON; everything that the result depends on besides earlier stages and the source.
+            settings: JSON; everything on which the result depends, besides earlier stages and the source.
             make: runs or resumes the stage; returns JSON.
             clear: removes the files of an attempt with other settings.
 
@@ -87,11 +88,11 @@ class Journal:
         return result
 
     def result(self, name: str) -> Any:
-        """Return the result of a finished stage."""
+        """Return the stored result of a finished stage."""
         return self._stages[name]["result"]
 
     def damaged(self, name: str) -> UserError:
-        """Make the error to raise for a stored result that is malformed."""
+        """Make the error to raise if a stored result is malformed."""
         return UserError(f"{self.file}: the result of {name} is damaged; remove {self.folder}, and capture again")
 
     def _save(self) -> None:

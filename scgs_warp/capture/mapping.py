@@ -1,4 +1,4 @@
-"""Camera poses: COLMAP's incremental mapping of matched frames, of which the largest model is kept."""
+"""Camera poses from COLMAP's incremental mapping of matched frames; only the largest model is kept."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from .features import FrameFiles, quiet
 
 MIN_VIEWS = 3
-"""Smallest number of frames in which a point is seen."""
+"""Smallest number of frames in which a point must be seen."""
 MAX_ERROR = 2.0
 """Largest mean reprojection error of a point, pixels."""
 
@@ -42,13 +42,13 @@ class CameraSolution(NamedTuple):
 def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done: Callable[[], object]) -> int:
     """Run the mapper and write its largest model to ``folder``.
 
-    It runs on one thread because sums over threads would differ from run to run.
+    The mapper runs on one thread, because sums over threads would differ from run to run.
 
     Args:
         done: called after each registered frame.
 
     Returns:
-        Number of registered frames of that model; 0 without a model.
+        Number of frames registered in the largest model; 0 without a model.
     """
     attempts = folder.with_name(f"{folder.name}-attempts")
     shutil.rmtree(attempts, ignore_errors=True)
@@ -72,11 +72,11 @@ def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done
 
 
 def _ignore(_: object) -> None:
-    """Discard a result: the mapper's callback must return None."""
+    """Discard a result. The mapper requires a callback that returns None."""
 
 
 def read_solution(folder: Path, frame_files: FrameFiles) -> CameraSolution | None:
-    """Read the model that :func:`solve` wrote; return None without one."""
+    """Read the model written by :func:`solve`; return None without a model."""
     if not (folder / "images.bin").is_file():
         return None
     with quiet() as pycolmap:
@@ -105,7 +105,8 @@ def read_solution(folder: Path, frame_files: FrameFiles) -> CameraSolution | Non
 
 
 def _arc(model, points: list) -> float:
-    """Return the median angle, in degrees, between the rays to a point from the first and last camera that see it."""
+    """Return the median over points of the angle, in degrees, between the rays from the first and the last camera that
+    see the point."""
     centres = {key: image.projection_center() for key, image in model.images.items() if image.has_pose}
     angles = []
     for point in points[:: max(1, len(points) // 2000)]:

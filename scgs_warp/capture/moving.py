@@ -1,8 +1,8 @@
 """Masks of independently moving pixels, from the user or from optical flow that disagrees with the static scene.
 
 Between two frames, the image of a static point moves along its epipolar line. The fundamental matrix that fits most of
-the optical flow is that of the camera's motion; pixels whose flow leaves the epipolar lines move independently. Motion
-along the lines, such as that of a car straight ahead, is not found; robust matching copes with it.
+the optical flow describes the camera's motion; pixels whose flow leaves the epipolar lines move independently. Motion
+along the lines, such as that of a car straight ahead, is not detected; robust matching tolerates it.
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ STEPS = (-2, -1, 1, 2)
 GRID = 12
 """Spacing, in pixels, of the flow vectors from which the camera's motion is estimated."""
 MIN_VECTORS = 60
-"""Smallest number of flow vectors for that estimate."""
+"""Smallest number of flow vectors from which the camera's motion is estimated."""
 MIN_LINE_DISTANCE = 1.5
-"""Smallest distance from the epipolar line of a moving pixel, in pixels at ``FLOW_SIDE``."""
+"""Distance from its epipolar line, in pixels at ``FLOW_SIDE``, above which a pixel may be moving."""
 TYPICAL_FACTOR = 6.0
-"""Factor of the median distance that a moving pixel also exceeds."""
+"""Ratio to the median distance from epipolar lines, which a moving pixel's distance must also exceed."""
 MAX_ROUND_TRIP = 1.5
-"""Largest distance between a pixel and its image after flow forth and back, pixels; occluded pixels exceed it."""
+"""Largest distance between a pixel and its position after flow forth and back, in pixels; occluded pixels exceed it."""
 MIN_CONTRAST = 4.0
-"""Smallest local contrast at which flow is trusted, grey levels."""
+"""Smallest local contrast, in grey levels, at which flow is trusted."""
 MIN_AGREEMENT = 0.5
-"""Smallest share of the comparisons in which a moving pixel is found to move."""
+"""Smallest share of the comparisons that must find a pixel moving."""
 MAX_MASK_SHARE = 0.5
-"""Largest share of the frame that a mask covers; a larger mask is discarded as a failure."""
+"""Largest share of the frame that a mask may cover; a larger mask is discarded as a failure."""
 DILATION = 0.015
-"""Dilation of masks as a share of ``FLOW_SIDE``, because flow is blurred at outlines."""
+"""Width by which masks are dilated, as a share of ``FLOW_SIDE``, because flow is blurred at outlines."""
 MIN_AREA = 0.001
-"""Smallest connected area of a mask, as a share of the frame; smaller ones are errors of the flow."""
+"""Smallest connected area of a mask, as a share of the frame; smaller areas are errors of the flow."""
 
 
 def find_moving(load: Callable[[int], np.ndarray], count: int, done: Callable[[], object]) -> list[np.ndarray]:
     """Find the moving pixels of ``count`` frames.
 
     Args:
-        load: frame number -> [H, W, 3] uint8 RGB.
+        load: function from the frame number to [H, W, 3] uint8 RGB.
         done: called after each frame.
 
     Returns:
-        [H, W] bool of each frame at its size, True on moving pixels.
+        [H, W] bool for each frame, at the frame's size, True on moving pixels.
     """
     kept: dict[int, np.ndarray] = {}
     flows: dict[tuple[int, int], np.ndarray] = {}
@@ -98,8 +98,8 @@ def leaves_epipolar_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -
         forth, back: [H, W, 2] flow from the image to the other one, and back.
 
     Returns:
-        [H, W] bool, which pixels leave their lines, and [H, W] bool, at which pixels the flow is reliable; None if no
-        camera motion is found.
+        [H, W] bool, True for pixels that leave their epipolar lines, and [H, W] bool, True for pixels with reliable
+        flow; None if the camera's motion cannot be estimated.
     """
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -128,7 +128,7 @@ def _textured(gray: np.ndarray) -> np.ndarray:
 
 
 def sampson(matrix: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Return the Sampson distance [...] in pixels of point pairs [..., 2] from a fundamental matrix."""
+    """Return the Sampson distance [...], in pixels, of point pairs [..., 2] under a fundamental matrix."""
     ones = np.ones((*here.shape[:-1], 1))
     a, b = np.concatenate([here, ones], -1), np.concatenate([there, ones], -1)
     lines, back = a @ matrix.T, b @ matrix
@@ -137,7 +137,8 @@ def sampson(matrix: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarr
 
 
 def _tidy(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Remove specks and holes, dilate, and resize to ``size`` (width, height); clear a mask that is too large."""
+    """Remove specks and holes, dilate, and resize to ``size`` (width, height); return an empty mask if it covers too
+    much."""
     reach = max(1, round(DILATION * max(mask.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     pixels = cv2.medianBlur(mask.astype(np.uint8), 5)

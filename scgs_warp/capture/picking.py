@@ -1,4 +1,4 @@
-"""Selection of frames from a film: sharp ones, spread over its time and its motion, without repetitions."""
+"""Selection of frames from a film: sharp frames, spread over the film's time and motion, without repetitions."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ SHARPNESS_SIDE = 640
 FLOW_SIDE = 320
 """Longer side of the images for measuring motion, pixels."""
 FASTEST_SHARE = 0.05
-"""Share of the pixels, the fastest ones, whose motion counts, so that a small moving object is noticed."""
+"""Share of the pixels, those with the fastest motion, over which motion is averaged, so that a small moving object is
+noticed."""
 NOISE_PIXELS = 0.15
-"""Motion between two frames that is attributed to noise, pixels at ``FLOW_SIDE``."""
+"""Largest motion between two frames that is attributed to noise, in pixels at ``FLOW_SIDE``."""
 MIN_MOTION = 1.0
-"""Smallest motion since the previously picked frame, pixels at ``FLOW_SIDE``; below it a frame is a repetition."""
+"""Motion since the previously picked frame below which a frame counts as a repetition, in pixels at ``FLOW_SIDE``."""
 MIN_SHARPNESS = 0.5
-"""Smallest sharpness relative to neighbouring frames; below it a frame is blurred."""
+"""Sharpness relative to neighbouring frames below which a frame counts as blurred."""
 NEIGHBOURS = 12
-"""Number of frames on each side whose sharpness is compared; they show similar content."""
+"""Number of frames on each side with which a frame's sharpness is compared; they show similar content."""
 NEIGHBOURS_QUANTILE = 0.75
-"""Quantile of the neighbours' sharpness that serves as reference, high enough to detect a burst of blurred frames."""
+"""Quantile of the neighbours' sharpness that serves as reference, high enough to detect a series of blurred frames."""
 
 
 class FrameMeasures(NamedTuple):
-    """Measurements of F frames."""
+    """Measurements of the F frames of a film."""
 
     index: np.ndarray
     """[F] index in the source"""
@@ -38,18 +39,18 @@ class FrameMeasures(NamedTuple):
     sharpness: np.ndarray
     """[F] energy of fine detail, in squared grey levels"""
     motion: np.ndarray
-    """[F] since the previous frame, pixels at ``FLOW_SIDE``; 0 for the first"""
+    """[F] motion since the previous frame, pixels at ``FLOW_SIDE``; 0 for the first frame."""
 
 
 class Selection(NamedTuple):
-    """The picked frames, and numbers of the omitted ones."""
+    """The picked frames, and counts of the omitted frames."""
 
     places: list[int]
     """Rows of the picked frames in ``FrameMeasures``, ascending."""
     blurred: int
-    """Number of blurred frames."""
+    """Number of frames omitted because they are blurred."""
     alike: int
-    """Number of frames that repeat the previously picked one."""
+    """Number of frames omitted because they repeat the previously picked one."""
 
 
 def measure(stills: Iterable[SourceFrame], done: Callable[[], object] = lambda: None) -> FrameMeasures:
@@ -78,14 +79,15 @@ def sharpness(gray: np.ndarray) -> float:
 
 
 def fastest(flow: np.ndarray) -> float:
-    """Return the mean length of the longest vectors of a flow [H, W, 2], ``FASTEST_SHARE`` of all."""
+    """Return the mean length of the longest vectors of a flow [H, W, 2]; ``FASTEST_SHARE`` of all vectors are
+    averaged."""
     lengths = np.hypot(flow[..., 0], flow[..., 1]).ravel()
     count = max(1, round(FASTEST_SHARE * len(lengths)))
     return float(np.partition(lengths, len(lengths) - count)[-count:].mean())
 
 
 def relative_sharpness(sharp: np.ndarray) -> np.ndarray:
-    """Divide sharpness [F] by that of the neighbours; 1 where the neighbours' is 0."""
+    """Divide sharpness [F] by the reference sharpness of the neighbours; 1 where that is 0."""
     padded = np.pad(sharp, NEIGHBOURS, "constant", constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
     usual = np.nanquantile(around, NEIGHBOURS_QUANTILE, axis=1)
@@ -95,9 +97,9 @@ def relative_sharpness(sharp: np.ndarray) -> np.ndarray:
 def pick(found: FrameMeasures, count: int) -> Selection:
     """Choose at most ``count`` frames.
 
-    The film is cut into ``count`` stretches of equal mean share of its time and its motion. The sharpest frame of each
-    stretch is picked unless it is blurred or repeats the previously picked one. With as many stretches as frames, only
-    blurred and repeated frames are left out.
+    The film is cut into ``count`` equal segments, measured by the mean of the share of the film's time and the share of
+    its motion. The sharpest frame of each segment is picked, unless it is blurred or repeats the previously picked one.
+    If there are as many segments as frames, only blurred and repeated frames are omitted.
     """
     frames = len(found.index)
     relative = relative_sharpness(found.sharpness)

@@ -14,10 +14,10 @@ from ..visualization.video import write_png
 from .writing import CapturedScene
 
 MAX_PICTURES = 48
-"""Largest number of pictures on the sheet."""
+"""Largest number of frames on the sheet."""
 COLUMNS = 8
 CELL = 200
-"""Width of a picture on the sheet, pixels."""
+"""Width of a frame on the sheet, pixels."""
 CAPTION = 18
 GAP = 4
 MOVING = (255, 60, 40)
@@ -34,11 +34,11 @@ def sheet(
     registered: set[int],
     video: bool,
 ) -> None:
-    """Write the contact sheet: frames in order of time, masked pixels tinted, frames without a camera struck out.
+    """Write the contact sheet: frames in order of time, masked pixels tinted, and frames without a camera struck out.
 
     Args:
-        load: number of a picked frame -> image [H, W, 3] uint8, mask [H, W] bool or None.
-        seconds: time of each picked frame; of a folder, its index.
+        load: function from the number of a picked frame to its image [H, W, 3] uint8 and mask [H, W] bool or None.
+        seconds: time of each picked frame; for a folder of images, its index.
         registered: numbers of the frames with a camera.
     """
     count = len(seconds)
@@ -105,8 +105,8 @@ def cameras(path: Path, scene: CapturedScene) -> None:
 
 
 def _frusta(scene: CapturedScene) -> np.ndarray:
-    """Return polylines [V, 5, 4, 3] of each camera: four sides that start and end at the centre, and the corners of the
-    image plane."""
+    """Return polylines [V, 5, 4, 3] of the cameras: each of the four sides starts and ends at the camera's centre, and
+    the fifth joins the corners of the image plane."""
     p = scene.pinhole
     reach = 0.25
     corners = np.array([[0, 0], [p.width, 0], [p.width, p.height], [0, p.height]], np.float64)
@@ -122,7 +122,7 @@ def _frusta(scene: CapturedScene) -> np.ndarray:
 
 
 def _window(points: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the plotted range: all cameras, and the points without outliers."""
+    """Return the corners of the plotted range, which covers all cameras, and the points without outliers."""
     if len(points):
         near, far = np.quantile(points, [0.02, 0.98], axis=0)
         points = points[((points >= near) & (points <= far)).all(1)]

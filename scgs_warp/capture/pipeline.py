@@ -26,7 +26,7 @@ from .source import Source, SourceFrame, open_source, read_rgb
 MAX_SECONDS = 1e9
 """Largest plausible time in a film, seconds."""
 MIN_FRAMES = 6
-"""Smallest number of frames of a capture."""
+"""Smallest number of frames for a capture."""
 SHEET, CAMERAS = "contact_sheet.png", "cameras.png"
 VIDEO_FRAMES = 150
 
@@ -40,14 +40,14 @@ class CaptureRequest:
     source: Path
     """A video, or a folder of images."""
     frames: int | None = None
-    """Largest number of frames; None: ``VIDEO_FRAMES`` of a video, all images of a folder."""
+    """Largest number of frames; None: ``VIDEO_FRAMES`` for a video, all images for a folder."""
     start: float | None = None
     end: float | None = None
-    """Range of the video to use, seconds."""
+    """End of the part of the video to use, seconds; ``start`` is its beginning."""
     size: int = 1280
-    """Largest longer side of the images, pixels."""
+    """Largest size of the longer side of the images, pixels."""
     masks: str = "auto"
-    """``auto``: masks of independently moving pixels; ``none``; else a path of masks."""
+    """``auto``: masks of independently moving pixels; ``none``: no masks; anything else: a path of masks."""
     matching: Matching = "auto"
     camera_model: CameraModel = "SIMPLE_RADIAL"
     fov: float | None = None
@@ -68,11 +68,11 @@ class PickedFrames(NamedTuple):
     names: list[str]
     """File names of the images of a folder; empty strings for a video."""
     span: tuple[float, float]
-    """Seconds of the video that become times 0 and 1."""
+    """Times of the video, in seconds, that become times 0 and 1."""
     size: tuple[int, int]
     """(width, height)"""
     seen: int
-    """Number of frames of the source."""
+    """Number of frames in the source."""
     blurred: int
     alike: int
 
@@ -88,7 +88,7 @@ class CaptureResult(NamedTuple):
     lines: list[str]
     """Description of the result, for the user."""
     made_before: bool
-    """True if the folder was complete before."""
+    """True if the folder was already complete."""
 
 
 def check(request: CaptureRequest) -> None:
@@ -121,7 +121,7 @@ def capture(
 
     Args:
         device: device of the comparison of descriptors.
-        show: ``show(total, text)`` is a context that shows progress; its value has ``advance()``.
+        show: ``show(total, text)`` is a context manager that shows progress; its value has ``advance()``.
 
     Raises:
         UserError: the source, the masks or an option is invalid, or too few frames got a camera.
@@ -204,7 +204,7 @@ def _until(stills: Iterator[SourceFrame], last: int) -> Iterator[SourceFrame]:
 
 
 def _choose(request: CaptureRequest, source: Source, show: ShowProgress) -> PickedFrames:
-    """Choose the frames; of a folder, all of them unless a number is given."""
+    """Choose the frames to use; for a folder, all of them unless a number is given."""
     start, end = request.start or 0.0, math.inf if request.end is None else request.end
     with show(source.count, "looking at frames") as bar:
         within = (
@@ -234,7 +234,7 @@ def _shown(source: Source, bar: Any) -> Iterator[SourceFrame]:
 def _masks(
     request: CaptureRequest, source: Source, frames: PickedFrames, journal: Journal, show: ShowProgress
 ) -> FrameFiles:
-    """Write the masks, if any are requested."""
+    """Write the masks, if requested."""
     folder, place = journal.work / "frames", journal.work / "masks"
     files = frames.files
     if request.masks == "none":
@@ -298,7 +298,7 @@ def _solve(
 
 
 def _share(journal: Journal) -> float:
-    """Return the share of masked pixels from the journal."""
+    """Return the share of masked pixels, read from the journal."""
     found = journal.result("masks")
     share = as_number(found.get("share")) if isinstance(found, dict) else None
     if share is None:

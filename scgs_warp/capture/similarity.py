@@ -1,4 +1,4 @@
-"""Similarity transforms x -> scale R x + t, up to which structure from motion determines a scene."""
+"""Similarity transforms x -> scale R x + t. Structure from motion determines a scene only up to such a transform."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from ..geometry.cameras import agreed_up
 
 MEDIAN_DISTANCE = 4.0
-"""Median distance of the cameras from the scene's centre in the written scene, similar to D-NeRF's."""
+"""Median distance of the cameras from the centre of the written scene, similar to D-NeRF's."""
 
 
 class Similarity(NamedTuple):
@@ -24,7 +24,8 @@ class Similarity(NamedTuple):
         return self.scale * points @ self.rotation.T + self.translation
 
     def viewmats(self, viewmats: np.ndarray) -> np.ndarray:
-        """Transform world-to-camera [V, 4, 4] to the new world; the cameras stay rigid and see the scaled scene."""
+        """Transform world-to-camera matrices [V, 4, 4] to the new world; the cameras stay rigid and see the scaled
+        scene."""
         moved = viewmats.copy()
         moved[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.T
         moved[:, :3, 3] = self.scale * viewmats[:, :3, 3] - moved[:, :3, :3] @ self.translation
@@ -53,7 +54,8 @@ def align(points: np.ndarray, targets: np.ndarray) -> Similarity:
 
 def upright(viewmats: np.ndarray, points: np.ndarray) -> Similarity:
     """Return the similarity that moves the points' median to the origin, turns the cameras' common up direction to +z
-    and their mean viewing direction to +y, and scales their median distance to ``MEDIAN_DISTANCE``."""
+    and their mean viewing direction to +y, and scales the cameras' median distance from the origin to
+    ``MEDIAN_DISTANCE``."""
     up, ahead = agreed_up(viewmats[:, :3, :3]), viewmats[:, 2, :3].mean(0)
     ahead = ahead - up * (up @ ahead)
     if np.linalg.norm(ahead) < 1e-6:  # Cameras all around have no mean direction: any horizontal one will do.

@@ -16,16 +16,17 @@ from ..errors import UserError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20
-"""Bytes at the beginning and the end of a file that enter its digest; videos are too large to hash whole."""
+"""Number of bytes at the beginning and at the end of a file that enter its digest; videos are too large to hash
+completely."""
 
 
 class SourceFrame(NamedTuple):
     """One frame of a source."""
 
     index: int
-    """Index in the video, or in the order of names; from 0."""
+    """Index in the video or in the order of names, from 0."""
     seconds: float
-    """Time since the first frame; of a folder, the index."""
+    """Time since the first frame, seconds; for a folder, the index."""
     image: np.ndarray
     """[H, W, 3] uint8 RGB"""
     name: str
@@ -37,12 +38,12 @@ class Source(Protocol):
 
     path: Path
     video: bool
-    """True for a video; images of a folder need not be consecutive."""
+    """True for a video, whose frames are consecutive; images of a folder need not be."""
     count: int
     """Number of frames according to the file's header, which may be wrong."""
 
     def frames(self, longest: int) -> Iterator[SourceFrame]:
-        """Yield all frames in order, reduced to a longer side of at most ``longest`` pixels.
+        """Yield all frames in order; larger frames are reduced so that the longer side has ``longest`` pixels.
 
         Raises:
             UserError: a frame cannot be decoded.
@@ -50,7 +51,7 @@ class Source(Protocol):
         ...
 
     def digest(self) -> str:
-        """Return a hash that identifies this source."""
+        """Return a hash that identifies the source."""
         ...
 
 
@@ -127,7 +128,8 @@ class Video:
 
 
 def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
-    """Return a decoded frame as displayed: upright, with pixels ``shape`` times as wide as high made square."""
+    """Return a decoded frame as displayed: upright, and with square pixels made from pixels ``shape`` times as wide as
+    high."""
     width, height = frame.width * shape, frame.height
     scale = min(1.0, longest / max(width, height))
     image = frame.to_ndarray(format="rgb24")
@@ -143,7 +145,7 @@ def rotate_image(image: np.ndarray, degrees: float) -> np.ndarray:
 
 
 class Folder:
-    """Images in the natural order of their names."""
+    """A folder of images, in the natural order of their names."""
 
     video = False
 
@@ -193,7 +195,7 @@ def read_rgb(file: Path) -> np.ndarray:
 
 
 def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
-    """Reduce the image to a longer side of at most ``longest``."""
+    """Reduce the image, if necessary, so that its longer side has at most ``longest`` pixels."""
     scale = longest / max(image.shape[:2])
     if scale >= 1:
         return image
@@ -202,7 +204,7 @@ def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
 
 
 def _digest(files: list[Path]) -> str:
-    """Hash the sizes and both ends of the files, independently of names and dates."""
+    """Hash the sizes and both ends of the files; their names and dates do not matter."""
     found = hashlib.sha256()
     for file in files:
         size = file.stat().st_size

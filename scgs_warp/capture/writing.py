@@ -43,7 +43,7 @@ class CapturedScene(NamedTuple):
     times: list[float]
     """[0, 1]"""
     seconds: list[float]
-    """Times in the video."""
+    """Times in the video, in seconds."""
     names: list[str]
     """File names in ``images``."""
     points: np.ndarray
@@ -53,8 +53,8 @@ class CapturedScene(NamedTuple):
 
 
 def pinhole_of(solved: CameraSolution) -> tuple[Pinhole, np.ndarray, np.ndarray]:
-    """Return the largest pinhole image without empty pixels inside the distorted one, and the distorted coordinates of
-    its pixels, x [H, W] and y [H, W] float32 in OpenCV's convention."""
+    """Find the largest pinhole image without empty pixels inside the distorted one. Return its intrinsics, and the
+    distorted coordinates of its pixels, x [H, W] and y [H, W] float32 in OpenCV's convention."""
     with quiet() as pycolmap:
         camera = pycolmap.Camera(model=solved.model, width=solved.width, height=solved.height)
         camera.params = list(solved.params)
@@ -67,7 +67,7 @@ def pinhole_of(solved: CameraSolution) -> tuple[Pinhole, np.ndarray, np.ndarray]
 
 
 def undistort(frame_files: FrameFiles, solved: CameraSolution, folder: Path, done: Callable[[], object]) -> Pinhole:
-    """Write ``images/``, and ``masks/`` if there are masks, of the registered frames.
+    """Write ``images/`` of the registered frames, and ``masks/`` if there are masks.
 
     Args:
         done: called after each frame.
@@ -95,7 +95,7 @@ def scene_of(
     seconds: Sequence[float],
     span: tuple[float, float],
 ) -> CapturedScene:
-    """Turn cameras and points upright and scale times to [0, 1] over ``span`` (seconds of the video)."""
+    """Turn cameras and points upright, and map times from ``span`` (seconds of the video) to [0, 1]."""
     moved = upright(solved.viewmats, solved.points)
     length = max(span[1] - span[0], 1e-9)
     chosen = [seconds[place] for place in solved.places]

@@ -1,5 +1,5 @@
-"""The settings of a training run: frozen dataclasses, one per component that uses them, with bounds and help for each
-field.
+"""The settings of a training run: frozen, nested dataclasses, one per component that uses them, with bounds and help
+for each field.
 
 Step counts that scale with the length of a run are declared with :func:`milestone`; ``presets.with_steps`` scales them
 all. ``config/presets.py`` makes, reads and writes presets; ``config/validation.py`` checks the bounds.
@@ -212,7 +212,7 @@ class DensifyConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses: L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10; seed S4)."""
+    """Settings of the losses: L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10; seed S4)."""
 
     ssim: float = bounded(0.2, 0)
     arap: float = bounded(1e-2, 0)
@@ -247,8 +247,8 @@ class TrainConfig:
     coarse: int = milestone(6_000, 0)
     """Number of main steps at the beginning in which models without stage 1 learn a static scene."""
     init_points: int = bounded(20_000, 1, 10_000_000)
-    """Number of initial Gaussians, which also limits the data's points. For images without alpha, points behind the
-    data's points are added up to this number."""
+    """Number of initial Gaussians. If the data has more points, only this many are used; if it has fewer and the images
+    have no alpha, points behind the data's points are added up to this number."""
     init_from: Literal["points", "spheres"] = "spheres"
     """Placement of the initial Gaussians. points: at the data's points or, without any, at random where the images'
     alpha shows an object. spheres: around the control points that stage 1 found."""

@@ -15,7 +15,7 @@ from .readers import colmap, dnerf, nerfies, nerfstudio, panoptic, poses_bounds
 __all__ = ["Dataset", "ImageCache", "load"]
 
 READERS = (dnerf, nerfstudio, nerfies, panoptic, poses_bounds, colmap)
-"""Readers, tried in this order: ``recognises(folder)``, then ``read(folder, split, options)``."""
+"""Readers in the order in which they are tried: ``recognises(folder)``, then ``read(folder, split, options)``."""
 
 
 def load(
@@ -32,15 +32,15 @@ def load(
     """Read one split of a data set. ``docs/data.md`` describes the layouts.
 
     Args:
-        folder: its files tell the layout.
+        folder: folder of the data set; its files determine the layout.
         split: ``train``, ``test`` or ``val``.
-        downscale: factor by which width and height are divided; the intrinsics follow.
+        downscale: factor by which width and height are divided; the intrinsics are adapted.
         resample: ``area`` (float, premultiplied by alpha) or ``bicubic`` (8 bits, Pillow: as the official SC-GS).
-        background: ``black`` or ``white``: RGBA images are composited on it once. ``random``: they stay
-            premultiplied, on black, for the trainer to composite.
+        background: ``black`` or ``white``: RGBA images are composited once, on this colour. ``random``: images stay
+            premultiplied, on black, and the trainer composites them.
         progress: called with (done, total) after each image.
-        cache_mib: size of the cache of decoded images; images beyond it are decoded again at each access.
-        cache: a cache shared with other splits, in place of one of ``cache_mib``.
+        cache_mib: size of the cache of decoded images; images that do not fit are decoded again at each access.
+        cache: a cache shared with other splits, used instead of a new one of ``cache_mib``.
 
     Returns:
         Frames in the file's order, images float32 in [0, 1].

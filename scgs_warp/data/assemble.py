@@ -1,6 +1,6 @@
 """Assembly of a data set from the frames that a reader found.
 
-Every file is decoded once and cached if there is room, so that a damaged file is reported before training begins.
+Every file is decoded once, so that a damaged file is reported before training begins, and cached if there is room.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from .lens import Lens
 from .points import finite_points
 
 BORDER_FRAMES = 24
-"""Largest number of frames that the border detection decodes; all of them are in memory at once."""
+"""Largest number of frames decoded for the detection of borders; all of them are in memory at once."""
 
 MAX_CAMERA_VALUE = 1e30
-"""Largest entry of a pose or of intrinsics: float32 holds it and the products formed from it."""
+"""Largest magnitude of an entry of a pose or of intrinsics: float32 holds the entry and the products formed from it."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class FrameRecord:
     """[4, 4] float64 world-to-camera, OpenCV."""
     time: float
     lens: Callable[[tuple[int, int]], Lens]
-    """(width, height) of the file -> lens; raises UserError if the size does not fit."""
+    """Function from the (width, height) of the file to the lens; raises UserError if the size does not fit."""
     name: str
     mask: Path | None = None
-    """Image that is black where the frame is not valid."""
+    """Path of the frame's own mask, an image that is black where the frame is not valid; None without a mask."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class _Facts:
     transparent: bool
     distorted: bool
     valid: bool
-    """True if the frame's own mask leaves a pixel."""
+    """True if the frame's own mask leaves at least one valid pixel."""
     valid_within_border: bool
 
 
@@ -69,8 +69,8 @@ def assemble(
 ) -> Dataset:
     """Decode every frame once and return the data set.
 
-    Many tools write RGBA files even for images without transparency. Alpha therefore counts only if some pixel of
-    some file is less than opaque; otherwise it is dropped, and frames get border masks and background points.
+    Many tools write RGBA files even for images without transparency. Alpha is therefore used only if at least one pixel
+    of one file is less than opaque; otherwise it is dropped, and the frames get border masks and background points.
 
     Args:
         one_size: whether to refuse files of different sizes.
@@ -165,7 +165,8 @@ def _reduced_border(border: np.ndarray | None, fact: _Facts) -> Tensor | None:
 
 
 def video_border(files: Sequence[Path], times: Sequence[float]) -> np.ndarray | None:
-    """Return [H, W] bool, False on the black border of the video; None without a border. Independent of the split."""
+    """Detect the black border of the video: return [H, W] bool, False on the border; None without a border. The result
+    does not depend on the split."""
     order = sorted(range(len(files)), key=lambda index: times[index])
     sampled = [files[order[place]] for place in spread(len(order), BORDER_FRAMES)]
     images = parallel_map(decode, [file for file in sampled if file.is_file()])

@@ -8,24 +8,25 @@ import cv2
 import numpy as np
 
 BLACK_LEVEL = 4 / 255
-"""Largest channel value of a black pixel, of 1: JPEG compression lifts black borders slightly."""
+"""Largest channel value, in [0, 1], of a black pixel: JPEG compression lifts black borders slightly."""
 MIN_FRAME_SHARE = 0.9
-"""Share of the frames in which a border pixel must be black, so that passing dark objects are not masked."""
+"""Share of the frames in which a border pixel must be black, so that dark objects that pass by are not masked."""
 MIN_FRAMES = 4
-"""Smallest number of frames from which a border is detected."""
+"""Smallest number of frames in which a border can be detected."""
 MAX_AREA = 0.2
-"""Largest share of the image that a border covers; beyond it, or in the middle, black is the scene's background."""
+"""Largest share of the image that a border covers. If black pixels cover more, or the middle of the image, they are the
+scene's background."""
 
 
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray | None:
-    """Find the border: pixels that are black in nearly all images and connected to the image's edge.
+    """Find the border: pixels that are black in nearly all images and connected to the edge of the image.
 
     Args:
-        images: [H, W, 3], all of one size, uint8 or uint16, from all over the video.
+        images: [H, W, 3], all of one size, uint8 or uint16, sampled from the whole video.
 
     Returns:
-        [H, W] bool, False on the border and on the one pixel beside it that interpolation darkened. None without a
-        border, with too few images, or with images of different sizes.
+        [H, W] bool, False on the border and on the pixels next to it, which interpolation has darkened. None if there
+        is no border, if there are too few images, or if their sizes differ.
     """
     if len(images) < MIN_FRAMES or len({image.shape for image in images}) != 1:
         return None

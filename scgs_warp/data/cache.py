@@ -1,7 +1,7 @@
-"""Cache of decoded images with a limit in bytes; images beyond it are decoded again at each access.
+"""Cache of decoded images with a limit in bytes. Images that do not fit are decoded again at each access.
 
-Training visits all frames in a new order every epoch, so cached images are never evicted: evicting the least recently
-used one would discard what is needed next. The bits of a run do not depend on the cache.
+Training visits all frames in a new order every epoch, so cached images are never evicted: the least recently used image
+is likely to be needed next. A run's results are bit-identical for every size of the cache.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from ..config.fields import CACHE_MIB
 from ..runtime import memory
 
 MEMORY_SHARE = 0.5
-"""Largest share of the memory free at the start that the cache may take."""
+"""Largest share that the cache may take of the memory that is free at the start."""
 READ_AHEAD = 2
-"""Images decoded ahead of their use."""
+"""Largest number of images decoded ahead of their use."""
 
 
 class Pixels(NamedTuple):
@@ -28,9 +28,9 @@ class Pixels(NamedTuple):
     image: Tensor
     """[H, W, 3] float32, stored planar."""
     alpha: Tensor | None = None
-    """[H, W] float32."""
+    """[H, W] float32; None without alpha."""
     mask: Tensor | None = None
-    """[H, W] bool, the frame's own mask, without the border of the video."""
+    """[H, W] bool, the frame's own mask, without the border of the video; None if every pixel is valid."""
 
     @property
     def bytes(self) -> int:
@@ -55,7 +55,7 @@ class ImageCache:
         """Return the cached pixels of ``key``, or read them and cache them if there is room.
 
         Raises:
-            whatever ``read`` raises.
+            Any exception that ``read`` raises.
         """
         with self._lock:
             found, coming = self._kept.get(key), self._coming.pop(key, None)
@@ -66,7 +66,7 @@ class ImageCache:
         return pixels
 
     def offer(self, key: Hashable, pixels: Pixels) -> None:
-        """Cache pixels if there is room."""
+        """Cache pixels, if they fit."""
         size = pixels.bytes
         with self._lock:
             if key not in self._kept and self.used + size <= self.budget:
@@ -75,11 +75,11 @@ class ImageCache:
 
     @property
     def read_ahead(self) -> int:
-        """Number of images being read in the background or waiting to be asked for."""
+        """Number of images that were requested in advance and not yet accessed."""
         return len(self._coming)
 
     def expect(self, key: Hashable, read: Callable[[], Pixels]) -> None:
-        """Start to read an image in the background before it is asked for."""
+        """Start to read an image in the background, before it is accessed."""
         with self._lock:
             if key in self._kept or key in self._coming:
                 return

@@ -20,7 +20,7 @@ from .images import size_text
 
 
 def spread(count: int, most: int) -> list[int]:
-    """Choose at most ``most`` of the indices below ``count``, evenly spaced from the first to the last."""
+    """Choose at most ``most`` of the indices 0 .. ``count`` - 1, evenly spaced from the first to the last."""
     if count <= most:
         return list(range(count))
     return [round(index * (count - 1) / max(most - 1, 1)) for index in range(most)]
@@ -28,17 +28,17 @@ def spread(count: int, most: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class StoredFrame:
-    """A frame whose pixels are read from disk when they are needed."""
+    """A frame whose pixels are read from disk on access."""
 
     camera: Camera
     time: float
     name: str
     read: Callable[[], Pixels]
-    """Decodes the file; returns the same pixels every time."""
+    """Function that decodes the file; it returns the same pixels every time."""
     has_alpha: bool = False
-    """True if the alpha of the file counts."""
+    """True if the alpha of the file is used; otherwise it is ignored."""
     common_mask: Tensor | None = None
-    """[H, W] bool, combined with the frame's own mask."""
+    """[H, W] bool, to be combined with the frame's own mask."""
     key: object = field(default_factory=object)
     """Key of the pixels in the cache."""
 
@@ -63,10 +63,10 @@ class StoredFrame:
 class Dataset(Sequence[Frame]):
     """Frames of one split, in the order of the file that lists them.
 
-    Pixels are read when a frame is accessed and cached while there is room in ``cache``. Iterate over frames one by
-    one, and use ``entries`` for everything but pixels.
+    Pixels are read when a frame is accessed, and cached while ``cache`` has room. Iterate over frames one by one, and
+    use ``entries`` for everything but pixels.
 
-    With ``background == "random"`` every image is premultiplied colour on black; ``image + (1 - alpha) * color``
+    With ``background == "random"``, every image holds premultiplied colour on black; ``image + (1 - alpha) * color``
     composites it on any colour.
     """
 
@@ -82,7 +82,7 @@ class Dataset(Sequence[Frame]):
         cache: ImageCache | None = None,
     ) -> None:
         self.entries = tuple(frames)
-        """Camera, time and name of each frame; pixels only of frames that are in memory."""
+        """Camera, time and name of each frame, without pixels unless the frame is in memory."""
         self.folder = folder
         self.split = split
         self.background = background
@@ -109,7 +109,7 @@ class Dataset(Sequence[Frame]):
         return self._with([dataclasses.replace(entry, camera=camera) for entry, camera in zip(self.entries, cameras)])
 
     def subset(self, indices: Sequence[int]) -> Dataset:
-        """Return the data set of these frames, in this order."""
+        """Return a data set of the given frames, in the given order."""
         return self._with([self.entries[index] for index in indices])
 
     @overload
@@ -131,7 +131,7 @@ class Dataset(Sequence[Frame]):
         return (self._frame(entry) for entry in self.entries)
 
     def expect(self, index: int) -> None:
-        """Start to read a frame in the background before it is accessed."""
+        """Start to read a frame in the background, before it is accessed."""
         entry = self.entries[index]
         if isinstance(entry, StoredFrame):
             self.cache.expect(entry.key, entry.read)
@@ -147,12 +147,13 @@ class Dataset(Sequence[Frame]):
 
     @property
     def background_color(self) -> Tensor:
-        """[3] colour that the images were composited on."""
+        """[3] colour on which the images are composited."""
         return torch.tensor(BACKGROUND_COLORS[self.background])
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the frames' names, times and sizes and of the background; a run resumes only on the same one."""
+        """Hash of the background and of the frames' names, times and sizes. A run resumes only on a data set with the
+        same hash."""
         listed = [(entry.name, entry.time, entry.camera.height, entry.camera.width, 3) for entry in self.entries]
         return hashlib.sha256(repr((self.background, listed)).encode()).hexdigest()[:16]
 
@@ -162,7 +163,7 @@ class Dataset(Sequence[Frame]):
 
     @property
     def times(self) -> Tensor:
-        """[V] in [0, 1]."""
+        """[V] times of the frames in [0, 1]."""
         return torch.tensor([entry.time for entry in self.entries], dtype=torch.float32)
 
     @property

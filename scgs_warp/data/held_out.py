@@ -1,4 +1,4 @@
-"""Held-out frames of data sets that list no splits."""
+"""Selection of held-out frames for data sets that list no splits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from ..errors import UserError
 
 HELD_OUT_EVERY = 8
 HELD_OUT_FIRST = 4
-"""Frames 4, 12, 20, ... are held out: never the first, so that no held-out time has to be extrapolated."""
+"""Index of the first held-out frame. Frames 4, 12, 20, ... are held out, never frame 0, so that no held-out time has to
+be extrapolated."""
 
 
 def held_out(path: Path, order: Sequence[int], split: str) -> list[int]:

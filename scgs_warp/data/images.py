@@ -25,11 +25,11 @@ from .lens import Lens, undistort, valid_pixels
 
 RESAMPLES = ("area", "bicubic")
 SMALLEST_SIDE = 8
-"""Smallest side after a reduction, pixels: SSIM's window would not fit into a smaller image."""
+"""Smallest side in pixels after a reduction: the window of SSIM would not fit into a smaller image."""
 
 TRUSTED_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 64
-"""Pixel count below which a header is trusted, and pixels per byte of the file beyond it: a megabyte of zeros may
-unpack to a gigabyte."""
+"""Number of pixels up to which a header is trusted, and number of pixels per byte of the file that is trusted beyond
+it: a megabyte of zeros may decompress to a gigabyte."""
 
 # Pixels do not depend on EXIF data, so the warning would only clutter the terminal.
 warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
@@ -39,13 +39,13 @@ R = TypeVar("R")
 
 
 def size_text(size: Sequence[int]) -> str:
-    """Return ``800 x 600 pixels`` for (width, height)."""
+    """Format (width, height) as ``800 x 600 pixels``."""
     return f"{size[0]} x {size[1]} pixels"
 
 
 class Decoded(NamedTuple):
     pixels: Pixels
-    """Composited pixels; ``alpha`` is None for a file without alpha, ``mask`` is None if every pixel is valid."""
+    """Composited pixels; ``alpha`` is None for a file without alpha, and ``mask`` is None if every pixel is valid."""
     source_size: tuple[int, int]
     """(width, height) of the file before the reduction."""
     transparent: bool
@@ -117,7 +117,7 @@ def read_image(
     With ``random`` the image stays premultiplied, on black.
 
     Args:
-        lens_of: called with (width, height) of the file; raises UserError if they do not fit.
+        lens_of: function from the (width, height) of the file to the lens; raises UserError if the size does not fit.
         mask_path: an image that is black where the frame is not valid, and not black everywhere.
 
     Raises:
@@ -192,7 +192,7 @@ def decode(path: Path) -> np.ndarray:
 
 
 def oversized_claim(data: bytes | memoryview) -> str | None:
-    """Return the size that an image file claims if its bytes are too few for it, else None."""
+    """Return the size announced by an image file if the file has too few bytes for it, else None."""
     from PIL import Image
 
     try:
@@ -207,10 +207,10 @@ def oversized_claim(data: bytes | memoryview) -> str | None:
 
 
 def is_complete(data: np.ndarray) -> bool:
-    """Return whether a JPEG or PNG, given as bytes, is not truncated.
+    """Return whether a JPEG or PNG, given as bytes, is complete.
 
-    Older versions of OpenCV fill the missing part of a JPEG with grey; all versions allocate as many bytes as a PNG
-    announces.
+    Truncation must be detected here: older versions of OpenCV fill the missing part of a JPEG with grey, and all
+    versions allocate as many bytes as a PNG announces.
     """
     content = data.tobytes()
     if content.startswith(b"\xff\xd8"):

@@ -1,4 +1,4 @@
-"""Lenses: the pinhole inside a camera model, and undistortion of images to that pinhole.
+"""Lenses: the pinhole camera inside a camera model, and undistortion of images to this pinhole camera.
 
 pycolmap evaluates the camera models of COLMAP, which include those of OpenCV and nerfstudio; OpenCV resamples pixels.
 Pixel centres are at +0.5, as in COLMAP; OpenCV's own functions count from the centre of the first pixel.
@@ -14,16 +14,16 @@ import cv2
 import numpy as np
 
 ROWS = 64
-"""Rows of an image whose rays are projected at once, to bound memory."""
+"""Number of image rows whose rays are projected at once, to limit memory."""
 DIRECTIONS = 16
 RADII = 512
-"""Directions and steps along them at which a model is tested for folding back."""
+"""Number of directions, and number of steps along each, at which a model is tested for folding back."""
 EDGE_TOLERANCE = 0.01
-"""Tolerance for rounding beyond the outermost pixel centres, pixels."""
+"""Tolerance for rounding errors beyond the outermost pixel centres, in pixels."""
 SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_FISHEYE", "SIMPLE_DIVISION")
 SINGLE_FOCAL += ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PINHOLE_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
-"""Models that are a pinhole if all parameters beyond the first three or four are 0."""
+"""Models that reduce to a pinhole if all parameters beyond the first three or four are 0."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Lens:
     model: str = "PINHOLE"
     """COLMAP's name of the camera model."""
     params: tuple[float, ...] = ()
-    """Parameters of the model in COLMAP's order, with focal lengths and centre; empty for a pinhole."""
+    """Parameters of the model in COLMAP's order, including focal lengths and centre; empty for a pinhole."""
     skew: float = 0.0
     """Skew in pixels: shift of x per unit of y."""
 
     @property
     def distorted(self) -> bool:
-        """True if the image differs from that of the pinhole."""
+        """True if the image differs from that of a pinhole camera."""
         if self.skew != 0.0:
             return True
         if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
@@ -56,7 +56,7 @@ def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
     """Make the lens of a COLMAP model with these parameters.
 
     Raises:
-        ValueError: unknown model, wrong number of parameters, or values that no camera has.
+        ValueError: the model is unknown, the number of parameters is wrong, or their values are impossible.
     """
     import pycolmap
 
@@ -79,7 +79,8 @@ def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
 
 
 def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
-    """Project camera rays [N, 3] (x right, y down, z forward) to pixels [N, 2] of the file; NaN outside the model."""
+    """Project camera rays [N, 3] (x right, y down, z forward) to pixels [N, 2] of the file; NaN where the model is
+    undefined."""
     import pycolmap
 
     model, params = lens.model, lens.params
@@ -94,10 +95,10 @@ def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
 
 
 def valid_radius(lens: Lens, width: int, height: int) -> float:
-    """Return the tangent of the largest angle to the optical axis at which the model is still monotonic.
+    """Return the tangent of the largest angle to the optical axis up to which the model is monotonic.
 
-    Distortion polynomials fold back beyond the range that they were fitted to. Infinite if the model is monotonic all
-    over the image.
+    Distortion polynomials fold back beyond the range to which they were fitted. The result is infinite if the model is
+    monotonic over the whole image.
     """
     corners = [abs(x) for x in (lens.cx, width - lens.cx)], [abs(y) for y in (lens.cy, height - lens.cy)]
     farthest = math.hypot(max(corners[0]) / lens.fx, max(corners[1]) / lens.fy)
@@ -114,8 +115,8 @@ def valid_radius(lens: Lens, width: int, height: int) -> float:
 
 @functools.lru_cache(maxsize=4)
 def undistortion_maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the file's coordinates of the pinhole's pixels, x [H, W] and y [H, W] float32 in OpenCV's convention, and
-    which of them lie inside the file, [H, W] bool."""
+    """Map the pinhole's pixels to the file: return coordinates x [H, W] and y [H, W] float32 in OpenCV's convention,
+    and [H, W] bool, True for pixels inside the file."""
     x = (np.arange(width) + 0.5 - lens.cx) / lens.fx
     y = (np.arange(height) + 0.5 - lens.cy) / lens.fy
     limit = valid_radius(lens, width, height)
@@ -127,7 +128,7 @@ def undistortion_maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, 
         pixels = project(lens, grid.reshape(-1, 3)).reshape(*grid.shape[:2], 2) - 0.5
         inside = (pixels >= -EDGE_TOLERANCE) & (
             pixels <= (width - 1 + EDGE_TOLERANCE, height - 1 + EDGE_TOLERANCE)
-        )  # NaN: no
+        )  # False for NaN
         valid[band] = inside.all(axis=2) & (np.hypot(grid[..., 0], grid[..., 1]) < limit)
         pixels = np.where(valid[band, :, None], pixels, -9.0)
         columns[band], rows[band] = pixels[..., 0], pixels[..., 1]
@@ -135,7 +136,7 @@ def undistortion_maps(lens: Lens, width: int, height: int) -> tuple[np.ndarray, 
 
 
 def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
-    """Resample an image [H, W, ...] to the lens's pinhole, bilinearly; 0 outside the file."""
+    """Resample an image [H, W, ...] bilinearly to the lens's pinhole camera; pixels outside the file are 0."""
     columns, rows, valid = undistortion_maps(lens, image.shape[1], image.shape[0])
     moved = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     moved[~valid] = 0
@@ -143,5 +144,5 @@ def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def valid_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
-    """Return [H, W] bool: which pixels of the undistorted image lie inside the file."""
+    """Return [H, W] bool, True for pixels of the undistorted image that lie inside the file."""
     return undistortion_maps(lens, width, height)[2]

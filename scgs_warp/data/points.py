@@ -14,7 +14,7 @@ from ..storage.safe_paths import is_regular
 
 
 def finite_points(points: np.ndarray) -> np.ndarray:
-    """Return [P] bool: which points [P, 3] float64 are finite in float32, the type of training."""
+    """Return [P] bool, True for points [P, 3] float64 that are finite in float32, the precision of training."""
     with np.errstate(over="ignore"):
         return np.all(np.isfinite(points.astype(np.float32)), axis=1)
 
@@ -22,8 +22,8 @@ def finite_points(points: np.ndarray) -> np.ndarray:
 def unit_colors(vertices: np.ndarray) -> np.ndarray | None:
     """Return colours [P, 3] in [0, 1], grey where they are non-finite; None if the file has no colours.
 
-    Integers are divided by the largest value of their type; floats by 255 if any exceeds 1. Gaussians take the colours
-    of their harmonics of degree 0.
+    Integers are divided by the largest value of their type, floats by 255 if any of them exceeds 1. For a file of
+    Gaussians, the colours are those of the harmonics of degree 0.
     """
     names = ("red", "green", "blue")
     harmonics = [f"f_dc_{channel}" for channel in range(3)]
@@ -46,7 +46,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     or from the Gaussians of a ``.splat`` or ``.spz``.
 
     Raises:
-        UserError: as :func:`read_ply` and ``gaussian_files.read_gaussians``.
+        UserError: in the same cases as :func:`read_ply` and ``gaussian_files.read_gaussians``.
     """
     if path.suffix.lower() in (".splat", ".spz"):
         return gaussian_points(path)
@@ -59,7 +59,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     Points that are non-finite in float32 are left out.
 
     Raises:
-        UserError: the file is missing, not a PLY, lacks x, y, z, or claims more points than fit into memory.
+        UserError: the file is missing, is not a PLY, lacks x, y or z, or announces more points than fit into memory.
     """
     from plyfile import PlyData, PlyParseError
 

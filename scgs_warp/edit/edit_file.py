@@ -34,7 +34,7 @@ def fingerprint(engine: Engine) -> str:
 
 
 def to_json(edit: Edit, engine: Engine) -> str:
-    """Write an edit as text that ``read`` turns back into the same edit."""
+    """Return the JSON text of an edit, which ``read`` turns back into the same edit."""
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,

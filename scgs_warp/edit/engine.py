@@ -120,7 +120,8 @@ class Engine:
 
         Args:
             at: moment of the film in seconds, for keyframes. None: the handles' present targets.
-            frame: half the width, in scene time, of the interval in which an edit of one frame shows.
+            frame: half the width, in scene time, of the interval around a handle's time in which an edit of one frame
+                shows.
 
         Returns:
             The pose, or None where the edit changes nothing, so that results are bit-identical to the unedited scene's.

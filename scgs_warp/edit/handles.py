@@ -20,7 +20,8 @@ Quaternion = tuple[float, float, float, float]
 Lasting = Literal["motion", "frame", "fade"]
 
 ONE_FRAME = 5e-3
-"""Half the width, in scene time, of the interval in which an edit of one frame shows, if the film's step is unknown."""
+"""Half the width, in scene time, of the interval around a handle's time in which an edit of one frame shows, if the
+film's step is unknown."""
 HALFWAY_STIFFNESS = 10.0
 """Stiffness of a fading handle at half strength. The handle holds its nodes less firmly as its strength goes to 0, so
 that they do not jump when it releases them."""
@@ -77,8 +78,7 @@ class Handle:
     pivot: Vector3 | None = None
     """Centre of rotation, world units; None: the mean of the nodes."""
     stiffness: float | None = None
-    """None: nodes go exactly to the target. A number: nodes are pulled there with this stiffness; their edges have
-    1."""
+    """None: nodes go exactly to the target. A number: nodes are pulled there with this stiffness (edges have 1)."""
     turns: bool | None = None
     """True: the handle also fixes its nodes' rotations. None: it does so if it has more than one node."""
     lasts: Lasting = "motion"

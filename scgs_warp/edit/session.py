@@ -41,7 +41,8 @@ class EditSession:
 
     Every change of the edit can be undone; a drag counts as one change from its first ``drag`` to ``release``. Results
     depend on the edit alone, except those with ``live=True``, which are previews during a drag. ``frame`` is half the
-    width, in scene time, of the interval in which an edit of one frame shows; None: as in the edit's film.
+    width, in scene time, of the interval around a handle's time in which an edit of one frame shows; None: as in the
+    edit's film.
 
     Attributes: ``scene``, ``graph``, ``edit`` (replace it with :meth:`apply`).
     """
@@ -333,7 +334,7 @@ class EditSession:
     # Files
 
     def save(self, path: str | Path) -> None:
-        """Write the edit as JSON, which loads as the same edit. It does not end a drag.
+        """Write the edit as JSON that loads as the same edit. Saving does not end a drag.
 
         Raises:
             UserError: the file cannot be written, or the edit has a field that no file may hold.

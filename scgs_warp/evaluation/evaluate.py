@@ -1,4 +1,4 @@
-"""Evaluation of a scene: the metrics of one split, as training and ``apps/evaluate.py`` report them."""
+"""Evaluation of a scene: the metrics of one split, as reported by training and ``apps/evaluate.py``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Lpips = Callable[[Tensor, Tensor], Tensor | float]
 
 
 def _mean(values: list[float]) -> float | None:
-    """Mean with exact summation, so that the order of the images does not matter; None of an empty list."""
+    """Return the mean, summed exactly so that the order of the images does not matter; None for an empty list."""
     return math.fsum(values) / len(values) if values else None
 
 
@@ -47,7 +47,7 @@ def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) ->
 
 
 class _Renders:
-    """Writer of renders and ground truth; keeps some pairs for the contact sheet."""
+    """Writer of renders and ground truth; keeps some pairs of both for the contact sheet."""
 
     def __init__(self, folder: Path, count: int) -> None:
         self.folder = folder
@@ -70,7 +70,7 @@ class _Renders:
         self._write(self.folder / "truth" / f"{name}.png", pair[0])
         self._write(self.folder / "renders" / f"{name}.png", pair[1])
         if index in self._chosen:
-            if frame.mask is not None:  # outside it the truth is unknown: show no error
+            if frame.mask is not None:  # outside the mask the truth is unknown: show no error
                 pair = pair[0], to_bytes(torch.where(frame.mask.to(image.device)[..., None], image, truth))
             self._rows.append(pair)
             self._scores.append(score)
@@ -101,7 +101,8 @@ def evaluate(
 
     Args:
         scene: the scene to render.
-        dataset: the truth. Both lie on its background colour; with ``random`` that is black.
+        dataset: the truth. Render and truth are composited on the data set's background colour, or on black if that is
+            ``random``.
         lpips: function from (image, truth), both [H, W, 3] in [0, 1], to their perceptual distance; None: not measured.
         render_dir: folder for ``renders/NAME.png``, ``truth/NAME.png`` and ``contact_sheet.png``; None: not written.
         progress: called with (done, total) after each image.
@@ -141,7 +142,7 @@ def metrics_of(
 ) -> dict[str, Any]:
     """Make the content of ``metrics.json``: the metrics of ``evaluate``, and a description of scene and data.
 
-    Where the data folder has ``ground_truth.npz``, it includes ``epe`` and ``jitter`` of the motion.
+    If the data folder has ``ground_truth.npz``, the content includes ``epe`` and ``jitter`` of the motion.
 
     Args:
         seconds: duration of the training, if known.
@@ -174,7 +175,7 @@ def metrics_of(
 
 
 def _plain(value: Any) -> Any:
-    """Replace infinity (the PSNR of equal images) and NaN by None: JSON has neither."""
+    """Replace infinity (the PSNR of equal images) and NaN by None, because JSON has neither."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -183,7 +184,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_metrics(metrics: dict[str, Any], path: str | Path) -> None:
-    """Write metrics as JSON atomically: a reader sees the old file or the new one.
+    """Write metrics as JSON atomically: a reader sees either the old file or the new one.
 
     Raises:
         UserError: the file cannot be written.

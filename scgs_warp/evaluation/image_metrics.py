@@ -1,4 +1,4 @@
-"""PSNR, SSIM and LPIPS of one image; the caller takes means over images."""
+"""PSNR, SSIM and LPIPS of one image; the caller averages over images."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
 class LPIPS:
     """Learned perceptual distance with VGG16 (Zhang et al. 2018, equation 1; weights of version 0.1).
 
-    Nothing is downloaded: the user gives a file of weights.
+    Nothing is downloaded: the user provides a file of weights.
     """
 
     def __init__(self, path: str | Path, device: torch.device | str = "cpu") -> None:
@@ -140,7 +140,7 @@ def _read(path: Path) -> dict[str, Tensor]:
 
             return load_file(path)
         loaded = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the readers raise errors of their own
+    except Exception as error:  # the readers raise various exception types
         reason = (str(error) or type(error).__name__).splitlines()[0][:120]
         raise UserError(f"{path}: not readable as LPIPS weights ({reason}); {_REMEDY}") from error
     if not isinstance(loaded, dict):
@@ -149,7 +149,7 @@ def _read(path: Path) -> dict[str, Tensor]:
 
 
 def _by_role(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Rename the tensors to one spelling."""
+    """Rename the tensors to a single naming scheme."""
     found = {}
     for key, tensor in tensors.items():
         if match := re.fullmatch(r"(?:.*\.)?(?:features|slice[1-5])\.(\d+)\.(weight|bias)", key):

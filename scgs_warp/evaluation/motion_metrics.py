@@ -1,4 +1,4 @@
-"""Metrics of motion where the true one is known: end-point error and jitter of surface tracks."""
+"""Metrics of motion for data with known true motion: end-point error and jitter of surface tracks."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ..storage.numpy_files import read_npy
 
 FILE = "ground_truth.npz"
 OPAQUE = 0.5
-"""A Gaussian of at most this opacity carries no surface point."""
+"""Opacity above which a Gaussian can carry a surface point."""
 LEAST_LENGTH, MOST_LENGTH = 1e-15, 1e15
-"""Bounds of a height or a coordinate, whose squares are float32."""
+"""Bounds of a height or a coordinate, so that its square fits in float32."""
 CHUNK = 128
-"""Number of surface points whose distances to all Gaussians are in memory at once."""
+"""Number of surface points processed at once; their distances to all Gaussians are in memory."""
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,18 @@ class GroundTruth:
     times: Tensor
     """[T] in [0, 1], increasing."""
     visible: Tensor
-    """[V, P] bool, per training view."""
+    """[V, P] bool, True if the point is visible in the training view."""
     height: float
-    """Height of the figure; errors are in percent of it."""
+    """Height of the figure; errors are given in percent of it."""
 
 
 class MotionScore(NamedTuple):
-    """Scores in percent of the figure's height; NaN without any Gaussian or visible point."""
+    """Scores in percent of the figure's height; NaN if there is no Gaussian or no visible point."""
 
     epe: float
-    """Mean distance between predicted and true point, over times and visible points."""
+    """Mean distance between the predicted and the true point, over times and visible points."""
     jitter: float
-    """Mean norm of the second difference in time of the predicted track minus the true one. NaN under 3 times."""
+    """Mean norm of the second difference in time of (predicted track - true track). NaN with fewer than 3 times."""
 
 
 def load_ground_truth(folder: str | Path) -> GroundTruth | None:
@@ -77,12 +77,12 @@ def score_motion(
 
     A surface point is carried by the opaque Gaussian nearest to it at the first time: its predicted track is
     ``point(t0) + gaussian(t) - gaussian(t0)``, so that at t0 the error is 0 and only motion is judged. A point counts,
-    at all times, if at least one training view sees it; others cannot be reconstructed. Where no Gaussian is opaque,
-    all are candidates.
+    at all times, if at least one training view sees it; other points cannot be reconstructed. If no Gaussian is opaque,
+    all Gaussians are candidates.
 
     Args:
         positions_at: function from a time in [0, 1] to Gaussian centres [N, 3], world units, always in the same order.
-        opacities: [N]; None: all are opaque.
+        opacities: [N]; None: all Gaussians are opaque.
     """
     counted = truth.visible.any(dim=0)
     points = truth.points[:, counted].double()
@@ -114,7 +114,7 @@ def score_tracks(predicted: Tensor, true: Tensor, height: float) -> MotionScore:
 
 
 def _nearest(points: Tensor, centres: Tensor) -> Tensor:
-    """Index [P] of the centre nearest to each point, the first of equals."""
+    """Return the index [P] of the centre nearest to each point; of equally near centres, the first."""
     found = [
         torch.cdist(chunk, centres, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)
         for chunk in points.split(CHUNK)

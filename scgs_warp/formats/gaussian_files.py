@@ -1,4 +1,4 @@
-"""Files of Gaussians, with readers chosen by the suffix."""
+"""Files of Gaussians; the reader is chosen by the suffix."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_gaussians(path: str | Path) -> GaussianParameters:
     """Read raw parameters, world units, from a ``.ply`` of 3D Gaussian splatting, a ``.splat`` or a ``.spz``.
 
     Raises:
-        UserError: the file is of another kind, missing, damaged, too large for memory, or has no finite Gaussian.
+        UserError: the file is of another kind, missing, damaged or too large for memory, or it has no finite Gaussian.
     """
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
@@ -33,10 +33,10 @@ def read_gaussians(path: str | Path) -> GaussianParameters:
 
 @contextmanager
 def shortage_as_user_error(path: Path) -> Iterator[None]:
-    """Report a shortage of memory inside the block as an error of the file.
+    """Convert a shortage of memory inside the context to a UserError about the file.
 
     Raises:
-        UserError: memory does not suffice for all Gaussians.
+        UserError: memory does not suffice for all Gaussians of the file.
     """
     try:
         yield
@@ -47,10 +47,10 @@ def shortage_as_user_error(path: Path) -> Iterator[None]:
 
 
 def gaussian_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the positions of a file's Gaussians, [P, 3] float64, and their colours of degree 0, [P, 3] in [0, 1].
+    """Read the positions [P, 3] float64 of a file's Gaussians and their colours of degree 0, [P, 3] in [0, 1].
 
     Raises:
-        UserError: as :func:`read_gaussians`.
+        UserError: in the same cases as :func:`read_gaussians`.
     """
     found = read_gaussians(path)
     colors = 0.5 + SH_C0 * found.sh_dc.detach().double().numpy()

@@ -11,14 +11,15 @@ from ..errors import UserError
 from ..gaussians import GaussianParameters
 
 MAX_VALUES = {"means": 1e15, "log_scales": 80.0, "quats": 1e15}
-"""Largest parameters: their squares and activated values stay in the range of float32. Others are limited to 1e6."""
+"""Largest magnitudes of parameters, so that squares and activated values stay in the range of float32. Parameters not
+listed are limited to 1e6."""
 
 
 def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParameters:
     """Convert rows of a file to parameters, leaving out rows that are non-finite, too large or without a rotation.
 
     Args:
-        values: float32, by the names of :class:`GaussianParameters`, [N, ...]; harmonics [N, K - 1, 3].
+        values: float32 arrays [N, ...], by the names of :class:`GaussianParameters`; harmonics are [N, K - 1, 3].
 
     Raises:
         UserError: no valid row is left.

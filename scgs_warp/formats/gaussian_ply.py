@@ -15,16 +15,16 @@ from .gaussian_parameters import to_parameters
 from .ply_header import check_ply_counts
 
 REST_COLUMNS = (0, 9, 24, 45)
-"""``f_rest_*`` columns of degrees 0 to 3."""
+"""Numbers of ``f_rest_*`` columns for degrees 0 to 3."""
 OPAQUE_LOGIT = 80.0
-"""Largest logit of an opacity, opaque to rounding; some programs write infinity."""
+"""Largest logit of an opacity: opaque up to rounding. It replaces infinity, which some programs write."""
 
 
 def read_gaussian_ply(path: str | Path) -> GaussianParameters:
     """Read raw parameters, world units; non-finite Gaussians are left out.
 
     Raises:
-        UserError: the file is missing, not a PLY of Gaussians, or without a finite Gaussian.
+        UserError: the file is missing, is not a PLY of Gaussians, or has no finite Gaussian.
     """
     path = Path(path)
     data = _vertices(path)
@@ -80,7 +80,8 @@ def _vertices(path: Path) -> np.ndarray:
 
 def write_gaussian_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write activated Gaussians, world units, in the layout of 3D-GS: logits of opacities, logarithms of scales, unit
-    quaternions, harmonics channel by channel. Binary, little endian; the same Gaussians give the same bytes.
+    quaternions, harmonics channel by channel. The file is binary, little endian; the same Gaussians give the same
+    bytes.
 
     Raises:
         UserError: the name does not end in .ply, or the file cannot be written.

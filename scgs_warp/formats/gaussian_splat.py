@@ -14,7 +14,8 @@ from ..types import Gaussians
 from .gaussian_parameters import to_parameters
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
-"""Position and standard deviations in the units of the ``.ply``; red, green, blue, opacity; wxyz as 128 + 128 q."""
+"""Layout of a row: position and standard deviations in the units of the ``.ply``; red, green, blue, opacity; the
+quaternion wxyz as 128 + 128 q."""
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:

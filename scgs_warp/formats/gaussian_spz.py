@@ -25,24 +25,25 @@ from .gaussian_parameters import to_parameters
 
 MAGIC = 0x5053474E
 VERSION = 3
-"""Version to write: the last one that a plain gzip reader opens and the first with four bytes per rotation."""
+"""Version to write: the last that a plain gzip reader can open, and the first with four bytes per rotation."""
 ANTIALIASED = 1
 COLOR_SCALE = 0.15
-"""A byte of colour is ``127.5 + 255 * COLOR_SCALE * sh_dc``."""
+"""Factor on coefficients of degree 0: a byte of colour is ``127.5 + 255 * COLOR_SCALE * sh_dc``."""
 SCALE_STEPS, SCALE_OFFSET = 16.0, 10.0
-"""A byte of scale is ``SCALE_STEPS * (log(scale) + SCALE_OFFSET)``: steps of 6 %, from 4.5e-5 to 377."""
+"""Parameters of the logarithmic encoding: a byte of scale is ``SCALE_STEPS * (log(scale) + SCALE_OFFSET)``, in steps of
+6 %, from 4.5e-5 to 377."""
 POSITION_BITS = 16
-"""Positions are rounded to the size of the scene over ``2 ** POSITION_BITS``."""
+"""Resolution of positions: they are rounded to (size of the scene) / ``2 ** POSITION_BITS``."""
 MAX_FRACTION_BITS = 24
 MAX_GAUSSIANS = 10_000_000
 """Largest number of Gaussians in a file, as in the format's reference reader."""
 SH_COUNTS = (0, 3, 8, 15)
-"""Numbers of coefficients above degree 0, for degrees 0 to 3."""
+"""Numbers of coefficients above degree 0, for maximum degrees 0 to 3."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Signs that a half turn about x gives to the harmonics of degrees 1 to 3."""
+"""Signs by which a half turn about x multiplies the harmonics of degrees 1 to 3."""
 SQRT_HALF = math.sqrt(0.5)
 MAX_GZIP_RATIO = 1040
-"""Upper bound of the bytes that one byte of a gzip stream decompresses to."""
+"""Largest number of bytes to which one byte of a gzip stream can decompress."""
 REMEDY = "export the .spz again"
 
 
@@ -65,11 +66,11 @@ def fraction_bits(means: np.ndarray) -> int:
 def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
     """Write activated Gaussians, world units, as version 3.
 
-    Rounded: positions to ``2 ** -fraction_bits``, opacities and colours to 8 bits, scales to 6 %, rotations to 10 bits
-    a component, harmonics to 1 / 128 within [-1, 1].
+    Values are rounded: positions to ``2 ** -fraction_bits``, opacities and colours to 8 bits, scales to 6 %, rotations
+    to 10 bits a component, harmonics to 1 / 128 within [-1, 1].
 
     Args:
-        antialiased: whether they were trained with the antialiasing compensation.
+        antialiased: whether the Gaussians were trained with the antialiasing compensation.
 
     Returns:
         Number of values that were clipped to the range of a byte: scales outside [4.5e-5, 377], harmonics of degrees 1
@@ -111,8 +112,8 @@ def _byte(values: np.ndarray) -> np.ndarray:
 
 
 def pack_quats(quats: np.ndarray) -> np.ndarray:
-    """Pack unit quaternions [N, 4] wxyz in a ``.ply``'s frame to [N] uint32: two bits name the largest of xyzw, ten
-    bits (sign and nine of magnitude) hold each of the others over sqrt(1/2), in the order of xyzw."""
+    """Pack unit quaternions [N, 4] wxyz, in the frame of a ``.ply``, to [N] uint32: two bits name the largest of xyzw;
+    ten bits (sign and nine of magnitude) hold each of the other three, divided by sqrt(1/2), in the order of xyzw."""
     turned = quats[:, [1, 2, 3, 0]] * (1, -1, -1, 1)
     largest = np.abs(turned).argmax(axis=1)
     turned = turned * np.where(np.take_along_axis(turned, largest[:, None], 1) < 0, -1.0, 1.0)
@@ -125,7 +126,7 @@ def pack_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def unpack_quats(packed: np.ndarray) -> np.ndarray:
-    """Unpack [N, 4] wxyz float64 in a ``.ply``'s frame: the inverse of :func:`pack_quats`."""
+    """Unpack to [N, 4] wxyz float64 in the frame of a ``.ply``: the inverse of :func:`pack_quats`."""
     left = packed.astype(np.uint32).copy()
     largest = left >> np.uint32(30)
     found = np.zeros((len(left), 4))
@@ -140,17 +141,19 @@ def unpack_quats(packed: np.ndarray) -> np.ndarray:
 
 
 def _three_bytes(packed: np.ndarray) -> np.ndarray:
-    """Unpack the rotations of version 2 to [N, 4] wxyz: x, y, z are bytes, w completes the unit length."""
+    """Unpack the rotations of version 2 to [N, 4] wxyz: x, y, z are bytes, and w completes the quaternion to unit
+    length."""
     axis = packed.astype(np.float64) / 127.5 - 1.0
     w = np.sqrt(np.maximum(1.0 - (axis**2).sum(axis=1), 0.0))
     return np.column_stack([w, axis * (1, -1, -1)])
 
 
 def read_spz(path: str | Path) -> GaussianParameters:
-    """Read raw parameters in a ``.ply``'s frame from versions 2 to 4.
+    """Read raw parameters in the frame of a ``.ply`` from versions 2 to 4.
 
     Raises:
-        UserError: the file is missing, damaged or of another version, or version 4 without the package zstandard.
+        UserError: the file is missing, damaged or of another version, or it is of version 4 and the package zstandard
+            is missing.
     """
     path = Path(path)
     content = read_bytes(path, "give a .spz")
@@ -180,7 +183,8 @@ def read_spz(path: str | Path) -> GaussianParameters:
 
 
 def read_antialiased(path: str | Path) -> bool:
-    """Return whether a ``.spz`` is marked as trained with the antialiasing compensation; False for other files."""
+    """Return whether a ``.spz`` is marked as trained with the antialiasing compensation; return False for other
+    files."""
     path = Path(path)
     if path.suffix.lower() != ".spz":
         return False
@@ -220,7 +224,7 @@ def _read_gzip(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.
     if sum(sizes) > MAX_GZIP_RATIO * len(content):
         raise UserError(f"{path}: cut short: {len(content):,} bytes cannot hold {count:,} Gaussians; {REMEDY}")
     try:
-        rows = stream.decompress(stream.unconsumed_tail, sum(sizes))  # Bounded by the header.
+        rows = stream.decompress(stream.unconsumed_tail, sum(sizes))  # The size is bounded by the header.
     except zlib.error:
         rows = b""
     if len(rows) != sum(sizes):

@@ -1,4 +1,4 @@
-"""Plausibility of PLY headers, checked before a reader allocates memory for what they announce."""
+"""Plausibility check of PLY headers, done before a reader allocates memory for the announced rows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ def check_ply_counts(path: Path) -> None:
     """Refuse a PLY file whose header announces more rows than the file has bytes.
 
     Raises:
-        ValueError: it does.
+        ValueError: the header announces too many rows.
         OSError: the file cannot be read.
     """
     size = path.stat().st_size

@@ -14,11 +14,11 @@ from torch import Tensor
 from ..types import Camera
 
 FULL_ORBIT_GAP = 100.0
-"""Largest gap between azimuths of cameras that surround the scene."""
+"""Largest gap between neighbouring azimuths of cameras that count as surrounding the scene."""
 SWING_SHARE = 0.8
-"""Share of an observed arc that a turntable uses: from the arc's ends the scene is seen at a slant."""
+"""Fraction of an observed arc that a turntable uses, since the arc's ends show the scene at a slant."""
 STEEPEST = 80.0
-"""Largest elevation of a turntable: above a pole, azimuth is undefined."""
+"""Largest elevation of a turntable, because azimuth is undefined above a pole."""
 ROUNDING = 2e-6
 """Relative error of positions taken from float32 viewmats, as a share of their distance from the origin."""
 
@@ -30,9 +30,9 @@ class Overview:
     """Summary of the training cameras: plain numbers in world units, stored with the scene."""
 
     centre: tuple[float, float, float]
-    """Point closest to all optical axes."""
+    """Point with the least squared distance to all optical axes."""
     up: tuple[float, float, float]
-    """Unit vector."""
+    """Common up direction of the cameras, a unit vector."""
     radius: float
     """Median distance of the cameras from the centre."""
     fov_x: float
@@ -44,15 +44,15 @@ class Overview:
     sweep: float = 360.0
     """Arc of azimuths that the cameras cover; 360 for a full orbit."""
     aspect: float = 1.0
-    """Width of the images over their height."""
+    """Aspect ratio of the images: width divided by height."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return values that JSON holds exactly."""
+        """Return the fields as values that JSON represents exactly."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Overview:
-        """Restore what ``to_dict`` returned.
+        """Restore an overview from the result of ``to_dict``.
 
         Raises:
             KeyError, TypeError, ValueError: the values do not describe an overview.
@@ -73,8 +73,9 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 def agreed_up(rotations: np.ndarray) -> np.ndarray:
     """Return the common up direction of cameras, [3].
 
-    The x axes of level cameras are perpendicular to it, whatever their pitch, so it is the direction in which the x
-    axes vary least. If the cameras hardly turn, that leaves a plane, and the mean of their -y axes decides.
+    The x axes of level cameras are perpendicular to the up direction, whatever their pitch, so it is the direction in
+    which the x axes vary least. If the cameras hardly turn, this determines only a plane that contains the up
+    direction, and the mean of their -y axes decides.
 
     Args:
         rotations: [V, 3, 3] world to camera.
@@ -94,8 +95,8 @@ def agreed_up(rotations: np.ndarray) -> np.ndarray:
 def _centre(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return the point with the least squared distance to all optical axes, [3].
 
-    If the axes are parallel or meet behind the cameras, return a point in front of the mean camera instead, three times
-    as far away as the cameras are spread.
+    If the axes are parallel or meet behind the cameras, return a point in front of the mean camera instead, at three
+    times the cameras' spread.
     """
     least = rounding(positions)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -114,19 +115,19 @@ def _centre(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 def rounding(positions: np.ndarray) -> float:
-    """Return the distance up to which camera centres [V, 3] taken from viewmats coincide."""
+    """Return the distance up to which camera centres [V, 3], computed from viewmats, count as equal."""
     return ROUNDING * float(np.linalg.norm(positions, axis=1).max())
 
 
 def _horizon(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit vectors of azimuth 0 and 90, perpendicular to ``up``; x and y if up is z."""
+    """Return the unit vectors of azimuths 0 and 90, which are perpendicular to ``up``; they are x and y if up is z."""
     helper = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     zero = _unit(helper - (helper @ up) * up)
     return zero, np.cross(up, zero)
 
 
 def _arc(azimuths: np.ndarray) -> tuple[float, float]:
-    """Return start and sweep of the shortest arc that holds all azimuths."""
+    """Return the start and the extent of the shortest arc that contains all azimuths."""
     ordered = np.sort(azimuths % 360.0)
     gaps = np.diff(np.append(ordered, ordered[0] + 360.0))
     widest = int(gaps.argmax())
@@ -180,7 +181,7 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
     Args:
         eye: [3] world.
         target: [3] world.
-        up: [3] any length; replaced by another direction if it points along the view.
+        up: [3] any length; replaced by another direction if it is parallel to the viewing direction.
 
     Returns:
         [4, 4] world-to-camera, OpenCV (x right, y down, z forward), float32.
@@ -203,7 +204,7 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
 
 
 def image_size(overview: Overview, size: int) -> tuple[int, int]:
-    """Return (width, height) in the training images' proportions: longer side ``size``, both even as video requires."""
+    """Return (width, height) in the training images' proportions: longer side ``size``, both even for video."""
     width = size if overview.aspect >= 1 else size * overview.aspect
     height = size / overview.aspect if overview.aspect >= 1 else size
     return max(2, 2 * round(width / 2)), max(2, 2 * round(height / 2))
@@ -242,7 +243,7 @@ def azimuth_of(overview: Overview, eye: Vector) -> float:
 
 
 def turntable(overview: Overview, frames: int, size: int, azimuths: tuple[float, float] | None = None) -> list[Camera]:
-    """Return the cameras of a film that goes round the scene and loops.
+    """Return the cameras of a looping film that goes around the scene.
 
     If the training cameras surround the scene, the film is one turn of equal steps that starts at the first camera. If
     they cover only an arc (a forward-facing capture), the scene's back is unknown: the camera swings like a pendulum,
@@ -252,7 +253,7 @@ def turntable(overview: Overview, frames: int, size: int, azimuths: tuple[float,
         overview: overview of the scene.
         frames: number of cameras.
         size: longer side of the images in pixels; the shorter follows the training images' proportions.
-        azimuths: (first, last) in degrees, to be used instead: equal steps from the first, without the last.
+        azimuths: (first, last) in degrees, which replace this path: equal steps from the first, without the last.
 
     Raises:
         ValueError: ``frames`` is less than 1.

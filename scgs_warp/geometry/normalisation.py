@@ -1,4 +1,4 @@
-"""Scene normalisation: one shift and one scale, in float64, that bring the content near the ball of radius 1.37."""
+"""Scene normalisation: a shift and a scale, in float64, that fit the content roughly into a ball of radius 1.37."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from ..types import Camera
 from .cameras import rounding
 
 COMMON_RADIUS = 1.3654
-"""Radius, after normalisation, of the region that all cameras see, or of the bulk of the initial points. D-NeRF's rig
-(cameras at 4.031, field of view 0.6911) has this radius, so its frame does not change: figures in [-1.3, 1.3]^3."""
+"""Radius, after normalisation, of the region that all cameras see, or of the bulk of the initial points. It is chosen
+so that D-NeRF's rig (cameras at 4.031, field of view 0.6911, figures in [-1.3, 1.3]^3) is left unchanged."""
 BULK = 0.95
 """Fraction of the initial points placed within COMMON_RADIUS; the rest may be far background."""
 FEWEST_POINTS = 10
-"""Smallest number of initial points that tells where the scene is."""
+"""Smallest number of initial points from which the scene is located; with fewer points the cameras are used."""
 PARALLEL = 1e-4
 """Smallest eigenvalue of the mean of (I - d d^T) at which optical axes define a nearest point: about 1 degree."""
 
 
 @dataclass(frozen=True)
 class Normalisation:
-    """``normalised = (world - centre) * scale``."""
+    """The map ``normalised = (world - centre) * scale``."""
 
     centre: np.ndarray
     """[3] float64, world units."""
     scale: float
-    """Normalised units per world unit, > 0."""
+    """Number of normalised units per world unit, > 0."""
 
     @staticmethod
     def identity() -> Normalisation:
@@ -38,10 +38,10 @@ class Normalisation:
 
     @staticmethod
     def fit(cameras: Sequence[Camera], points: Tensor | None = None) -> Normalisation:
-        """Fit centre and scale to ten or more initial points (median; 95 % within the radius), else to the cameras.
+        """Fit centre and scale to ten or more initial points (median; 95 % within the radius), or else to the cameras.
 
-        From cameras, the centre is the point nearest to all optical axes, and the radius is that of the sphere around
-        it that the median camera sees whole.
+        From cameras, the centre is the point nearest to all optical axes, and the radius is that of the largest sphere
+        around the centre that fits into the median camera's view.
 
         Args:
             cameras: at least one.
@@ -80,7 +80,7 @@ class Normalisation:
         return (lengths.double() / self.scale).to(lengths.dtype)
 
     def apply_camera(self, camera: Camera) -> Camera:
-        """Return the camera that sees the normalised scene at the same pixels, with depths times ``scale``."""
+        """Return the camera that sees the normalised scene at the same pixels, with depths multiplied by ``scale``."""
         viewmat = camera.viewmat.double()
         centre = torch.as_tensor(self.centre, device=viewmat.device)
         moved = viewmat.clone()
@@ -88,7 +88,7 @@ class Normalisation:
         return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
 
     def undo_camera(self, camera: Camera) -> Camera:
-        """Return the camera that :meth:`apply_camera` was given."""
+        """Invert :meth:`apply_camera`: return the camera in world units."""
         viewmat = camera.viewmat.double()
         centre = torch.as_tensor(self.centre, device=viewmat.device)
         moved = viewmat.clone()
@@ -110,7 +110,8 @@ def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def _nearest_to_axes(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Solve sum over cameras of (I - d d^T)(x - p) = 0 for the point x nearest to all optical axes.
 
-    Near-parallel axes leave x undetermined along them; it then lies ahead of the cameras by twice the rig's size.
+    Near-parallel axes leave x undetermined along their direction; x then lies ahead of the cameras by twice the rig's
+    size.
     """
     projectors = np.eye(3) - np.einsum("vi,vj->vij", axes, axes)
     A, least = projectors.mean(axis=0), rounding(positions)

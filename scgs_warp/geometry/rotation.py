@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 RIGID_TOLERANCE = 1e-3
-"""Largest entry of ``R^T R - I`` that counts as rounding."""
+"""Largest magnitude of an entry of ``R^T R - I`` that counts as rounding."""
 
 
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from ..types import Gaussians
 
 
 class TrainingPose(NamedTuple):
-    """Gaussians and regulariser of one training view."""
+    """Posed Gaussians and regulariser of one training view."""
 
     gaussians: Gaussians
     regulariser: Tensor | None
@@ -30,8 +30,8 @@ class Motion(nn.Module):
     name: ClassVar[str]
     moves: ClassVar[bool] = True
     takes_time_tensor: ClassVar[bool] = False
-    """True where :meth:`gaussians_at` also accepts the time as a tensor [1] on its device, and then copies nothing
-    between host and device: such a frame can be recorded once and replayed (``FrameGraph``)."""
+    """True if :meth:`gaussians_at` also accepts the time as a tensor [1] on its device and then copies nothing between
+    host and device. Such a frame can be recorded once and replayed (``FrameGraph``)."""
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         """Activate the Gaussians and pose them at ``time``; differentiable."""
@@ -40,26 +40,27 @@ class Motion(nn.Module):
     def train_at(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
     ) -> TrainingPose:
-        """Pose for training, with the frozen phase and the regulariser at ``step``. ``view``: index in the step's
-        batch; random draws differ between views."""
+        """Pose the Gaussians for training at ``step``, which determines the frozen phase and the regulariser. ``view``
+        is the index in the step's batch; random draws differ between views."""
         return TrainingPose(self.gaussians_at(gaussians, time), None)
 
     def control_points_at(self, time: float) -> Tensor:
-        """Control points [M, 3] at ``time``; [0, 3] for models without them."""
+        """Return the control points [M, 3] at ``time``; [0, 3] for models without control points."""
         return torch.zeros(0, 3)
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
-        """Learning rate of every named parameter at this main step."""
+        """Return the learning rate of every named parameter at this main step."""
         return {}
 
     def optimizer(self, config: TrainConfig) -> Adam | None:
-        """Make Adam over all parameters, one named group each; None for a model without parameters."""
+        """Make an Adam optimiser over all parameters, with one named group each; None for a model without
+        parameters."""
         parameters = dict(self.named_parameters())
         return Adam(parameters, self.rates(0, config)) if parameters else None
 
     def extra_state(self) -> dict[str, Tensor]:
-        """Return the tensors that a resumed run needs beside the parameters."""
+        """Return the tensors that a resumed run needs in addition to the parameters."""
         return {}
 
     def load_extra_state(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what :meth:`extra_state` returned."""
+        """Restore the tensors returned by :meth:`extra_state`."""

@@ -24,7 +24,7 @@ NODE_NAMES = ("positions", "log_radii", "hyper", "strength_logits")
 
 
 def heads_of(config: MotionConfig) -> dict[str, int]:
-    """Output channels of the network for every control point, by name."""
+    """Return the number of output channels of the network per control point for each head, by name."""
     heads = {"rotations": 4, "translations": 3}
     if config.shape_rotation:
         heads["shape_rotations"] = 4
@@ -52,8 +52,8 @@ def unit_rotations(raw: Tensor) -> Tensor:
 
 
 def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | None], masked: bool) -> Gaussians:
-    """Activate the moved Gaussians. ``masked``: the last hyper-coordinate is the logit of a Gaussian's share of the
-    motion."""
+    """Activate the moved Gaussians. ``masked``: the last hyper-coordinate is the logit of the share of the motion that
+    a Gaussian takes."""
     means, quats, log_scales = moved
     if masked:
         with one_piece():
@@ -94,8 +94,8 @@ class ControlPoints(Motion):
         return self.positions.shape[0]
 
     def poses(self, times: Tensor) -> list[Pose]:
-        """One :class:`Pose` per time, from one network evaluation. Its input is detached: the encoding's high octaves
-        would shake the control points."""
+        """Return one :class:`Pose` per time, from one network evaluation. The network's input is detached, because
+        gradients through the encoding's high octaves would make the control points oscillate."""
         out = self.network(self.positions.detach(), times.to(self.positions.device))
         rotations = unit_rotations(out["rotations"])
         shape = unit_rotations(out["shape_rotations"]) if "shape_rotations" in out else None
@@ -111,12 +111,12 @@ class ControlPoints(Motion):
         ]
 
     def _hyper(self, gaussians: GaussianParameters) -> Tensor:
-        """The Gaussians' hyper-coordinates [N, H], without the mask's logit."""
+        """Return the Gaussians' hyper-coordinates [N, H], without the mask's logit."""
         return gaussians.hyper[:, : self.config.hyper_dim].contiguous()
 
     def neighbors(self, gaussians: GaussianParameters) -> Tensor:
-        """Nearest control points [N, K] int32 of every Gaussian at rest, exact at every call: in space, with
-        hyper-coordinates appended where the model has them."""
+        """Find the nearest control points [N, K] int32 of every Gaussian at rest, exactly and anew at every call: in
+        space, with hyper-coordinates appended if the model has them."""
         points, nodes = gaussians.means.detach(), self.positions.detach()
         if self.config.hyper_dim:
             points = torch.cat([points, self._hyper(gaussians).detach()], dim=1)
@@ -124,7 +124,8 @@ class ControlPoints(Motion):
         return self._search(points, nodes, self.config.neighbors)
 
     def binding(self, gaussians: GaussianParameters) -> tuple[Tensor, Tensor]:
-        """Neighbours and their RBF weights (Eq. 5): indices [N, K], weights [N, K]. They do not depend on time."""
+        """Compute neighbours and their RBF weights (Eq. 5): indices [N, K], weights [N, K]. They do not depend on
+        time."""
         indices = self.neighbors(gaussians)
         points, nodes = gaussians.means, self.positions
         if self.config.hyper_dim:
@@ -134,12 +135,12 @@ class ControlPoints(Motion):
         return indices, rbf_weights(points, nodes, self.log_radii.exp(), indices, strengths)
 
     def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
-        """Linear blend skinning of all Gaussians (Eq. 6-7). Editing replaces ``pose``, nothing else."""
+        """Move all Gaussians by linear blend skinning (Eq. 6-7). Editing replaces only ``pose``."""
         moved = skin(gaussians.means, gaussians.quats, self.positions, pose, *binding)
         return _posed(gaussians, moved, self.config.mask)
 
     def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
-        """Bind and pose all Gaussians in one pass; ``frozen`` control points get no gradient."""
+        """Bind and pose all Gaussians in one pass; ``frozen`` control points receive no gradient."""
         hyper = self.config.hyper_dim > 0
         rows = (
             self.positions,
@@ -159,13 +160,14 @@ class ControlPoints(Motion):
         return _posed(gaussians, moved, self.config.mask)
 
     def cache_binding(self, gaussians: GaussianParameters | None) -> None:
-        """Keep neighbours and weights for rendering, as they do not depend on time; None forgets them."""
+        """Keep neighbours and weights for rendering, as they do not depend on time; None discards them."""
         with torch.no_grad():
             self._cached = None if gaussians is None else self.binding(gaussians)
         self._cached_for = None if gaussians is None else self._binding_state(gaussians)
 
     def _binding_state(self, gaussians: GaussianParameters) -> list[tuple[Tensor, int, int]]:
-        """Identify the inputs of :meth:`binding`: equal as long as no tensor is replaced or changed in place."""
+        """Identify the inputs of :meth:`binding`: the result stays equal as long as no tensor is replaced or changed in
+        place."""
         own = self.positions, self.log_radii, self.hyper, self.strength_logits
         return [
             (x, x.data_ptr(), 0 if x.is_inference() else x._version) for x in (gaussians.means, gaussians.hyper, *own)
@@ -207,7 +209,7 @@ class ControlPoints(Motion):
             self.graph = build_graph(self.trajectories, loss)
 
     def trajectories(self, times: Tensor) -> Tensor:
-        """[T, M, 3] control points at ``times`` [T]."""
+        """Return the control points [T, M, 3] at ``times`` [T]."""
         return torch.stack([self.positions.detach() + pose.translations for pose in self.poses(times)])
 
     def control_points_at(self, time: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""4D-GS: features from multi-resolution planes over (x, y, z, t), decoded per Gaussian (seed Table S2's rival)."""
+"""4D-GS: features from multi-resolution planes over (x, y, z, t), decoded per Gaussian (the rival in seed Table S2)."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ SPATIAL = 64
 TEMPORAL = 25
 """Default number of texels along t."""
 MULTIPLES = (1, 2)
-"""Spatial resolutions: 64 and 128; time keeps its own in both, as in the 4D-GS configurations for D-NeRF."""
+"""Spatial resolutions: 64 and 128 texels. Time has its own resolution, the same for both, as in the 4D-GS
+configurations for D-NeRF."""
 WIDTH = 64
 HEADS = {"means": 3, "quats": 4, "log_scales": 3}
-"""Outputs of the heads and their widths."""
+"""Names of the heads and the widths of their outputs."""
 BOUND = 1.6
 """Half the edge of the planes' cube, normalised units."""
 
 
 class HexPlane(Motion):
-    """Six feature planes at two resolutions, multiplied over the planes, concatenated over resolutions, and three small
-    heads for position, rotation and log scale."""
+    """Six feature planes at each of two resolutions, and three small heads for position, rotation and log scale.
+    Features are multiplied over the planes and concatenated over the resolutions."""
 
     name = "hexplane"
     takes_time_tensor = True
@@ -64,7 +65,8 @@ class HexPlane(Motion):
         self._packed = PackedLayers()
 
     def features(self, positions: Tensor, time: float | Tensor) -> Tensor:
-        """Features [N, 64], products of bilinear samples; positions outside the cube take the border's value."""
+        """Return features [N, 64], products of bilinear samples. Positions outside the cube take the value at its
+        border."""
         return plane_features(positions / BOUND, time, list(self.planes))
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
@@ -73,7 +75,7 @@ class HexPlane(Motion):
     def train_at(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
     ) -> TrainingPose:
-        if step < config.coarse:  # a static scene first (4D-GS)
+        if step < config.coarse:  # learn a static scene first (4D-GS)
             return TrainingPose(gaussians.activate(), None)
         weights = Smoothness(config.loss.hexplane_tv, config.loss.hexplane_smooth, config.loss.hexplane_rest)
         variation = plane_variation(list(self.planes), weights) if any(weights) else None
@@ -95,8 +97,8 @@ class HexPlane(Motion):
         )
 
     def _decode(self, features: Tensor) -> Tensor:
-        """Evaluate trunk and heads [N, 10] as one network of three layers: the trunk, the heads' first layers side by
-        side, and their last ones in a block diagonal."""
+        """Evaluate trunk and heads as one network of three layers, returning [N, 10]: the trunk, the heads' first
+        layers side by side, and their last layers in a block-diagonal matrix."""
         if features.device.type != "cpu":
             hidden = self.trunk(features)
             return torch.cat([head(hidden) for head in self.heads.values()], dim=1)

@@ -12,7 +12,7 @@ from ..runtime.environment import one_piece
 
 
 def encode(values: Tensor, frequencies: int) -> Tensor:
-    """[..., D] -> [..., D (1 + 2 F)]: the values, then sin and cos of 2^k times them, k = 0 .. F - 1."""
+    """Encode [..., D] as [..., D (1 + 2 F)]: the values, then sin and cos of 2^k times the values, k = 0 .. F - 1."""
     octaves = 2.0 ** torch.arange(frequencies, device=values.device, dtype=values.dtype)
     angles = (values[..., None, :] * octaves[:, None]).flatten(-2)
     with one_piece():
@@ -20,8 +20,8 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
 
 
 class _Bfloat16Linear(torch.autograd.Function):
-    """A linear layer in bfloat16. The parameters' gradients, sums over the rows, are computed in one piece: oneDNN's
-    partition depends on the number of threads (with AMX, at 9,999 rows)."""
+    """A linear layer in bfloat16. The parameters' gradients, which are sums over the rows, are computed in one piece,
+    because oneDNN's partition of a sum depends on the number of threads (observed with AMX at 9,999 rows)."""
 
     @staticmethod
     def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -44,10 +44,10 @@ def _bfloat16_linear(x: Tensor, layer: nn.Module) -> Tensor:
 
 
 class DeformationNetwork(nn.Module):
-    """Maps position and time to the channels of a rigid motion; ``heads`` name the outputs and their widths.
+    """Network from position and time to the channels of a rigid motion; ``heads`` name the outputs and their widths.
 
-    Eight layers of 256 by default; the output of layer ``skip`` is concatenated with the input. The heads start at
-    almost zero, so the scene starts at rest.
+    The default has eight layers of 256 channels. The output of layer ``skip`` is concatenated with the input. The
+    heads' initial outputs are almost zero, so the scene starts at rest.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class DeformationNetwork(nn.Module):
             times: [T] in [0, 1].
 
         Returns:
-            one tensor [T, M, width] per head.
+            One tensor [T, M, width] per head.
         """
         where = encode(positions, self.position_frequencies)
         when = encode(times[:, None], self.time_frequencies)
@@ -102,7 +102,7 @@ class DeformationNetwork(nn.Module):
         return dict(zip(self.heads, out.split(list(self.heads.values()), dim=-1)))
 
     def _layered(self, where: Tensor, when: Tensor) -> Tensor:
-        """Evaluate layer by layer in torch: on CUDA, in bfloat16, and where positions or times need a gradient."""
+        """Evaluate layer by layer in torch: used on CUDA, in bfloat16, and if positions or times need a gradient."""
         count, instants = where.shape[0], when.shape[0]
         both = [where[None].expand(instants, -1, -1), when[:, None].expand(-1, count, -1)]
         inputs = torch.cat(both, dim=-1).reshape(instants * count, -1)
@@ -116,7 +116,7 @@ class DeformationNetwork(nn.Module):
         return self.head(hidden.float())
 
     def _fused(self, where: Tensor, when: Tensor) -> Tensor | None:
-        """Evaluate all layers in one kernel; None where no kernel fits them."""
+        """Evaluate all layers in one kernel; return None if no kernel fits them."""
         layers = [cast(nn.Linear, layer) for layer in (*self.layers, self.head)]
         weights: list[Tensor] = [layer.weight for layer in layers]
         biases: list[Tensor] = [layer.bias for layer in layers]

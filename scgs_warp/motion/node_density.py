@@ -1,4 +1,5 @@
-"""Adaptive control points: clone where gradients are large, prune where influence is small (paper section 4.3)."""
+"""Adaptive density of control points: clone those with large gradients, prune those with little influence (paper
+section 4.3)."""
 
 from __future__ import annotations
 
@@ -13,24 +14,25 @@ from ..optim import Adam
 from .control_points import NODE_NAMES, ControlPoints
 
 PRUNE_IMPACT = 1e-2
-"""Sum of weights over all Gaussians below which a control point is pruned: it moves nothing visible."""
+"""Sum of weights over all Gaussians below which a control point is pruned, because it moves nothing visible."""
 MOST_NEW = 0.1
-"""Largest share of new control points at a time, those with the largest gradients."""
+"""Largest number of control points cloned at a time (those with the largest gradients), as a share of all."""
 
 
 class Influence(NamedTuple):
-    """Sums over the Gaussians of each control point, float64."""
+    """Statistics of the Gaussians that each control point moves, float64."""
 
     impact: np.ndarray
-    """[M] sum of weights."""
+    """[M] sum of the Gaussians' weights."""
     gradient: np.ndarray
-    """[M] weighted mean of the Gaussians' screen gradients."""
+    """[M] weighted mean of the Gaussians' screen-space gradients."""
     centre: np.ndarray
-    """[M, 3] mean position of its Gaussians, weighted by weight and gradient: the position of a clone."""
+    """[M, 3] mean position of the Gaussians, weighted by weight and gradient: the position of a clone."""
 
 
 def influence(motion: ControlPoints, gaussians: GaussianParameters, gradient: Tensor) -> Influence:
-    """Sum over the Gaussians of each control point. ``bincount`` adds in row order, whatever the threads."""
+    """Compute the statistics of each control point. ``bincount`` adds in row order, regardless of the number of
+    threads."""
     with torch.no_grad():
         indices, weights = motion.binding(gaussians)
     flat = indices.cpu().numpy().ravel()
@@ -61,7 +63,7 @@ def adapt_control_points(
         grad_threshold: clone a control point whose weighted mean gradient exceeds this.
 
     Returns:
-        numbers of clones and of pruned control points.
+        Number of clones, and number of pruned control points.
     """
     sums = influence(motion, gaussians, gradient)
     keep = sums.impact >= PRUNE_IMPACT

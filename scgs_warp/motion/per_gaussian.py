@@ -1,4 +1,4 @@
-"""The paper's baseline: the same network, evaluated at every Gaussian instead of at control points."""
+"""The paper's baseline: the network of SC-GS, evaluated at every Gaussian instead of at control points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from .network import DeformationNetwork
 
 
 class PerGaussian(Motion):
-    """Position, rotation and scale residuals predicted for each Gaussian from its rest position and the time."""
+    """Motion model that predicts residuals of position, rotation and scale for each Gaussian, from its rest position
+    and the time."""
 
     name = "per-gaussian"
     takes_time_tensor = True

@@ -15,14 +15,15 @@ from ..optim import log_linear
 
 
 class Graph(NamedTuple):
-    """Neighbours over time, between which motion should be rigid."""
+    """Neighbours over the whole time, with their weights: motion should be rigid between neighbouring control
+    points."""
 
     neighbors: Tensor
     """[M, J] int32, padded with -1."""
     weights: Tensor
     """[M, J], rows sum to 1."""
     reverse: NodeLists
-    """Edges that lead to each control point."""
+    """Edges that end at each control point."""
 
     @staticmethod
     def of(neighbors: Tensor, weights: Tensor) -> Graph:
@@ -30,20 +31,21 @@ class Graph(NamedTuple):
 
 
 def arap_weight(step: int, loss: LossConfig) -> float:
-    """Weight at this main step: exponential decay over ``arap_until`` steps, then 0. Every ``arap_every``-th step
-    carries the term, with as many times the weight."""
+    """Return the weight at this main step: exponential decay over ``arap_until`` steps, then 0. Only every
+    ``arap_every``-th step includes the term, with its weight multiplied by ``arap_every``."""
     if loss.arap <= 0.0 or step >= loss.arap_until or step % loss.arap_every:
         return 0.0
     return log_linear(loss.arap, loss.arap_end, step, loss.arap_until) * loss.arap_every
 
 
 def arap_times(loss: LossConfig, random: torch.Generator) -> list[float]:
-    """Draw the instants at which the network is evaluated beside the step's own."""
+    """Draw the instants at which the network is evaluated in addition to the step's own."""
     return torch.rand(1 if loss.arap_pair == "frame" else 2, generator=random).tolist()
 
 
 def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> Graph | None:
-    """Find neighbours by trajectory from ``positions_at(times [T]) -> [T, M, 3]`` at N_t times; None if M < 2."""
+    """Find neighbours by trajectory from ``positions_at(times [T]) -> [T, M, 3]`` at N_t times; return None if M <
+    2."""
     with torch.no_grad():
         trajectories = positions_at(torch.linspace(0.0, 1.0, loss.arap_times))
         count = min(loss.arap_neighbors, trajectories.shape[1] - 1)
@@ -51,8 +53,8 @@ def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> G
 
 
 def rigidity(instants: list[Tensor], graph: Graph) -> Tensor:
-    """Sum the energy between the last two of ``instants`` [M, 3] over control points. A product with ones sums in a
-    fixed order."""
+    """Sum the energy between the last two of ``instants`` [M, 3] over control points, in a fixed order: as a product
+    with ones."""
     first, second = instants[-2:]
     energy = arap_energy(first, second, graph.neighbors, graph.weights, reverse=graph.reverse)
     return energy @ torch.ones_like(energy)

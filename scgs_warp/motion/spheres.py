@@ -1,4 +1,5 @@
-"""Stage 1: control points as same-sized spheres, each moved by the network at its own position (seed S4)."""
+"""Stage 1: control points as spheres of equal size, each moved by the network evaluated at its own position (seed
+S4)."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from .rigidity import Graph, arap_times, build_graph, rigidity
 
 
 class Spheres(Motion):
-    """The network and the one radius that all spheres share; their centres are the means of the Gaussians."""
+    """The network and the radius shared by all spheres; the spheres' centres are the means of the Gaussians."""
 
     name = "spheres"
 
@@ -27,7 +28,8 @@ class Spheres(Motion):
         self.graph: Graph | None = None
 
     def translations(self, positions: Tensor, times: Tensor) -> Tensor:
-        """Displacements [T, n, 3] of ``positions`` [n, 3], detached: the encoding's octaves would shake them."""
+        """Return displacements [T, n, 3] of ``positions`` [n, 3]. The positions are detached, because gradients through
+        the encoding's high octaves would make the spheres oscillate."""
         return self.network(positions.detach(), times.to(positions.device))["translations"]
 
     def _spheres_at(self, gaussians: GaussianParameters, means: Tensor) -> Gaussians:

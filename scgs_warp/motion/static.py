@@ -1,4 +1,4 @@
-"""No motion: 3D-GS, the seed's reference for speed."""
+"""Static model without motion: 3D-GS, the seed's reference for speed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .base import Motion
 
 
 class Static(Motion):
-    """Gaussians at rest."""
+    """Motion model that leaves all Gaussians at rest."""
 
     name = "static"
     moves = False

@@ -16,15 +16,16 @@ COUNT = 512
 """Default number of control points."""
 NEIGHBORS = 4
 OPAQUE = 0.1
-"""Least opacity of Gaussians that control points are sampled from: floaters would attract the farthest ones."""
+"""Opacity above which a Gaussian is a candidate for control points; farthest-point sampling would favour floaters,
+which are more transparent."""
 CORE = 0.98
-"""Share of the opaque Gaussians, nearest to their median first, that control points are sampled from."""
+"""Share of the opaque Gaussians, those nearest to their median, from which control points are sampled."""
 SPACINGS = 0.75
 """Ratio of a control point's radius to the mean distance to its three nearest neighbours."""
 
 
 class StaticNodes(Motion):
-    """Control points [M, 3] at rest; buffers, not parameters, as nothing is trained."""
+    """Control points [M, 3] at rest. They are buffers rather than parameters, because nothing is trained."""
 
     name = "static"
     moves = False
@@ -40,10 +41,10 @@ class StaticNodes(Motion):
     @staticmethod
     @torch.no_grad()
     def sample(gaussians: GaussianParameters, count: int = COUNT) -> StaticNodes:
-        """Sample control points evenly over the opaque Gaussians, as farthest points.
+        """Sample control points evenly over the opaque Gaussians, by farthest-point sampling.
 
         Args:
-            count: number of control points, at most that of Gaussians.
+            count: number of control points; at most the number of Gaussians.
         """
         means, opacities = gaussians.means.detach(), gaussians.opacities().detach()
         finite = means.isfinite().all(dim=1)
@@ -61,34 +62,34 @@ class StaticNodes(Motion):
         return self.positions.shape[0]
 
     def poses(self, times: Tensor) -> list[Pose]:
-        """One :class:`Pose` per time, all at rest."""
+        """Return one :class:`Pose` per time, all at rest."""
         zeros = torch.zeros_like(self.positions)
         still = torch.zeros(len(self), 4, device=zeros.device)
         still[:, 0] = 1.0
         return [Pose(zeros, still) for _ in range(times.shape[0])]
 
     def trajectories(self, times: Tensor) -> Tensor:
-        """Control points [T, M, 3], the same at all times."""
+        """Return the control points [T, M, 3], the same at all times."""
         return self.positions.expand(times.shape[0], -1, -1)
 
     def control_points_at(self, time: float) -> Tensor:
         return self.positions
 
     def neighbors(self, gaussians: GaussianParameters) -> Tensor:
-        """Nearest control points [N, K] int32 of every Gaussian, nearest first."""
+        """Find the nearest control points [N, K] int32 of every Gaussian, nearest first."""
         means = gaussians.means.detach()
         return nearest(means, self.positions, min(NEIGHBORS, len(self)))[0]
 
     @torch.no_grad()
     def binding(self, gaussians: GaussianParameters) -> tuple[Tensor, Tensor]:
-        """Neighbours and their RBF weights (SC-GS, Eq. 5): indices [N, K], weights [N, K]."""
+        """Compute neighbours and their RBF weights (SC-GS, Eq. 5): indices [N, K], weights [N, K]."""
         indices = self.neighbors(gaussians)
         return indices, rbf_weights(gaussians.means.detach(), self.positions, self.radii, indices)
 
     @torch.no_grad()
     def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
-        """Linear blend skinning of all Gaussians (SC-GS, Eq. 6-7). Gaussians of unmoved control points keep their
-        bits."""
+        """Move all Gaussians by linear blend skinning (SC-GS, Eq. 6-7). Gaussians whose control points have not moved
+        stay bit-identical."""
         means, quats, _ = skin(gaussians.means.detach(), gaussians.quats.detach(), self.positions, pose, *binding)
         rest = gaussians.activate()
         moved = pose.translations.any(dim=1) | pose.rotations[:, 1:].any(dim=1)
@@ -101,7 +102,7 @@ class StaticNodes(Motion):
 
 
 def spacing(nodes: Tensor) -> Tensor:
-    """Mean distance [M] to the three nearest other nodes; 1 for a single node."""
+    """Return the mean distance [M] to the three nearest other nodes; 1 for a single node."""
     count = min(3, nodes.shape[0] - 1)
     if count < 1:
         return torch.ones(nodes.shape[0], device=nodes.device)

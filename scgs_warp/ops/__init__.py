@@ -1,1 +1,1 @@
-"""Kernels as torch functions: arguments are validated here, once; one file for each stage."""
+"""Torch functions that validate their arguments and launch the kernels, with one file per stage."""

@@ -20,10 +20,10 @@ Form = Literal["auto", "plain", "cpu"]
 
 
 class Update(NamedTuple):
-    """One tensor's share of a step; all tensors have one shape, float32, contiguous."""
+    """One tensor's part of a step. Its four tensors have the same shape and are contiguous float32."""
 
     value: Tensor
-    """Changed in place."""
+    """Parameter, changed in place."""
     gradient: Tensor
     exp_avg: Tensor
     """First moment, changed in place."""
@@ -31,7 +31,7 @@ class Update(NamedTuple):
     """Second moment, changed in place."""
     rate: float
     steps: int
-    """Steps taken, this one included: 1 or more."""
+    """Number of steps taken, this one included: 1 or more."""
 
 
 def adam_step(
@@ -73,7 +73,7 @@ def adam_step(
 
 
 def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
-    """Return the index of the first tensor with an infinity or a NaN, or None. Exact: no sum can overflow.
+    """Return the index of the first tensor with an infinity or a NaN, or None. No sum is involved that could overflow.
 
     Args:
         tensors: float32, on one device.
@@ -95,11 +95,11 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
 
 
 def first_not_finite_by_norm(tensors: Sequence[Tensor]) -> int | None:
-    """Return what :func:`first_not_finite` does, in torch operations and with one read of the device.
+    """Compute the result of :func:`first_not_finite` in torch operations, with one wait for the device.
 
     Args:
-        tensors: floating point, on one device. Tensors without elements count as finite: torch has no infinity norm
-            of them, and stage 1 has such a gradient (spheres carry no spherical harmonics beyond degree 0).
+        tensors: floating point, on one device. Empty tensors count as finite, because torch has no infinity norm of
+            them. Stage 1 has such a gradient: its spheres carry no spherical harmonics beyond degree 0.
     """
     filled = [(index, tensor) for index, tensor in enumerate(tensors) if tensor.numel() > 0]
     if not filled or math.isfinite(float(torch.nn.utils.get_total_norm([tensor for _, tensor in filled], math.inf))):
@@ -116,7 +116,7 @@ def _simd(form: str, device: torch.device) -> bool:
 
 
 def _fits(update: Update, device: torch.device) -> bool:
-    """Return whether an update is valid; runs for each tensor in each step, hence without a loop."""
+    """Return whether an update is valid. There is no loop, because this runs for each tensor in each step."""
     value, gradient, exp_avg, exp_avg_sq = update[:4]
     return (
         value.shape == gradient.shape == exp_avg.shape == exp_avg_sq.shape

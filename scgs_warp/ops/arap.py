@@ -52,7 +52,7 @@ def local_rotations(rest: Tensor, posed: Tensor, neighbors: Tensor, weights: Ten
 
 
 def reverse_edges(neighbors: Tensor) -> NodeLists:
-    """Return the edges that lead to each node, to be computed once for many calls of ``arap_energy``."""
+    """Return the incoming edges of each node, which many calls of ``arap_energy`` can share."""
     return node_lists(neighbors, neighbors.shape[0])
 
 
@@ -109,7 +109,7 @@ def arap_energy(
 
 
 def trajectory_graph(trajectories: Tensor, count: int = 8) -> tuple[Tensor, Tensor]:
-    """Return the neighbours of the control points by their distance over time, and weights (SC-GS, Eq. 10).
+    """Return the control points' nearest neighbours by distance over time, and their weights (SC-GS, Eq. 10).
 
     The squared distance of two nodes is averaged over the sampled times. Weights are ``exp(-d^2 / (2 h^2))`` with h the
     mean neighbour distance, normalised for every node.
@@ -137,8 +137,8 @@ def trajectory_graph(trajectories: Tensor, count: int = 8) -> tuple[Tensor, Tens
         return neighbors, weights
     tracks = trajectories.detach().permute(1, 0, 2).reshape(nodes, 3 * times) / times**0.5
     indices, distances = nearest(tracks, tracks, available + 1)
-    # Every node is removed from its own list. Among duplicates it need not come first; if it does not appear at all,
-    # the last entry goes. A non-finite node may appear twice: its list then ends with placeholders.
+    # Every node is removed from its own list. Among duplicates it need not come first; if it is missing, the last entry
+    # is removed instead. A non-finite node may appear twice: its list then ends with placeholders.
     own = indices == torch.arange(nodes, device=device, dtype=torch.int32)[:, None]
     own &= own.cumsum(dim=1) == 1
     own[:, -1] |= ~own.any(dim=1)

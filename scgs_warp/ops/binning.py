@@ -15,9 +15,9 @@ from .binning_cuda import MAX_PAIRS, RadixBinning, geometry_of
 from .memory_windows import Demand, Window
 
 CHUNK_SIZE = 1024
-"""Smallest number of splats in a chunk on a CPU."""
+"""Smallest number of splats that a chunk holds on a CPU."""
 MAX_CHUNKS = 128
-"""Largest number of chunks: each counts its splats per row of tiles, and many counts would outweigh the splats."""
+"""Largest number of chunks. Each keeps a count per row of tiles, and the counts must not outweigh the splats."""
 
 
 def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | None = None) -> Tiles:
@@ -30,12 +30,12 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | N
     Args:
         splats: N projected Gaussians, on any device.
         tile_size: side of a tile in pixels.
-        demand: memory that compositing takes beside the lists. If given, an image whose lists do not fit into memory is
-            cut into windows, which ``composite`` draws one after the other. None: the lists have to fit.
+        demand: memory that compositing takes in addition to the lists. If given, an image whose lists do not fit into
+            memory is cut into windows, which ``composite`` draws one after the other. None: the lists have to fit.
 
     Returns:
-        Tiles on the same device; ``ranges`` row major, ``slots`` such that splat ``i`` owns ``offsets[i]`` up to
-        ``offsets[i + 1]``, in the order rows first, then columns.
+        Tiles on the same device, with ``ranges`` in row-major order. Splat ``i`` owns the slots ``offsets[i]`` up to
+        ``offsets[i + 1]``, one per tile it touches, in row-major order.
 
     Raises:
         ValueError: a field has a wrong shape, an image side or tile size is not positive, or there are more than
@@ -61,11 +61,11 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | N
 
 
 def bin_window(splats: Splats, tiles: Tiles, window: Window) -> Tiles:
-    """List the splats of some tiles of an image; the lists of all other tiles are empty.
+    """List the splats of a window of tiles; the lists of all other tiles are empty.
 
     Args:
         tiles: result of ``bin_splats`` for the same splats.
-        window: begin and end of the tiles to list.
+        window: begin and end of the range of tiles to list.
     """
     size = (tiles.width, tiles.height, tiles.columns, tiles.rows, tiles.tile_size)
     return _listed(splats, size, _count(splats, size, window))
@@ -84,8 +84,9 @@ def _listed(splats: Splats, size: tuple[int, int, int, int, int], count: BandBin
 
 
 class BandBinning:
-    """Binning on a CPU (a ``ListSize``): splats are dealt to rows of tiles, and each row is sorted by itself; see
-    ``kernels.cpu.binning``."""
+    """Binning on a CPU (a ``ListSize``): splats are distributed to rows of tiles, and each row is sorted separately.
+
+    See ``kernels.cpu.binning``."""
 
     max_entries = MAX_PAIRS
 

@@ -22,7 +22,7 @@ from . import checks
 
 MAX_PAIRS = 2**31 - 1
 MAX_ROOM = MAX_PAIRS // 2
-"""Largest number of pairs that a radix sort can hold: its lists are twice as long."""
+"""Largest number of pairs in a radix sort, whose lists are twice as long and indexed by int32."""
 
 
 def bin_within(splats: Splats, capacity: int, *, slots: bool = True) -> tuple[Tiles, Tensor]:
@@ -58,7 +58,7 @@ def bin_within(splats: Splats, capacity: int, *, slots: bool = True) -> tuple[Ti
 
 
 class RadixBinning:
-    """Binning on a GPU (a ``ListSize``), with lists of exactly the number of pairs, at the price of one wait."""
+    """Binning on a GPU (a ``ListSize``), with lists of exact length, for which the host waits once for the device."""
 
     max_entries = MAX_ROOM
 
@@ -83,7 +83,7 @@ class RadixBinning:
 
 
 def bytes_within(capacity: int, count: int, tiles: int) -> int:
-    """Return the bytes that ``bin_within`` takes without slots, for ``count`` splats."""
+    """Return the number of bytes that ``bin_within`` allocates without slots, for ``count`` splats."""
     return 16 * capacity + 52 * count + 8 * tiles
 
 
@@ -94,7 +94,7 @@ def geometry_of(splats: Splats) -> list[Tensor]:
 
 
 def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Return the number of tiles that each splat touches, [N], and [2 N] whose first half is the order by depth."""
+    """Return the number of tiles that each splat touches, [N], and a list [2 N] that starts with the order by depth."""
     count, device = len(geometry[0]), geometry[0].device
     counts = torch.empty(count, dtype=torch.int32, device=device)
     depth_keys = torch.empty(2 * count, device=device)
@@ -105,7 +105,7 @@ def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tenso
 
 
 def _running_sums(counts: Tensor) -> Tensor:
-    """Return the sums of the counts before each, [N + 1] int64."""
+    """Return the exclusive prefix sums of the counts and their total, [N + 1] int64."""
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
     torch.cumsum(counts, 0, dtype=torch.int64, out=offsets[1:])
     return offsets
@@ -141,7 +141,7 @@ def _list(
 
 
 def radix_sort(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
-    """Sort the first halves by key, stably; the second halves are scratch."""
+    """Sort the first halves of the tensors by key, stably; the second halves are scratch memory."""
     if count == 0:
         return
     with on_torch_stream(keys.device) if keys.is_cuda else contextlib.nullcontext():

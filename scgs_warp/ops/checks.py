@@ -9,11 +9,11 @@ from ..runtime import debug
 from ..types import Splats, Tiles
 
 UNWRITTEN = -1
-"""Initial entry of lists in debug mode."""
+"""Initial value of list entries in debug mode."""
 UNWRITTEN_BITS = 0x7FABCDEF
-"""Initial bits of gradient slots in debug mode: a NaN that no arithmetic makes."""
+"""Initial bits of gradient slots in debug mode: a NaN that arithmetic never produces."""
 SAFE_MAGNITUDE = 1e30
-"""Largest magnitude of values whose sums are surely finite."""
+"""Largest magnitude of values whose sums are certain to be finite."""
 
 
 def unwritten(size: int, device: torch.device | str = "cpu") -> Tensor:
@@ -32,10 +32,10 @@ def unwritten_slots(pairs: int, width: int, device: torch.device) -> Tensor:
 
 
 def expect(holds: bool | Tensor, what: str) -> None:
-    """Check an invariant, described by ``what``.
+    """Check that the invariant described by ``what`` holds everywhere.
 
     Raises:
-        BrokenInvariant: it does not hold everywhere.
+        BrokenInvariant: it does not.
     """
     if isinstance(holds, Tensor):
         holds = bool(holds.all())
@@ -47,7 +47,7 @@ def check_tiles(splats: Splats, tiles: Tiles) -> None:
     """Check complete lists: every counted pair is listed once, in its tile, in order, with a slot of its own.
 
     Raises:
-        BrokenInvariant: naming the violated invariant.
+        BrokenInvariant: an invariant is violated; the message names it.
     """
     count, pairs = len(splats.means2d), len(tiles.splats)
     check_room(tiles, pairs, count)
@@ -74,19 +74,19 @@ def check_tiles(splats: Splats, tiles: Tiles) -> None:
 
 
 def check_dealt(begun: Tensor, ended: Tensor) -> None:
-    """Check on a CPU that dealing wrote every stretch that sorting will read.
+    """Check on a CPU that ``deal_chunks`` wrote every stretch that ``sort_bands`` will read.
 
     Args:
         begun, ended: [chunks, rows + 1] position of each chunk's first stretch of each row, and behind its last one.
 
     Raises:
-        BrokenInvariant: a chunk dealt more or fewer than it counted.
+        BrokenInvariant: a chunk wrote more or fewer stretches than it counted.
     """
     expect(begun.T.flatten()[1:] == ended.T.flatten()[:-1], "each chunk deals as many stretches as it counted")
 
 
 def check_room(tiles: Tiles, capacity: int, count: int) -> None:
-    """Check lists with room for ``capacity`` pairs of ``count`` splats, whether or not all pairs found room.
+    """Check lists with room for ``capacity`` pairs of ``count`` splats; pairs that did not fit may be missing.
 
     Raises:
         BrokenInvariant: an entry points outside the lists.
@@ -102,13 +102,13 @@ def check_room(tiles: Tiles, capacity: int, count: int) -> None:
 
 
 def check_pixels(tiles: Tiles, window: tuple[int, int], alpha: Tensor, transmittance: Tensor, last: Tensor) -> None:
-    """Check the results of the forward pass for the pixels of some tiles.
+    """Check the results of the forward pass for the pixels of a window of tiles.
 
     Args:
         alpha, transmittance, last: [H, W] of the whole image.
 
     Raises:
-        BrokenInvariant: naming the violated invariant.
+        BrokenInvariant: an invariant is violated; the message names it.
     """
     side, device = tiles.tile_size, alpha.device
     rows = torch.arange(tiles.height, device=device) // side
@@ -124,7 +124,7 @@ def check_pixels(tiles: Tiles, window: tuple[int, int], alpha: Tensor, transmitt
 
 
 def check_image(image: Tensor, channels: Tensor, background: Tensor) -> None:
-    """Check that an image of finite colours is finite.
+    """Check that an image drawn from finite colours is finite.
 
     Raises:
         BrokenInvariant: it is not.
@@ -135,7 +135,7 @@ def check_image(image: Tensor, channels: Tensor, background: Tensor) -> None:
 
 
 def check_slots(tiles: Tiles, v_slots: Tensor) -> None:
-    """Check the gradient slots.
+    """Check that each pair has a gradient slot and that every slot was written.
 
     Raises:
         BrokenInvariant: a slot is missing, or would be read without having been written.

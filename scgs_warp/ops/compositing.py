@@ -26,7 +26,7 @@ EMPTY_TILE = 8
 
 @dataclass(frozen=True)
 class _Job:
-    """Arguments of one call of ``composite`` beside its differentiable tensors."""
+    """Arguments of one call of ``composite`` except its differentiable tensors."""
 
     splats: Splats
     tiles: Tiles
@@ -36,7 +36,7 @@ class _Job:
 
 
 def demand(splats: Splats, channels: Tensor, background: Tensor | None = None) -> Demand:
-    """Estimate the memory that :func:`composite` takes beside the lists of splats, its image's further use included."""
+    """Estimate the memory that :func:`composite` and later uses of its image take, without the lists of splats."""
     count, width = channels.shape
     packed = 4 * (PACKED_GEOMETRY + _padded(width)) if channels.device.type == "cpu" else 4
     tensors = (splats.means2d, splats.conics, splats.opacities, channels)
@@ -47,7 +47,7 @@ def demand(splats: Splats, channels: Tensor, background: Tensor | None = None) -
 
 
 def image_demand(width: int, height: int, channels: int, gradients: bool = False) -> int:
-    """Estimate the bytes of an image and its alpha, with depth, colours, gradients and a loss' images made of them."""
+    """Estimate the bytes of an image, its alpha, and derived tensors: depth, colours, gradients, a loss's images."""
     planes = 3 * (channels + 1) + 2 if gradients else channels + 3
     return 4 * planes * width * height
 
@@ -64,20 +64,21 @@ def composite(
 ) -> tuple[Tensor, Tensor]:
     """Blend the splats of each pixel front to back: sum_i channels_i alpha_i T_i + T background.
 
-    3D Gaussian Splatting (Kerbl et al. 2023), equation 3, with gsplat 1.5.3's thresholds: alpha is at most 0.999 (and
-    passes no gradient there), is skipped under 1/255, and a pixel ends for good before the splat that would leave a
-    transmittance of 1e-4 or less. A splat with a channel that is non-finite or beyond 1e18 is left out.
+    This is equation 3 of 3D Gaussian Splatting (Kerbl et al. 2023) with gsplat 1.5.3's thresholds: alpha is clamped to
+    0.999 (a clamped alpha passes no gradient), a splat is skipped where its alpha is under 1/255, and a pixel ends
+    before the splat that would leave a transmittance of 1e-4 or less. A splat with a channel that is non-finite or
+    beyond 1e18 is left out.
 
-    Gradients go to ``splats.means2d``, ``conics`` and ``opacities``, to ``channels`` and to ``background``. A gradient
-    to the geometry that overflows becomes 0.
+    Gradients reach ``splats.means2d``, ``conics`` and ``opacities``, ``channels`` and ``background``. A gradient of the
+    geometry that overflows becomes 0.
 
     Args:
         splats: N projected Gaussians; ``depths`` is not read.
         channels: [N, C] values to blend: colours, depths, anything.
-        tiles: result of ``bin_splats(splats)``. If cut into windows, these are listed and drawn one after the other, in
-            the backward pass as well: the same bits, with the lists of one window in memory.
+        tiles: result of ``bin_splats(splats)``. If it is cut into windows, they are listed and drawn one after the
+            other, in the backward pass as well. Results are bit-identical, with one window's lists in memory.
         background: [C] values behind all splats. None: zeros, which also replace non-finite values.
-        stats: if given, the backward pass adds its statistics.
+        stats: statistics to which the backward pass adds. None: they are not collected.
         absgrad: [N, 2] buffer that the backward pass overwrites with the sum over pixels of the absolute gradients of
             ``means2d``.
         form: kernels to run; ``auto`` takes the fastest for the device. ``pixel`` is the readable reference on any
@@ -157,7 +158,7 @@ def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
 
 
 def _pieces(job: _Job) -> Iterator[tuple[Tiles, Window]]:
-    """Yield lists and window: all at once, or window by window. The caller must drop each before the next."""
+    """Yield the lists and range of all tiles, or of each window; the caller must drop one pair before the next."""
     if not job.tiles.windows:
         yield job.tiles, (0, len(job.tiles.ranges))
         return
@@ -167,8 +168,8 @@ def _pieces(job: _Job) -> Iterator[tuple[Tiles, Window]]:
 
 
 def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, ...]:
-    """Return image and alpha, and for the adjoint (None unless ``keep``) the form's representation of the splats, final
-    transmittance and last contributor."""
+    """Return image and alpha, then, for the adjoint, the form's representation of the splats, final transmittance and
+    last contributor; these are None unless ``keep``."""
     means2d, conics, opacities, channels, background = tensors
     device, count = channels.device, channels.shape[1]
     image = torch.empty(count, job.tiles.height, job.tiles.width, device=device)
@@ -200,7 +201,7 @@ def _draw(
     source: Tensor,
     outputs: tuple[Tensor | None, ...],
 ) -> None:
-    """Draw the pixels of some tiles."""
+    """Composite the pixels of a window of tiles."""
     means2d, conics, _, channels, background = tensors
     size, begin, count = (tiles.width, tiles.height, tiles.columns), window[0], window[1] - window[0]
     if form == "cpu":
@@ -217,7 +218,7 @@ def _draw(
 
 
 def _pixels(tiles: Tiles, window: Window) -> list[tuple[int, int]]:
-    """Return first pixel and number of pixels of each row-major stretch of the image that a window covers."""
+    """Return the first pixel and the number of pixels of each contiguous run (row major) that a window covers."""
     (top, left), (bottom, right) = divmod(window[0], tiles.columns), divmod(window[1], tiles.columns)
     side, width = tiles.tile_size, tiles.width
     y_begin = top * side
@@ -229,7 +230,7 @@ def _pixels(tiles: Tiles, window: Window) -> list[tuple[int, int]]:
 
 
 def _load(tiles: Tiles, window: Window) -> Tensor:
-    """Return the cost on a CPU of the window's tiles up to each, [T], in pairs."""
+    """Return the cumulative cost on a CPU of the window's tiles, [T], in pairs."""
     ends = tiles.ranges[window[0] : window[1], 1]
     return ends + torch.arange(EMPTY_TILE, (len(ends) + 1) * EMPTY_TILE, EMPTY_TILE)
 
@@ -259,8 +260,8 @@ def _adjoint(
     pixels: tuple[Tensor, ...],
     absolute: bool,
 ) -> Tensor:
-    """Return the gradient of every listed pair in its slot, [P, S]. ``pixels``: final transmittance, last contributor,
-    and the gradients to image and alpha."""
+    """Return the gradient slots of all listed pairs, [P, S]. ``pixels``: final transmittance, last contributor, and the
+    gradients of image and alpha."""
     means2d, conics, _, channels, background = tensors
     v_slots = checks.unwritten_slots(len(tiles.splats), _slot_width(channels.shape[1]), channels.device)
     lists = (background, tiles.ranges, tiles.splats, tiles.slots, *pixels)
@@ -281,7 +282,7 @@ def _adjoint(
 
 
 def _background_gradient(v_image: Tensor, transmittance: Tensor) -> Tensor:
-    """Return the sum over pixels of v_image times transmittance, [C], in a fixed order."""
+    """Return the background's gradient: the sum over pixels of v_image times transmittance, [C], in fixed order."""
     channels, height, _ = v_image.shape
     rows = torch.empty(height, channels, device=v_image.device)
     launch(kernels.background_rows, height, v_image, transmittance, rows, grain=16)

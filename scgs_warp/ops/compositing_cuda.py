@@ -1,4 +1,4 @@
-"""Launches of the forms of compositing with a block of threads per tile: ``cuda``, and the portable ``blocks``."""
+"""Launches of the forms of compositing that use a block of threads per tile: ``cuda`` and the portable ``blocks``."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def forward(
     outputs: tuple[Tensor | None, ...],
     window: tuple[int, int],
 ) -> None:
-    """Draw some tiles.
+    """Composite a window of tiles.
 
     Args:
         lists: the kernels' tensors up to the sorted list.
         size: width, height, columns.
         outputs: image, alpha, final transmittance and last contributor.
-        window: begin and end of the tiles to draw.
+        window: begin and end of the range of tiles to composite.
     """
     begin, blocks = window[0], window[1] - window[0]
     if form == "cuda":
@@ -50,7 +50,7 @@ def adjoint(
     v_slots: Tensor,
     window: tuple[int, int],
 ) -> None:
-    """Write the gradients of some tiles' pairs into their slots.
+    """Write the gradients of the pairs in a window of tiles into the pairs' slots.
 
     The portable form takes over where there are more channels than a slot of the native form holds.
 

@@ -61,21 +61,21 @@ class _SphericalHarmonics(torch.autograd.Function):
 def spherical_harmonics(
     sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_position: Tensor, degree: int, *, form: Form = "auto"
 ) -> Tensor:
-    """Return the colours of Gaussians seen from one point: harmonics + 0.5, clamped at 0 (signs as in 3D-GS).
+    """Return the colours of Gaussians seen from one point: harmonics + 0.5, clamped at 0 (basis signs as in 3D-GS).
 
     Args:
         sh_dc: [N, 3] float32, coefficients of degree 0.
-        sh_rest: [N, R, 3] float32, coefficients of the higher degrees, R >= (degree + 1)^2 - 1; those beyond ``degree``
-            get a zero gradient.
+        sh_rest: [N, R, 3] float32, coefficients of the higher degrees, R >= (degree + 1)^2 - 1. Coefficients beyond
+            ``degree`` get a zero gradient.
         means: [N, 3] float32, world.
         camera_position: [3] float32, world.
         degree: 0 to 3.
         form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
-        [N, 3] colours >= 0; non-finite where a used coefficient is, and ``composite`` leaves such a Gaussian out.
-        Gradients reach all four tensors; a clamped or non-finite channel passes no gradient, nor does one to the mean
-        that would overflow.
+        [N, 3] colours >= 0, or non-finite where a used coefficient is non-finite; ``composite`` leaves such Gaussians
+        out. Gradients reach all four tensors, but none passes through a clamped or non-finite channel, and a mean whose
+        gradient would overflow gets 0.
 
     Raises:
         ValueError: a shape is wrong, or the degree is not 0 to 3 or more than ``sh_rest`` has.

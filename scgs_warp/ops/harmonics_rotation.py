@@ -43,9 +43,9 @@ def _basis(degree: int, d: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _tables() -> tuple[Tensor, Tensor]:
-    """Return directions [15, 3] and the inverses [83] of the bands' values there.
+    """Return directions [15, 3] and the inverses [83] of the matrices of the bands' values in these directions.
 
-    A seeded search finds directions whose matrices are well conditioned, so that values are as exact as coefficients.
+    A seeded search finds directions whose matrices are well conditioned, so that inverting them loses no accuracy.
     """
     random = np.random.default_rng(1)
     directions, inverses = [], []
@@ -60,11 +60,11 @@ def _tables() -> tuple[Tensor, Tensor]:
 
 
 def rotate_harmonics(sh_rest: Tensor, quats: Tensor) -> Tensor:
-    """Rotate spherical harmonics: along R d the result has the colour that the input has along d.
+    """Rotate spherical harmonics by R: the result has along R d the colour that the input has along d.
 
     Args:
         sh_rest: [N, R, 3] coefficients of degree 1 and higher; R is 0, 3, 8 or 15.
-        quats: [N, 4] wxyz, any norm. The identity (x, y and z are 0) keeps the coefficients' bits.
+        quats: [N, 4] wxyz, any norm. Under the identity (x, y and z are 0) the result is bit-identical to the input.
 
     Returns:
         [N, R, 3]; degree 0 needs no rotation. No gradient.

@@ -1,8 +1,9 @@
-"""Windows of tiles, for images whose lists of splats do not fit into memory together.
+"""Windows of tiles: ranges that are listed and drawn one after the other if the whole image's lists exceed memory.
 
-A tile's list does not depend on what else is listed, so a window's pixels have the bits of the whole image's. Windows
-are rows of tiles as long as one row fits, then parts of a row, in the end one tile. They follow the order of the tiles,
-so that sums over a splat's slots continue from window to window in the order they have in one piece.
+A tile's list does not depend on which other tiles are listed, so pixels drawn in windows are bit-identical to those
+drawn at once. A window consists of whole rows of tiles if at least one row fits into memory, otherwise of part of a
+row, at least one tile. Windows follow the order of the tiles, so that sums over a splat's slots continue from window
+to window in the order in which the whole image would add them.
 """
 
 from __future__ import annotations
@@ -18,15 +19,15 @@ from ..runtime import memory
 from ..types import Splats
 
 Window = tuple[int, int]
-"""Tiles from begin to end; either whole rows or within one row."""
+"""Range of tiles (begin, end): either whole rows, or part of one row."""
 
 WINDOW_SHARE = 0.5
-"""Share of the free memory that a window may fill, while it can be cut further: memory is not free again at once."""
+"""Share of the free memory that a window may fill if it can be cut further: freed memory returns with a delay."""
 REMEDY = "make the image smaller or use fewer Gaussians"
 
 
 class ListSize(Protocol):
-    """Size of the lists of a window, counted before they are allocated."""
+    """Size of a window's lists, computed before they are allocated."""
 
     pairs: int
     """Number of pairs of splat and tile."""
@@ -37,36 +38,36 @@ class ListSize(Protocol):
 
     @property
     def list_bytes(self) -> int:
-        """Bytes of the lists."""
+        """Number of bytes of the lists."""
         ...
 
     @property
     def scratch_bytes(self) -> int:
-        """Bytes used only while the lists are made."""
+        """Number of bytes used only while the lists are made."""
         ...
 
 
 @dataclass(frozen=True)
 class Demand:
-    """Memory that compositing takes beside the lists, in bytes."""
+    """Memory that compositing takes in addition to the lists, in bytes."""
 
     fixed: int
-    """Independent of the number of pairs: images, packed splats, gradients."""
+    """Bytes independent of the number of pairs: images, packed splats, gradients."""
     per_pair: int = 0
-    """Per pair in the backward pass: a gradient slot."""
+    """Bytes per pair in the backward pass: a gradient slot."""
 
     def total(self, size: ListSize) -> int:
-        """Bytes with the lists and their scratch memory."""
+        """Return the number of bytes including the lists and their scratch memory."""
         return self.fixed + size.list_bytes + max(size.scratch_bytes, self.per_pair * size.pairs)
 
 
 def fits(size: ListSize, demand: Demand, device: torch.device) -> bool:
-    """Return whether everything can be listed and drawn at once."""
+    """Return whether all tiles counted in ``size`` can be listed and drawn at once."""
     return size.entries <= size.max_entries and memory.fits(demand.total(size), device)
 
 
 def require_image(need: int, size: tuple[int, int], count: int, device: torch.device) -> None:
-    """Refuse an image that does not fit whatever its lists, before its tiles are counted.
+    """Refuse an image that does not fit even without its lists, before its tiles are counted.
 
     Args:
         need: bytes that do not depend on the number of pairs.
@@ -103,8 +104,8 @@ def cut(measure: Callable[[Window], ListSize], columns: int, rows: int, demand: 
     """Cut an image into windows that all fit, in the order of the tiles.
 
     Args:
-        measure: counts the lists of a window.
-        columns, rows: tiles of the image.
+        measure: function that returns the size of a window's lists.
+        columns, rows: numbers of tiles in the image.
 
     Raises:
         NotEnoughMemory: the image itself, or one of its tiles, takes too much.
@@ -141,6 +142,6 @@ def halves(window: Window, columns: int) -> tuple[Window, Window]:
 
 
 def slot_bytes(tensors: tuple[Tensor, ...], width: int) -> int:
-    """Bytes of a gradient slot of ``width`` columns; 0 if there will be no backward pass."""
+    """Return the bytes of a gradient slot of ``width`` columns; 0 if there will be no backward pass."""
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     return 4 * width if wanted else 0

@@ -14,10 +14,10 @@ from .node_sums import rbf_node_sums
 
 
 class NodeLists(NamedTuple):
-    """The (Gaussian, neighbour) pairs of every node, ascending: its gradients are summed in this order."""
+    """The (Gaussian, neighbour) pairs of every node in ascending order, the order in which its gradients are summed."""
 
     order: Tensor
-    """[N * K] int32, pairs ``i * K + k`` sorted by node."""
+    """[N * K] int32, indices ``i * K + k`` of the pairs, sorted by node."""
     begin: Tensor
     """[M + 1] int32, node m's pairs are ``order[begin[m]:begin[m + 1]]``."""
 
@@ -83,7 +83,7 @@ def _blocks(points: Tensor) -> int:
 
 
 class CandidateLists(NamedTuple):
-    """Candidate nodes of every block of sixteen points, with the nodes' positions at the time of the search."""
+    """Candidate nodes of every block of sixteen points, with the positions that the nodes had when they were listed."""
 
     k: int
     order: Tensor
@@ -103,16 +103,16 @@ class CandidateLists(NamedTuple):
 
 
 class NeighborSearch:
-    """:func:`nearest` for points and nodes that move a little between calls.
+    """A search like :func:`nearest` that is faster if points and nodes move little between calls.
 
-    On a CPU it remembers candidate nodes for blocks of points that are close together. Later calls search the
-    candidates alone wherever a bound on all movements since then proves that this is enough, and every node elsewhere.
-    The memory never changes a result, so it need be neither invalidated nor saved.
+    On a CPU it remembers candidate nodes for blocks of points that are close together. A later call searches a block's
+    candidates only, if a bound on all movements since then proves that they suffice, and otherwise every node. The
+    remembered candidates never change a result, so they need be neither invalidated nor saved.
     """
 
     def __init__(self) -> None:
         self.lists: CandidateLists | None = None
-        """Candidates in use."""
+        """Candidates in use, or None before the first search."""
         self.full_searches = 0
         """Number of blocks searched in full since the lists were made."""
 
@@ -126,7 +126,7 @@ class NeighborSearch:
         if not _in_lanes(points):
             return nearest(points, nodes, k)[0]
         blocks = _blocks(points)
-        # New lists cost about as much as a full search of every block: they are due after as many full searches.
+        # New lists cost about as much as a full search of every block, so they are made after as many full searches.
         own = self.lists  # read once: another thread may replace them
         if own is None or self.full_searches > blocks or not own.fit(points, nodes, k):
             indices, distances = nearest(points, nodes, k)
@@ -161,7 +161,7 @@ def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> CandidateLi
 def _node_sums(
     indices: Tensor, points: Tensor, nodes: Tensor, v_logits: Tensor, lists: NodeLists | None
 ) -> tuple[int, Tensor]:
-    """Return the number of partial sums and their buffer [parts * M, 2 + D]."""
+    """Sum the nodes' gradients in parts, and return the number of parts and their buffer [parts * M, 2 + D]."""
     count, width = nodes.shape[0], 2 + nodes.shape[1]
     if lists is None and points.device.type == "cpu":
         size = chunk_size(count)
@@ -214,9 +214,9 @@ def rbf_weights(
 ) -> Tensor:
     """Return the weights of a Gaussian's control points: ``s_k exp(-d_k^2 / (2 r_k^2))``, normalised.
 
-    SC-GS, Eq. 5; the strengths are the official code's learned node weights. The weights are a softmax of exponents, so
-    a Gaussian far from every node keeps sensible ones. A row without a finite exponent gives weight 1 to its first
-    neighbour and passes no gradient.
+    See SC-GS, Eq. 5; the strengths s_k are the official code's learned node weights. The weights are computed as a
+    softmax of exponents, so those of a Gaussian far from every node do not underflow. A row without a finite exponent
+    gives weight 1 to its first neighbour and passes no gradient.
 
     Args:
         points: [N, D] rest positions, with hyper-coordinates appended if used.

@@ -14,21 +14,21 @@ from ..kernels.types import NETWORK_BLOCK, NETWORK_PANEL
 from ..runtime.launch import launch
 
 ROW_MULTIPLE = 8
-"""The number of rows of a matrix is a multiple of this."""
+"""Number of which every matrix's row count is a multiple."""
 ROWS_AT_ONCE = 8192
-"""Rows evaluated at once without gradients: hidden values stay in the cache from layer to layer."""
+"""Number of rows evaluated at once without gradients: hidden values stay in the cache from layer to layer."""
 ADJOINT_ROWS_AT_ONCE = 2048
-"""Rows of the adjoint evaluated at once; the bits do not depend on it."""
+"""Number of rows of the adjoint evaluated at once; it does not affect the result."""
 
 
 class Layers:
-    """Weights of all layers, packed as the kernels read them; packed anew after a parameter has changed.
+    """Weights of all layers, packed in the kernels' layout; valid until a parameter changes.
 
     Args:
-        weights: [out, in] of every layer, float32, contiguous, on the CPU; the first reads the inputs alone.
+        weights: [out, in] of every layer, float32, contiguous, on the CPU; the first layer reads only the inputs.
         biases: [out] of every layer.
-        inputs: number of input columns. A layer with that many more columns than its predecessor has outputs reads the
-            inputs again, in front of those outputs (a skip connection).
+        inputs: number of input columns. A layer whose ``in`` exceeds its predecessor's ``out`` by this number reads the
+            inputs again, before the predecessor's outputs (a skip connection).
         inputs_adjoint: whether :meth:`gradients` will compute the gradient of the inputs.
     """
 
@@ -59,7 +59,7 @@ class Layers:
         launch(kernels.pack_weights, len(rows) * widest, widest, self.table, self.packed, grain=1)
 
     def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Return inputs and hidden values in panels, and the outputs [T M, out]."""
+        """Return the inputs and the hidden values in panels, and the outputs [T M, out]."""
         count = where.shape[0] * when.shape[0]
         rows = -(-count // ROW_MULTIPLE) * ROW_MULTIPLE
         inputs = torch.empty(-(-self.inputs // NETWORK_PANEL), rows, NETWORK_PANEL)
@@ -73,7 +73,7 @@ class Layers:
     def gradients(
         self, inputs: Tensor, hidden: Tensor, v_out: Tensor, sizes: tuple[int, int, int] | None
     ) -> tuple[Tensor | None, list[Tensor]]:
-        """Return the gradient of ``where`` and those of all weights, then of all biases.
+        """Return the gradient of ``where``, and a list of the gradients of all weights, then of all biases.
 
         Args:
             sizes: M, T and A of ``where`` [M, A] at T times. None: its gradient is not needed.
@@ -103,7 +103,7 @@ class Layers:
 
 
 def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> Tensor:
-    """Sum [T M, A] over the times to [M, A], in order."""
+    """Sum [T M, A] over the times, in their order, to [M, A]."""
     if times == 0:
         return torch.zeros(positions, columns)
     instants = v_inputs.view(times, positions, columns)
@@ -116,8 +116,8 @@ def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> T
 class PackedLayers:
     """Cache of packed weights, valid until a parameter is replaced or changed in place.
 
-    It misses changes that torch does not count (edits through ``.data``, writes of other libraries): call
-    :meth:`forget` after them.
+    The cache does not notice changes that torch does not count (edits through ``.data``, writes of other libraries).
+    Call :meth:`forget` after such changes.
     """
 
     def __init__(self) -> None:
@@ -127,7 +127,7 @@ class PackedLayers:
         self._kept = None
 
     def __call__(self, parameters: Iterable[Tensor], make: Callable[[], Layers]) -> Layers:
-        """Return the layers that ``make`` packs from ``parameters``."""
+        """Return the packed layers; call ``make`` to pack ``parameters`` if the cache is out of date."""
         parameters = list(parameters)
         if any(p.is_inference() for p in parameters):  # torch does not count changes of inference tensors
             return make()
@@ -169,13 +169,13 @@ def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Ten
     Args:
         where: [M, A] inputs that depend on the position.
         when: [T, B] inputs that depend on the time. No gradient.
-        weights: [out, in] of every layer; ``in`` is A + B for the first layer, and for the others the width of the
-            layer before, or A + B more for a skip connection, which reads the inputs again, in front.
+        weights: [out, in] of every layer. ``in`` is A + B for the first layer and the previous layer's ``out`` for the
+            others; A + B more make a skip connection, which reads the inputs again, before the previous outputs.
         biases: [out] of every layer.
 
     Returns:
-        [T M, out of the last layer], rows ``t M + m``. Gradients go to weights, biases and ``where``, summed in a fixed
-        order.
+        [T M, out of the last layer], with time t and position m in row ``t M + m``. Gradients reach weights, biases and
+        ``where``, summed in a fixed order.
 
     Raises:
         ValueError: a shape is wrong, or the parameters are not :func:`supported`.

@@ -1,4 +1,4 @@
-"""Gradients of control points on CUDA: sums over the sorted list of all pairs of Gaussian and control point."""
+"""Gradients of control points (nodes) on CUDA: sums over the sorted list of all pairs of Gaussian and node."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from ..runtime.launch import launch
 
 
 def skin_node_sums(order: Tensor, begin: Tensor, pairs: tuple, scaled: int) -> Tensor:
-    """Return the sums [M, SUMS (+ 3)] for ``skin_finish``; ``pairs`` are the arguments of ``skin_segments`` from
-    ``means_in`` on, of which ``nodes`` is the third."""
+    """Return the sums [M, SUMS] for ``skin_finish``, with 3 more columns if there are log scales.
+
+    ``pairs`` are the arguments of ``skin_segments`` from ``means_in`` on; the third of them is ``nodes``."""
     rows = _rows(order, pairs[2], SUMS + 3 * scaled)
     launch(kernels.skin_segments, _segments(order), order, *pairs, rows, grain=8)
     return _sum(begin, rows)

@@ -20,28 +20,28 @@ class Smoothness(NamedTuple):
     space: float = 1.0
     """Squared first differences along x, y and z, in all planes: total variation."""
     time: float = 1.0
-    """Squared second differences along t: features may change, but evenly."""
+    """Squared second differences along t, so that features may change, but evenly."""
     rest: float = 0.0
-    """Absolute distances of the time planes from 1, where nothing moves."""
+    """Absolute distances of the time planes from 1, the value for a scene at rest."""
 
 
 EVEN = Smoothness()
 
 
 def plane_features(positions: Tensor, time: float | Tensor, planes: list[Tensor]) -> Tensor:
-    """Multiply six bilinear samples for each Gaussian and level; levels stand side by side.
+    """Multiply six bilinear samples for each Gaussian and level, and concatenate the levels.
 
     Args:
-        positions: [N, 3]; the planes span [-1, 1], first and last texels at the ends. Outside, the border's value
-            counts and passes no gradient to the position; nor does the border itself. A NaN coordinate counts as -1.
-        time: clamped to [0, 1] (NaN: 0), or such a tensor [1] on the positions' device (no gradient; the host does not
-            read it); the time planes span that.
-        planes: six a level, in the order of :data:`PAIRS`: [second axis, first axis, 32], float32, at least two texels
-            a side. The planes of a level have the same extent along the same axis.
+        positions: [N, 3]. The planes span [-1, 1], with the first and last texels at the ends. On the border and beyond
+            it, samples are the border's and pass no gradient to the position. A NaN coordinate counts as -1.
+        time: a number, or a tensor [1] on the positions' device (no gradient; the host does not read it); clamped to
+            [0, 1] (NaN: 0), which the time planes span.
+        planes: six per level, in the order of :data:`PAIRS`: [second axis, first axis, 32], float32, at least two
+            texels per side. The planes of a level that share an axis have the same extent along it.
 
     Returns:
-        [N, 32 levels]. Gradients go to the positions and to all planes. torch adds those of the planes one after the
-        other on a CPU, atomically on CUDA.
+        [N, 32 levels]. Gradients reach the positions and all planes. torch sums the gradients of the planes
+        sequentially on a CPU, and atomically on CUDA.
 
     Raises:
         ValueError: a shape, dtype or device does not fit.
@@ -88,7 +88,7 @@ def plane_variation(planes: list[Tensor], weights: Smoothness = EVEN) -> Tensor:
         parts.append((weights.time if has_time else weights.space, down.square()))
         if has_time:
             parts.append((weights.rest, (plane - 1.0).abs()))
-        # Row by row first, so that the order of the sums does not depend on the number of threads.
+        # Summing rows first makes the order of the sums independent of the number of threads.
         terms += [weight * part.mean(-1).mean(-1).mean() for weight, part in parts if part.numel()]
     return torch.stack(terms).sum()
 
@@ -99,7 +99,7 @@ def _validate(planes: list[Tensor]) -> None:
     for index, plane in enumerate(planes):
         first, second = PAIRS[index % len(PAIRS)]
         level = index - index % len(PAIRS)
-        # Extents of a level: x and t from plane (x, t), y and z from (y, t) and (z, t).
+        # A level's extents are taken from its planes: x and t from (x, t), y from (y, t), and z from (z, t).
         extents = [planes[level + 3 + axis].shape[1:2] for axis in range(3)] + [planes[level + 3].shape[:1]]
         expected = (*extents[second], *extents[first], CHANNELS)
         if tuple(plane.shape) != expected or min(expected) < 2:

@@ -112,8 +112,9 @@ def project(
     """Project Gaussians to a pinhole camera's image (EWA splatting, conventions of gsplat 1.5.3).
 
     A splat ends where its alpha falls under 1/255: ``radii = ceil(sqrt(2 ln(255 opacity) covariance2d))`` per axis. A
-    Gaussian is culled, with all fields 0 and no gradient, if it is not between the planes or off the image, both radii
-    are at most ``radius_clip``, the opacity is under 1/255, the quaternion is zero, or a value is non-finite.
+    Gaussian is culled, with all fields 0 and no gradient, if its depth is not between the planes, its splat is off the
+    image, both radii are at most ``radius_clip``, the opacity is under 1/255, the quaternion is zero, or a value is
+    non-finite.
 
     Args:
         means: [N, 3] float32, world.
@@ -126,14 +127,15 @@ def project(
         height: image height, pixels.
         near_plane: smallest camera z kept.
         far_plane: largest camera z kept.
-        radius_clip: splats of this radius or a smaller one are dropped, pixels.
+        radius_clip: pixels; splats whose radii are not larger are culled.
         eps2d: added to both variances of the 2D covariance, px^2.
-        antialiased: multiply the opacity by sqrt(det / det with eps2d) (Mip-Splatting, section 5.2), before the extent.
+        antialiased: multiply the opacity by sqrt(det / det with eps2d) (Mip-Splatting, section 5.2) before the radii
+            are computed.
         form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
-        Splats of this image. Gradients reach means, quats, scales, opacities and viewmat. The clamp of the Jacobian to
-        the frustum widened by 0.3 tan(fov / 2) passes no gradient, nor does a Gaussian with an overflowing gradient.
+        Splats of this image. Gradients reach means, quats, scales, opacities and viewmat. No gradient passes through
+        the clamp of the Jacobian to the frustum widened by 0.3 tan(fov / 2), or to a Gaussian whose gradient overflows.
 
     Raises:
         ValueError: a shape or a size is wrong.

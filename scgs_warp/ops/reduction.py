@@ -1,4 +1,4 @@
-"""Column sums in an order that depends on the shape alone; ``tensor.sum(0)`` promises no order."""
+"""Column sums in an order that depends on the shape alone; torch does not guarantee one for ``tensor.sum(0)``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..runtime.launch import launch
 
 
 def sum_rows(values: Tensor) -> Tensor:
-    """Sum the rows of ``values`` [N, C], float32, to [C], in a tree with 64 children per node. No gradient."""
+    """Sum ``values`` [N, C], float32, over its rows to [C], as a tree with 64 children per node. No gradient."""
     if values.ndim != 2:
         raise ValueError(f"values must be [N, C], got {tuple(values.shape)}")
     if values.shape[0] == 0:

@@ -9,7 +9,7 @@ from ..kernels import sampling as kernels
 from ..runtime.launch import launch
 
 CHUNK = {"cpu": 4096, "cuda": 128}
-"""Points that one grid index handles; the result does not depend on it."""
+"""Number of points that one grid index processes; it does not affect the result."""
 
 
 def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:

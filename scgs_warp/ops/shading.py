@@ -11,7 +11,7 @@ from ..kernels import shading as kernels
 from ..runtime.launch import launch
 
 COLUMNS = 10
-"""Shading parameters per Gaussian: a 3 x 3 matrix and a coefficient."""
+"""Number of shading parameters per Gaussian: a 3 x 3 matrix and a coefficient."""
 
 
 class _Shade(torch.autograd.Function):
@@ -47,8 +47,8 @@ def shade(sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor) -> Ten
         quats_t: [N, 4] wxyz at the rendered instant, any norm.
 
     Returns:
-        [N, 3] coefficients of degree 0. Gradients reach ``sh_dc`` and ``shading`` alone, so that no surface turns to
-        match a brightness.
+        [N, 3] coefficients of degree 0. Gradients reach only ``sh_dc`` and ``shading``, so that training does not turn
+        surfaces to match a brightness.
 
     Raises:
         ValueError: a shape is wrong.

@@ -65,7 +65,7 @@ def _skin_lanes(means, quats, nodes, translations, rotations, shapes, log_scales
 
 
 def _node_sums(pairs: tuple, scaled: int, lists: NodeLists | None) -> tuple[int, Tensor]:
-    """Return the number of partial sums and their buffer [parts * M, columns]."""
+    """Sum the nodes' gradients in parts, and return the number of parts and their buffer [parts * M, columns]."""
     means, nodes, indices = pairs[0], pairs[2], pairs[4]
     count, width = nodes.shape[0], kernels.SUMS + 3 * scaled
     if lists is None and means.device.type == "cpu":
@@ -149,8 +149,8 @@ def skin(
 
 
 SAME_SIDE = 0.7072
-"""Unit quaternions with a larger first component are less than 45 degrees from the identity (as directions in four
-dimensions), hence less than 90 degrees from each other."""
+"""Bound on the first component of unit quaternions. Quaternions above it are, as directions in four dimensions, less
+than 45 degrees from the identity, and hence less than 90 degrees from each other."""
 
 
 class Palette(NamedTuple):
@@ -159,11 +159,11 @@ class Palette(NamedTuple):
     motion: Tensor
     reach: Tensor
     aligned: int
-    """1 if all shape rotations are less than 90 degrees apart: no sign has to be flipped. Saves time, same result."""
+    """Integer flag, 1 if all shape rotations are less than 90 degrees apart: the kernels then skip the sign flips."""
 
 
 def pack_palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None) -> Palette:
-    """Pack contiguous tensors; ``pose`` is translations, rotations, shape rotations and log scales."""
+    """Pack contiguous tensors of control points; ``pose``: translations, rotations, shape rotations, log scales."""
     translations, rotations, shapes, log_scales = pose
     count = nodes.shape[0]
     motion, reach = (torch.empty(count, skinning_palette.ROW) for _ in range(2))
@@ -250,7 +250,7 @@ def skin_rbf(
     hyper_points: Tensor | None = None,
     hyper_nodes: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Skin with the weights of ``rbf_weights``; on a CPU in one pass and one adjoint pass.
+    """Skin with the weights of ``rbf_weights``; on a CPU one kernel computes both, and one kernel its adjoint.
 
     Args:
         means, quats, nodes, pose, indices: as in ``skin``.

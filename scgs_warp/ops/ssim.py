@@ -23,7 +23,7 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form
         image: [C, H, W] float32.
         truth: [C, H, W] float32, a constant: no gradient reaches it.
         mask: [H, W] bool, True for valid pixels. None: all are valid. Invalid pixels of ``image`` are replaced by those
-            of ``truth``, so that no window sees them, and the mean leaves them out.
+            of ``truth`` so that they do not affect neighbouring windows, and they are left out of the mean.
         form: kernels to run: ``pixel`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:

@@ -1,4 +1,4 @@
-"""gsplat's main entry point on this project's kernels: same names, so that users switch by changing one import."""
+"""gsplat's main entry point on this project's kernels, with the same names, so that changing one import suffices."""
 
 from __future__ import annotations
 
@@ -67,15 +67,16 @@ def rasterization(
         height: pixels.
         near_plane: smallest camera z kept.
         far_plane: largest camera z kept.
-        radius_clip: splats of this radius or a smaller one are dropped, pixels.
+        radius_clip: pixels; splats whose radii are not larger are culled.
         eps2d: added to both variances of the 2D covariance, px^2.
         sh_degree: 0 to 3 if ``colors`` are harmonics. None: they are colours.
-        backgrounds: [C, D] behind everything. None: zeros. The depth behind everything is zero.
+        backgrounds: [C, D] colours behind everything. None: zeros. The depth behind everything is zero.
         render_mode: content of the last dimension: colour, accumulated depth (D), expected depth (ED), or both.
         absgrad: after ``backward``, ``meta["means2d"].absgrad`` [C, N, 2] is the sum over pixels of the absolute
             gradients of the 2D means (AbsGS).
         rasterize_mode: ``antialiased``: Mip-Splatting's opacity compensation.
-        packed: no effect, like ``tile_size``, ``sparse_grad``, ``channel_chunk`` and ``segmented``: one layout exists.
+        packed: no effect, like ``tile_size``, ``sparse_grad``, ``channel_chunk`` and ``segmented``, because there is
+            only one memory layout.
 
     Returns:
         renders [C, H, W, D], alphas [C, H, W, 1], and meta: ``means2d`` [C, N, 2] (may ``retain_grad``), ``radii``
@@ -145,7 +146,7 @@ def _channels(
     render_mode: str,
     background: Tensor | None,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return the channels that one camera blends, [N, D], depth last, and the background, [D]."""
+    """Return the channels to blend for one camera, [N, D], depth last, and the background, [D]."""
     depths = splats.depths[:, None]
     if not render_mode.startswith("RGB"):
         return depths, None

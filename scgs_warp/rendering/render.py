@@ -25,14 +25,14 @@ def render(
     stats: Stats | None = None,
     antialiased: bool = False,
 ) -> Image:
-    """Render Gaussians (3D Gaussian Splatting, Kerbl et al. 2023, section 4), colour and expected depth in one pass.
+    """Render colour and expected depth in one pass (3D Gaussian Splatting, Kerbl et al. 2023, section 4).
 
     Args:
         gaussians: N activated Gaussians in world units; N may be 0.
         camera: viewpoint, on the device of the Gaussians.
         background: [3] colour behind everything. None: black.
         sh_degree: degree of the harmonics used. None: the highest one present.
-        stats: if given, the backward pass adds its statistics.
+        stats: statistics to which the backward pass adds. None: they are not collected.
         antialiased: Mip-Splatting's opacity compensation.
 
     Returns:
@@ -59,7 +59,7 @@ def draw(
     depth: bool = False,
     binned: Callable[[Splats], Tiles] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Render as :func:`render` does, to planar images, with depth only on demand: training does without its cost.
+    """Render as :func:`render` does, to planar images, with depth only on request, which saves its cost in training.
 
     Args:
         depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
@@ -86,7 +86,7 @@ def draw(
 
 
 class _FiniteGradient(torch.autograd.Function):
-    """Identity whose gradient is 0 wherever it would be non-finite."""
+    """Identity function that replaces non-finite gradients by 0."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ class _FiniteGradient(torch.autograd.Function):
 
 
 def centre_of(camera: Camera) -> Tensor:
-    """Return ``camera.position``, [3], with gradient 0 where a broken viewmat (zero times NaN) would make it NaN."""
+    """Return ``camera.position``, [3]; its gradient is 0 where a non-finite viewmat (zero times NaN) would give NaN."""
     if not camera.viewmat.requires_grad:
         return camera.position
     viewmat: Tensor = _FiniteGradient.apply(camera.viewmat)  # type: ignore[assignment]

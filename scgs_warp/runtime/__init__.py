@@ -1,1 +1,1 @@
-"""The process and its devices: environment, threads, kernel launches, memory, progress, stop signals."""
+"""Services around the computation: environment, threads, kernel launches, memory, progress, stop signals."""

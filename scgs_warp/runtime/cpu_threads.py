@@ -1,8 +1,8 @@
-"""Sharing of a grid among CPU threads: cutting it into chunks, and running them.
+"""Sharing of a grid among CPU threads: cutting the grid into chunks, and running them.
 
-Chunks get smaller towards the end (guided self-scheduling, Polychronopoulos and Kuck 1987): a few large ones cost
-little, and small last ones let all threads end at about the same time. If the cost of each grid index is known
-beforehand, chunks are cut by cost and the heaviest come first.
+Chunks get smaller towards the end (guided self-scheduling, Polychronopoulos and Kuck 1987): a few large chunks have
+little overhead, and small final ones let all threads end at about the same time. If the cost of each grid index is
+known beforehand, chunks are cut by cost and the heaviest come first.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from torch import Tensor
 from . import environment
 
 Chunk = tuple[int, int]
-"""First grid index and number of indices."""
+"""Chunk of a grid: its first index and its number of indices."""
 
 CHUNKS_PER_SHARE = 3
-"""A chunk is one of so many parts of a thread's fair share of the remaining grid. Costs are estimates: the first chunk
-must not end last."""
+"""Number of chunks in a thread's fair share of the remaining grid. More than one, because costs are estimates and the
+first chunk must not end last."""
 MAX_CHUNKS_PER_SHARE = 32
-"""No chunk is smaller than one of so many parts of a thread's fair share of the whole grid."""
+"""Largest number of chunks in a thread's fair share of the whole grid; it limits how small chunks get."""
 
 
 @functools.cache
 def _shares(threads: int) -> np.ndarray:
-    """Ends of the chunks as fractions of the whole, ascending to 1."""
+    """Return the ends of the chunks as fractions of the whole grid, ascending to 1."""
     ends, left = [], 1.0
     while left > 0.0:
         left -= max(left / (CHUNKS_PER_SHARE * threads), 1.0 / (MAX_CHUNKS_PER_SHARE * threads))
@@ -51,7 +51,7 @@ def cut_by_load(load: Tensor, threads: int) -> list[Chunk]:
     """Cut a grid into chunks of similar cost, heaviest first.
 
     Args:
-        load: [count] integers, on the CPU: cost of all indices up to each, itself included.
+        load: [count] integers, on the CPU: cumulative cost of the indices, each included.
         threads: number of threads that share the work.
     """
     running = load.numpy()
@@ -68,10 +68,10 @@ def _chunks(ends: np.ndarray) -> list[Chunk]:
 
 
 class HelperThreads:
-    """Threads that wait for jobs for as long as the process lives."""
+    """Helper threads that wait for jobs as long as the process lives."""
 
     def __init__(self, flush_denormals: bool) -> None:
-        # All threads flush denormals or no thread does: results must not depend on which thread computes them.
+        # Either all threads flush denormals or none does, so that results do not depend on the thread.
         self.flush_denormals = flush_denormals
         self.jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self.count = 0
@@ -97,7 +97,7 @@ helpers = HelperThreads(False)
 
 
 def _forked() -> None:
-    """Start afresh in a child process, which inherits no threads."""
+    """Start anew in a child process, which inherits no threads."""
     global helpers
     helpers = HelperThreads(helpers.flush_denormals)
 
@@ -109,8 +109,8 @@ if hasattr(os, "register_at_fork"):
 def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: int) -> None:
     """Run ``call(first, size)`` once for each chunk, in this thread and up to ``threads - 1`` others.
 
-    Returns when all chunks are done, whether or not all helpers have woken up. A late helper finds nothing to do, and
-    does not keep ``call`` and its tensors alive: the next step needs their memory.
+    The function returns when all chunks are done, even if some helpers have not woken up yet. Such a helper finds
+    nothing to do and does not keep ``call`` and its tensors alive, because the next step needs their memory.
     """
     global helpers
     flush = environment.configured()

@@ -20,8 +20,8 @@ def on_torch_stream(device: torch.device) -> contextlib.AbstractContextManager:
 def warp_stream(device: torch.device) -> wp.Stream:
     """Return Warp's object for torch's current stream, the same object every time.
 
-    Warp keeps what belongs to a stream (an event, the radix sort's memory, a capture in progress) only as long as the
-    object lives, so a new object for each launch would discard it. Torch's streams live as long as the process.
+    Warp keeps a stream's state (an event, the radix sort's memory, a capture in progress) only as long as this object
+    lives, so a new object for each launch would discard the state. Torch's streams live as long as the process.
     """
     stream = torch.cuda.current_stream(device)
     of_device = _streams.setdefault(stream.device_index, {})
@@ -33,12 +33,12 @@ def warp_stream(device: torch.device) -> wp.Stream:
 class CudaGraph:
     """A CUDA graph of everything that ``body`` launches through torch and Warp.
 
-    ``body`` must not wait for the device, nor copy to or from the host. The tensors it makes live in the graph's own
-    memory and are overwritten by every replay.
+    ``body`` must neither wait for the device nor copy to or from the host. The tensors that it allocates are in the
+    graph's own memory and are overwritten by every replay.
     """
 
     overwrites = True
-    """True: a replay overwrites the result of the one before."""
+    """Flag that a replay overwrites the previous result, always True here."""
 
     def __init__(self, body: Callable[[], Any], device: torch.device) -> None:
         """Run ``body`` twice to load and compile its kernels, then capture it.
@@ -59,12 +59,12 @@ class CudaGraph:
             torch.cuda.device(device),
             torch.cuda.graph(self.graph, stream=capturing, capture_error_mode="thread_local"),
         ):
-            # Warp is told of the capture, so that its radix sort takes its memory from the graph.
+            # Warp must know of the capture, so that its radix sort takes its memory from the graph.
             capture = wp.ScopedCapture(stream=warp_stream(device), external=True)
             with capture:
                 self.result = body()
         self._modules = capture.graph
-        """Keeps the modules of the captured kernels loaded."""
+        """Warp's graph, which keeps the modules of the captured kernels loaded."""
 
     def replay(self) -> Any:
         """Launch the graph on torch's current stream and return its result, the same tensors every time."""

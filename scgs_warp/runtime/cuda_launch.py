@@ -1,6 +1,6 @@
-"""Launches on CUDA for the price of packing a few numbers.
+"""Recorded kernel launches on CUDA: repeating one costs little more than packing its arguments.
 
-The arguments of a kernel lie in one block of memory; Warp's recorded launch, made once, reads them there.
+Warp records the launch of a kernel once. It reads the arguments from one block of memory, which later launches refill.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import warp as wp
 from .kernel_arguments import ArgumentPacker, warp_arguments
 
 FIRST_SIZE = ctypes.sizeof(ctypes.c_int)
-"""Bytes of ``first``, which the other arguments follow."""
+"""Number of bytes of ``first``, which precedes the other arguments."""
 
 
 class RecordedKernel:
-    """A kernel, ready to be launched on one device with one block size."""
+    """A kernel prepared for repeated launches on one device with one block size."""
 
     def __init__(
         self,
@@ -33,8 +33,8 @@ class RecordedKernel:
         """
         Args:
             kernel: its first argument is ``first: int``.
-            args: the arguments after ``first``, of the right kinds; every launch gives its own.
-            dim: of the grid.
+            args: example arguments after ``first``, of the declared kinds; every launch passes its own.
+            dim: dimensions of the grid.
 
         Raises:
             ValueError, TypeError: as :meth:`launch`.

@@ -1,7 +1,7 @@
-"""Debug mode: checks the kernels' invariants at every call, at a multiple of the time.
+"""Debug mode: checks of the kernels' invariants at every call, which multiply the running time.
 
-``SCGS_DEBUG=1`` turns it on for a process, ``debug.enable()`` from the call on. The mode changes no result; it raises
-``BrokenInvariant`` for a wrong one.
+``SCGS_DEBUG=1`` turns debug mode on for a process; ``debug.enable()`` turns it on from that call onwards. Debug mode
+does not change results, but raises ``BrokenInvariant`` if an invariant is violated.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ _enabled = os.environ.get("SCGS_DEBUG", "") not in ("", "0")
 
 
 class BrokenInvariant(RuntimeError):
-    """A defect of this project or of the machine, not of the input; the message names the violated invariant."""
+    """Error caused by a defect of this project or the machine, not by the input; the message names the invariant."""
 
 
 def enable(on: bool = True) -> None:

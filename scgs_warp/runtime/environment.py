@@ -1,4 +1,4 @@
-"""Process-wide settings, all made here: OpenMP's waiting policy, thread counts, denormals, Warp's start."""
+"""Process-wide settings: OpenMP's waiting policy, thread counts, denormals, Warp's start."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _configured = False
 
 
 def prepare_environment() -> None:
-    """Set environment variables that torch reads when it is imported; values the user has set win.
+    """Set environment variables that torch reads when it is imported; values set by the user take precedence.
 
     OpenMP threads sleep instead of spinning between torch calls, because kernels use those cores meanwhile. cuBLAS gets
-    the fixed workspace that makes its sums reproducible. MKL gives the same bits for any number of threads; otherwise
-    the gradient of a narrow layer differs.
+    a workspace of fixed size, which makes its sums reproducible. MKL is set to a mode whose results do not depend on
+    the number of threads; otherwise the gradient of a narrow layer would.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("KMP_BLOCKTIME", "0")
@@ -46,14 +46,14 @@ def init_warp() -> None:
 
 
 def available_threads() -> int:
-    """Count the cores this process may use, limited by its affinity and by a container's share of processor time."""
+    """Count the cores that this process may use, limited by its affinity and a container's share of processor time."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, math.ceil(min(cores, container_quota())))
 
 
 @functools.cache
 def container_quota(folder: str = "/sys/fs/cgroup") -> float:
-    """Return the processor time that the control group grants, in processors (Linux); infinite without a limit."""
+    """Return the control group's limit on processor time, in processors (Linux); infinite without a limit."""
     for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):  # version 2, version 1
         try:
             words = " ".join(Path(folder, name).read_text() for name in names).split()
@@ -71,7 +71,7 @@ def thread_count() -> int:
 
 
 def configured() -> bool:
-    """Return whether :func:`configure` was called; helper threads then flush denormals as the main thread does."""
+    """Return whether :func:`configure` was called; if so, helper threads flush denormals as the main thread does."""
     return _configured
 
 
@@ -82,8 +82,10 @@ def ensure_configured() -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Ask glibc to keep freed buffers instead of returning them to the system: every step allocates the same ones
-    again, and faulting their pages in takes a quarter of the compositing time."""
+    """Ask glibc to keep freed buffers instead of returning them to the system.
+
+    Every step allocates buffers of the same sizes again, and faulting in their pages would take a quarter of the
+    compositing time."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):  # not glibc
@@ -120,10 +122,10 @@ def configure(threads: int | None = None) -> None:
 
 @contextlib.contextmanager
 def one_piece() -> Iterator[None]:
-    """Run torch's exp, sigmoid, sine and the like in one thread, so that the bits do not depend on the thread count.
+    """Run torch's exp, sigmoid, sine and the like in one thread, so that results do not depend on the thread count.
 
-    Torch cuts large tensors into one piece per thread and computes the last elements of each piece with other
-    instructions, which round differently. One thread is fast enough at the sizes in use.
+    Torch cuts large tensors into one piece per thread and computes the last elements of each piece with different
+    instructions, which round differently. At the sizes in use, one thread is fast enough.
     """
     import torch
 

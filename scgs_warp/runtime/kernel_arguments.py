@@ -1,7 +1,7 @@
 """Kernel arguments: torch tensors checked against what a kernel declares, and packed into one block of memory.
 
-Warp's own launch looks everything up anew and takes tens of microseconds; a training step has some 60 launches. Here
-the arguments of a launch become the bytes of a C structure by one call of ``struct``.
+Warp's own launch looks up every parameter again and takes tens of microseconds, and a training step has some 60
+launches. Here one call of ``struct`` turns the arguments of a launch into the bytes of a C structure.
 """
 
 from __future__ import annotations
@@ -43,27 +43,27 @@ _SCALAR_FORMATS = {
     ctypes.c_bool: "?",
 }
 MAX_LAYOUTS = 256
-"""Shapes that a parameter remembers: those of most tensors stay the same, some change with every frame."""
+"""Largest number of shapes cached per parameter: most tensors keep their shape, but some change with every frame."""
 
 
 class ArrayParameter(NamedTuple):
-    """What an array parameter of a kernel expects of a tensor."""
+    """Requirements of a kernel's array parameter on a tensor."""
 
     label: str
     dtype: torch.dtype
     inner: tuple[int, ...]
     """Shape of one element: (3,) for vec3."""
     ndim: int
-    """Number of dimensions without the inner ones."""
+    """Number of dimensions, not counting those of an element."""
     element_size: int
-    """Bytes."""
+    """Size of one element in bytes."""
 
 
 _parameters: dict[wp.Kernel, list[ArrayParameter | None]] = {}
 
 
 def parameters_of(kernel: wp.Kernel) -> list[ArrayParameter | None]:
-    """Return what a kernel declares for each argument after ``first``; None where it is no array."""
+    """Return the array parameter that a kernel declares for each argument after ``first``; None for non-arrays."""
     if kernel not in _parameters:
         _parameters[kernel] = [_describe_parameter(argument) for argument in kernel.adj.args[1:]]
     return _parameters[kernel]
@@ -96,7 +96,7 @@ def _check_tensor(
 
 
 def _descriptor(kernel: wp.Kernel, parameter: ArrayParameter, tensor: torch.Tensor) -> Any:
-    """Return Warp's descriptor of a contiguous tensor; refuse a wrong dtype, shape or strides by its name."""
+    """Return Warp's descriptor of a contiguous tensor; refuse a wrong dtype, shape or strides, naming the parameter."""
     shape = tuple(tensor.shape)
     outer = shape[: len(shape) - len(parameter.inner)]
     if (
@@ -118,7 +118,7 @@ def _descriptor(kernel: wp.Kernel, parameter: ArrayParameter, tensor: torch.Tens
 
 
 def warp_arguments(kernel: wp.Kernel, args: Sequence[Any]) -> list[Any]:
-    """Return the arguments after ``first`` as ``wp.launch`` takes them: descriptors for tensors, the others unchanged.
+    """Convert the arguments after ``first`` for ``wp.launch``: tensors to descriptors; others stay unchanged.
 
     Raises:
         ValueError: a tensor's dtype, shape, strides or device is not what the kernel declares.
@@ -136,9 +136,9 @@ def warp_arguments(kernel: wp.Kernel, args: Sequence[Any]) -> list[Any]:
 
 
 class ArgumentPacker:
-    """Packs the arguments of one kernel on one device, again and again.
+    """A reusable packer for the arguments of one kernel on one device.
 
-    The bytes are those of a C structure laid out by the compiler's rules, without its first member, ``first``.
+    Packed bytes are those of a C structure in the compiler's layout, without its first member, ``first``.
     """
 
     def __init__(self, kernel: wp.Kernel, params: Sequence[Any], device: torch.device) -> None:
@@ -146,7 +146,7 @@ class ArgumentPacker:
         Args:
             kernel: its first argument is ``first: int``.
             params: ``params[1:]`` of a recorded launch of the kernel: ``first`` and the other arguments as ctypes.
-            device: that all tensors must be on.
+            device: device on which all tensors must be.
         """
         self._kernel, self._device = kernel, device
         self._parameters = parameters_of(kernel)
@@ -157,7 +157,7 @@ class ArgumentPacker:
         self.offsets: list[int] = [getattr(structure, label).offset for label, _ in fields]
         """Offset of each argument in the structure, ``first`` included."""
         self.size: int = ctypes.sizeof(structure)
-        """Bytes of the structure."""
+        """Size of the structure in bytes."""
         self._packer = struct.Struct(self._format())
 
     def _format(self) -> str:
@@ -165,7 +165,7 @@ class ArgumentPacker:
         text, end = "=", ctypes.sizeof(ctypes.c_int)
         for parameter, ctype, offset in zip(self._parameters, self._types, self.offsets[1:]):
             size = ctypes.sizeof(ctype)
-            # Of an array, the address changes with every launch, and the tail depends on nothing but the shape.
+            # An array's address changes with every launch; the rest of its descriptor depends on the shape only.
             form = f"Q{size - 8}s" if parameter is not None else _SCALAR_FORMATS.get(ctype, f"{size}s")
             text += f"{offset - end}x{form}"
             end = offset + size

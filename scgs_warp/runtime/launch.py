@@ -1,8 +1,8 @@
 """The one place that hands torch tensors to Warp: ``launch`` and ``launch_blocks``.
 
-On a CPU a Warp launch runs its grid in one thread and releases the GIL, so ``launch`` cuts the grid into chunks and
-lets a few threads take them one by one (``cpu_threads``). Kernels get the index that their chunk begins at as their
-first argument, ``first``. On CUDA a launch goes to torch's current stream, whole.
+On a CPU a Warp launch runs its grid in one thread and releases the GIL, so ``launch`` cuts the grid into chunks that
+several threads take one by one (``cpu_threads``). A kernel's first argument, ``first``, is the index at which its chunk
+begins. On CUDA the whole grid is launched at once, on torch's current stream.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CPU = torch.device("cpu")
 
 
 class CpuKernel:
-    """A kernel made ready for the CPU: its compiled entry point, and the packer of its arguments."""
+    """A kernel prepared for the CPU: its compiled entry point, and the packer of its arguments."""
 
     def __init__(self, kernel: wp.Kernel, args: tuple) -> None:
         self.kernel = kernel
@@ -36,8 +36,10 @@ class CpuKernel:
         self.pack = ArgumentPacker(kernel, params[1:], CPU).pack
 
     def bind(self, arguments: bytes, tensors: tuple, begin: int = 0) -> Callable[[int, int], None]:
-        """Return a function that runs a chunk of the grid, given its first index after ``begin`` and its size; it keeps
-        the tensors alive."""
+        """Return a function that runs one chunk of the grid, and that keeps the tensors alive.
+
+        Its arguments are the chunk's first index, counted from ``begin``, and the chunk's size.
+        """
         entry, bounds = self._entry, self._bounds
 
         def call(first: int, size: int, _tensors: tuple = tensors) -> None:
@@ -60,9 +62,9 @@ def launch(
         count: size of the one-dimensional grid; 0 does nothing.
         args: the kernel's other arguments, in order: contiguous tensors on one device, numbers, Warp values, or None
             for an array that the kernel will not touch.
-        grain: fewest grid indices worth a chunk of their own on a CPU (1 for kernels whose index is a whole tile).
-        load: [count] integers on the CPU, ascending: cost of all indices up to each, itself included. Chunks are then
-            cut by cost, and ``grain`` only says from how many indices on threads share the work.
+        grain: smallest number of grid indices in a chunk on a CPU (1 for kernels whose index is a whole tile).
+        load: [count] integers on the CPU, ascending: cumulative cost of the indices, each included. If given, chunks
+            are cut by cost, and ``grain`` is only the number of indices from which threads share the work.
         begin: the first grid index.
 
     Raises:

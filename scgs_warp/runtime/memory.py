@@ -1,7 +1,7 @@
-"""Memory that may still be taken: asked before an allocation, so that what does not fit is cut up or refused.
+"""Available memory, queried before large allocations so that work which does not fit is split or refused.
 
-The limit is the user's (``set_limit``, ``--memory-gib``, ``SCGS_MEMORY_GIB``), or else what the machine, its control
-group and the process' own limits leave. On a GPU it concerns the GPU's memory.
+The limit is the user's (``set_limit``, ``--memory-gib``, ``SCGS_MEMORY_GIB``), or else the memory that the machine, its
+control group and the process's own limits leave. For tensors on a GPU, the GPU's memory counts.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ import torch
 from ..errors import UserError
 
 LIMIT_VARIABLE = "SCGS_MEMORY_GIB"
-"""Environment variable: the user's limit."""
+"""Environment variable that holds the user's limit in GiB."""
 SIBLINGS_VARIABLE = "SCGS_SIBLINGS"
-"""Environment variable: how many processes of one job share the machine. ``torchrun`` has a variable of its own."""
+"""Environment variable that holds the number of processes of one job on this machine. ``torchrun`` sets another one."""
 GIB = 2**30
 USABLE_SHARE = 0.9
-"""Share of the free memory that may be planned for: threads, libraries and small tensors grow too."""
+"""Share of the free memory that requests may take; the rest is for threads, libraries and small tensors."""
 READING_SECONDS = 1.0
-"""Seconds for which a reading answers requests that are small beside it."""
+"""Number of seconds for which a reading of the free memory is reused for requests that are small in comparison."""
 SMALL_PART = 0.25
-"""Share of a reading up to which a request counts as small."""
+"""Largest request that counts as small, as a fraction of the reading."""
 UNKNOWN_FREE = 2.0**60
-"""Bytes assumed free where the system says nothing (outside Linux)."""
+"""Number of bytes assumed free where the system does not tell (outside Linux)."""
 
 
 class NotEnoughMemory(UserError, MemoryError):
-    """A request takes more than may be taken: the message gives both figures and the remedy. Nothing was allocated."""
+    """A request exceeds the available memory. The message gives both figures and the remedy; nothing was allocated."""
 
 
 _limit: int | None = None
@@ -48,7 +48,7 @@ def set_limit(gib: float | None) -> None:
     """Limit the memory of the process on a CPU, and what torch allocates on a GPU.
 
     Args:
-        gib: GiB, more than 0. None: no limit beside the machine's.
+        gib: GiB, more than 0. None: no limit except the machine's.
 
     Raises:
         UserError: ``gib`` is not a positive number.
@@ -61,7 +61,7 @@ def set_limit(gib: float | None) -> None:
 
 
 def set_limit_from_environment() -> None:
-    """Set the limit that ``SCGS_MEMORY_GIB`` gives, or none.
+    """Set the limit given by ``SCGS_MEMORY_GIB``; without the variable there is no limit.
 
     Raises:
         UserError: the variable is not a positive number.
@@ -74,7 +74,7 @@ def set_limit_from_environment() -> None:
 
 
 def limit() -> int | None:
-    """Return the user's limit in bytes: that of ``set_limit``, or else of ``SCGS_MEMORY_GIB``; None without either.
+    """Return the user's limit in bytes, from ``set_limit`` or else from ``SCGS_MEMORY_GIB``; None without either.
 
     Raises:
         UserError: the variable is not a positive number.
@@ -85,7 +85,7 @@ def limit() -> int | None:
 
 
 def forget_readings() -> None:
-    """Ask the system again at the next request."""
+    """Forget earlier readings, so that the next request asks the system again."""
     with _lock:
         _readings.clear()
 
@@ -98,7 +98,7 @@ def in_gib(size: float) -> str:
 
 
 def fits(need: int, device: torch.device | str = "cpu") -> bool:
-    """Return whether ``need`` bytes may be taken; without asking the system if a recent reading is far larger."""
+    """Return whether ``need`` bytes are available. If a recent reading is far larger, the system is not asked again."""
     name = str(device)
     taken, room = _readings.get(name, (-math.inf, 0))
     if need <= SMALL_PART * room and time.monotonic() - taken < READING_SECONDS:
@@ -110,13 +110,13 @@ def fits(need: int, device: torch.device | str = "cpu") -> bool:
 
 
 def room(device: torch.device | str = "cpu") -> int:
-    """Return the bytes that may be taken now, after handing freed memory back to the system."""
+    """Return the number of bytes available now, after handing freed memory back to the system."""
     hand_back(str(device))
     return measure(str(device))
 
 
 def measure(name: str) -> int:
-    """Return the bytes that may be taken by the system's count, and remember them for ``fits``."""
+    """Return the number of bytes available according to the system, and remember it for ``fits``."""
     bounds = _free_on_gpu(name) if name.startswith("cuda") else free_on_host()
     free = int(USABLE_SHARE * max(0.0, min(*bounds, UNKNOWN_FREE)))
     with _lock:
@@ -140,7 +140,7 @@ def require(need: int, device: torch.device | str, what: str, remedy: str) -> No
 
 
 def refusal(need: int, device: torch.device | str, what: str, remedy: str, room: int | None = None) -> NotEnoughMemory:
-    """Make the error that ``require`` raises. ``room``: bytes that may be taken, if already known."""
+    """Make the error that ``require`` raises. ``room``: number of bytes available, if already known."""
     own = limit()
     of = "" if own is None else f" of the {in_gib(own)} allowed"
     allowed = f"{in_gib(measure(str(device)) if room is None else room)}{of} may be taken"
@@ -148,7 +148,7 @@ def refusal(need: int, device: torch.device | str, what: str, remedy: str, room:
 
 
 def hand_back(name: str = "cpu") -> None:
-    """Return freed memory to the system (glibc keeps it otherwise), so that resident memory is memory in use."""
+    """Return freed memory to the system, since glibc would keep it, so that resident memory is the memory in use."""
     if name.startswith("cuda"):
         return  # torch's cache is counted as free
     with contextlib.suppress(OSError, AttributeError, TypeError):
@@ -180,8 +180,9 @@ def _free_on_gpu(name: str) -> Iterator[float]:
 
 
 def free_on_host() -> Iterator[float]:
-    """Yield every bound that applies, and infinity. Processes of the same job, which plan at the same moment, share
-    the machine's memory evenly."""
+    """Yield every bound that applies, and infinity.
+
+    Processes of one job request memory at the same moment, so each counts on an equal share of the machine's memory."""
     yield math.inf
     own = limit()
     if own is not None:
@@ -201,7 +202,7 @@ def free_on_host() -> Iterator[float]:
 
 
 def free_in_groups(root: str = "/sys/fs/cgroup", own: str = "/proc/self/cgroup") -> Iterator[float]:
-    """Yield what the process' control group and its parents leave (Linux), including pages the kernel may drop."""
+    """Yield the memory that the process's control group and its parents leave (Linux), including droppable pages."""
     try:
         lines = Path(own).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):

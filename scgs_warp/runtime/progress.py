@@ -1,6 +1,6 @@
-"""Progress with rate and time left: a bar on a terminal, a few plain lines in a log file.
+"""Progress display with rate and time left: a bar on a terminal, occasional plain lines in a log file.
 
-``advance`` costs well under a microsecond unless it is time to draw, so that every training step may call it.
+``advance`` takes well under a microsecond unless a redraw is due, so that every training step may call it.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from typing import Any, TextIO, TypeVar
 REDRAW_SECONDS = 0.2
 """Seconds between two drawings on a terminal."""
 LINE_FRACTION = 0.05
-"""A log file gets a line after this fraction of the work ..."""
+"""Fraction of the work after which a log file gets a line, within the two limits below."""
 LINE_SHORTEST = 2.0
-"""... but no sooner than after these seconds ..."""
+"""Smallest number of seconds between two lines in a log file."""
 LINE_LONGEST = 30.0
-"""... and after these in any case."""
+"""Largest number of seconds between two lines in a log file."""
 RATE_SECONDS = 15.0
-"""The rate is measured over these last seconds: training steps become slower as Gaussians are added."""
+"""Seconds over which the rate is measured: only recent steps count, because added Gaussians slow the steps down."""
 
 
 Result = TypeVar("Result")
 
 
 def mute(stream: TextIO) -> None:
-    """Discard all further output to ``stream``, whose terminal was closed or whose pipe nobody reads."""
+    """Discard all further output to ``stream``, whose terminal is closed or whose pipe has no reader."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
@@ -37,7 +37,7 @@ def mute(stream: TextIO) -> None:
 
 
 def say(text: str) -> None:
-    """Print a line on standard output; a closed terminal or pipe does not end the work."""
+    """Print a line on standard output. A closed terminal or pipe does not raise an error."""
     try:
         print(text, flush=True)
     except OSError:
@@ -58,7 +58,7 @@ def _text(value: Any) -> str:
 
 
 class Progress:
-    """Count of finished steps, with the newest value of each field, drawn from time to time."""
+    """Number of finished steps and newest value of each field, drawn from time to time."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int = 0) -> None:
         self.total = total
@@ -89,7 +89,7 @@ class Progress:
         self._safely(lambda: self._finish(completed), None)
 
     def _safely(self, draw: Callable[[], Result], otherwise: Result) -> Result:
-        """Stop drawing, not the work, when the terminal was closed or nobody reads the pipe."""
+        """Draw, or return ``otherwise`` and stop all output if the terminal is closed or the pipe has no reader."""
         try:
             return draw()
         except OSError:
@@ -103,7 +103,7 @@ class Progress:
         raise NotImplementedError
 
     def _draw(self, now: float) -> float:
-        """Show the state and return the time of the next drawing."""
+        """Draw the state and return the time of the next drawing."""
         raise NotImplementedError
 
     def _mark(self, now: float) -> None:
@@ -113,12 +113,12 @@ class Progress:
 
     @property
     def elapsed(self) -> float:
-        """Seconds since the start."""
+        """Number of seconds since the start."""
         return time.perf_counter() - self._began
 
     @property
     def rate(self) -> float:
-        """Steps per second over the last seconds; 0 while unknown."""
+        """Steps per second over the last ``RATE_SECONDS``; 0 while unknown."""
         (then, before), (now, after) = self._marks[0], self._marks[-1]
         return (after - before) / (now - then) if now > then else 0.0
 
@@ -138,7 +138,7 @@ class Progress:
 
 
 class _LogLines(Progress):
-    """A plain line from time to time, for log files, of which rich would write the last alone."""
+    """Plain lines from time to time, for log files, to which rich would write only the final state."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
         super().__init__(total, description, stream, start)
@@ -166,7 +166,7 @@ class _LogLines(Progress):
 
 
 class _TerminalBar(Progress):
-    """A bar drawn by rich, for terminals. ``advance`` refreshes it: a thread of its own would compete for a core."""
+    """A bar drawn by rich, for terminals. ``advance`` refreshes it, as a separate thread would compete for a core."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
         super().__init__(total, description, stream, start)

@@ -1,4 +1,4 @@
-"""Signals by which a user, the system or a terminal asks a run to stop."""
+"""Signals with which a user, the system or a terminal asks a run to stop."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from typing import Any
 def stop_signals() -> Iterator[threading.Event]:
     """Turn Ctrl-C, SIGTERM and SIGHUP (a closed terminal) into a request to stop; a second Ctrl-C ends the process.
 
-    A second SIGTERM or SIGHUP changes nothing: the shell and the system may each send one.
+    A second SIGTERM or SIGHUP has no effect, because the shell and the system may each send one. Outside the main
+    thread, signals are left alone.
 
     Yields:
-        An event that is set once a stop was requested. Outside the main thread signals are left alone.
+        An event that is set once a stop is requested.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():

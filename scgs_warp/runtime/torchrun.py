@@ -12,7 +12,7 @@ from .environment import available_threads
 
 @dataclass(frozen=True)
 class ProcessRank:
-    """This process among those of a job."""
+    """Rank of this process, and number of processes in its job."""
 
     rank: int
     size: int
@@ -22,15 +22,15 @@ class ProcessRank:
 
     @property
     def threads(self) -> int:
-        """Its share of the machine's cores."""
+        """Number of cores for this process: its share of the machine's."""
         return max(1, available_threads() // self.local_size)
 
 
 def process_rank() -> ProcessRank | None:
-    """Read the rank that ``torchrun`` gave this process; None for a process on its own.
+    """Read the rank that ``torchrun`` gave this process; return None if ``torchrun`` did not start it.
 
     Raises:
-        UserError: the environment is not one that ``torchrun`` makes.
+        UserError: the environment is not one that ``torchrun`` sets up.
     """
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     if "RANK" not in os.environ or "MASTER_ADDR" not in os.environ or os.environ.get("WORLD_SIZE", "1") == "1":
@@ -45,7 +45,7 @@ def process_rank() -> ProcessRank | None:
 
 
 def process_label() -> str:
-    """Return ``" (process 1 of 2)"`` for messages of every process but the first, which gets an empty text."""
+    """Return a suffix for messages, like ``" (process 1 of 2)"``; it is empty for the first process."""
     with contextlib.suppress(UserError):
         own = process_rank()
         if own is not None and own.rank > 0:

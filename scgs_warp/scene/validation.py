@@ -175,7 +175,7 @@ def _check_graph(tensors: Mapping[str, Tensor], source: str) -> None:
     neighbors, weights = tensors.get("extra.graph.neighbors"), tensors.get("extra.graph.weights")
     if neighbors is None and weights is None:
         return
-    nodes = len(tensors.get("motion.positions", tensors["gaussians.means"]))  # In stage 1 the spheres are both.
+    nodes = len(tensors.get("motion.positions", tensors["gaussians.means"]))  # In stage 1 they are the same.
     fits = neighbors is not None and weights is not None and neighbors.shape == weights.shape and neighbors.ndim == 2
     if not fits or neighbors is None or neighbors.dtype != torch.int32 or len(neighbors) != nodes:
         raise _unusable(source, f"extra.graph.neighbors and weights are not both [{nodes}, J]")

@@ -1,4 +1,4 @@
-"""Checkpoints: one safetensors file, written atomically; the previous one is kept.
+"""Checkpoints: one safetensors file, written atomically, beside the previous one.
 
 A checkpoint holds no pickle, path, date or host name.
 """
@@ -28,15 +28,15 @@ from .json_files import parse_json
 FILE = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
 DAMAGED = "checkpoint.damaged.safetensors"
-"""Name of a damaged checkpoint after training has fallen back on the previous one."""
+"""Name given to a damaged checkpoint when training falls back on the previous one."""
 METADATA_KEY = "scgs_warp"
-"""The only metadata key, of sorted JSON: safetensors writes several keys in random order."""
+"""The only metadata key, which holds sorted JSON, because safetensors writes multiple keys in random order."""
 FORMAT = 1
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 TEMPORARY_ERRORS = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ESTALE)
-"""Read errors that say nothing of the content: the file may be sound."""
+"""Errors on reading that do not indicate damage: the file may be sound."""
 METADATA_SUM = ""
-"""Name of the metadata's check sum among those of the tensors."""
+"""Key of the metadata's check sum, beside those of the tensors."""
 
 
 class DamagedCheckpoint(UserError):
@@ -44,7 +44,7 @@ class DamagedCheckpoint(UserError):
 
 
 def _sum_of_words(metadata: Mapping[str, Any]) -> int:
-    """Check sum of the metadata without its check sums."""
+    """Return the check sum of the metadata, leaving out the check sums in it."""
     rest = {name: value for name, value in metadata.items() if name != "crc32"}
     return zlib.crc32(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode())
 
@@ -54,13 +54,13 @@ def _sum(tensor: Tensor) -> int:
 
 
 def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Write ``checkpoint.safetensors`` and keep the one before as ``checkpoint.previous.safetensors``.
+    """Write ``checkpoint.safetensors`` and keep its predecessor as ``checkpoint.previous.safetensors``.
 
-    Whenever the process ends, the folder holds a sound checkpoint under one of the two names. The metadata holds a
+    Whenever the process may end, the folder holds a sound checkpoint under one of the two names. The metadata holds a
     check sum of each tensor and of itself.
 
     Raises:
-        UserError: the checkpoint cannot be written; the one before it is intact.
+        UserError: the checkpoint cannot be written; its predecessor is intact.
     """
     # Cloned, since safetensors refuses tensors that share memory.
     saved = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
@@ -77,7 +77,7 @@ def write(folder: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, An
         except OSError as error:
             if error.errno not in DISK_FULL or not os.path.exists(path):
                 raise
-            (folder / PREVIOUS).unlink(missing_ok=True)  # there is room for two checkpoints, not for three
+            (folder / PREVIOUS).unlink(missing_ok=True)  # frees room: the disk may hold only two checkpoints
             files.write_and_flush(temporary, content)
         if os.path.exists(path):
             _name_also(path, folder / PREVIOUS)
@@ -114,8 +114,9 @@ def read(
     """Read the tensors whose names start with one of ``prefixes``, and the metadata, from the file ``name``.
 
     Raises:
-        DamagedCheckpoint: the file is damaged, or missing beside a previous one (with the remedy).
-        UserError: there is no checkpoint, or its format is another.
+        DamagedCheckpoint: the file is damaged, or it is missing while a previous one exists; the message has the
+            remedy.
+        UserError: there is no checkpoint, or its format is unknown.
     """
     path = folder / name
     spare = name == FILE and (folder / PREVIOUS).is_file()

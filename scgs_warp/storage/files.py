@@ -1,4 +1,4 @@
-"""Whole files: read with a message that helps, written atomically."""
+"""Whole files: reading with helpful error messages, and atomic writing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def read_bytes(path: Path, remedy: str) -> bytes:
     """Read a whole file.
 
     Args:
-        remedy: what to do without the file; ends the message.
+        remedy: advice for a missing file; ends the message.
 
     Raises:
         UserError: the file is missing or cannot be read.
@@ -30,12 +30,12 @@ def read_bytes(path: Path, remedy: str) -> bytes:
 
 
 def temporary_of(path: Path) -> Path:
-    """Return the name of ``path`` while it is written: always the same, so that killed processes leave one file."""
+    """Return the temporary name for writing ``path``. It is fixed, so that killed processes leave one file at most."""
     return path.with_name(f".{path.name}.tmp")
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames in ``folder`` survive a loss of power, where the system can."""
+    """Make renames in ``folder`` survive a loss of power, where the system supports this."""
     with suppress(OSError):  # Windows and some network shares cannot
         number = os.open(folder, os.O_RDONLY)
         try:
@@ -63,8 +63,9 @@ def write_and_flush(path: Path, content: bytes) -> None:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write to a temporary file, flush it, and rename it: readers see the old file or the new one, never a part of
-    it, even after a loss of power.
+    """Write to a temporary file, flush it, and rename it.
+
+    Readers see either the old file or the complete new one, even after a loss of power.
 
     Raises:
         UserError: the disk is full or the folder cannot be written; the old file is intact.

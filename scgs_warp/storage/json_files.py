@@ -13,10 +13,10 @@ from ..errors import UserError
 
 
 def parse_json(text: str | bytes, **hooks: Any) -> Any:
-    """Parse JSON as ``json.loads`` does; brackets nested too deeply are a ValueError here.
+    """Parse JSON as ``json.loads`` does, but raise ValueError for brackets that are nested too deeply.
 
     Raises:
-        ValueError: not valid JSON; a ``json.JSONDecodeError`` where the position is known.
+        ValueError: the text is not valid JSON; a ``json.JSONDecodeError`` where the position is known.
     """
     try:
         return json.loads(text, **hooks)
@@ -31,7 +31,7 @@ def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
         needed: why the file is needed, or the remedy; ends the message if the file is missing.
 
     Raises:
-        UserError: the file is missing, is not JSON, or holds something else than an object.
+        UserError: the file is missing, is not JSON, or holds something other than an object.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -54,7 +54,7 @@ def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
 
 
 def as_number(value: Any) -> float | None:
-    """Return a finite number as float, and None for anything else (bool and strings too)."""
+    """Return a finite number as float, and None for anything else, including bool and strings."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Numpy arrays from files that others wrote: bounded in size, without pickle."""
+"""NumPy arrays from files that others wrote: bounded in size, without pickle."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..errors import UserError
 from .safe_paths import is_regular
 
 MAX_ARRAY_BYTES = 2**28
-"""Largest array accepted: beyond it the header is damaged, or a small archive unpacks to more than any data set has."""
+"""Largest array accepted. A larger one means a damaged header, or a small archive that unpacks to a huge array."""
 
 
 def read_npy(path: Path, member: str | None = None, flags: bool = False) -> np.ndarray:
@@ -23,7 +23,7 @@ def read_npy(path: Path, member: str | None = None, flags: bool = False) -> np.n
         flags: read an array of booleans instead, as it is.
 
     Raises:
-        UserError: the file is missing or damaged, or announces more than it holds.
+        UserError: the file is missing or damaged, or its header announces more data than it holds.
     """
     try:
         if not is_regular(path):
@@ -50,7 +50,7 @@ def read_npy(path: Path, member: str | None = None, flags: bool = False) -> np.n
 
 
 def _read_array(file: IO[bytes], size: int, flags: bool) -> np.ndarray:
-    """Read as numpy would, but allocate nothing before the header is plausible."""
+    """Read an array as NumPy does, but check that the header is plausible before allocating memory."""
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:

@@ -1,4 +1,4 @@
-"""Output folders: checked before the work, replaced as a whole after it."""
+"""Output folders, which are checked before work begins and replaced as a whole after it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def make_parent(path: Path) -> None:
 
 
 def holds_only(folder: Path, pattern: str) -> bool:
-    """Return whether all names in a folder match a regular expression, so that it may be replaced."""
+    """Return whether a folder may be replaced: all names in it match a regular expression."""
     return all(re.fullmatch(pattern, entry.name) for entry in folder.iterdir())
 
 

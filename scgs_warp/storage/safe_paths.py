@@ -1,4 +1,4 @@
-"""Paths named in other people's files: accepted only inside the file's own folder.
+"""Validation of paths named in other people's files: a path must lie inside the file's own folder.
 
 A data set or a model may come from a stranger. A name that leads out of its folder (``..``, another root, a drive) is
 refused, as is anything but a regular file: ``/dev/zero`` never ends. Links in the folder are followed: its owner put
@@ -15,11 +15,11 @@ from pathlib import Path
 from ..errors import UserError
 
 LONGEST_NAME, LONGEST_PATH = 240, 2000
-"""Bytes; file systems allow 255 and 4096, and suffixes may be added."""
+"""Limits in bytes. File systems allow 255 per name and 4096 per path, and suffixes may be added."""
 
 
 def inside(folder: Path, name: str, where: str, what: str = "file") -> Path:
-    """Return the path of ``name`` in ``folder``; slashes and backslashes both separate.
+    """Return the path of ``name`` in ``folder``; both slashes and backslashes are separators.
 
     Args:
         where: file and field that hold the name; begins the message.

@@ -27,7 +27,7 @@ def first_frames(data: Dataset) -> Dataset:
 
 
 def view_number(step: int, config: TrainConfig, view: int) -> int:
-    """Number the views of all steps. The order of frames and a view's random draws depend only on this number, not on
+    """Number the views of all steps. The order of frames and a view's random draws depend on this number rather than on
     the process that renders the view."""
     return step * config.batch + view
 

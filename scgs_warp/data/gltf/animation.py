@@ -1,4 +1,4 @@
-"""glTF animation clips and their samplers. All float64; quaternions as glTF stores them, xyzw.
+"""glTF animation clips and their samplers. All values are float64; quaternions are xyzw, as glTF stores them.
 
 Formulas: glTF 2.0 specification, appendix C (interpolation).
 """
@@ -17,12 +17,12 @@ PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 
 
 class Sampler(NamedTuple):
-    """A curve through keyframes."""
+    """A curve through the keyframes of one property."""
 
     times: np.ndarray
     """[N] seconds, increasing."""
     values: np.ndarray
-    """[N, C]; of a cubic spline [N, 3, C]: in-tangent, value, out-tangent."""
+    """[N, C]; for a cubic spline [N, 3, C]: in-tangent, value, out-tangent."""
     interpolation: str
     """LINEAR, STEP or CUBICSPLINE."""
 
@@ -37,9 +37,9 @@ class Clip(NamedTuple):
     name: str
     channels: list[Channel]
     start: float
-    """Seconds of the first keyframe."""
+    """Time of the first keyframe, seconds."""
     end: float
-    """Seconds of the last keyframe."""
+    """Time of the last keyframe, seconds."""
 
 
 def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
@@ -86,7 +86,7 @@ def _unit(value: np.ndarray, rotation: bool) -> np.ndarray:
 
 
 def read_clips(file: GltfFile) -> list[Clip]:
-    """Read every animation of the file, in its order; unnamed ones are called ``animation_0`` and so on.
+    """Read every animation of the file, in the file's order; unnamed ones are called ``animation_0`` and so on.
 
     Raises:
         UserError: a sampler is invalid; the message names it.
@@ -136,10 +136,10 @@ def _sampler(file: GltfFile, sampler: Any, path: str, where: str) -> Sampler:
 
 
 def choose_clip(file: GltfFile, clips: list[Clip], name: str | None) -> Clip | None:
-    """Choose the clip of that name, ignoring case if none matches exactly; without a name, the first one.
+    """Choose the clip with the given name, ignoring case if no name matches exactly; without a name, the first clip.
 
     Returns:
-        None for a file without animations.
+        The clip; None for a file without animations.
 
     Raises:
         UserError: there is no such clip; the message lists the clips.

@@ -1,4 +1,4 @@
-"""glTF 2.0 files: arrays and images of a document that pygltflib parses.
+"""Access to glTF 2.0 files: the arrays and images of a document that pygltflib parses.
 
 All access to a document goes through ``GltfFile``, so that messages name the file and the field, as in
 ``figure.glb: accessors[3].count``.
@@ -35,7 +35,7 @@ SUPPORTED_EXTENSIONS = {
 }
 """Extensions whose data is read; others are refused if a file requires them."""
 IGNORABLE_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights")
-"""Prefixes of extensions that change reflection but not geometry; they are ignored even if a file requires them."""
+"""Prefixes of extensions that change reflection but not geometry. They are ignored, even if a file requires them."""
 REMEDIES = {
     "KHR_draco_mesh_compression": "export it again without Draco compression",
     "EXT_meshopt_compression": "export it again without meshopt compression",
@@ -46,7 +46,7 @@ TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: n
 
 
 class GltfFile:
-    """A parsed .glb or .gltf, whose look-ups raise errors that name the file and the field."""
+    """A parsed .glb or .gltf file. Errors of its look-ups name the file and the field."""
 
     def __init__(self, path: str | Path) -> None:
         """
@@ -68,12 +68,12 @@ class GltfFile:
                 raise self.error("extensionsRequired", f"names {name}, which is not supported; {remedy}")
 
     def error(self, field: str, text: str) -> UserError:
-        """Make the error to raise, from the field, the fault and its remedy."""
+        """Make the error to raise, from the field, its fault and the remedy."""
         return UserError(f"{self.path}: {field} {text}")
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the file and of the resources read so far."""
+        """SHA-256 of the file and of the external resources read so far."""
         return self._digest.hexdigest()
 
     def item(self, kind: str, index: Any, field: str) -> Any:
@@ -147,7 +147,7 @@ class GltfFile:
         return result
 
     def view(self, index: Any, field: str) -> tuple[bytes, int]:
-        """Return (bytes, stride or 0) of a buffer view."""
+        """Return the bytes of a buffer view, and its stride or 0."""
         view = self.item("bufferViews", index, f"{field}.bufferView")
         data = self._buffer(view.buffer, f"bufferViews[{index}]")
         start, length = view.byteOffset or 0, view.byteLength or 0
@@ -167,7 +167,7 @@ class GltfFile:
         return self._buffers[index]
 
     def resource(self, uri: str, field: str) -> bytes:
-        """Read the bytes of a URI: embedded data, or a file next to this one."""
+        """Read the bytes of a URI: embedded data, or a file in this file's folder."""
         if uri.startswith("data:"):
             try:
                 return base64.b64decode(uri.partition(",")[2], validate=False)

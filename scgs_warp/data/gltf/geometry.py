@@ -18,7 +18,7 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
 class Bone(NamedTuple):
-    """A row of the palette: ``world[node] @ inverse_bind``."""
+    """A row of the palette: the matrix ``world[node] @ inverse_bind``."""
 
     node: int
     inverse_bind: np.ndarray
@@ -30,17 +30,17 @@ class Morph(NamedTuple):
 
     node: int
     first: int
-    """Index of the first vertex."""
+    """Index of the first vertex to which the targets apply."""
     positions: np.ndarray
     """[targets, P, 3]"""
     normals: np.ndarray
     """[targets, P, 3]; zeros if the file has none."""
     weights: np.ndarray
-    """[targets], at rest."""
+    """[targets], weights at rest."""
 
 
 class MeshPart(NamedTuple):
-    """One primitive at one node."""
+    """One mesh primitive attached to one node."""
 
     positions: np.ndarray
     """[P, 3]"""
@@ -54,11 +54,11 @@ class MeshPart(NamedTuple):
     """[F, 3]"""
     material: int
     bones: np.ndarray
-    """[P, K] rows of the palette."""
+    """[P, K] indices of rows of the palette."""
     weights: np.ndarray
     """[P, K], rows sum to 1."""
     targets: tuple[np.ndarray, np.ndarray] | None
-    """Position and normal differences, each [targets, P, 3]."""
+    """Position and normal differences of the morph targets, each [targets, P, 3]."""
 
 
 class Geometry(NamedTuple):
@@ -68,7 +68,7 @@ class Geometry(NamedTuple):
     palette: list[Bone]
     morphs: list[Morph]
     skipped: int
-    """Primitives that are points or lines."""
+    """Number of primitives that are points or lines."""
 
 
 def read_geometry(file: GltfFile, nodes: Nodes, materials: list[Material]) -> Geometry:

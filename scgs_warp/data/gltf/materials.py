@@ -1,7 +1,7 @@
 """glTF materials reduced to diffuse surfaces: a base colour, its texture and the alpha mode.
 
-Factors and vertex colours are linear, textures are sRGB (glTF 2.0, 3.9). Metals, which have no diffuse colour, are
-shown in their base colour.
+Factors and vertex colours are linear, textures are sRGB (glTF 2.0, 3.9). Metals have no diffuse colour and are shown in
+their base colour.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Material:
     texture: int = -1
     """Index of the texture; -1 without one."""
     coordinates: int = 0
-    """Number of the TEXCOORD set that the texture uses."""
+    """Index of the TEXCOORD set that the texture uses."""
     transform: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 1.0, 1.0)
     """Offset u, v, rotation in radians, scale u, v (KHR_texture_transform)."""
     alpha_mode: int = OPAQUE
@@ -57,7 +57,7 @@ def transformed(uv: np.ndarray, material: Material) -> np.ndarray:
 
 
 def read_materials(file: GltfFile) -> tuple[list[Material], list[Texture]]:
-    """Read all materials in the file's order, followed by the default one, and their textures.
+    """Read all materials in the file's order, followed by the default material, and their textures.
 
     Raises:
         UserError: a texture, an image or a colour factor is invalid.
@@ -99,7 +99,7 @@ def read_materials(file: GltfFile) -> tuple[list[Material], list[Texture]]:
 
 
 def _field(info: Any, name: str) -> Any:
-    """Return a field of the parser's object, or of a dictionary inside an extension."""
+    """Return a field of an object of the parser, or of a dictionary inside an extension."""
     return info.get(name) if isinstance(info, dict) else getattr(info, name, None)
 
 
@@ -114,7 +114,7 @@ def _color(file: GltfFile, factor: Any, where: str) -> tuple[float, float, float
 
 
 def _placing(info: Any) -> tuple[int, tuple[float, float, float, float, float]]:
-    """Return (TEXCOORD set, transform) of a reference to a texture."""
+    """Return the TEXCOORD set and the transform of a reference to a texture."""
     if info is None:
         return 0, Material.transform
     moved = (_field(info, "extensions") or {}).get("KHR_texture_transform") or {}

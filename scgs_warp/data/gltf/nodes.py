@@ -1,4 +1,4 @@
-"""Node hierarchy of a glTF file, and its world transforms at an instant of a clip. All float64."""
+"""Node hierarchy of a glTF file, and the nodes' world transforms at an instant of a clip. All values are float64."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def rotation_matrix(quat: np.ndarray) -> np.ndarray:
 
 
 def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Compose translation, rotation and scale to [4, 4], T R S."""
+    """Compose translation, rotation and scale to the matrix [4, 4], T R S."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrix(rotation) * scale
     matrix[:3, 3] = translation
@@ -65,7 +65,8 @@ class Nodes:
         return order
 
     def _local(self, index: int, node: Any) -> dict[str, np.ndarray]:
-        """Return either ``matrix``, or ``translation``, ``rotation`` and ``scale``."""
+        """Return the node's local transform, given either as ``matrix`` or as ``translation``, ``rotation`` and
+        ``scale``."""
 
         def numbers(name: str, default: list[float]) -> np.ndarray:
             value = getattr(node, name)
@@ -84,7 +85,8 @@ class Nodes:
         return {"translation": translation, "rotation": rotation / length, "scale": scale}
 
     def check_clip(self, clip: Clip) -> None:
-        """Raise UserError if a clip animates a node given by a matrix, whose parts it could not replace."""
+        """Raise UserError if a clip animates a node given by a matrix, because the clip could not replace parts of the
+        matrix."""
         for channel in clip.channels:
             if channel.path != "weights" and "matrix" in self.local[channel.node]:
                 raise self.file.error(
@@ -107,7 +109,7 @@ class Nodes:
         return list(dict.fromkeys(found))
 
     def world(self, clip: Clip | None, seconds: float) -> np.ndarray:
-        """Return node-to-world [nodes, 4, 4] at an instant of a clip; without a clip, at rest."""
+        """Return node-to-world matrices [nodes, 4, 4] at an instant of a clip, or at rest without a clip."""
         moved: dict[int, dict[str, np.ndarray]] = {}
         for channel in clip.channels if clip else []:
             if channel.path != "weights":

@@ -1,4 +1,5 @@
-"""Moving triangle mesh of a glTF file: ``read_scene``, then ``GltfScene.posed`` at any instant. All float64."""
+"""Moving triangle mesh of a glTF file: ``read_scene``, then ``GltfScene.posed`` at any instant. All values are
+float64."""
 
 from __future__ import annotations
 
@@ -15,16 +16,16 @@ from .materials import Material, Texture, read_materials
 from .nodes import Nodes
 
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""glTF (y up, a figure faces +z) to this package's worlds (z up, it faces -y)."""
+"""Rotation from glTF (y up, a figure faces +z) to this package's worlds (z up, the figure faces -y)."""
 
 
 class Triangles(NamedTuple):
-    """Faces, materials, texture coordinates and colours, which do not change with time."""
+    """The parts of a mesh that do not change with time: faces, materials, texture coordinates and colours."""
 
     faces: np.ndarray
     """[F, 3] int32"""
     material: np.ndarray
-    """[F] int32"""
+    """[F] int32, index of the material."""
     uv: np.ndarray
     """[P, 2]"""
     colors: np.ndarray
@@ -47,7 +48,7 @@ class GltfScene:
     path: Path
     clips: list[Clip]
     clip: Clip | None
-    """None if the file has no animation."""
+    """The chosen clip; None if the file has no animation."""
     nodes: Nodes
     parts: list[MeshPart]
     palette: list[Bone]
@@ -57,16 +58,17 @@ class GltfScene:
     textures: list[Texture]
     triangles: Triangles
     skipped: int
-    """Number of primitives of points or lines, which are not drawn."""
+    """Number of primitives that are points or lines, which are not drawn."""
     digest: str
     """SHA-256 of the file and its resources."""
     world_from_gltf: np.ndarray
-    """[4, 4] applied to everything; ``UPRIGHT`` until the scene is fitted into a room."""
+    """[4, 4] transform applied to everything; it is ``UPRIGHT`` until the scene is fitted into a room."""
 
     def palette_at(self, seconds: float) -> np.ndarray:
-        """Return the matrix [B, 4, 4] that moves each bone's vertices.
+        """Return the matrices [B, 4, 4] that move the vertices of each bone.
 
-        ``world(joint) @ inverse_bind``; the transform of the node of a skinned mesh is ignored (glTF 2.0, 3.7.3.3).
+        A matrix is ``world(joint) @ inverse_bind``; the transform of a skinned mesh's node is ignored (glTF 2.0,
+        3.7.3.3).
         """
         world = self.nodes.world(self.clip, seconds)
         return np.stack([self.world_from_gltf @ world[bone.node] @ bone.inverse_bind for bone in self.palette])
@@ -87,7 +89,7 @@ class GltfScene:
         return Vertices(positions, _transformed_normals(normals, linear))
 
     def _morphed(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Add the morph targets of the instant to the rest positions and normals [P, 3]."""
+        """Add the morph targets, weighted for the instant, to the rest positions and normals [P, 3]."""
         rest = np.concatenate([part.positions for part in self.parts])
         normals = np.concatenate([part.normals for part in self.parts])
         curves = {c.node: c.sampler for c in (self.clip.channels if self.clip else []) if c.path == "weights"}
@@ -104,7 +106,8 @@ class GltfScene:
 
 
 def _transformed_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Transform normals by linear maps [P, 3, 3] to unit normals [P, 3], by cofactors, which need no inverse."""
+    """Transform normals by linear maps [P, 3, 3] to unit normals [P, 3]; uses cofactors, so singular maps are
+    allowed."""
     a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     sign = np.where(np.einsum("pi,pi->p", a, cofactors[:, 0]) < 0, -1.0, 1.0)
@@ -165,7 +168,7 @@ def _triangles(parts: list[MeshPart]) -> Triangles:
 
 
 def _face_outward(scene: GltfScene) -> None:
-    """Reverse the triangles of mirrored nodes, whose winding order the specification inverts."""
+    """Reverse the triangles of mirrored nodes, because the specification inverts their winding order."""
     matrices = scene.palette_at(scene.clip.start if scene.clip else 0.0)
     start = 0
     for part in scene.parts:

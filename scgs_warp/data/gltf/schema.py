@@ -1,4 +1,4 @@
-"""Types of all glTF fields that are read, checked once before use because the parser accepts any JSON.
+"""Types of all glTF fields that are read. They are checked once, before use, because the parser accepts any JSON.
 
 Names and types: glTF 2.0 specification, chapter 5, and the extensions listed in ``file.py``.
 """
@@ -11,7 +11,7 @@ from typing import Any
 INT, NUMBER, TEXT, FLAG = "a whole number from 0 on", "a finite number", "text", "true or false"
 MAX_INT = 2**40
 MAX_NUMBER = 1e12
-"""Largest number in a scene: products of a few matrices of such numbers stay in the range of float64."""
+"""Largest magnitude of a number in a scene: products of a few matrices of such numbers stay in the range of float64."""
 
 _TEXTURE = {
     "index": INT,
@@ -65,7 +65,8 @@ FIELDS: dict[str, Any] = {
     ],
     "": ("asset",),
 }  # fmt: skip
-"""A type, a list of a type, or an object; "" lists the required fields of an object. Other fields are ignored."""
+"""Expected type of each field: a type, a list of a type, or an object; "" lists the required fields of an object. Other
+fields are ignored."""
 
 
 def find_problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, str] | None:

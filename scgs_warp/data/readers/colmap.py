@@ -26,9 +26,9 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: every eighth image, in the order of names, is held out for ``test`` and ``val`` alike.
 
-    A model has no times. If every file name contains a number, the last number of each name is its time: images that
-    COLMAP did not register leave a gap, and cameras with equally numbered files share times. Otherwise the images are
-    evenly spaced in the order of their names.
+    A model has no times. If every file name contains a number, the last number of each name is the image's time. Images
+    that COLMAP did not register then leave a gap, and cameras with equally numbered files share times. Otherwise the
+    images are evenly spaced in the order of their names.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -67,7 +67,8 @@ def _file(base: Path, image: ModelImage, place: Path) -> Path:
 
 
 def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Lens]]) -> None:
-    """Check the files of all splits before any is decoded, so that a model of other images is refused at once."""
+    """Check the presence and the sizes of the files of all splits before any is decoded, so that a model of other
+    images is refused at once."""
     for file, lens in zip(files, lenses):
         size = header_size(file)
         if size is not None:
@@ -81,7 +82,8 @@ def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Len
 
 
 def times_from_names(names: list[str]) -> list[float]:
-    """Return times in [0, 1]: from the last number in each name if all have one and they differ, else by order."""
+    """Return times in [0, 1]: from the last number in each name if all names have one and the numbers differ, else from
+    the order."""
     found = [re.findall(r"[0-9]{1,15}", PurePosixPath(name).stem) for name in names]
     if all(found):
         numbers = [int(digits[-1]) for digits in found]

@@ -44,11 +44,12 @@ class SparseModel(NamedTuple):
 
 
 class _Damaged(Exception):
-    """A file is damaged; the message says how in a few words."""
+    """Raised for a damaged file; the message describes the damage in a few words."""
 
 
 def find_model(folder: Path) -> Path | None:
-    """Find the folder of the model: of several, the one with the largest file of images; None without a model."""
+    """Find the folder of the model; if there are several models, that with the largest file of images. Return None
+    without a model."""
     places = [folder, *(folder / name for name in ("sparse", "colmap/sparse", "colmap_sparse", "colmap"))]
     candidates = []
     for place in places:
@@ -101,7 +102,7 @@ def _read(file: Path, reader: Callable[[bytes], Any]) -> Any:
 
 
 def _pose(quaternion: np.ndarray, translation: np.ndarray, name: str) -> np.ndarray:
-    """Return world-to-camera [4, 4] of a wxyz quaternion and a translation."""
+    """Return the world-to-camera matrix [4, 4] of a wxyz quaternion and a translation."""
     with np.errstate(over="ignore"):  # An infinite length is refused below.
         length = float(np.linalg.norm(quaternion))
     if not (np.isfinite(translation).all() and 0.99 < length < 1.01):  # False for NaN
@@ -170,7 +171,7 @@ def _binary_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _plausible_count(count: int, left: int, least: int) -> int:
-    """Return ``count`` if ``left`` bytes can hold so many entries of at least ``least`` bytes; raise otherwise."""
+    """Return ``count`` if ``left`` bytes suffice for that many entries of at least ``least`` bytes; raise otherwise."""
     if count * least > left:
         raise _Damaged(f"truncated or damaged: lists {count} entries, more than the file holds")
     return count

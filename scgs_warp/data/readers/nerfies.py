@@ -78,7 +78,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
 
 
 def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
-    """Return all listed ids, and those of this split."""
+    """Return the ids of all listed frames, and those of this split."""
     content = read_json(path)
     lists: dict[str, list[str]] = {}
     for key in ("ids", "train_ids", "val_ids"):
@@ -105,7 +105,8 @@ def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
 
 
 def _times(path: Path, names: list[str]) -> dict[str, float]:
-    """Return times in [0, 1] from the metadata of all frames; evenly spaced in the listed order without metadata."""
+    """Return times in [0, 1] from the metadata of all frames; without metadata, times are evenly spaced in the listed
+    order."""
     if not path.is_file():
         return {name: index / max(len(names) - 1, 1) for index, name in enumerate(names)}
     content = read_json(path)
@@ -134,8 +135,8 @@ def _world(path: Path) -> World:
 
 
 def _images(folder: Path, downscale: float) -> tuple[Path, int]:
-    """Choose the folder of the smallest images that are large enough, or else of the largest; return it with the ratio
-    of the cameras' image size to its own."""
+    """Choose the folder of the smallest images that are large enough, or else of the largest images. Return the folder,
+    and the ratio of the cameras' image size to the size of its images."""
     found = {}
     for place in folder.iterdir() if folder.is_dir() else ():
         match = re.fullmatch(r"([1-9][0-9]{0,2})x", place.name)
@@ -160,7 +161,7 @@ def _viewmat(path: Path, content: dict[str, Any], world: World) -> np.ndarray:
 
 
 def _lens(path: Path, content: dict[str, Any], ratio: int, source: tuple[int, int]) -> Lens:
-    """Return the lens at the size of the images, which are ``ratio`` times smaller than the camera's."""
+    """Return the lens at the size of the images, which is the camera's image size divided by ``ratio``."""
     size = as_array(content.get("image_size"), (2,))
     if size is None or (size < 1).any():
         raise UserError(f"{path}: image_size is not two positive numbers; give width and height in pixels")

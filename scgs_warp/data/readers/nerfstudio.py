@@ -3,8 +3,8 @@
 ``fl_x, fl_y, cx, cy, w, h`` (pixels; for all frames or in each), per frame ``file_path``, ``transform_matrix``
 (camera-to-world, OpenGL), ``time`` in [0, 1] and ``mask_path``; ``ply_file_path``, sparse points in the frame of the
 poses; ``train_filenames``, ``val_filenames``, ``test_filenames``; ``camera_model`` and ``k1`` ... ``k6, p1, p2``, or
-``distortion_params``, for all frames or in each: such images are undistorted.
-Layout: Tancik et al., Nerfstudio, SIGGRAPH 2023.
+``distortion_params``, for all frames or in each (images with distortion are undistorted). Layout: Tancik et al.,
+Nerfstudio, SIGGRAPH 2023.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
     Frames without times are evenly spaced in the order of their names (9 before 10). Without lists of files, every
-    eighth frame is held out for ``test`` and ``val`` alike. If only one of these two lists is present and not empty,
-    it serves for both. A frame's mask is False where ``mask_path`` is black and on the borders of undistorted images.
+    eighth frame is held out for ``test`` and ``val`` alike. If only one of the lists for ``test`` and ``val`` is
+    present and not empty, it serves for both splits. A frame's mask is False where ``mask_path`` is black and on the
+    borders of undistorted images.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -120,14 +121,14 @@ def _points(
         raise UserError(f"{path}: ply_file_path is not text; name the file of points or leave it out")
     points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
     moved = _applied(path, content, points)
-    # Some writers apply the poses' transform to the points and some do not: keep what more cameras see.
+    # Some writers apply the poses' transform to the points and some do not: keep the version that more cameras see.
     if moved is not None and _seen(moved, cameras) > _seen(points, cameras):
         points = moved
     return points, colors
 
 
 def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndarray | None:
-    """Apply ``applied_transform`` and ``applied_scale`` to the points; return None if the file has neither."""
+    """Apply ``applied_transform`` and ``applied_scale`` to the points; return None if the file has neither of them."""
     if "applied_transform" not in content and "applied_scale" not in content:
         return None
     try:
@@ -144,7 +145,7 @@ def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndar
 
 
 def _seen(points: np.ndarray, cameras: list[Camera]) -> int:
-    """Count the (point, camera) pairs in which the point falls into the image."""
+    """Count the pairs of a point and a camera in which the point projects into the image."""
     total = 0
     for camera in cameras:
         viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()

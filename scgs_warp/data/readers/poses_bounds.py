@@ -30,7 +30,7 @@ HELD_OUT_CAMERA = 0
 """Index of the held-out camera: the central one of Neural 3D Video, as in published results."""
 POINTS = ("points3D.ply", "points3D_downsample2.ply", "points3d.ply")
 MAX_ASPECT_ERROR = 0.01
-"""Largest relative difference between the reductions of width and height that is attributed to rounding."""
+"""Largest relative difference between the scale factors of width and height that is attributed to rounding."""
 
 
 def recognises(folder: Path) -> bool:
@@ -41,7 +41,7 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the first camera is ``test`` and ``val``, the others are ``train``.
 
-    All cameras share their times, which are evenly spaced in the order of the images' names.
+    All cameras share the same times, which are evenly spaced in the order of the images' names.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -111,7 +111,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
-    """Return world-to-camera [4, 4], OpenCV, of a row's pose."""
+    """Return the world-to-camera matrix [4, 4], OpenCV, of a row of the file."""
     down, right, backwards, position = pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3]
     rotation = np.stack([right, down, -backwards])
     if not np.isfinite(pose).all() or not is_rotation(rotation):
@@ -122,7 +122,7 @@ def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
 
 
 def _lens(path: Path, index: int, column: np.ndarray, source: tuple[int, int]) -> Lens:
-    """Return the lens of images that may be smaller than those of the calibration."""
+    """Return the lens of images, which may be smaller than the images of the calibration."""
     height, width, focal = column
     if min(height, width, focal) < 1:
         raise UserError(f"{path}: row {index} has a non-positive height, width or focal length; restore the file")

@@ -22,10 +22,10 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LISTED_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Parameters in ``distortion_params``, in nerfstudio's order."""
+"""Names of the parameters in ``distortion_params``, in nerfstudio's order."""
 PERSPECTIVES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Camera models (names of COLMAP and nerfstudio) that are a pinhole if all distortion is 0: radial, tangential, and
-with FULL_OPENCV a quotient of polynomials."""
+"""Camera models (names of COLMAP and nerfstudio) that are a pinhole if all distortion is 0. The distortion is radial
+and tangential; for FULL_OPENCV the radial part is a quotient of polynomials."""
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Camera models in which the distance from the centre is a polynomial of the angle to the optical axis."""
 
@@ -66,7 +66,7 @@ def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
 
 
 def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
-    """Return every frame's time in [0, 1]; evenly spaced in the order of the file if no frame has one."""
+    """Return every frame's time in [0, 1]; if no frame has a time, times are evenly spaced in the order of the file."""
     given = ["time" in entry for entry in entries]
     if not any(given):
         last = max(len(entries) - 1, 1)
@@ -86,7 +86,7 @@ def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
 
 
 def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path:
-    """Return the frame's image file; complete a name without suffix."""
+    """Find the frame's image file; complete a name that lacks its suffix."""
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
         raise UserError(f"{path}: frames[{index}].file_path is missing or not text; name the image file")
@@ -98,13 +98,13 @@ def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> P
 
 
 def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's camera model and its parameters after (fx, fy, cx, cy).
+    """Return COLMAP's camera model, and its parameters after (fx, fy, cx, cy).
 
     Args:
         fields: the fields of the file, overridden by those of a frame.
 
     Raises:
-        UserError: an unknown camera model, or parameters that it does not have.
+        UserError: the camera model is unknown, or the file has parameters that the model does not have.
     """
     name = fields.get("camera_model")
     if name is not None and (not isinstance(name, str) or name.upper() not in (*PERSPECTIVES, *FISHEYES)):
@@ -153,7 +153,7 @@ def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int,
         fields: the fields of the file, overridden by those of a frame.
 
     Raises:
-        UserError: intrinsics are missing, invalid, or of images of another size than ``source``.
+        UserError: intrinsics are missing or invalid, or belong to images of a size other than ``source``.
     """
     fx, fy, cx, cy = read_intrinsics(path, fields, index, source)
     model, further = read_distortion(path, fields)

@@ -1,7 +1,7 @@
 """The built-in synthetic scene, written in the D-NeRF layout together with its true motion.
 
 The scene is monocular like D-NeRF: each training frame has its own time and its own camera, drawn from the upper
-hemisphere; test frames are spread over time and have other cameras. The same arguments give the same bytes.
+hemisphere. Test frames are spread over time and have other cameras. The same arguments give the same bytes.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from .raycast import Raycaster
 from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_folder_atomically, write_pictures
 
 VERSION = 4
-"""Version of the pictures and the ground truth; folders of another version are replaced."""
+"""Version of the pictures and the ground truth; folders with another version are replaced."""
 MARKER = "synthetic.json"
 RADIUS = 4.0311
 FIELD_OF_VIEW = 0.6911112070083618
-"""Radians, D-NeRF's camera_angle_x."""
+"""Horizontal field of view in radians: ``camera_angle_x`` of D-NeRF."""
 SINE_OF_ELEVATION = (0.05, 0.85)
 SAMPLES = 4
-"""Rays per pixel and axis."""
+"""Number of rays per pixel along each axis."""
 
 
 def make_synthetic(
@@ -41,9 +41,9 @@ def make_synthetic(
     progress: Callable[[int, int], None] | None = None,
     device: str = "cpu",
 ) -> Path:
-    """Make the scene in ``folder``, unless it exists with these arguments.
+    """Make the scene in ``folder``, unless the folder already holds it with these arguments.
 
-    An interrupted run leaves no incomplete folder (``write_folder_atomically``).
+    An interrupted call leaves no incomplete folder (``write_folder_atomically``).
 
     Args:
         size: width and height in pixels.
@@ -95,7 +95,8 @@ class FigureSubject:
         self.pose, self.render, self.visible = self.raycaster.pose, self.raycaster.render, self.raycaster.visible
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Sample surface points: part and position in its bone's frame, as ``sample_surface``."""
+        """Sample surface points: for each, its part and its position in the frame of the part's bone (see
+        ``sample_surface``)."""
         return sample_surface(self.figure, count, rng)
 
     def track(self, points: tuple[np.ndarray, np.ndarray], times: Sequence[float]) -> np.ndarray:
@@ -129,14 +130,14 @@ def _write_scene(work: Path, recipe: dict[str, Any], progress: Callable[[int, in
 
 
 def random_camera(rng: np.random.Generator) -> np.ndarray:
-    """Draw a camera, [4, 4] camera-to-world, OpenGL: uniform on the upper hemisphere, looking at the origin."""
+    """Draw a camera-to-world matrix [4, 4], OpenGL: uniform on the upper hemisphere, facing the origin."""
     return random_on_sphere(rng, SINE_OF_ELEVATION, RADIUS)
 
 
 def sample_surface(figure: Figure, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Sample points evenly by area over all parts: part [P], and position in its bone's frame [P, 3].
+    """Sample points evenly by area over all parts: return the part [P], and the position in its bone's frame [P, 3].
 
-    Points inside a neighbouring part are never visible.
+    Some points lie inside a neighbouring part; these are never visible.
     """
     face, u, v = pick_on_triangles(figure.local[figure.faces], count, rng)
     a, b, c = figure.local[figure.faces[face]].transpose(1, 0, 2)

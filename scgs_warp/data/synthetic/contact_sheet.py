@@ -27,7 +27,7 @@ class ContactSheet:
     def __init__(self, counts: dict[str, int]) -> None:
         """
         Args:
-            counts: pictures of each split.
+            counts: number of pictures of each split.
         """
         self._wanted = {split: set(spread(count, COLUMNS)) for split, count in counts.items() if split != "val"}
         self._rows: dict[str, list[np.ndarray]] = {"train": [], "tracks": [], "test": []}
@@ -48,7 +48,8 @@ class ContactSheet:
             self._rows["tracks"].append(_captioned(self._dotted(picture, camera, points, visible), "visible points"))
 
     def _dotted(self, picture: np.ndarray, camera: Camera, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
-        """Fade the picture and draw a dot at each visible surface point; a point keeps its colour over time."""
+        """Fade the picture and draw a dot at each visible surface point; each point has the same colour at all
+        times."""
         assert self._colors is not None
         reduced = _reduced((0.4 * picture + 0.6 * 255 * GROUND).astype(np.uint8))
         pixels = project(camera, points[visible]) * (reduced.shape[1] / picture.shape[1])

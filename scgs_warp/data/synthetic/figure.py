@@ -1,4 +1,5 @@
-"""The figure of the built-in scene: a small robot of rounded solids, each rigid on one bone, with solid textures.
+"""Geometry of the built-in scene's figure: a small robot of rounded solids, each rigid on one bone, with solid
+textures.
 
 Rest frame: z up, the figure faces -y, its left is +x, and it is about 2 units tall. A part's own frame, in which its
 texture is defined, has the same axes and its origin at the part's centre.
@@ -23,7 +24,8 @@ STEEL = (0.62, 0.68, 0.76)
 
 
 class Part(NamedTuple):
-    """A rounded box on a bone: ``half`` extents, edge ``radius`` (before scaling), ``offset`` of its centre."""
+    """A rounded box on a bone: half extents ``half``, edge ``radius`` (before scaling), and ``offset`` of the
+    centre."""
 
     bone: str
     half: Vector
@@ -36,11 +38,11 @@ class Part(NamedTuple):
     """Relative growth of the cross section from the bottom to the top."""
     divisions: int = 6
     hole: float = 0.0
-    """Radius of a torus about z that replaces the box, if above 0; ``half[2]`` is the radius of its tube."""
+    """If above 0, radius of a torus about z that replaces the box; ``half[2]`` is then the radius of its tube."""
 
 
 def _arm(side: str, sign: float) -> list[Part]:
-    """Make the parts of an arm; joints are spheres, so that neighbours rotate without a gap."""
+    """Make the parts of an arm; the joints are spheres, so that neighbouring parts rotate without a gap."""
     sleeve = (TEAL, CREAM, MUSTARD)
     return [
         Part(
@@ -171,15 +173,15 @@ class Figure:
     faces: np.ndarray
     """[F, 3] int32, counter-clockwise from outside."""
     vertex_part: np.ndarray
-    """[P] int32"""
+    """[P] int32, part of each vertex."""
     face_part: np.ndarray
-    """[F] int32"""
+    """[F] int32, part of each face."""
     normals: np.ndarray
     """[P, 3] unit, in the bone's frame."""
 
 
 def _cube(divisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tessellate the surface of [-1, 1]^3 with welded seams: vertices [P, 3], outward faces [F, 3]."""
+    """Tessellate the surface of [-1, 1]^3 with welded seams: return vertices [P, 3] and outward faces [F, 3]."""
     ticks = np.tan(np.linspace(-1, 1, divisions + 1) * np.pi / 4)  # Even angles avoid crowding at the corners.
     u, v = np.meshgrid(ticks, ticks, indexing="ij")
     corner = np.arange(divisions)[:, None] * (divisions + 1) + np.arange(divisions)
@@ -199,7 +201,8 @@ def _cube(divisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rounded_box(half: Vector, radius: float, divisions: int = 10, taper: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Make a box with rounded edges, the points at ``radius`` from an inner box; a capsule or a ball at the extremes.
+    """Make a box with rounded edges: the points at distance ``radius`` from an inner box. A capsule and a ball are
+    limiting cases.
 
     Returns:
         vertices [P, 3] and faces [F, 3], counter-clockwise from outside.
@@ -220,7 +223,7 @@ def rounded_box(half: Vector, radius: float, divisions: int = 10, taper: float =
 
 
 def torus(radius: float, tube: float, divisions: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Make a torus about z: vertices [P, 3], faces [F, 3]."""
+    """Make a torus about z: return vertices [P, 3] and faces [F, 3]."""
     rings, sides = 2 * divisions, divisions
     around, across = np.meshgrid(
         np.arange(rings) * 2 * np.pi / rings, np.arange(sides) * 2 * np.pi / sides, indexing="ij"

@@ -15,7 +15,7 @@ Vector = tuple[float, float, float]
 
 
 class Joint(NamedTuple):
-    """A joint of the skeleton: its parent and its position in the parent's frame (None: the world)."""
+    """A joint of the skeleton: its parent (None: the world), and its position in the parent's frame."""
 
     parent: str | None
     place: Vector
@@ -41,13 +41,13 @@ BONES: dict[str, Joint] = {
 
 
 def smoother_step(x: float) -> float:
-    """Rise from 0 to 1 with zero first and second derivatives at both ends (Perlin's quintic)."""
+    """Interpolate from 0 to 1 with zero first and second derivatives at both ends (Perlin's quintic)."""
     x = min(max(x, 0.0), 1.0)
     return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
 
 
 def rotation(x: float, y: float, z: float) -> np.ndarray:
-    """Return the rotation [3, 3] Rz Ry Rx of angles in degrees."""
+    """Return the rotation matrix [3, 3], Rz Ry Rx, of angles in degrees about x, y, z."""
     result = np.eye(3)
     for axis, degrees in ((2, z), (1, y), (0, x)):
         c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
@@ -59,8 +59,8 @@ def rotation(x: float, y: float, z: float) -> np.ndarray:
 
 
 def joint_angles(time: float) -> dict[str, Vector]:
-    """Return the angles in degrees about x, y, z of every moving joint; a negative x angle swings a limb forward, to
-    -y."""
+    """Return the angles in degrees about x, y, z of every moving joint. A negative x angle swings a limb forward,
+    towards -y."""
     wave = math.sin(2.0 * math.pi * time)
     rise = smoother_step(time)
     return {

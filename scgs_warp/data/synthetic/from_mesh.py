@@ -1,4 +1,5 @@
-"""Data sets of a glTF file or the built-in figure: ``plan_synthesis`` checks a request, ``synthesize`` writes it."""
+"""Data sets made from a glTF file or the built-in figure: ``plan_synthesis`` checks a request, ``synthesize`` writes
+the data set."""
 
 from __future__ import annotations
 
@@ -23,26 +24,26 @@ from .renderer import SURFACE_POINTS, Background, Optics, Subject, write_folder_
 MARKER = "synthesis.json"
 SHEET = "contact_sheet.png"
 VERSION = 1
-"""Version of the pictures and the ground truth of a request."""
+"""Version of the pictures and the ground truth that a request yields."""
 MAX_SIDE = 8192
 
 
 @dataclass(frozen=True)
 class SynthesisRequest:
-    """Settings of a data set: everything that its bytes depend on but the contents of the mesh file."""
+    """Settings of a data set: everything that determines its bytes, except the contents of the mesh file."""
 
     mesh: Path | None = None
     """A glTF file; None: the built-in figure."""
     clip: str | None = None
     """Name of the clip; None: the file's first."""
     start: float | None = None
-    """Seconds of the clip that become time 0; None: its first keyframe."""
+    """Time of the clip, in seconds, that becomes time 0; None: its first keyframe."""
     end: float | None = None
-    """Seconds of the clip that become time 1; None: its last keyframe."""
+    """Time of the clip, in seconds, that becomes time 1; None: its last keyframe."""
     filming: FilmingSettings = field(default_factory=FilmingSettings)
     shading: Shading = field(default_factory=Shading)
     samples: int = 4
-    """Rays per pixel and axis."""
+    """Number of rays per pixel along each axis."""
     background: Background = "transparent"
     seed: int = 0
 
@@ -103,10 +104,10 @@ def check(request: SynthesisRequest) -> None:
 
 
 def span_of(scene: GltfScene, start: float | None, end: float | None) -> tuple[float, float]:
-    """Return the seconds of the clip that become times 0 and 1.
+    """Return the times of the clip, in seconds, that become times 0 and 1.
 
     Raises:
-        UserError: they lie outside the clip, or in the wrong order.
+        UserError: the times lie outside the clip, or are in the wrong order.
     """
     clip = scene.clip
     if clip is None:
@@ -126,7 +127,7 @@ def span_of(scene: GltfScene, start: float | None, end: float | None) -> tuple[f
 
 
 def load_subject(request: SynthesisRequest, device: str) -> tuple[Subject, dict[str, Any], list[str]]:
-    """Load the subject; return it with its part of the recipe and its description.
+    """Load the subject; return it with its part of the recipe (the marker file's content) and its description.
 
     Raises:
         UserError: the mesh, the clip or the time range is invalid.
@@ -188,7 +189,7 @@ def plan_synthesis(folder: str | Path, request: SynthesisRequest, device: str = 
 
 
 def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | None = None) -> Path:
-    """Make the data set, unless it exists. The same request gives the same bytes.
+    """Make the data set, unless it already exists. The same request gives the same bytes.
 
     Args:
         progress: called with (done, total) after each picture.
@@ -221,7 +222,7 @@ def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | No
 
 
 def _recipe(request: SynthesisRequest, found: dict[str, Any]) -> dict[str, Any]:
-    """Make the content of the marker, which holds no path, date or host."""
+    """Make the content of the marker file, which holds no path, date or host."""
     options = {
         "filming": asdict(request.filming),
         "look": asdict(request.shading),

@@ -19,23 +19,24 @@ from .raycast import TOLERANCE, mesh_over, pixel_window
 from .renderer import ROOM_RADIUS, SurfacePoints, points_on_triangles
 
 FIT_TIMES = 101
-"""Number of instants of the clip at which its extent is measured."""
+"""Number of instants of the clip at which the extent of the mesh is measured."""
 RAY_OFFSET = 1e-5
-"""Distance, in room radii, behind a transparent surface at which a ray continues."""
+"""Distance behind a transparent surface at which a ray continues, in room radii."""
 MAX_RAY_LENGTH = 1000.0
 
 
 @dataclass(frozen=True)
 class Shading:
-    """Light and diffuse shading."""
+    """Settings of light and diffuse shading."""
 
     light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
     """Direction to the light, world (z up, the subject faces -y)."""
     ambient: float = 0.5
     diffuse: float = 0.5
-    """Light of a surface = ambient x (0.75 .. 1, more from above) + diffuse x cosine, in linear light."""
+    """Factor of the diffuse light. Light of a surface = ambient x (0.75 .. 1, more from above) + diffuse x cosine, in
+    linear light."""
     unlit: bool = False
-    """Show bare base colours."""
+    """Show base colours without shading."""
 
 
 class PosedMesh(NamedTuple):
@@ -43,7 +44,7 @@ class PosedMesh(NamedTuple):
 
     mesh: wp.Mesh
     vertices: Tensor
-    """[P, 3] world; the mesh lies over this memory."""
+    """[P, 3] world; the mesh shares this memory."""
     normals: Tensor
     """[P, 3]"""
 
@@ -55,12 +56,12 @@ def srgb_to_linear() -> np.ndarray:
 
 
 class MeshSubject:
-    """Poses, pictures and tracks of a glTF scene; ``time`` from 0 to 1 covers ``span``, seconds of its clip."""
+    """Poses, pictures and tracks of a glTF scene. ``time`` from 0 to 1 covers ``span``, in seconds of the clip."""
 
     def __init__(self, scene: GltfScene, span: tuple[float, float], shading: Shading, device: str = "cpu") -> None:
         """
         Raises:
-            UserError: the scene has no extent, or the light no direction.
+            UserError: the scene has no extent, or the light has no direction.
         """
         self.scene = scene
         self.span = span
@@ -87,7 +88,8 @@ class MeshSubject:
         return self.span[0] + time * (self.span[1] - self.span[0])
 
     def _fit(self) -> None:
-        """Translate and scale the scene into a ball of radius ``ROOM_RADIUS`` around the origin at all times."""
+        """Translate and scale the scene so that it lies in a ball of radius ``ROOM_RADIUS`` around the origin at all
+        times."""
         times = np.linspace(0.0, 1.0, FIT_TIMES if self.scene.clip else 1)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for time in times:
@@ -146,7 +148,7 @@ class MeshSubject:
         return image
 
     def visible(self, posed: PosedMesh, camera: Camera, points: Tensor) -> Tensor:
-        """Return [P] bool: which surface points [P, 3] the camera sees."""
+        """Return [P] bool, True for surface points [P, 3] that the camera sees."""
         seen = torch.empty(len(points), dtype=torch.int32, device=self.device)
         launch(
             kernels.visible_on_mesh, len(points), posed.mesh.id, points, self.faces, *self._surface(),

@@ -1,4 +1,4 @@
-"""Cameras around a subject at the origin, for synthetic data: random on a sphere, or along a path around it.
+"""Cameras around a subject at the origin, for synthetic data: random on a sphere, or along a path around the subject.
 
 ``camera_to_world`` matrices are OpenGL's (x right, y up, z backward), as the D-NeRF layout writes them. Angles are in
 degrees.
@@ -17,37 +17,38 @@ from ...types import Camera
 
 Arrangement = Literal["sphere", "path"]
 FRAMED_RADIUS = 1.365
-"""Radius of the ball around the origin that just fits into the pictures; it sets the distance of the cameras."""
+"""Radius of the largest ball around the origin that fits into the pictures; it determines the distance of the
+cameras."""
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True)
 class FilmingSettings:
-    """Settings of the pictures and cameras of a scene."""
+    """Settings for the pictures and cameras of a scene."""
 
     width: int = 400
     height: int = 400
     train: int = 150
-    """Number of training instants; each is seen by all cameras of a rig."""
+    """Number of training instants; all cameras of a rig see each of them."""
     test: int = 20
     val: int = 10
     cameras: Arrangement = "sphere"
     views: int = 1
     """Number of synchronised cameras of a rig; 1 is monocular."""
     fov: float = 39.597752
-    """Horizontal field of view; the default is D-NeRF's."""
+    """Horizontal field of view; the default is that of D-NeRF."""
     elevation: tuple[float, float] = (2.866, 58.212)
-    """Lowest and highest elevation of a camera."""
+    """Lowest and highest elevation of the cameras."""
     turns: float = 1.0
-    """Number of turns of a path around the subject."""
+    """Number of turns of a camera path around the subject."""
 
 
 class PlannedPicture(NamedTuple):
-    """A picture to be rendered."""
+    """A picture to be rendered: its camera and its time."""
 
     time: float
     camera_to_world: np.ndarray
-    """[4, 4]"""
+    """[4, 4], OpenGL."""
     view: int
     """Index of the camera in a rig; 0 for a single camera."""
 
@@ -60,7 +61,8 @@ def camera_distance(filming: FilmingSettings) -> float:
 
 
 def camera_at(azimuth: float, sine: float, radius: float) -> np.ndarray:
-    """Return camera-to-world [4, 4] at an azimuth (radians) and a sine of the elevation, facing the origin, z up."""
+    """Return the camera-to-world matrix [4, 4] at an azimuth (radians) and a sine of the elevation; the camera faces
+    the origin, z is up."""
     flat = math.sqrt(1.0 - sine * sine)
     backward = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), sine])
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
@@ -71,7 +73,7 @@ def camera_at(azimuth: float, sine: float, radius: float) -> np.ndarray:
 
 
 def random_on_sphere(rng: np.random.Generator, sines: tuple[float, float], radius: float) -> np.ndarray:
-    """Draw a camera, uniform over the area of the sphere between two sines of elevation."""
+    """Draw a camera uniformly over the area of the sphere between two sines of elevation."""
     azimuth = rng.uniform(0.0, 2.0 * math.pi)
     return camera_at(azimuth, rng.uniform(*sines), radius)
 
@@ -93,8 +95,8 @@ def rig(filming: FilmingSettings, start: float) -> list[np.ndarray]:
 
 
 def along_path(filming: FilmingSettings, time: float, start: float, view: int) -> np.ndarray:
-    """Place a moving camera: ``turns`` around the subject, up and down once per turn; cameras of a rig follow each
-    other at equal angles."""
+    """Place a moving camera: it circles the subject ``turns`` times, moving up and down once per turn. The cameras of a
+    rig follow each other at equal angles."""
     low, high = filming.elevation
     angle = 2.0 * math.pi * (filming.turns * time + view / filming.views)
     height = math.radians((low + high) / 2 + (high - low) / 2 * math.sin(angle))
@@ -128,7 +130,7 @@ def plan_pictures(filming: FilmingSettings, rng: np.random.Generator) -> dict[st
 
 
 def camera_of(camera_to_world: np.ndarray, fov: float, width: int, height: int) -> Camera:
-    """Make the camera of a picture. ``fov``: horizontal, radians."""
+    """Make the camera of a picture. ``fov`` is horizontal, in radians."""
     viewmat = np.linalg.inv(camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0]))
     focal = 0.5 * width / math.tan(0.5 * fov)
     K = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])

@@ -17,12 +17,12 @@ from .figure import PARTS, Figure, Part
 from .figure_motion import bone_transforms
 
 LIGHT = (-0.42, -0.62, 0.66)
-"""Direction to the key light: above, in front, on the figure's right."""
+"""Direction to the key light: above and in front of the figure, on its right."""
 LIGHT_SPREAD = 0.35
 SKY_RAYS, KEY_RAYS = 40, 16
 OCCLUSION_REACH = 0.5
 TOLERANCE = 2e-3
-"""Largest distance of a visible point behind the first hit, world units."""
+"""Largest distance behind the first hit of a ray at which a point counts as visible, world units."""
 
 
 class PosedFigure(NamedTuple):
@@ -36,7 +36,7 @@ class PosedFigure(NamedTuple):
 
 
 class Raycaster:
-    """Ray caster of one figure on one device; constant data is uploaded once."""
+    """Ray caster for one figure on one device; constant data is uploaded once."""
 
     def __init__(self, figure: Figure, device: str = "cpu", parts: tuple[Part, ...] = PARTS) -> None:
         self.figure = figure
@@ -85,7 +85,7 @@ class Raycaster:
         return image
 
     def visible(self, posed: PosedFigure, camera: Camera, points: Tensor) -> Tensor:
-        """Return [P] bool: which surface points [P, 3] the camera sees."""
+        """Return [P] bool, True for surface points [P, 3] that the camera sees."""
         seen = torch.empty(len(points), dtype=torch.int32, device=self.device)
         launch(
             kernels.visible, len(points), posed.mesh.id, points, camera.viewmat.to(self.device),

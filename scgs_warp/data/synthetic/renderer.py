@@ -1,7 +1,7 @@
 """Data sets rendered from moving subjects: pictures in the D-NeRF layout, with the true motion of their surface.
 
-A ``Subject`` poses and renders itself: the built-in figure (``builtin``) or a glTF file (``mesh``). This file renders
-the planned pictures and writes the folder that a reader expects.
+A ``Subject`` poses and renders itself; it is the built-in figure (``builtin``) or a glTF file (``mesh``). This file
+lets the subject render the planned pictures, and writes the folder that a reader expects.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ...types import Camera
 from .orbit_cameras import PlannedPicture, camera_of
 
 ROOM_RADIUS = 1.3
-"""World radius of the ball around the origin that a subject never leaves, as in D-NeRF's scenes."""
+"""World radius of the ball around the origin that contains a subject at all times, as in D-NeRF's scenes."""
 SURFACE_POINTS = 2000
 GROUND_TRUTH_TIMES = 51
 
@@ -33,24 +33,26 @@ Background = Literal["transparent", "black", "white"]
 
 
 class Subject(Protocol):
-    """A moving subject: time in [0, 1], inside the ball of radius ``ROOM_RADIUS`` (world, z up)."""
+    """A moving subject. Times are in [0, 1]; the subject stays inside the ball of radius ``ROOM_RADIUS`` (world, z
+    up)."""
 
     device: str
 
     def pose(self, time: float) -> Any:
-        """Pose the subject for the methods below; the result has ``vertices [P, 3]``."""
+        """Pose the subject for the methods below; the result has an attribute ``vertices`` [P, 3]."""
         ...
 
     def render(self, posed: Any, camera: Camera, samples: int) -> Tensor:
-        """Render [H, W, 4] premultiplied colour and coverage in [0, 1], ``samples`` x ``samples`` rays per pixel."""
+        """Render [H, W, 4] premultiplied colour and coverage in [0, 1] with ``samples`` x ``samples`` rays per
+        pixel."""
         ...
 
     def visible(self, posed: Any, camera: Camera, points: Tensor) -> Tensor:
-        """Return [P] bool: which surface points [P, 3] the camera sees."""
+        """Return [P] bool, True for surface points [P, 3] that the camera sees."""
         ...
 
     def sample(self, count: int, rng: np.random.Generator) -> Any:
-        """Sample surface points evenly by area, in the form that ``track`` takes."""
+        """Sample surface points evenly by area, in the form that ``track`` accepts."""
         ...
 
     def track(self, points: Any, times: Sequence[float]) -> np.ndarray:
@@ -59,10 +61,10 @@ class Subject(Protocol):
 
 
 class SurfacePoints(NamedTuple):
-    """Points fixed to triangles of a mesh."""
+    """Points attached to triangles of a mesh."""
 
     face: np.ndarray
-    """[P]"""
+    """[P] index of the triangle."""
     shares: np.ndarray
     """[P, 3] barycentric coordinates; rows sum to 1."""
 
@@ -76,16 +78,16 @@ class Optics:
     width: int
     height: int
     samples: int
-    """Rays per pixel and axis."""
+    """Number of rays per pixel along each axis."""
     background: Background = "transparent"
 
 
 def pick_on_triangles(
     corners: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sample points evenly by area over triangles [F, 3, 3]: triangle [P] and coordinates u [P, 1], v [P, 1].
+    """Sample points evenly by area over triangles [F, 3, 3]: return triangles [P] and coordinates u, v, each [P, 1].
 
-    A point is ``a + u (b - a) + v (c - a)``.
+    The point in triangle a, b, c is ``a + u (b - a) + v (c - a)``.
     """
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     cumulative = np.cumsum(areas / areas.sum())
@@ -117,7 +119,7 @@ def write_rgba(path: Path, image: np.ndarray) -> None:
 
 
 def over_gray(image: np.ndarray, gray: float) -> np.ndarray:
-    """Composite a premultiplied picture [H, W, 4] on grey, [H, W, 3]."""
+    """Composite a premultiplied picture [H, W, 4] on grey; return [H, W, 3]."""
     return image[..., :3] + (1.0 - image[..., 3:]) * gray
 
 
@@ -130,7 +132,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def write_picture(path: Path, image: np.ndarray, background: Background) -> None:
-    """Write a premultiplied picture [H, W, 4] with its alpha, or composited on the background without alpha."""
+    """Write a premultiplied picture [H, W, 4]: with its alpha, or composited on the background and without alpha."""
     if background == "transparent":
         write_rgba(path, image)
         return
@@ -139,7 +141,7 @@ def write_picture(path: Path, image: np.ndarray, background: Background) -> None
 
 
 class Watcher(Protocol):
-    """Callback that receives each picture when it is made."""
+    """Callback that receives each picture after it is rendered."""
 
     def __call__(
         self, split: str, index: int, planned: PlannedPicture, camera: Camera, image: np.ndarray, seen: Any
@@ -158,9 +160,9 @@ def write_pictures(
     """Render and write ``SPLIT/r_000.png`` and ``transforms_SPLIT.json`` of every split, and ``ground_truth.npz``.
 
     Args:
-        points: surface points of ``subject.sample``; their visibility is recorded in the training pictures.
+        points: surface points from ``subject.sample``; their visibility is recorded for the training pictures.
         done: called after each picture.
-        watch: receives each picture; ``seen`` is (positions [P, 3], visible [P]) in training pictures, else None.
+        watch: receives each picture; ``seen`` is (positions [P, 3], visible [P]) for training pictures, else None.
 
     Raises:
         OSError: a file cannot be written.
@@ -201,14 +203,15 @@ def write_pictures(
 
 
 def subject_height(subject: Subject) -> float:
-    """Return the extent along z at time 0, or the largest extent of a subject that lies flat."""
+    """Return the extent along z at time 0; for a subject that lies flat, its largest extent."""
     vertices = subject.pose(0.0).vertices.cpu().numpy()
     extent = vertices.max(0) - vertices.min(0)
     return extent[2] if extent[2] > 0.05 * extent.max() else extent.max()
 
 
 def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None:
-    """Let ``write`` fill a temporary folder next to ``folder``, then rename it; an incomplete folder never remains.
+    """Let ``write`` fill a temporary folder next to ``folder``, then rename it, so that an incomplete folder never
+    remains.
 
     Raises:
         UserError: the folder cannot be written.
@@ -220,7 +223,7 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None
         raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
     try:
         write(work)
-        os.chmod(work, 0o755)  # Folders of mkdtemp are private.
+        os.chmod(work, 0o755)  # mkdtemp makes private folders.
         _replace(folder, work)
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror}); make room or choose another folder") from None
