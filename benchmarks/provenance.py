@@ -42,7 +42,7 @@ def changed_since(commit: str | None, paths: tuple[str, ...]) -> bool:
 def reported_note(commits: Iterable[str]) -> str:
     """Write the legend of ``REPORTED``; empty without commits."""
     names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
-    return f"{REPORTED} Reported at commit {names}, not measured by a committed run." if names else ""
+    return f"{REPORTED} Recorded in commit {names}; the repository holds no result file for it." if names else ""
 
 
 def older_note(commits: Iterable[str]) -> str:

@@ -19,7 +19,7 @@ REMEDY = "use the previous checkpoint, or train again"
 SH_COUNTS = (0, 3, 8, 15)
 """Numbers of coefficients above degree 0, for degrees 0 to 3."""
 MAX_MAGNITUDE = 1e12
-"""Largest centre, scale, overview value and step."""
+"""Largest magnitude that a checkpoint may hold for the normalisation, the overview and the step number."""
 TIME_PLANE = "planes.3"
 MAX_PLANE_TIMES = 4096
 MIN_MOMENT = 1e-30
