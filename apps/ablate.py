@@ -31,15 +31,16 @@ class SweepOptions:
     data: tuple[Path, ...] = ()
     """Folders of data sets; by default the built-in scene, which is made on first use."""
     values: tuple[str, ...] = ()
-    """Rows, separated by commas or spaces; all by default. The table also shows cells that were trained before."""
+    """Rows of the table to train, separated by commas or spaces; all by default. The table also shows cells that were
+    trained before."""
     seeds: tuple[str, ...] = ()
     """Seeds, separated by commas or spaces. Every cell is trained once with each; the table has standard deviations."""
     jobs: int = 1
     """Cells to train at a time, each in its own process with a share of the threads; with --ray, on each machine."""
     ray: str | None = None
     """Ray cluster to train on: local (started on this machine for this command only), auto (the one that already runs
-    on this machine), HOST:PORT, or ray://HOST:PORT from a machine outside the cluster. --threads then counts for each
-    machine. By default no cluster."""
+    on this machine), HOST:PORT, or ray://HOST:PORT from a machine outside the cluster. With a cluster, --threads is the
+    number of threads on each machine. By default, no cluster is used."""
     lpips_weights: Path | None = None
     """File with VGG16 and LPIPS weights; without it LPIPS is not measured."""
     table_only: bool = False
@@ -132,10 +133,10 @@ def make_cells(options: Options, device: str) -> list[Cell]:
 
 
 def train(options: Options, cells: list[Cell]) -> dict[str, str]:
-    """Train all cells, here or on a cluster, and write the table again after each.
+    """Train all cells on this machine or on a cluster, and rewrite the table after each.
 
     Returns:
-        Reasons of failures, by the cells' names.
+        The reason of each failure, by the name of the cell that failed.
     """
     from scgs_warp.ablation.cells import is_done
     from scgs_warp.ablation.local_runner import run_cells

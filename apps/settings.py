@@ -31,7 +31,7 @@ class Settings:
     resample: Literal["area", "bicubic"] | None = None
     """Filter that reduces images: area, or bicubic as in the official code."""
     background: Literal["black", "white", "random"] | None = None
-    """Background of transparent pixels."""
+    """Colour behind transparent pixels."""
     batch: int | None = None
     """Views per step, whose gradients are averaged; with torchrun one per process by default (docs/scaling.md)."""
     steps: int | None = None

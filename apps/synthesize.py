@@ -19,7 +19,7 @@ class Options:
     mesh: Path | None = None
     """File .glb or .gltf; skins, moving nodes and morph targets are animated. By default the built-in figure."""
     clip: str | None = None
-    """Name of the animation; the first one by default. A wrong name prints the list."""
+    """Name of the animation; the first one by default. With an unknown name, the command lists all names."""
     start: float | None = None
     """Second of the clip that becomes time 0; its first keyframe by default."""
     end: float | None = None
@@ -33,11 +33,12 @@ class Options:
     val: int = 10
     """Validation images, like the test images; 0 for none."""
     cameras: Literal["sphere", "path"] = "sphere"
-    """sphere: positions on a dome, new for every image (fixed for a rig); path: cameras that move round the figure."""
+    """sphere: positions on a dome, new for every image (with several --views, fixed); path: cameras that move round the
+    figure."""
     views: int = 1
     """Number of synchronised cameras; 1 is monocular, more are a rig."""
     turns: float = 1.0
-    """Turns of a path; less than 1 is an arc."""
+    """Number of times that a camera path goes round the figure; less than 1 is an arc."""
     elevation: tuple[float, float] = (2.866, 58.212)
     """Elevation of the lowest and the highest camera, degrees."""
     fov: float = 39.597752

@@ -29,7 +29,7 @@ class Options:
     """turntable: the camera moves round a still scene; time: the scene moves; both: both at once. If the training
     cameras saw the scene from one side only, the camera swings within that range."""
     show: Literal["rgb", "depth", "alpha", "nodes", "trajectories"] = "rgb"
-    """Colours, depth (near is warm), alpha, control points, or their trajectories."""
+    """Content of the film: colours, depth (near is warm), alpha, control points, or their trajectories."""
     frames: int = 120
     """Frame count of the film."""
     size: int = 512

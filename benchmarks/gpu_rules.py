@@ -12,12 +12,13 @@ from torch import Tensor
 
 PIXEL_TOLERANCE = 1e-4
 LARGEST_DIFFERENCE = 8e-3
-"""Largest difference of a pixel: one flipped alpha threshold moves it by up to 1/255, two by up to this."""
+"""Largest allowed difference of a pixel. A splat with an alpha of about 1/255 may be drawn by one renderer and skipped
+by the other, which moves the pixel by up to 1/255; two such splats are allowed."""
 GRADIENT_TOLERANCE = 1e-2
 
 
 def time_of(function: Callable[[], Any], device: str, repeats: int) -> dict[str, float]:
-    """Time calls after three to warm up, in milliseconds.
+    """Time calls of ``function`` in milliseconds, after three calls to warm up.
 
     Returns:
         ``ms_median`` and ``ms_min`` of calls that are waited for one by one; ``ms_in_a_row``, the mean of calls without

@@ -40,13 +40,13 @@ def changed_since(commit: str | None, paths: tuple[str, ...]) -> bool:
 
 
 def reported_note(commits: Iterable[str]) -> str:
-    """Write the legend of ``REPORTED``; empty without commits."""
+    """Write the legend of the mark ``REPORTED``; return an empty text if there are no commits."""
     names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
     return f"{REPORTED} Recorded in commit {names}; the repository holds no result file for it." if names else ""
 
 
 def older_note(commits: Iterable[str]) -> str:
-    """Write the legend of ``OLDER``; empty without commits."""
+    """Write the legend of the mark ``OLDER``; return an empty text if there are no commits."""
     names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
     return f"{OLDER} Recorded at commit {names}; the measured code has changed since." if names else ""
 

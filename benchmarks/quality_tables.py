@@ -54,7 +54,7 @@ class Source:
         return self.runs.get((self.name, row, scene), {})
 
     def mean(self, row: str, scenes: Iterable[str], key: str) -> float | None:
-        """Take the reported mean unless every scene is measured."""
+        """Return the mean of ``key`` over ``scenes``: the reported one, unless every scene is measured."""
         own = [self.run(row, scene) for scene in scenes]
         if all(run.get("provenance") == "measured" for run in own) or (self.name, row, "mean") not in self.runs:
             values = [run.get(key) for run in own]
@@ -155,7 +155,7 @@ def node_counts(source: Source) -> str:
 
 
 def motion_models(source: Source) -> str:
-    """Write control points and their rivals at equal steps."""
+    """Write the table of motion models: control points and their rivals, trained for equally many steps."""
     ours = source.mean("control-points", TWO, "psnr")
     published = {row: math.fsum(known[scene] for scene in TWO) / 2 for row, known in PUBLISHED_PSNR.items()}
     lines = []
@@ -185,7 +185,7 @@ def motion_models(source: Source) -> str:
 
 
 def arap(source: Source) -> str:
-    """Write the ARAP ablation, where the true motion is known."""
+    """Write the table of the ARAP ablation, for scenes whose true motion is known."""
     base = source.run("per-gaussian", "figure")
     lines = []
     for row, text in (
@@ -212,7 +212,7 @@ def arap(source: Source) -> str:
 
 
 def changes(scenes: tuple[str, ...], base: str) -> Callable[[Source], str]:
-    """Make the writer of a table of single changes.
+    """Make a writer for a table whose rows each change one setting of the row ``base``.
 
     Args:
         scenes: columns of the table.

@@ -5,9 +5,9 @@
 
 A table NAME stands between ``<!-- table: NAME -->`` and ``<!-- /table -->``, in any page, once or more. Timings come
 from results/NAME.json, scores of training runs from results/quality/, and results/reported/NAME.json holds tables that
-were reported without a committed run. Rows of reported figures are marked with a dagger, rows whose commit is older
-than the newest one that touched the code they measure with a double dagger; ``--check`` leaves the latter out of
-account, since they depend on the history and not on the result.
+were reported without a committed run. Rows of reported figures are marked with a dagger. A double dagger marks rows
+whose code was changed after they were measured; ``--check`` ignores it, since it depends on the history and not on the
+result.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
 
 
 def table_names(results: Path) -> list[str]:
-    """Names of all tables that must stand on a page."""
+    """Return the names of all tables that must stand on a page."""
     reported = {path.stem for path in (results / "reported").glob("*.json")}
     return [
         *BENCHMARKS,

@@ -11,7 +11,7 @@ from markdown_table import number, table
 from provenance import EDITING, OLDER, RENDERING, TRAINING, changed_since, older_note
 
 TRUSTED_SCALING = 1.8
-"""Least speed-up of two threads at pure arithmetic for which figures of several threads count."""
+"""Smallest speed-up of two threads at pure arithmetic at which figures for several threads are trusted."""
 
 Report = dict[str, Any]
 
@@ -48,7 +48,10 @@ def size_line(row: Report) -> str:
 
 
 def stages(report: Report) -> str:
-    """Write a table for each motion model: wholes and stages, two columns for each number of threads."""
+    """Write a table for each motion model: the times of whole frames or steps and of their stages.
+
+    Each number of threads has two columns.
+    """
     parts = [machine_line(report) + scaling_line(report["rows"])]
     for motion in dict.fromkeys(row["motion"] for row in report["rows"]):
         rows = [row for row in report["rows"] if row["motion"] == motion]
@@ -134,7 +137,7 @@ def opensplat(report: Report) -> str:
 
 
 def scaling(report: Report) -> str:
-    """Write a table for each sweep: the wholes and their limits."""
+    """Write a table for each sweep: the times of whole frames and rasterisations, and their lower limits."""
     limits = [
         f"{counted(one['threads'])}: {one['gigabytes']:.1f} GB/s copied, {one['gigaflops']:.0f} GFLOP/s"
         for one in report["limits"].values()

@@ -9,7 +9,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def largest_entry(S: wp.mat33d):
-    """Return the largest absolute entry, or 0 if an entry is non-finite; neither such matrix has a rotation."""
+    """Return the largest absolute entry, or 0 if an entry is non-finite.
+
+    The result 0 tells callers that the matrix determines no rotation.
+    """
     largest = wp.float64(0.0)
     for a in range(3):
         for b in range(3):
@@ -30,7 +33,10 @@ def local_rotations(
     # Out:
     rotations_out: wp.array[wp.mat33],  # [M]
 ):
-    """Compute R = argmin sum w |e' - R e|^2 = U diag(1, 1, det(U V^T)) V^T with U S V^T = sum w e' e^T. Grid: M.
+    """Compute the rotation R of each node that minimises sum w |e' - R e|^2 over its edges. Grid: M.
+
+    e is an edge at rest and e' the posed one. With the SVD ``U S V^T = sum w e' e^T``, R is
+    ``U diag(1, 1, det(U V^T)) V^T``.
 
     The computation is in float64, because nodes have few edges and those in thin limbs are nearly collinear.
     """

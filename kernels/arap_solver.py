@@ -28,8 +28,10 @@ def turn_nodes(
     # Out:
     rotations_out: wp.array[wp.mat33d],  # [M], rows of nodes_in only
 ):
-    """Compute R = argmin sum w (|e' - R e|^2 + smoothness |R - R_j|^2) + leaning |R - asked|^2, with determinant +1
-    (SR-ARAP, Levi & Gotsman). Grid: F.
+    """Compute the rotation R of each node in ``nodes_in`` (SR-ARAP, Levi & Gotsman). Grid: F.
+
+    R minimises ``sum w (|e' - R e|^2 + smoothness |R - R_j|^2) + leaning |R - asked|^2`` over the node's edges. e is an
+    edge at rest and e' the posed one, R_j is the rotation of the neighbour, and ``asked`` is the requested rotation.
 
     If all edges are parallel, many rotations fit equally well; the smallest is taken.
     """

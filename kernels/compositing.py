@@ -106,7 +106,8 @@ def add_pixel_adjoint(
     slot: int,
     v_slots: wp.array2d[float],
 ):
-    """Add the gradients of a splat's mean, conic and opacity to its slot, given that of its alpha at one pixel."""
+    """Add the gradients of a splat's mean, conic and opacity to its slot, from the gradient of its alpha at one
+    pixel."""
     d = centre - mean
     falloff = wp.exp(-0.5 * squared_distance(conic, d))
     if opacity * falloff > ALPHA_MAX:
@@ -198,7 +199,10 @@ def sum_slots(
     v_channels_out: wp.array2d[float],  # [N, C]
     absgrad_out: wp.array[wp.vec2],  # [N]; empty: not wanted
 ):
-    """Sum each splat's slots in the order in which they were emitted, so that results are reproducible bit by bit."""
+    """Sum the gradient slots of each splat (one per tile that it touches) in the order in which binning emitted them.
+
+    The fixed order makes results reproducible bit by bit.
+    """
     i = first + wp.tid()
     begin = int(offsets_in[i])
     end = int(offsets_in[i + 1])

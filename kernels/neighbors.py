@@ -69,7 +69,7 @@ def rbf_weights(
     # Out:
     weights_out: wp.array2d[float],  # [N, K]
 ):
-    """Compute a Gaussian's weights: the softmax of ``log s - d^2 / (2 r^2)`` over its neighbours.
+    """Compute a Gaussian's weights: the softmax of ``log strength - distance^2 / (2 radius^2)`` over its neighbours.
 
     The first neighbour gets all the weight if no exponent is finite.
     """

@@ -241,7 +241,11 @@ def visible_on_mesh(
     # Out:
     visible_out: wp.array[wp.int32],  # [P] 1 where inside the image, drawn, and at most half hidden
 ):
-    """Mark surface points that a camera sees: inside the frustum, on a surface that stops the ray, not hidden."""
+    """Mark surface points that a camera sees.
+
+    Such a point is inside the image, its surface is not fully transparent there, and the surfaces in front of it let at
+    least half of the light pass.
+    """
     i = first + wp.tid()
     point = points_in[i]
     visible_out[i] = 0

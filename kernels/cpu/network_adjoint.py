@@ -82,9 +82,9 @@ def network_weights_adjoint(
     hidden_in: wp.array3d[float],  # [L, R, width]
     v_hidden_in: wp.array3d[float],  # [L, V, width]
 ):
-    """Write gradients of weights and biases to the table's addresses; add to them for all rows after the first V.
+    """Write the gradients of weights and biases to the table's addresses. Grid: L x panels x parts.
 
-    Grid: L x panels x parts.
+    A launch covers V rows from ``begin``; if ``begin`` is not 0, its sums are added to those of earlier launches.
     """
     task = first + wp.tid()
     layer = task // (panels * parts)

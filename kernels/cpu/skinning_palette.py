@@ -1,7 +1,10 @@
 """Palette for ``cpu/skinning.py``: two rows of sixteen floats per control point (node), each row one register.
 
 - ``motion``: the affine map ``[R | p + T - R p]`` (12, row by row), then the unit shape rotation (4);
-- ``reach``: position (3), ``-1 / (2 r^2)``, ``log s``, log scales (3), hyper-coordinates (MAX_HYPER, zero-padded).
+- ``reach``: position (3), ``-1 / (2 radius^2)``, ``log strength``, log scales (3), hyper-coordinates (MAX_HYPER,
+  zero-padded).
+
+p is the node's rest position, T its translation and R its rotation; radius and strength give the RBF weight.
 """
 
 import warp as wp
