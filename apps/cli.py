@@ -62,7 +62,10 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
 
 
 def prepare(device: Device, threads: int | None, memory_gib: float | None = None) -> str:
-    """Set threads, denormals and the memory limit before the first tensor operation, then choose the device."""
+    """Configure threads, the flushing of denormals and the memory limit, then choose the device.
+
+    Call it before the first tensor operation.
+    """
     if threads is not None and threads < 1:
         raise UserError(f"--threads {threads}: must be at least 1")
     if memory_gib is not None and not 0.0 < memory_gib < math.inf:

@@ -147,7 +147,10 @@ def _rbf_add(
     nodes: wp.array2d[float],
     sums: wp.array2d[float],
 ):
-    """Add pair (i, m) of Gaussian and node to the node's sums: v, v d^2, v (x - p)."""
+    """Add the pair of Gaussian i and node m to the node's sums: v, v |x - p|^2 and v (x - p).
+
+    v is the gradient of the pair's exponent, x the Gaussian's position, and p the node's.
+    """
     if v != 0.0:
         d2 = float(0.0)
         for d in range(nodes.shape[1]):

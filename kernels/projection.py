@@ -156,7 +156,10 @@ def project(
 def covariance2d_adjoint(
     row_x: wp.vec3, row_y: wp.vec3, eps2d: float, antialiased: int, opacity: float, v_conic: wp.vec3, v_opacity: float
 ):
-    """Compute v_xx, v_xy, v_yy of the 2D covariance (xy counted once) and v_opacity_in before compensation."""
+    """Compute the gradients v_xx, v_xy (counted once) and v_yy of the 2D covariance, and that of the input opacity.
+
+    The input opacity is the one before the antialiasing compensation.
+    """
     raw_xx = wp.dot(row_x, row_x)
     raw_yy = wp.dot(row_y, row_y)
     xy = wp.dot(row_x, row_y)

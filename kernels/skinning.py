@@ -24,7 +24,8 @@ from .quaternion import (
 wp.set_module_options({"enable_backward": False})
 
 SUMS = 16
-"""Number of columns of the node sums: G (9), w v (3), w s v_blend (4); with log scales 3 more, w v_log_scales."""
+"""Number of columns of the node sums: G (9), w v (3), w s v_blend (4); with log scales 3 more, w v_log_scales. w is the
+weight, v the gradient of the moved mean, and s = +-1 the sign that aligns the quaternion."""
 
 
 @wp.func

@@ -61,7 +61,8 @@ NETWORK_BLOCK = 32
 """Number of rows that one grid index takes through all layers on a CPU; matrices have a multiple of 8 rows."""
 
 SSIM_BAND = 64
-"""Number of rows in a band, which one grid index of the CPU's photometric loss computes; 10 more are blurred for it."""
+"""Number of rows in a band, which one grid index of the CPU's photometric loss computes; it also blurs 10 rows
+beyond."""
 
 SSIM_BLOCK = 128
 """Number of columns of a band processed at once: 4 maps x 11 rows x 128 columns take 22 KiB."""

@@ -58,7 +58,7 @@ def pack_inputs(
     # Out:
     inputs_out: wp.array3d[float],  # [panels, R, 32], R >= T M; rows t M + m; zero elsewhere
 ):
-    """Write one input row: the columns of a position, then those of a time, for every pair of both. Grid: R."""
+    """Write the input row of one pair of position and time: the position's columns, then the time's. Grid: R."""
     pack_row(first + wp.tid(), where_in, when_in, inputs_out)
 
 

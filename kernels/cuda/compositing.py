@@ -30,7 +30,8 @@ MAX_CHANNELS = SLOT_WIDTH - SLOT_GEOMETRY
 """Largest number of channels that fit into a slot; the forward pass has no such bound."""
 
 _BOUNDS = (BLOCK_DIM, 4)
-"""Threads per block and blocks per multiprocessor: threads get 64 registers each and spill next to nothing."""
+"""Launch bounds: threads per block, and blocks per multiprocessor. They leave 64 registers to each thread, which then
+spills hardly any values to memory."""
 
 
 # fmt: off

@@ -39,7 +39,7 @@ VARIED = {
 NUMBERS = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds")
 """Metrics of ``metrics.json`` that tables show."""
 NUMBER_LIMIT = 1e12
-"""Magnitude from which on a metric counts as damaged."""
+"""Magnitude at and above which a metric counts as damaged."""
 ERROR = "error.txt"
 """File in a cell's folder with the reason why the cell failed."""
 LOG = "train.log"

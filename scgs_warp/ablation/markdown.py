@@ -43,7 +43,7 @@ def measured(found: dict[str, Any] | None, digits: int) -> str:
 
 
 def columns(report: dict[str, Any], rows: list[Row]) -> list[Column]:
-    """Return heading and text function of each column of one table."""
+    """Return, for each column of one table, its heading and the function that writes a row's text."""
     ablation = report["ablation"]
     labels: dict[str, str] = LABELS.get(ablation, {})
     made: list[Column] = [(HEADS[ablation], lambda row: str(labels.get(row["value"], row["value"])))]

@@ -31,7 +31,11 @@ Table = dict[str, Any]
 
 
 def picture(report: dict[str, Any]) -> bytes:
-    """Draw a PNG: PSNR and final count over the requested count for ``nodes``, bars for each scene otherwise."""
+    """Draw the plot and return it as a PNG.
+
+    For ``nodes`` it shows PSNR and the final number of control points over the requested number, otherwise bars for
+    each scene.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # no display, no global backend
     from matplotlib.figure import Figure
 
@@ -45,7 +49,10 @@ def picture(report: dict[str, Any]) -> bytes:
 
 
 def _points(table: Table, key: str) -> tuple[list[int], list[float], list[float]]:
-    """Return requested counts, means (NaN, a gap in the line, for missing cells) and deviations (0 for one seed)."""
+    """Return requested numbers of control points, means and deviations.
+
+    The mean of missing cells is NaN, which leaves a gap in the line; the deviation of a single seed is 0.
+    """
     statistics = [(int(row["value"]), row[key] or {"mean": math.nan, "std": None}) for row in table["rows"]]
     counts, rows = [count for count, _ in statistics], [row for _, row in statistics]
     return counts, [row["mean"] for row in rows], [row["std"] or 0.0 for row in rows]

@@ -22,8 +22,8 @@ PUBLISHED_PSNR = {
     "static": {"jumpingjacks": 20.64, "hook": 21.71, "mutant": 24.53, "standup": 21.91, "hellwarrior": 29.89,
                "trex": 21.93, "bouncingballs": 23.20, "mean": 23.40},
 }  # fmt: skip
-"""D-NeRF at 400 x 400: SC-GS, its per-Gaussian baseline and 4D-GS by the SC-GS paper, best checkpoint by test score;
-static 3D-GS at 800 x 800 by Deformable-3D-GS."""
+"""PSNR on D-NeRF. SC-GS, its per-Gaussian baseline and 4D-GS: from the SC-GS paper, at 400 x 400, checkpoint with the
+best test score. Static 3D-GS: from the paper of Deformable-3D-GS, at 800 x 800."""
 NOTES = {
     "nodes": "Published: SC-GS, Table S1, mean of D-NeRF at 400 x 400, best checkpoint by test score.",
     "motion": "Published, D-NeRF at 400 x 400, best checkpoint by test score: SC-GS, its per-Gaussian baseline, 4D-GS; "

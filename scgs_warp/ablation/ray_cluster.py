@@ -25,12 +25,13 @@ CONNECT_SECONDS = 5.0
 ANSWER_SECONDS = 45.0
 """Longest wait for Ray to be imported and to answer."""
 PULSE_SECONDS = 2.0
-"""Time between two checks of the head."""
+"""Time between two checks of the cluster's head node."""
 GONE_SECONDS = 20.0
-"""Time without an answer from the head after which the sweep ends with a one-line error; Ray would end the process
-after 60 s."""
+"""Time without an answer from the head node after which the ablation ends with a one-line error; Ray would end the
+process after 60 s."""
 STORE_BYTES = 100 << 20
-"""Shared memory for the objects of a local cluster; an ablation's objects are lines of text."""
+"""Bytes of shared memory for the objects of a local cluster. Little is needed: an ablation's objects are lines of
+text."""
 START_HINT = "start a cluster with 'ray start --head', or give --ray local"
 
 
@@ -143,8 +144,8 @@ def last_error_line(text: str) -> str:
 
 
 class HeadMonitor:
-    """Watches whether the cluster's head answers. Connections from outside (``ray://``) need no watching, since they
-    end with the head."""
+    """Monitor of the cluster's head node. Connections from outside (``ray://``) are not monitored, since they end with
+    the head node."""
 
     def __init__(self, ray: Any, address: str) -> None:
         self.address = address
@@ -185,7 +186,7 @@ def machines(ray: Any) -> list[Machine]:
 
 
 def usable_machines(found: Sequence[Machine], cuda: bool) -> list[Machine]:
-    """Return the machines that can train a cell; the head of a cluster often offers no processors.
+    """Return the machines that can train a cell; a head node often offers no processors and is left out.
 
     Raises:
         UserError: there are none.

@@ -203,7 +203,7 @@ class Task:
     losses: int = 0
     """Workers lost since the checkpoint last changed."""
     mark: int = 0
-    """Modification time of the checkpoint, ns, when a worker was last lost."""
+    """Modification time, ns, that the checkpoint had when a worker was last lost."""
     seen: bool = False
     """True if the machine that runs this attempt has been reported."""
     done: int = 0
@@ -345,7 +345,7 @@ class Sweep:
 
 
 def _loss(error: Exception) -> str:
-    """Return the reason of a lost worker."""
+    """Return the reason why a worker was lost."""
     known = {
         "WorkerCrashedError": "its worker was killed",
         "NodeDiedError": "its machine was lost",

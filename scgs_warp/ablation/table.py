@@ -171,7 +171,7 @@ def _compare(ablation: str, rows: list[Row]) -> None:
 
 
 def _published_leads(rows: list[Row], scenes: list[str], key: str) -> None:
-    """Add the published means over ``scenes`` to the rows if they are known for all of these."""
+    """Add the published means over ``scenes`` to the rows, if a figure is published for every scene."""
     ours = PUBLISHED_PSNR["control-points"]
     if not all(scene in ours for scene in scenes):
         return

@@ -68,5 +68,5 @@ def peak_mib(device: str) -> float | None:
 
 
 def extra_mib(peak: float | None, before: float | None) -> float | None:
-    """Return the memory that measuring took beyond the use ``before`` the first frame; None if unknown."""
+    """Return the memory that measuring took: ``peak`` less the use ``before`` the first frame; None if unknown."""
     return None if peak is None or before is None else max(peak - before, 0.0)

@@ -22,7 +22,7 @@ KEYS = (
 )
 """Keys of every row. ``fps`` is None for a stage; ``share``, a stage's part of the whole, is None for a whole."""
 MIDDLE = 0.5
-"""Time at which the load is counted and a rasterisation is measured."""
+"""Scene time at which the load is counted and a rasterisation is measured."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,10 @@ class BenchCase:
         renderer: str = "scgs_warp",
         staged: Callable[[int], Any] | None = None,
     ) -> list[dict[str, Any]]:
-        """Time the whole undisturbed, then its stages in separate calls (of ``staged`` if it is given)."""
+        """Time calls of ``function`` as a whole, then the stages ``targets`` in separate calls.
+
+        The stages are timed in calls of ``staged`` instead, if it is given.
+        """
         plan, device = self.plan, self.plan.device
         plan.report(f"{name}, {self.scene.motion_name}, {self.threads} threads")
         scaling = two_thread_scaling()

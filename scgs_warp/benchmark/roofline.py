@@ -57,7 +57,7 @@ class Limits(NamedTuple):
     """Arithmetic in single precision in Gflop/s; a multiply-add counts as two."""
 
     def milliseconds(self, work: Work) -> float:
-        """Return the least time for ``work`` if moving and computing overlap."""
+        """Return the least time for ``work`` if memory traffic and arithmetic overlap."""
         return 1e3 * max(work.bytes / (1e9 * self.gigabytes), work.flops / (1e9 * self.gigaflops))
 
 

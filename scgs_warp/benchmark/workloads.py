@@ -34,8 +34,11 @@ RENDER_STAGES = {
 
 
 def motion_stages(motion: Motion, training: bool = False) -> dict[str, list[tuple[Any, str]]]:
-    """Return the stages of a motion model: the network (with planes, their heads and in training their smoothness) and
-    skinning (in training with the search for neighbours)."""
+    """Return the functions to time for each stage of a motion model.
+
+    The stage ``network`` includes a hexplane model's planes and, in training, their smoothness term. Models with
+    control points add ``skin``, which in training includes the search for neighbours, and in training ``arap``.
+    """
     if isinstance(motion, ControlPoints):
         stages: dict[str, list[tuple[Any, str]]] = {"network": [(motion, "poses")]}
         stages["skin"] = [(motion, "bind_and_pose"), (motion, "apply_pose")]

@@ -17,8 +17,8 @@ CACHE_MIB = 2048
 
 
 def bounded(default: float, least: float | None = None, most: float | None = None, **more: Any) -> Any:
-    """A number with inclusive bounds. ``most`` limits sizes that take memory, because a configuration may come from an
-    untrusted file.
+    """Declare a number with inclusive bounds. ``most`` limits sizes that take memory, because a configuration may come
+    from an untrusted file.
 
     Without ``least``, the field is checked by a separate rule in ``validation.py`` or may be any number.
     """
@@ -26,12 +26,12 @@ def bounded(default: float, least: float | None = None, most: float | None = Non
 
 
 def chosen(default: int, least: int, most: int) -> Any:
-    """A whole number between two inclusive bounds that are close together."""
+    """Declare a whole number between two inclusive bounds that are close together."""
     return field(default=default, metadata={"choices": (least, most)})
 
 
 def milestone(steps: int, least: int | None = None) -> Any:
-    """A step count that scales with the length of the run."""
+    """Declare a step count that scales with the length of the run."""
     return bounded(steps, least, milestone=True)
 
 
@@ -52,7 +52,7 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Control points and the network that moves them (seed S4; paper section 4.1)."""
+    """Control points and the network that moves them (paper section 4.1)."""
 
     model: MotionName = "control-points"
     nodes: int = bounded(512, most=1_000_000)
@@ -100,7 +100,7 @@ class MotionConfig:
 
 @dataclass(frozen=True)
 class PretrainConfig:
-    """Stage 1: control points trained alone, rendered as same-sized spheres (seed S4)."""
+    """Stage 1: control points trained alone, rendered as same-sized spheres."""
 
     steps: int = milestone(10_000, 0)
     with_points: bool = False
@@ -121,8 +121,8 @@ class PretrainConfig:
     """Largest number of spheres per control point (at least 256 control points are assumed) once they move: the network
     is then evaluated at each sphere."""
     opacity_rate: float = 0.02
-    """Learning rate of the spheres' opacities; ``color_rate`` is that of their colours. With the rates of the
-    Gaussians, spheres turn transparent before they find their colour."""
+    """Learning rate of the spheres' opacities; ``color_rate`` is that of their colours. With the learning rates of the
+    Gaussians, spheres would turn transparent before they find their colour."""
     color_rate: float = 1e-2
     arap_weight: float = bounded(1e-3, 0)
     random_background: bool = True
@@ -212,7 +212,7 @@ class DensifyConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Settings of the losses: L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10; seed S4)."""
+    """Settings of the losses: L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10)."""
 
     ssim: float = bounded(0.2, 0)
     arap: float = bounded(1e-2, 0)
@@ -232,8 +232,8 @@ class LossConfig:
     hexplane_tv: float = bounded(1e-4, 0)
     hexplane_smooth: float = bounded(1e-2, 0)
     hexplane_rest: float = bounded(1e-4, 0)
-    """Weight of the distance of time planes from 1. ``hexplane_tv`` weighs differences in space, ``hexplane_smooth``
-    second differences in time (feature planes, 4D-GS)."""
+    """Weight of the term that keeps the time planes near 1, the value at rest (feature planes, 4D-GS). ``hexplane_tv``
+    is the weight of differences in space, ``hexplane_smooth`` that of second differences in time."""
 
 
 @dataclass(frozen=True)

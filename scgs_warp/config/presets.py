@@ -43,8 +43,8 @@ PRESETS: tuple[str, ...] = get_args(PresetName)
 
 
 def preset(name: PresetName) -> TrainConfig:
-    """Make a configuration. ``quick`` suits the built-in scene, ``cpu`` takes minutes on two cores, ``paper`` is seed
-    S4."""
+    """Make a configuration. ``quick`` suits the built-in scene, ``cpu`` takes minutes on two cores, ``paper`` is the
+    full schedule."""
     if name == "paper":
         return TrainConfig()
     cpu = TrainConfig(

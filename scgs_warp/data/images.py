@@ -28,8 +28,8 @@ SMALLEST_SIDE = 8
 """Smallest side in pixels after a reduction: the window of SSIM would not fit into a smaller image."""
 
 TRUSTED_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 64
-"""Number of pixels up to which a header is trusted, and number of pixels per byte of the file that is trusted beyond
-it: a megabyte of zeros may decompress to a gigabyte."""
+"""Limits on the size that a file's header may announce. Up to ``TRUSTED_PIXELS`` any size is trusted, beyond it at most
+``MAX_PIXELS_PER_BYTE`` for each byte of the file: a megabyte of zeros may decompress to a gigabyte."""
 
 # Pixels do not depend on EXIF data, so the warning would only clutter the terminal.
 warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)

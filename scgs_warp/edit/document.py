@@ -62,8 +62,10 @@ class Film:
 
 @functools.lru_cache(maxsize=16)
 def frame_reach(film: Film, playback: Playback) -> float:
-    """Return half the width, in scene time, of the interval around a handle's time in which an edit of one frame shows:
-    half the median step between two frames of the film, so that exactly one frame shows the edit."""
+    """Return the largest distance from a handle's time, in scene time, at which a one-frame edit still shows.
+
+    It is half the median step between two frames of the film, so that exactly one frame shows the edit.
+    """
     times = playback.times_at(np.arange(film.frames) / film.fps, film.seconds)
     steps = np.abs(np.diff(times))
     moving = steps[steps > 0]
@@ -89,7 +91,7 @@ class Edit:
 
     @property
     def reach(self) -> float:
-        """Half the width, in scene time, of the interval around a handle's time in which an edit of one frame shows."""
+        """Largest distance from a handle's time, in scene time, at which a one-frame edit still shows."""
         return frame_reach(self.film, self.playback)
 
     def handle(self, name: str) -> Handle | None:

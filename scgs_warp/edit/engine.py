@@ -46,7 +46,7 @@ class _Problem(NamedTuple):
     goals: list[Goal]
     pins: np.ndarray
     stay: np.ndarray
-    """[M] bool: control points that follow no leader, because they are pinned or a handle acts on their component."""
+    """[M] bool: strays that do not follow their leader, because they are pinned or a handle acts on their component."""
 
 
 class _Live(NamedTuple):
@@ -106,7 +106,7 @@ class Engine:
         return _remember(self._motions, time, lambda: motion_pose(self.rig, time))
 
     def base_at(self, edit: Edit, time: float) -> NodePose:
-        """Return the control points under holds and exaggeration, before any handle."""
+        """Return the control points with the edit's holds and exaggeration applied, but no handles."""
         key = time, edit.holds, edit.exaggerate
         return _remember(self._bases, key, lambda: self.player.play(time, edit.holds, edit.exaggerate))
 
@@ -120,8 +120,7 @@ class Engine:
 
         Args:
             at: moment of the film in seconds, for keyframes. None: the handles' present targets.
-            frame: half the width, in scene time, of the interval around a handle's time in which an edit of one frame
-                shows.
+            frame: largest distance from a handle's time, in scene time, at which a one-frame edit still shows.
 
         Returns:
             The pose, or None where the edit changes nothing, so that results are bit-identical to the unedited scene's.
@@ -223,7 +222,7 @@ class Engine:
         return _Problem(base, used, pins[alive[pins]], stay)
 
     def _finish(self, problem: _Problem, shape: Shape) -> NodePose:
-        """Let strays follow their leaders, and compose the result with the base pose."""
+        """Move strays (see ``graph.ControlGraph``) with their leaders, and compose the result with the base pose."""
         base = problem.base
         turns = from_matrix(shape.rotations)
         positions, turns = self.graph.follow(base.positions, shape.positions, turns, problem.stay)

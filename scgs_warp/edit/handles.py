@@ -20,15 +20,15 @@ Quaternion = tuple[float, float, float, float]
 Lasting = Literal["motion", "frame", "fade"]
 
 ONE_FRAME = 5e-3
-"""Half the width, in scene time, of the interval around a handle's time in which an edit of one frame shows, if the
-film's step is unknown."""
+"""Largest distance from a handle's time, in scene time, at which a one-frame edit still shows if the film's step is
+unknown."""
 HALFWAY_STIFFNESS = 10.0
 """Stiffness of a fading handle at half strength. The handle holds its nodes less firmly as its strength goes to 0, so
 that they do not jump when it releases them."""
 MIN_STIFFNESS, MAX_STIFFNESS = 1e-6, 1e6
 """Limits of a stiffness."""
 MIN_NODES_FOR_FRAME = 4
-"""Node count below which a region's rotation is estimated together with its neighbours."""
+"""Number of nodes below which neighbouring nodes also enter the estimate of a region's rotation."""
 
 
 @dataclass(frozen=True)

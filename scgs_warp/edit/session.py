@@ -40,9 +40,9 @@ class EditSession:
     in seconds, at which keyframes place the handles. If it is None, handles are at their present targets.
 
     Every change of the edit can be undone; a drag counts as one change from its first ``drag`` to ``release``. Results
-    depend on the edit alone, except those with ``live=True``, which are previews during a drag. ``frame`` is half the
-    width, in scene time, of the interval around a handle's time in which an edit of one frame shows; None: as in the
-    edit's film.
+    depend on the edit alone, except those with ``live=True``, which are previews during a drag. ``frame`` is the
+    largest distance from a handle's time, in scene time, at which a one-frame edit still shows; None: as in the edit's
+    film.
 
     Attributes: ``scene``, ``graph``, ``edit`` (replace it with :meth:`apply`).
     """
@@ -57,7 +57,7 @@ class EditSession:
         self._before_drag: Edit | None = None
 
     def __len__(self) -> int:
-        """Number of control points."""
+        """Return the number of control points."""
         return len(self.graph)
 
     def fork(self) -> EditSession:

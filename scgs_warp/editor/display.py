@@ -35,7 +35,10 @@ class Display:
         return np.asarray(points, np.float64) / self.scale + self.centre
 
     def depth(self, depth: np.ndarray, behind: float, stride: int = 1) -> np.ndarray:
-        """Convert depth [H, W], float32 world units, to browser units, add ``behind``, and limit it to ``FARTHEST``."""
+        """Convert every ``stride``-th row and column of depth [H, W], float32 world units, to browser units.
+
+        The result is moved away by ``behind`` (browser units) and limited to ``FARTHEST``.
+        """
         return np.minimum(depth[::stride, ::stride] * np.float32(self.scale) + np.float32(behind), FARTHEST)
 
     @property

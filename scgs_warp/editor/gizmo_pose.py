@@ -17,7 +17,8 @@ from .views import ClientCamera
 
 PICK_SIZE = 512
 NOISE = 1e-7
-"""Half the angle in radians below which a turn that the browser reports counts as noise in a shift."""
+"""Half the angle, in radians, of the smallest turn that counts. While a handle is only shifted, the browser reports
+smaller turns, which are rounding errors."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ _REMEDY = (
 
 
 def psnr(image: Tensor, truth: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio in decibels, -10 log10(mean squared error) of values clamped to [0, 1].
+    """Compute the peak signal-to-noise ratio in decibels, -10 log10(mean squared error) of values clamped to [0, 1].
 
     Args:
         image: any shape, typically [H, W, 3], or [P, 3] of the valid pixels.
@@ -50,7 +50,7 @@ def psnr(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Structural similarity of two images [H, W, 3], with the window of the loss (see ``ops.ssim``).
+    """Compute the structural similarity of two images [H, W, 3], with the window of the loss (see ``ops.ssim``).
 
     Args:
         image: [H, W, 3] float32 in [0, 1].

@@ -17,7 +17,7 @@ GREY = 0.35
 CORNERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
 FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
 SIDES = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]])
-"""Triangles of a bar, whose corners are three at its first end, then three at its second."""
+"""Triangles of a bar with six corners: 0 to 2 lie at its first end, 3 to 5 at its second."""
 
 
 def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[float, float, float]) -> None:

@@ -57,7 +57,7 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
 
 
 def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> tuple[bytes, int]:
-    """Return the page of the highest degree that fits, and its Gaussian count."""
+    """Return the page with the highest degree of spherical harmonics that fits, and its number of Gaussians."""
     page = b""
     for degree in range(min(scene.gaussians.sh_degree, MAX_DEGREE), -1, -1):
         content = page_scene(scene, degree)

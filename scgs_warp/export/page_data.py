@@ -19,10 +19,10 @@ from ..errors import UserError
 
 VERSION = 1
 COMMON, SPREAD = 0.999, 2.0
-"""If the bits do not suffice, values beyond ``SPREAD`` times the quantile ``COMMON`` of their magnitudes are clipped,
-because a single outlier would coarsen all the others."""
+"""Bounds of a column's common range: ``SPREAD`` times the quantile ``COMMON`` of the values' magnitudes. If a column
+has too few bits for all of its values, outliers are clipped to this range, so that they do not coarsen the others."""
 LEVEL = 6
-"""Compression level of deflate; the highest takes four times as long for half a percent."""
+"""Compression level of deflate. The highest level takes four times as long and saves only half a percent."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Column:
 
 def quantise(name: str, values: np.ndarray, step: float, *, most_bits: int = 24, delta: bool = False) -> Column:
     """Quantise ``values`` [R] in steps of at most ``step``; the least and the largest value are exact. If ``most_bits``
-    (1 to 24) do not suffice, outliers are clipped to the common range, and steps widen if that is not enough.
+    (1 to 24) do not suffice, outliers are clipped to the common range. If that is not enough, the steps widen.
 
     Raises:
         UserError: a value is not finite.

@@ -20,8 +20,9 @@ from .page_data import Column, common_size, integers, quantise
 MIN_SAMPLES, MAX_SAMPLES = 33, 257
 """Smallest and largest number of times at which control points are sampled; see ``COARSE_ERROR``."""
 COARSE_ERROR = 8e-4
-"""Error of interpolation halfway between two times (root mean square, normalised units and radians) at which the number
-of times is doubled once more and then kept; the last doubling leaves about a quarter of the error."""
+"""Acceptable error of interpolation halfway between two times (root mean square, normalised units and radians). The
+number of times is doubled until the error is below this, and then once more, which leaves about a quarter of the
+error."""
 POSE_PARTS = ("translation", "rotation", "shape", "log_scale")
 QUATERNIONS = ("rotation", "shape")
 TIMES_AT_ONCE = 16
@@ -165,7 +166,7 @@ def _quaternion_columns(name: str, quats: np.ndarray) -> list[Column]:
 def _binding_columns(
     motion: ControlPoints, gaussians: GaussianParameters, kept: Tensor, facts: dict[str, Any]
 ) -> list[Column]:
-    """Store each Gaussian's control points and all weights but the first, as they sum to one."""
+    """Store each Gaussian's control points, and all of its weights but the first, since weights sum to one."""
     indices, weights = (value[kept] for value in motion.binding(gaussians))
     count = indices.shape[1]
     facts.update(nodes=len(motion), neighbors=count, masked=bool(motion.config.mask))

@@ -20,7 +20,8 @@ BULK = 0.95
 FEWEST_POINTS = 10
 """Smallest number of initial points from which the scene is located; with fewer points the cameras are used."""
 PARALLEL = 1e-4
-"""Smallest eigenvalue of the mean of (I - d d^T) at which optical axes define a nearest point: about 1 degree."""
+"""Smallest eigenvalue of the mean of I - d d^T, over optical axes with directions d, at which the axes define a nearest
+point. It corresponds to angles of about 1 degree between them."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,8 @@ def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _nearest_to_axes(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Solve sum over cameras of (I - d d^T)(x - p) = 0 for the point x nearest to all optical axes.
+    """Return the point x nearest to all optical axes: sum of (I - d d^T)(x - p) = 0, with axes of direction d through
+    p.
 
     Near-parallel axes leave x undetermined along their direction; x then lies ahead of the cameras by twice the rig's
     size.

@@ -160,7 +160,8 @@ class ControlPoints(Motion):
         return _posed(gaussians, moved, self.config.mask)
 
     def cache_binding(self, gaussians: GaussianParameters | None) -> None:
-        """Keep neighbours and weights for rendering, as they do not depend on time; None discards them."""
+        """Keep the Gaussians' neighbours and weights for rendering, as they do not depend on time; with None, discard
+        them."""
         with torch.no_grad():
             self._cached = None if gaussians is None else self.binding(gaussians)
         self._cached_for = None if gaussians is None else self._binding_state(gaussians)

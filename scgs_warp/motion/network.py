@@ -1,4 +1,4 @@
-"""The deformation network Psi: positional encoding and an MLP with one skip (paper section 4.1; seed S4)."""
+"""The deformation network Psi: positional encoding and an MLP with one skip (paper section 4.1)."""
 
 from __future__ import annotations
 

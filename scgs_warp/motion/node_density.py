@@ -14,7 +14,8 @@ from ..optim import Adam
 from .control_points import NODE_NAMES, ControlPoints
 
 PRUNE_IMPACT = 1e-2
-"""Sum of weights over all Gaussians below which a control point is pruned, because it moves nothing visible."""
+"""Smallest sum of a control point's weights over all Gaussians. A control point with a smaller sum moves nothing
+visible and is pruned."""
 MOST_NEW = 0.1
 """Largest number of control points cloned at a time (those with the largest gradients), as a share of all."""
 

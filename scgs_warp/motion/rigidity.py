@@ -1,4 +1,4 @@
-"""As-rigid-as-possible regulariser on trajectories (paper Eq. 9-10; seed S4)."""
+"""As-rigid-as-possible regulariser on trajectories (paper Eq. 9-10)."""
 
 from __future__ import annotations
 
@@ -53,8 +53,10 @@ def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> G
 
 
 def rigidity(instants: list[Tensor], graph: Graph) -> Tensor:
-    """Sum the energy between the last two of ``instants`` [M, 3] over control points, in a fixed order: as a product
-    with ones."""
+    """Return the ARAP energy between the last two of ``instants`` (positions [M, 3] each), summed over control points.
+
+    The sum is computed as a product with ones, which adds in a fixed order.
+    """
     first, second = instants[-2:]
     energy = arap_energy(first, second, graph.neighbors, graph.weights, reverse=graph.reverse)
     return energy @ torch.ones_like(energy)

@@ -1,5 +1,4 @@
-"""Stage 1: control points as spheres of equal size, each moved by the network evaluated at its own position (seed
-S4)."""
+"""Stage 1: control points as spheres of equal size, each moved by the network evaluated at its own position."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Static model without motion: 3D-GS, the seed's reference for speed."""
+"""Static model without motion: 3D-GS, the paper's reference for speed (Table S2)."""
 
 from __future__ import annotations
 

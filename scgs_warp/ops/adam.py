@@ -95,11 +95,12 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
 
 
 def first_not_finite_by_norm(tensors: Sequence[Tensor]) -> int | None:
-    """Compute the result of :func:`first_not_finite` in torch operations, with one wait for the device.
+    """Compute the result of :func:`first_not_finite` in torch operations. If all values are finite, the host waits
+    once.
 
     Args:
-        tensors: floating point, on one device. Empty tensors count as finite, because torch has no infinity norm of
-            them. Stage 1 has such a gradient: its spheres carry no spherical harmonics beyond degree 0.
+        tensors: floating point, on one device. Empty tensors are skipped, because torch has no infinity norm of them.
+            Stage 1 has empty gradients: its spheres have no spherical harmonics beyond degree 0.
     """
     filled = [(index, tensor) for index, tensor in enumerate(tensors) if tensor.numel() > 0]
     if not filled or math.isfinite(float(torch.nn.utils.get_total_norm([tensor for _, tensor in filled], math.inf))):

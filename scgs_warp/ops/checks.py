@@ -77,7 +77,8 @@ def check_dealt(begun: Tensor, ended: Tensor) -> None:
     """Check on a CPU that ``deal_chunks`` wrote every stretch that ``sort_bands`` will read.
 
     Args:
-        begun, ended: [chunks, rows + 1] position of each chunk's first stretch of each row, and behind its last one.
+        begun, ended: [chunks, rows + 1] position of each chunk's first stretch in each row, and the position behind its
+            last one.
 
     Raises:
         BrokenInvariant: a chunk wrote more or fewer stretches than it counted.

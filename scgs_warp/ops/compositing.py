@@ -158,7 +158,10 @@ def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
 
 
 def _pieces(job: _Job) -> Iterator[tuple[Tiles, Window]]:
-    """Yield the lists and range of all tiles, or of each window; the caller must drop one pair before the next."""
+    """Yield (lists, range of tiles) of the whole image, or of each window in turn.
+
+    The caller must drop a pair before asking for the next, so that only one window's lists are in memory.
+    """
     if not job.tiles.windows:
         yield job.tiles, (0, len(job.tiles.ranges))
         return

@@ -24,8 +24,8 @@ def forward(
     """Composite a window of tiles.
 
     Args:
-        lists: the kernels' tensors up to the sorted list.
-        size: width, height, columns.
+        lists: the kernels' tensor arguments up to the sorted list.
+        size: width and height in pixels, and number of tiles in a row.
         outputs: image, alpha, final transmittance and last contributor.
         window: begin and end of the range of tiles to composite.
     """
@@ -55,7 +55,7 @@ def adjoint(
     The portable form takes over where there are more channels than a slot of the native form holds.
 
     Args:
-        lists: the kernels' tensors up to ``v_alpha``.
+        lists: the kernels' tensor arguments up to ``v_alpha``.
         size, window: as in :func:`forward`.
     """
     begin, blocks = window[0], window[1] - window[0]

@@ -14,7 +14,7 @@ from ..kernels.types import NETWORK_BLOCK, NETWORK_PANEL
 from ..runtime.launch import launch
 
 ROW_MULTIPLE = 8
-"""Number of which every matrix's row count is a multiple."""
+"""Number to a multiple of which the rows of every matrix are rounded up."""
 ROWS_AT_ONCE = 8192
 """Number of rows evaluated at once without gradients: hidden values stay in the cache from layer to layer."""
 ADJOINT_ROWS_AT_ONCE = 2048

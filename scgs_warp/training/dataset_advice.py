@@ -95,7 +95,7 @@ def survey(data: Dataset) -> Survey:
 
 
 def _directions(data: Dataset) -> np.ndarray:
-    """Unit vectors [V, 3] from the centre of the scene to the cameras."""
+    """Return the unit vectors [V, 3] from the centre of the scene to the cameras."""
     centre = Normalisation.fit(data.cameras, data.points).centre
     offsets = np.stack([camera.position.double().cpu().numpy() for camera in data.cameras]) - centre
     return offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)

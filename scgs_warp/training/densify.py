@@ -1,4 +1,4 @@
-"""Row operations on Gaussians and their optimiser: clone, split, prune, reset (3D-GS section 5; seed S4).
+"""Row operations on Gaussians and their optimiser: clone, split, prune, reset (3D-GS section 5).
 
 ``density_control.py`` decides when and on which rows.
 """

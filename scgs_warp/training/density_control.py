@@ -222,7 +222,7 @@ def grow_and_prune(
         stats: statistics accumulated since the last round; the caller resets them.
         grad_threshold: norm of the screen-space gradient, normalised device coordinates.
         extent: radius of the cameras, normalised units.
-        prune_large: also remove Gaussians that are too large on screen or in space ; True only after the first opacity
+        prune_large: also remove Gaussians that are too large on screen or in space; True only after the first opacity
             reset.
         random: generator for the positions of split halves.
     """

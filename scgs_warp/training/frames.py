@@ -65,8 +65,8 @@ class Frames:
 
         Args:
             progressive: draw from the first 20 % of the frames by time at first; every ``progressive_every`` steps
-                another 20 % is added (seed S4), one frame at a time. Every other view is then one of the newest 20 %,
-                so that the spheres follow a moving limb before views of its earlier positions make them transparent.
+                another 20 % is added, one frame at a time. Every other view is then one of the newest 20 %, so that the
+                spheres follow a moving limb before views of its earlier positions make them transparent.
         """
         first, allowed, number = 0, len(self.frames), view_number(step, self.config, view)
         if progressive:

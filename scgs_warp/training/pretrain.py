@@ -133,8 +133,10 @@ def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Sphere
 
 
 def control_points_from_spheres(gaussians: GaussianParameters, spheres: Spheres, config: TrainConfig) -> ControlPoints:
-    """Make control points at the spheres' centres, all with the same initial radius (seed S4: o_i is shared): that of
-    the spheres, but at least their typical spacing, so that neighbours blend."""
+    """Make control points at the spheres' centres, all with the same initial radius.
+
+    The radius is that of the spheres, but at least their typical spacing, so that neighbours blend.
+    """
     positions = gaussians.means.detach()
     spacing = float(neighbor_distance(positions).median())
     radius = max(float(spheres.log_radius.detach().exp()), spacing)

@@ -105,7 +105,7 @@ def sh_degree(state: TrainState, step: int) -> int:
 
 
 def motion_frozen(state: TrainState) -> bool:
-    """Return True during the main steps at the beginning in which only the Gaussians learn (seed S4)."""
+    """Return True during the main steps at the beginning in which only the Gaussians learn."""
     return state.stage == "main" and state.stage_step < state.config.rest_steps
 
 

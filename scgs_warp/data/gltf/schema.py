@@ -65,8 +65,8 @@ FIELDS: dict[str, Any] = {
     ],
     "": ("asset",),
 }  # fmt: skip
-"""Expected type of each field: a type, a list of a type, or an object; "" lists the required fields of an object. Other
-fields are ignored."""
+"""Expected type of each field: a type, a list of a type, or an object; the key "" of an object lists its required
+fields. Other fields are ignored."""
 
 
 def find_problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, str] | None:

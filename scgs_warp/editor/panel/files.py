@@ -112,7 +112,7 @@ class FilesSection:
         self.jobs.start(name, total, action, client)
 
     def export_film(self, client: Any = None) -> Path:
-        """Start the film of the edit as it is now; later changes do not affect it."""
+        """Start to write the film of the edit as it is now; later changes do not affect the film."""
         path = self._path(self.format.value)
         with self.model.lock:
             session = self.model.session.fork()

@@ -90,7 +90,7 @@ class ShapeSection:
             self.remove.on_click(self.host.guarded(lambda event: self._ended(event.target.value)))
 
     def handle_labels(self) -> dict[str, str | None]:
-        """Return the handles' names by unique labels, because a name may equal the label of a new handle."""
+        """Return the handles' names (None: a new handle) by the labels to show, which are made unique."""
         labels: dict[str, str | None] = {NEW: None}
         for handle in self.model.session.edit.handles:
             label = handle.name
