@@ -33,7 +33,7 @@ class Settings:
     background: Literal["black", "white", "random"] | None = None
     """Colour behind transparent pixels."""
     batch: int | None = None
-    """Views per step, whose gradients are averaged; with torchrun one per process by default (docs/scaling.md)."""
+    """Views per step; their gradients are averaged. With torchrun, the default is one per process (docs/scaling.md)."""
     steps: int | None = None
     """Steps of both stages together; every milestone of the schedule scales with it."""
     nodes: int | None = None

@@ -100,8 +100,7 @@ def rotate_harmonics(
     # Out:
     sh_rest_out: wp.array[wp.vec3],  # [N * R]
 ):
-    """Rotate all bands of a Gaussian; for an exact identity rotation the result is bit-identical to the input. Grid:
-    N."""
+    """Rotate all bands of a Gaussian; an exact identity leaves them bit-identical. Grid: N."""
     i = first + wp.tid()
     q = quats_in[i]
     k = i * rest

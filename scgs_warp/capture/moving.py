@@ -28,7 +28,7 @@ MIN_VECTORS = 60
 MIN_LINE_DISTANCE = 1.5
 """Distance from its epipolar line, in pixels at ``FLOW_SIDE``, above which a pixel may be moving."""
 TYPICAL_FACTOR = 6.0
-"""Ratio to the median distance from epipolar lines, which a moving pixel's distance must also exceed."""
+"""Factor on the median distance from epipolar lines; a moving pixel's distance must exceed this product, too."""
 MAX_ROUND_TRIP = 1.5
 """Largest distance between a pixel and its position after flow forth and back, in pixels; occluded pixels exceed it."""
 MIN_CONTRAST = 4.0

@@ -97,9 +97,9 @@ def relative_sharpness(sharp: np.ndarray) -> np.ndarray:
 def pick(found: FrameMeasures, count: int) -> Selection:
     """Choose at most ``count`` frames.
 
-    The film is cut into ``count`` equal segments, measured by the mean of the share of the film's time and the share of
-    its motion. The sharpest frame of each segment is picked, unless it is blurred or repeats the previously picked one.
-    If there are as many segments as frames, only blurred and repeated frames are omitted.
+    The film is cut into ``count`` segments of equal length, where length is the mean of the share of the film's time
+    and the share of its motion. The sharpest frame of each segment is picked, unless it is blurred or repeats the
+    previously picked one. If there are as many segments as frames, only blurred and repeated frames are omitted.
     """
     frames = len(found.index)
     relative = relative_sharpness(found.sharpness)

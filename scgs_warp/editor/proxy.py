@@ -41,7 +41,8 @@ class RequestHead(NamedTuple):
     """Names in lower case."""
 
     def get(self, name: str) -> str | None:
-        """Return a header's value: None if it is missing, empty (which passes no check) if it is repeated."""
+        """Return a header's value; None if it is missing, and an empty text, which passes no check, if it is
+        repeated."""
         values = [value for key, value in self.headers if key == name]
         return None if not values else values[0] if len(values) == 1 else ""
 

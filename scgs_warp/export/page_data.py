@@ -1,7 +1,8 @@
 """Packing of a page's data as columns of small integers; docs/page.md describes the layout.
 
-A column is quantised to as many bits as its precision needs, and its bytes are stored plane by plane, so that deflate
-compresses a plane to about the bits that its values use, and the reader needs a single loop.
+A column is quantised to as many bits as its precision needs. Its codes are stored plane by plane: all lowest bytes,
+then all second bytes, and so on. Deflate compresses each plane to about the bits that its values use, and the reader
+needs a single loop.
 """
 
 from __future__ import annotations

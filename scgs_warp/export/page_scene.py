@@ -41,8 +41,8 @@ STEPS = {
 }
 """Quantisation step of each part; docs/page.md gives the loss of quality."""
 FAR = 200.0
-"""Distance, normalised units, that 24 bits span in steps of a position. Gaussians beyond it that are also more than
-twice as far as 99.9 % of all are left out."""
+"""Distance, normalised units, up to which 24 bits suffice for the quantisation step of positions. A Gaussian is left
+out if it is beyond this distance and more than twice as far as 99.9 % of all Gaussians."""
 BYTE = 8
 """Largest number of bits of ``sh_rest``, because the page unpacks bytes."""
 

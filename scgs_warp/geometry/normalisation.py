@@ -109,8 +109,7 @@ def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _nearest_to_axes(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return the point x nearest to all optical axes: sum of (I - d d^T)(x - p) = 0, with axes of direction d through
-    p.
+    """Return the point x nearest to all optical axes (directions d, through p): sum (I - d d^T)(x - p) = 0.
 
     Near-parallel axes leave x undetermined along their direction; x then lies ahead of the cameras by twice the rig's
     size.

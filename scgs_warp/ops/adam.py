@@ -95,8 +95,9 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
 
 
 def first_not_finite_by_norm(tensors: Sequence[Tensor]) -> int | None:
-    """Compute the result of :func:`first_not_finite` in torch operations. If all values are finite, the host waits
-    once.
+    """Compute the result of :func:`first_not_finite` in torch operations.
+
+    The host waits for the device only once, unless a value is non-finite.
 
     Args:
         tensors: floating point, on one device. Empty tensors are skipped, because torch has no infinity norm of them.

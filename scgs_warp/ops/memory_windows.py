@@ -1,9 +1,9 @@
 """Windows of tiles: ranges that are listed and drawn one after the other if the whole image's lists exceed memory.
 
 A tile's list does not depend on which other tiles are listed, so pixels drawn in windows are bit-identical to those
-drawn at once. A window consists of whole rows of tiles if at least one row fits into memory, otherwise of part of a
-row, at least one tile. Windows follow the order of the tiles, so that sums over a splat's slots continue from window
-to window in the order in which the whole image would add them.
+drawn at once. A window consists of whole rows of tiles if at least one row fits into memory, otherwise of a part of one
+row. Windows follow the order of the tiles, so that sums over a splat's slots continue from window to window in the
+order in which the whole image would add them.
 """
 
 from __future__ import annotations

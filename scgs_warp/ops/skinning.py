@@ -119,8 +119,9 @@ def skin(
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Move Gaussians with their control points (SC-GS, Eq. 6 and 7).
 
-    ``mu_t = sum_k w_k (R_k (mu - p_k) + p_k + T_k)`` and ``q_t = unit(sum_k w_k s_k r_k) x unit(q)``, where s_k = +-1
-    brings r_k to the side of the first neighbour's. The gradient to mu includes the blended rotation.
+    ``mu_t = sum_k w_k (R_k (mu - p_k) + p_k + T_k)`` and ``q_t = unit(sum_k w_k s_k r_k) x unit(q)``, where the sign
+    s_k = +-1 makes the dot product of r_k with the first neighbour's rotation non-negative. The gradient to mu includes
+    the blended rotation.
 
     Args:
         means: [N, 3] at rest, world.

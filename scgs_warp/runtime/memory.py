@@ -22,8 +22,8 @@ from ..errors import UserError
 LIMIT_VARIABLE = "SCGS_MEMORY_GIB"
 """Environment variable that holds the user's limit in GiB."""
 SIBLINGS_VARIABLE = "SCGS_SIBLINGS"
-"""Environment variable that holds the number of processes of one job on this machine, for jobs not started by
-``torchrun``, which sets a variable of its own."""
+"""Environment variable that holds the number of processes of one job on this machine. ``torchrun`` uses a variable of
+its own for it."""
 GIB = 2**30
 USABLE_SHARE = 0.9
 """Share of the free memory that requests may take; the rest is for threads, libraries and small tensors."""

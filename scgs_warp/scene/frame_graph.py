@@ -27,9 +27,9 @@ from ..runtime.cuda_graph import CudaGraph
 from ..types import Camera, Image, Splats, Tiles
 
 CAPACITY_FACTOR = 1.25
-"""Factor from the number of pairs of a frame that exceeded the capacity to the new capacity."""
+"""Ratio of the new capacity to the number of pairs of a frame that exceeded the old one."""
 CAPACITY_STEP = 1 << 16
-"""Number of pairs of which the capacity is a multiple, so that it seldom changes."""
+"""Number of pairs to a multiple of which the capacity is rounded up, so that it seldom changes."""
 RECORD_AFTER = 2
 """Number of frames drawn step by step before one is recorded, since recording does not pay for a single picture."""
 

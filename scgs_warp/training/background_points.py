@@ -35,8 +35,8 @@ def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _valid_cells(count: int, frame: Frame, random: torch.Generator) -> Tensor:
-    """Draw ``count`` valid pixels with repetition; return row times width plus column [count], or [0] if the mask is
-    empty."""
+    """Draw ``count`` valid pixels with repetition; return their flat indices (row times width plus column), [count], or
+    [0] if the mask is empty."""
     # torch.multinomial takes at most 2^24 pixels; integers have no such limit.
     if frame.mask is None:
         return torch.randint(frame.camera.width * frame.camera.height, (count,), generator=random)

@@ -40,8 +40,8 @@ STEPS_PER_VIEW = 20
 """Visibility pruning renders at most one view per this many steps since the last pruning. A view takes about half as
 long as a step, so the share of the time is a few percent."""
 MOST_VIEWS, FEWEST_VIEWS = 300, 50
-"""Largest number of rendered views, enough to see every side, and smallest number of views to judge by if the data has
-that many."""
+"""Limits for the number of rendered views: ``MOST_VIEWS`` are enough to see every side. With fewer than
+``FEWEST_VIEWS`` (or than all views of smaller data) nothing is pruned."""
 NUMBERS_PER_PARAMETER = 6
 """Number of float32 values in memory per parameter: value, gradient, two moments, posed value and its gradient."""
 NUMBERS_PER_GAUSSIAN = 220

@@ -16,7 +16,7 @@ from ..errors import UserError
 from ..storage.output_folders import holds_only, make_parent, replace_folder
 
 SUFFIXES = (".mp4", ".gif", "")
-"""Suffixes that ``film`` writes; none stands for a folder of PNGs."""
+"""Suffixes that ``film`` accepts; an empty one stands for a folder of PNGs."""
 QUALITY = 18
 """x264's constant rate factor; 18 is visually almost lossless, and each 6 more halve the file."""
 PALETTE_PIXELS = 400_000
@@ -51,7 +51,7 @@ def check_path(path: str | Path) -> Path:
 
 
 def frame_gib(width: int, height: int | None = None) -> float:
-    """Return the memory in GiB that a frame takes while it is rendered and written; square without ``height``."""
+    """Return the memory in GiB that a frame takes while it is rendered and written; without ``height`` it is square."""
     return PIXEL_BYTES * width * (height or width) / 2**30
 
 
