@@ -173,7 +173,10 @@ def sphere_direction(index: int, count: int, rotation: float):
 
 @wp.func
 def blocked(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, reach: float):
-    """Return whether the ray first hits a front face; a ray that starts inside another part (a joint) does not."""
+    """Return whether a front face blocks the ray.
+
+    A ray that starts inside another part, as at a joint, first hits a back face and counts as free.
+    """
     query = wp.mesh_query_ray(mesh, origin, direction, reach)
     return query.result and query.sign > 0.0
 

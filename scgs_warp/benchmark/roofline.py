@@ -107,8 +107,8 @@ def _network(layers: list[nn.Linear], rows: int) -> Work:
 
 
 def frame_work(scene: Scene, load: Load, width: int, height: int) -> dict[str, Work]:
-    """Count the work of each stage of a frame, with colour and depth, harmonics of degree 3, cached neighbours and
-    weights."""
+    """Count the work of each stage of a frame with colour, depth and harmonics of degree 3; neighbours and weights are
+    cached."""
     count = scene.gaussian_count
     work = {}
     if scene.motion.moves:

@@ -1,5 +1,5 @@
-"""Conversion to browser units, in which all scenes have the same size, because pictures encode depths up to 167
-only."""
+"""Conversion to browser units, in which all scenes have the same size: a picture for the browser encodes depths up to
+167."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class EditorModel:
         self.active: str | None = None
         self.region = Region()
         self.pin_rings: int | None = 3
-        """Rings around a new handle beyond which everything is pinned; None: nothing is."""
+        """Number of rings of nodes around a new handle beyond which all nodes are pinned; None: no node is pinned."""
         self.lasts: Any = "motion"
         self.window = 0.1
         self.stiffness: float | None = None

@@ -74,7 +74,7 @@ def film_moments(session: EditSession) -> list[AnimationMoment]:
 
 
 def posed_gaussians(scene: Scene, session: EditSession | None, moment: AnimationMoment) -> Gaussians:
-    """Return activated Gaussians, world units, under the edit if there is a session."""
+    """Return activated Gaussians, world units, with the session's edit applied if there is a session."""
     if session is None:
         return scene.gaussians_at(moment.time)
     return session.gaussians_at(moment.time, moment.at)

@@ -171,8 +171,8 @@ def _pieces(job: _Job) -> Iterator[tuple[Tiles, Window]]:
 
 
 def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, ...]:
-    """Return image and alpha, then, for the adjoint, the form's representation of the splats, final transmittance and
-    last contributor; these are None unless ``keep``."""
+    """Return image and alpha, followed by three values for the adjoint, which are None unless ``keep``: the form's
+    representation of the splats, the final transmittance, and the last contributor."""
     means2d, conics, opacities, channels, background = tensors
     device, count = channels.device, channels.shape[1]
     image = torch.empty(count, job.tiles.height, job.tiles.width, device=device)

@@ -76,7 +76,7 @@ class Layers:
         """Return the gradient of ``where``, and a list of the gradients of all weights, then of all biases.
 
         Args:
-            sizes: M, T and A of ``where`` [M, A] at T times. None: its gradient is not needed.
+            sizes: M, T and A of ``where`` [M, A] at T times. None: the gradient of ``where`` is not needed.
         """
         layers, rows, count = len(self.weights), hidden.shape[1], v_out.shape[0]
         flat = torch.zeros(self.gradient_size) if count == 0 else torch.empty(self.gradient_size)

@@ -1,4 +1,4 @@
-"""The editor as its panel sees it."""
+"""Interface of the editor for the sections of its panel."""
 
 from __future__ import annotations
 
