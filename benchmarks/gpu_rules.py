@@ -52,7 +52,7 @@ def compare_images(a: Tensor, b: Tensor) -> dict[str, Any]:
 
 
 def compare_gradients(ours: Tensor, theirs: Tensor) -> dict[str, Any]:
-    """Compare gradients by the relative L2 error per Gaussian, with a floor of 1e-6 of the tensor's norm."""
+    """Compare gradients by each Gaussian's L2 error, relative to the Gaussian's norm or 1e-6 of the whole tensor's."""
     a, b = (t.detach().cpu().double().reshape(len(t), -1) for t in (ours, theirs))
     error = (a - b).norm(dim=1) / torch.maximum(b.norm(dim=1), 1e-6 * b.norm())
     p99 = float(error.kthvalue(max(1, int(0.99 * len(error)))).values)

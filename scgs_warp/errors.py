@@ -33,7 +33,7 @@ def one_line(error: Exception) -> str:
 
 
 class FrameError(UserError):
-    """A frame's pixels can no longer be read. The training step that requested them has changed nothing."""
+    """Error that a frame's pixels can no longer be read. The training step that requested them has changed nothing."""
 
 
 def is_shortage(error: BaseException) -> bool:

@@ -153,10 +153,10 @@ class HeadMonitor:
         self._answered = self._asked = time.monotonic()
 
     def check(self) -> None:
-        """Ask the head every ``PULSE_SECONDS``; call this often.
+        """Ask the head node for an answer every ``PULSE_SECONDS``; call this often.
 
         Raises:
-            UserError: the head did not answer for ``GONE_SECONDS``.
+            UserError: the head node did not answer for ``GONE_SECONDS``.
         """
         now = time.monotonic()
         if self._address_of_head is None or now - self._asked < PULSE_SECONDS:

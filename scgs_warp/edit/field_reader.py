@@ -68,7 +68,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class FieldReader:
-    """Reads the fields of a JSON object by name and type; ``done`` refuses fields that were not read.
+    """Reader of the fields of a JSON object by name and type; ``done`` refuses fields that were not read.
 
     Args:
         value: the object.

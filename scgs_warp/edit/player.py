@@ -18,7 +18,7 @@ MEAN_TIMES = 16
 
 
 class Player:
-    """Applies holds and exaggeration to control points; results depend on the arguments alone."""
+    """Player of control points with holds and exaggeration; results depend on the arguments alone."""
 
     def __init__(self, graph: ControlGraph, solver: ArapSolver, motion_at: Callable[[float], MotionPose]) -> None:
         self.graph, self.solver, self.motion_at = graph, solver, motion_at

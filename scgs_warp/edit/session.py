@@ -34,7 +34,7 @@ HISTORY = 1000
 
 
 class EditSession:
-    """Holds a scene, its graph of control points, an :class:`Edit`, and the last thousand edits for undo.
+    """A scene, its graph of control points, an :class:`Edit`, and the last thousand edits for undo.
 
     All points, cameras and lengths are in world units; ``time`` is scene time in [0, 1]; ``at`` is a moment of the film
     in seconds, at which keyframes place the handles. If it is None, handles are at their present targets.

@@ -93,7 +93,7 @@ class _System(NamedTuple):
 
 
 class ArapSolver:
-    """Solves for one graph and caches factorisations. Float64 on the CPU; the same arguments give bit-identical
+    """Solver for one graph, with cached factorisations. Float64 on the CPU; the same arguments give bit-identical
     results."""
 
     def __init__(self, graph: ControlGraph, smoothness: float = SMOOTHNESS, stretch: float = STRETCH) -> None:

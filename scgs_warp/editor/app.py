@@ -55,7 +55,7 @@ def import_viser() -> Any:
 
 
 class Editor:
-    """Serves one session to any number of browsers, until ``stop``.
+    """Server of one session for any number of browsers, until ``stop``.
 
     Args:
         session: scene and edit.

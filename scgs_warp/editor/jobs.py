@@ -32,7 +32,7 @@ class JobProgress:
 
 
 class Jobs:
-    """Runs one job at a time on a thread of its own.
+    """Runner of one job at a time, on a thread of its own.
 
     Args:
         shown: called with the progress from time to time, and with None when the job has ended.

@@ -147,7 +147,8 @@ def guarded(key: str | None) -> Iterator[None]:
 
 
 class Proxy:
-    """Forwards requests that have the token to ``port`` on 127.0.0.1. Runs on a thread of its own until ``stop``.
+    """Forwarder of requests that have the token to ``port`` on 127.0.0.1. It runs on a thread of its own until
+    ``stop``.
 
     Args:
         port: port of the editor.

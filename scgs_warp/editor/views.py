@@ -65,7 +65,7 @@ class _ClientState:
 
 
 class PictureSchedule:
-    """Decides whose picture is drawn next. Not thread safe: the worker's lock guards it."""
+    """Schedule that decides whose picture is drawn next. Not thread safe: the worker's lock guards it."""
 
     def __init__(self) -> None:
         self._clients: dict[int, _ClientState] = {}
@@ -131,7 +131,7 @@ class PictureSchedule:
 
 
 class Pace:
-    """Adapts the size of pictures to a target time.
+    """Control of the size of pictures, so that drawing one takes a target time.
 
     Args:
         seconds: target time of a picture.

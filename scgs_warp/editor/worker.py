@@ -26,7 +26,7 @@ PATIENCE = 1.0
 
 
 class Worker:
-    """Runs calls and draws the pictures that ``schedule`` says are due.
+    """Thread that runs calls and draws the pictures that ``schedule`` says are due.
 
     Args:
         schedule: pictures that are due; guarded by this worker's lock.

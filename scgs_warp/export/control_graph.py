@@ -71,7 +71,7 @@ def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[flo
 
 
 def _bars(rest: np.ndarray, edges: np.ndarray, spans: np.ndarray, radius: float) -> np.ndarray:
-    """Return corners [6 E, 3]: a triangle across each edge at either end."""
+    """Return the bars' corners [6 E, 3]: for each edge, a triangle across it at either end."""
     lengths = np.linalg.norm(spans, axis=1, keepdims=True)
     along = np.where(lengths > 0, spans / np.where(lengths > 0, lengths, 1.0), (0.0, 0.0, 1.0))
     helper = np.eye(3)[np.abs(along).argmin(axis=1)]  # the axis most perpendicular to the edge

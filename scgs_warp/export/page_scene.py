@@ -26,7 +26,7 @@ error."""
 POSE_PARTS = ("translation", "rotation", "shape", "log_scale")
 QUATERNIONS = ("rotation", "shape")
 TIMES_AT_ONCE = 16
-"""Times per evaluation of the network, which limits memory for many control points."""
+"""Number of times per evaluation of the network; it limits the memory for many control points."""
 STEPS = {
     "mean": 2.5e-5,  # normalised units (the visible scene has a radius of 1.4): a hundredth of a pixel at 800 x 800
     "quat": 1.4e-3,

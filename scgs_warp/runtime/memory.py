@@ -36,7 +36,8 @@ UNKNOWN_FREE = 2.0**60
 
 
 class NotEnoughMemory(UserError, MemoryError):
-    """A request exceeds the available memory. The message gives both figures and the remedy; nothing was allocated."""
+    """Error that a request exceeds the available memory. The message gives both figures and the remedy; nothing was
+    allocated."""
 
 
 _limit: int | None = None

@@ -40,7 +40,7 @@ METADATA_SUM = ""
 
 
 class DamagedCheckpoint(UserError):
-    """The newest checkpoint cannot be used; the previous one may be sound (:func:`fall_back`)."""
+    """Error that the newest checkpoint cannot be used; the previous one may be sound (:func:`fall_back`)."""
 
 
 def _sum_of_words(metadata: Mapping[str, Any]) -> int:

@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class ProcessLost(UserError):
-    """Raised when another process has ended or hangs."""
+    """Error that another process has ended or hangs."""
 
 
 @contextlib.contextmanager

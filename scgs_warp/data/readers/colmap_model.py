@@ -44,7 +44,7 @@ class SparseModel(NamedTuple):
 
 
 class _Damaged(Exception):
-    """Raised for a damaged file; the message describes the damage in a few words."""
+    """Error about a damaged file; the message describes the damage in a few words."""
 
 
 def find_model(folder: Path) -> Path | None:
