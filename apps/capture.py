@@ -37,8 +37,8 @@ class Options:
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
         "SIMPLE_RADIAL"
     )
-    """COLMAP's camera model, whose parameters all frames share and which are found with the poses: OPENCV for wide
-    angles, OPENCV_FISHEYE for wider ones."""
+    """COLMAP's camera model: OPENCV for wide angles, OPENCV_FISHEYE for wider ones. All frames share its parameters,
+    which are found together with the poses."""
     fov: float | None = None
     """Initial value of the horizontal field of view in degrees, if it is known."""
     features: int = 4096

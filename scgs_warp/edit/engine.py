@@ -58,7 +58,7 @@ class _Live(NamedTuple):
 
 
 class Engine:
-    """Bends the control points of one scene.
+    """Engine that bends the control points of one scene.
 
     Attributes: ``scene`` (a static one is given control points), ``rig``, ``binding``, ``graph``, ``units`` (centre and
     scale of the normalised scene).

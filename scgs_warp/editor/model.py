@@ -168,7 +168,7 @@ class EditorModel:
             session.reset()
 
     def set(self, **fields: Any) -> None:
-        """Set attributes of this model, which are no part of the edit: region, pin_rings, show ..."""
+        """Set attributes of this model that are no part of the edit, such as region, pin_rings and show."""
         with self.lock:
             for name, value in fields.items():
                 setattr(self, name, value)

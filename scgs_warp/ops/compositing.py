@@ -21,7 +21,7 @@ from .memory_windows import Demand, Window, slot_bytes
 
 Form = Literal["auto", "pixel", "cpu", "cuda", "blocks"]
 EMPTY_TILE = 8
-"""Cost of reading and writing a tile's pixels on a CPU, in pairs of splat and tile."""
+"""Cost of reading and writing a tile's pixels on a CPU, as the number of pairs of splat and tile that cost the same."""
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ def _pixels(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def common_view(points: Tensor, data: Dataset, normalisation: Normalisation) -> Tensor:
-    """Return the share [P] of up to 100 views that contain each of ``points`` [P, 3], normalised."""
+    """Return, for each of ``points`` [P, 3], normalised, the share [P] of up to 100 views that contain it."""
     chosen = spread(len(data), MOST_VIEWS)
     seen = torch.zeros(len(points))
     for index in chosen:
