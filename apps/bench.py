@@ -44,7 +44,7 @@ class Options(Common):
     run: Path | None = None
     """Run folder whose scene is measured instead of a synthetic one."""
     against: Literal["gsplat"] | None = None
-    """Also time gsplat on the same Gaussians; with raster only, on a GPU."""
+    """Also time gsplat on the same Gaussians (only with raster, and only on a GPU)."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class Scaling(Common):
     """Sweep frames and rasterisations over Gaussians, pixels, control points and threads; show the machine's limits."""
 
     sweeps: str = "gaussians,resolution,nodes,threads"
-    """Quantities to vary, separated by commas, with optional points after a colon: nodes:64/128. The others stay at
-    --gaussians, --nodes, --size and all threads (or --threads)."""
+    """Quantities to vary, separated by commas, with optional values after a colon: nodes:64/128. Other quantities stay
+    at --gaussians, --nodes, --size and all threads (or --threads)."""
     figures: Path = FIGURES
     """Folder for one figure per sweep: scaling-NAME.png."""
 
@@ -174,7 +174,7 @@ def show_table_s2(report: dict[str, Any]) -> None:
 
 
 def show_scaling(report: dict[str, Any]) -> None:
-    """Print the machine's limits and the whole frames and rasterisations."""
+    """Print the machine's limits, and the times of whole frames and rasterisations."""
     for limit in report["limits"].values():
         best = f"{limit['gigabytes']:.1f} GB/s copied, {limit['gigaflops']:.0f} GFLOP/s"
         print(f"at best, {limit['threads']} threads: {best}")
@@ -189,7 +189,7 @@ def show_scaling(report: dict[str, Any]) -> None:
 
 
 def measure(options: Options, plan: Any) -> dict[str, Any]:
-    """Measure one size: rows and their summaries."""
+    """Measure one size; return the report with its rows and their summaries."""
     from scgs_warp.benchmark import run as bench
     from scgs_warp.benchmark import summary
 
@@ -210,7 +210,7 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.benchmark import run as bench
     from scgs_warp.benchmark.scenes import camera_size
     from scgs_warp.benchmark.summary import PAPER_FPS
-    from scgs_warp.benchmark.timing import command_line
+    from scgs_warp.runtime.provenance import command_line
 
     table = isinstance(options, Frame) and options.table_s2
     plan = bench.BenchPlan(

@@ -63,6 +63,7 @@ def main(args: list[str] | None) -> None:
     config, named = configuration(options, file, flags, "cpu" if options.data else None, where.size if where else 1)
 
     from scgs_warp.runtime.progress import say
+    from scgs_warp.runtime.provenance import command_line
     from scgs_warp.training.dataset_advice import advise, survey
     from scgs_warp.training.process_group import join_processes
     from scgs_warp.training.run import summary, train_and_evaluate
@@ -81,7 +82,8 @@ def main(args: list[str] | None) -> None:
         if folder is None:  # Only one of several processes makes it.
             folder = group.in_turn(lambda: builtin_scene(device)) if group else builtin_scene(device)
         rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "group": group}
-        metrics = train_and_evaluate(config, folder, output, before_training=show_advice, **rest)
+        command = command_line("apps/train.py", sys.argv[1:] if args is None else args)
+        metrics = train_and_evaluate(config, folder, output, before_training=show_advice, command=command, **rest)
         say(summary(metrics))
         if group:
             say(group.summary())

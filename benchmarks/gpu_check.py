@@ -34,7 +34,6 @@ from scgs_warp.benchmark.plan import MIDDLE, BenchPlan, posed
 from scgs_warp.benchmark.run import bench
 from scgs_warp.benchmark.scenes import load_of, scene_camera, synthetic_scene
 from scgs_warp.benchmark.summary import table_s2
-from scgs_warp.benchmark.timing import provenance
 from scgs_warp.benchmark.workloads import Leaves
 from scgs_warp.config.presets import MOTIONS
 from scgs_warp.ops.binning import bin_splats
@@ -46,6 +45,7 @@ from scgs_warp.ops.ssim import photometric_loss
 from scgs_warp.rendering.render import render
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.cuda_graph import CudaGraph
+from scgs_warp.runtime.provenance import provenance
 from scgs_warp.scene.frame_graph import FrameGraph
 from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Camera, Image, Splats
@@ -81,12 +81,13 @@ def setting(device: str, quick: bool) -> Setting:
 
 
 def leaves_of(count: int, size: tuple[int, int], device: str) -> Leaves:
-    """Make the synthetic figure at rest, as leaf tensors."""
+    """Make the Gaussians of the synthetic figure at rest, as leaf tensors that receive gradients."""
     return Leaves(*posed(synthetic_scene("static", count, 0, device), size, MIDDLE))
 
 
 def drawn(leaves: Leaves, form: str) -> list[Tensor]:
-    """Return image [4, H, W] (colour, depth), alpha [1, H, W], and all gradients for a random gradient of both."""
+    """Return image [4, H, W] (colour, depth), alpha [1, H, W], and the gradients of all leaves for random gradients of
+    both images."""
     own, camera = leaves.gaussians, leaves.camera
     splats = project(*leaves.geometry, camera.viewmat, camera.K, camera.width, camera.height)
     colors = spherical_harmonics(own.sh_dc, own.sh_rest, own.means, camera.position, leaves.degree)
@@ -107,7 +108,10 @@ def compare(results: list[Tensor], truth: list[Tensor], names: list[str]) -> Rep
 
 
 def agreement(s: Setting) -> Report:
-    """Compare the device's fastest form with the CPU's (on a CPU, with the pixel form), and two runs bit by bit."""
+    """Compare the images and gradients of the device's fastest form of compositing with the CPU's.
+
+    On a CPU the comparison is with the readable pixel form. A second run must have the same bits as the first.
+    """
     count, size = next(iter(s.scenes.values()))
     leaves = leaves_of(count, size, s.device)
     ours, again = drawn(leaves, "auto"), drawn(leaves, "auto")
@@ -118,7 +122,7 @@ def agreement(s: Setting) -> Report:
 
 
 def forms(s: Setting) -> Report:
-    """Compare every form of compositing on the device with the pixel form, images and gradients, and time it."""
+    """Compare every form of compositing on the device with the readable pixel form, and time it."""
     names = ("cuda", "blocks") if s.device == "cuda" else ("cpu",)
     report: Report = {"passed": True}
     for scene, (count, size) in s.scenes.items():
@@ -132,7 +136,7 @@ def forms(s: Setting) -> Report:
 
 
 def form_times(leaves: Leaves, form: str, s: Setting) -> Report:
-    """Time only the compositing of three channels."""
+    """Time the compositing of three channels alone, without projection and binning."""
     own, camera = leaves.gaussians, leaves.camera
     with torch.no_grad():
         splats = project(*leaves.geometry, camera.viewmat, camera.K, camera.width, camera.height)
@@ -150,7 +154,7 @@ def form_times(leaves: Leaves, form: str, s: Setting) -> Report:
 
 
 def stepwise(scene: Scene, camera: Camera, at: float) -> Image:
-    """Draw a frame without a graph and with the exact number of pairs."""
+    """Draw a frame without a recorded graph, with lists of exactly as many pairs of splat and tile as there are."""
     with torch.no_grad():
         view = scene.normalisation.apply_camera(camera).to(scene.device)
         color = torch.tensor(scene.background_color, device=scene.device)
@@ -266,7 +270,7 @@ def gsplat(s: Setting) -> Report:
 
 
 def motion_ms(scene: Scene, s: Setting) -> float:
-    """Time posing of all Gaussians, recorded if possible, in milliseconds."""
+    """Return the milliseconds for posing all Gaussians, from a recorded graph if possible."""
     at = torch.full((1,), 0.4, device=scene.device)
 
     @torch.no_grad()
@@ -291,7 +295,10 @@ def two_under_way(graph: FrameGraph, scene: Scene, camera: Camera, repeats: int)
 
 
 def dynamic(s: Setting) -> Report:
-    """Time frames of the moving scene with every motion model: frames per second, the share of motion, Table S2."""
+    """Time frames of the moving scene with every motion model.
+
+    The result has frames per second, the share of the time that motion takes, and the relative speeds of Table S2.
+    """
     rows = [dynamic_row(name, s) for name in MOTIONS]
     for row in rows:
         row["ratios"] = {peer["motion"]: row["fps"] / peer["fps"] for peer in rows}

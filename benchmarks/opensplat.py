@@ -42,6 +42,7 @@ from scgs_warp.ops.compositing import composite
 from scgs_warp.ops.harmonics import spherical_harmonics
 from scgs_warp.ops.projection import project
 from scgs_warp.runtime import environment
+from scgs_warp.runtime.provenance import command_line, provenance
 from scgs_warp.types import Splats
 
 SOURCE = Path("rasterizer/gsplat-cpu/gsplat_cpu.cpp")
@@ -147,7 +148,10 @@ def relative(ours: Tensor, theirs: Tensor) -> float:
 
 
 def timed(passes: dict[str, Callable[[], Any]], seconds: float) -> dict[str, dict[str, float]]:
-    """Time all passes in turns, so that a disturbance affects both sides; medians and least times in milliseconds."""
+    """Time all passes in turns, so that a disturbance affects both sides.
+
+    Return medians and least times in milliseconds.
+    """
     times: dict[str, list[float]] = {name: [] for name in passes}
     began = time.perf_counter()
     while time.perf_counter() - began < seconds or len(next(iter(times.values()))) < timing.MIN_REPEATS + 1:
@@ -244,9 +248,9 @@ def main() -> int:
     finally:
         if options.build is None:
             shutil.rmtree(folder, ignore_errors=True)
-    command = timing.command_line("benchmarks/opensplat.py", sys.argv[1:])
+    command = command_line("benchmarks/opensplat.py", sys.argv[1:])
     extra = {"opensplat": commit_of(options.checkout), "flags": options.flags}
-    report = {"command": command, **timing.provenance("cpu"), "what": "opensplat", **extra, **found}
+    report = {"command": command, **provenance("cpu"), "what": "opensplat", **extra, **found}
     if options.json is not None:
         write(report, options.json)
     print(json.dumps(report, indent=2))

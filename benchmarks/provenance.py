@@ -23,20 +23,31 @@ EDITING = (*RENDERING, "scgs_warp/edit", "scgs_warp/editor")
 
 @functools.cache
 def changed_since(commit: str | None, paths: tuple[str, ...]) -> bool:
-    """Tell whether a commit after ``commit`` touched ``paths``; False where git or the commit is missing.
+    """Tell whether a commit after ``commit`` touched ``paths``; False without git, and for a shallow clone's gaps.
 
     A result that was measured with uncommitted changes (``COMMIT-dirty``) counts as changed.
+
+    Raises:
+        ValueError: the repository has its whole history, and ``commit`` is not in it.
     """
     if commit is None:
         return False
     if commit.endswith("-dirty"):
         return True
-    command = ["git", "log", "-1", "--format=%h", f"{commit}..HEAD", "--", *paths]
-    try:
-        found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
-    except (OSError, subprocess.TimeoutExpired):
+    if _git("rev-parse", "--is-shallow-repository") != "false":
         return False
-    return found.returncode == 0 and bool(found.stdout.strip())
+    if _git("merge-base", "--is-ancestor", commit, "HEAD") is None:
+        raise ValueError(f"a result names commit {commit}, which is not in the history: measure it again")
+    return bool(_git("log", "-1", "--format=%h", f"{commit}..HEAD", "--", *paths))
+
+
+def _git(*words: str) -> str | None:
+    """Return what a git command prints; None where it fails."""
+    try:
+        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
 
 
 def reported_note(commits: Iterable[str]) -> str:

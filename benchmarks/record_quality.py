@@ -1,9 +1,8 @@
 """Keep the scores of a training run beside those that the pages show: benchmarks/results/quality/TABLE-ROW-SCENE.json.
 
-    python benchmarks/record_quality.py runs/hook-cpu --table published --row cpu --scene hook \\
-        --command "python apps/train.py --data hook --downscale 2 --preset cpu"
+    python benchmarks/record_quality.py runs/hook-cpu --table published --row cpu --scene hook
 
-Run it in the checkout that trained the run, before anything is committed: it writes down the commit and the processor.
+Command, commit and processor are those that apps/train.py wrote to metrics.json.
 """
 
 from __future__ import annotations
@@ -16,8 +15,6 @@ from pathlib import Path
 from quality_tables import WRITERS
 from report import RESULTS
 
-from scgs_warp.benchmark.timing import provenance
-
 
 def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -27,7 +24,6 @@ def main(args: list[str] | None = None) -> int:
         "--row", required=True, help="name of the row, as quality_tables.py or the reported runs have it"
     )
     parser.add_argument("--scene", required=True)
-    parser.add_argument("--command", required=True, help="what trained the run")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
     options = parser.parse_args(args)
     try:
@@ -37,13 +33,19 @@ def main(args: list[str] | None = None) -> int:
             f"record_quality: {options.run}/metrics.json cannot be read ({error}); name a run folder", file=sys.stderr
         )
         return 2
-    origin = provenance(metrics["device"])
+    origin = metrics.pop("provenance", None)
+    if not origin or not origin["command"] or not origin["commit"]:
+        print(
+            f"record_quality: {options.run}/metrics.json names no command and commit; train it again with apps/train.py"
+            " in a clone",
+            file=sys.stderr,
+        )
+        return 2
     machine = origin["machine"]
     processor = machine["gpu"] or f"{machine['processor']}, {machine['cores']} cores"
     run = {
         **{key: getattr(options, key) for key in ("table", "row", "scene")},
         "provenance": "measured",
-        "command": options.command,
         **origin,
         "processor": processor,
         **{key: value for key, value in metrics.items() if key not in ("per_image", "data")},

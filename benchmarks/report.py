@@ -87,7 +87,11 @@ def main(args: list[str] | None = None) -> int:
         return 1
     status = 0
     for path, page in pages.items():
-        filled = fill(page, options.results)
+        try:
+            filled = fill(page, options.results)
+        except ValueError as error:
+            print(f"{path}: {error}", file=sys.stderr)
+            return 1
         if options.check and without_older_marks(filled) != without_older_marks(page):
             print(f"{path} is not what {options.results} gives: run benchmarks/report.py", file=sys.stderr)
             status = 1

@@ -29,9 +29,9 @@ from scgs_warp.apps.cli import prepare
 from scgs_warp.apps.cli import run as run_app
 from scgs_warp.benchmark.memory import model_mib, peak_mib
 from scgs_warp.benchmark.scenes import synthetic_scene, training_data, training_state
-from scgs_warp.benchmark.timing import command_line, provenance
 from scgs_warp.optim import Adam
 from scgs_warp.runtime import environment
+from scgs_warp.runtime.provenance import command_line, provenance
 from scgs_warp.runtime.torchrun import process_rank
 from scgs_warp.training import step as training
 from scgs_warp.training.frames import Frames

@@ -32,11 +32,11 @@ import numpy as np  # isort: skip
 from scipy.stats import theilslopes
 from soak_editor import RandomUser
 
-from scgs_warp.benchmark.timing import command_line, provenance
 from scgs_warp.config.presets import MOTIONS, TrainConfig, from_dict, preset, with_steps
 from scgs_warp.data.synthetic.builtin import make_synthetic
 from scgs_warp.edit import EditSession
 from scgs_warp.runtime import environment
+from scgs_warp.runtime.provenance import command_line, provenance
 from scgs_warp.scene.scene import Scene
 from scgs_warp.training.run import train_and_evaluate
 

@@ -10,7 +10,6 @@ import importlib.metadata
 import importlib.util
 import json
 import os
-import platform
 import socket
 import tempfile
 import time
@@ -21,6 +20,7 @@ from typing import Any
 from .. import __version__
 from ..errors import UserError
 from ..runtime import environment, memory
+from ..runtime.provenance import processor
 from ..storage.files import write_atomically
 from ..training.run_folder import LOCK
 from .cells import LOG, attempt, cell_from_json
@@ -28,7 +28,7 @@ from .cells import LOG, attempt, cell_from_json
 WORKER = "worker.json"
 """File in a cell's folder with the machine and the process that train the cell, or trained it last."""
 PACKAGES = ("torch", "warp-lang", "numpy")
-"""Packages whose versions must agree, since others may round differently."""
+"""Packages whose versions must agree, since other versions may round differently."""
 LOCK_SECONDS = 150.0
 """Longest wait for a lost worker's lock: a file server releases a dead machine's locks after a lease, NFS after 90
 s."""
@@ -84,17 +84,6 @@ def fingerprint(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def processor() -> str:
-    """Return the processor's model, as the system calls it."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass  # The system is not Linux.
-    return platform.processor() or platform.machine()
-
-
 def inspect_machine(question: dict[str, Any]) -> dict[str, Any]:
     """Describe this machine, and check whether it can train the cells.
 
@@ -114,7 +103,7 @@ def inspect_machine(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def _folder_problem(file: Path, token: str) -> str | None:
-    """Check that the cells' folder is the shared one, can be written, and knows the locks of other machines."""
+    """Check that the cells' folder is the shared one, can be written, and shows the locks of other machines."""
     try:
         same = file.read_text(encoding="utf-8") == token
     except OSError:

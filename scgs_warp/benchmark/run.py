@@ -10,6 +10,7 @@ from typing import Any, Literal
 from ..config.presets import MOTIONS
 from ..errors import UserError
 from ..runtime import environment
+from ..runtime.provenance import provenance
 from ..scene.scene import Scene
 from .editing import edit_rows
 from .gsplat import Peers
@@ -17,15 +18,16 @@ from .memory import resident_mib
 from .plan import MIDDLE, BenchCase, BenchPlan, posed
 from .scenes import load_of, synthetic_scene
 from .summary import compare_frames, motion_costs
-from .timing import provenance
 from .workloads import frame_rows, frames_of, raster_rows, step_rows
 
 What = Literal["frame", "raster", "step", "edit"]
 
 
 def thread_counts(threads: int | None, device: str) -> tuple[int, ...]:
-    """Return the thread counts to measure: the given one, otherwise one thread and all; on a GPU, where the CPU's
-    threads hardly matter, the present one."""
+    """Return the numbers of threads to measure with: ``threads``, if it is given, otherwise 1 and all available ones.
+
+    On a GPU, where the CPU's threads hardly matter, only the present number is used.
+    """
     if threads is not None or device == "cuda":
         return (environment.thread_count() if threads is None else threads,)
     return tuple(sorted({1, environment.available_threads()}))
@@ -36,7 +38,8 @@ def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
 
     Returns:
         ``date``, ``commit``, ``machine``, ``what`` and ``rows``, dictionaries with ``KEYS``; for frames also
-        ``motion``, the cost of moving the scene, and ``compared``, several motion models in turns. Ready for JSON.
+        ``motion``, the cost of moving the scene, and ``compared``, the comparison of several motion models. Ready for
+        JSON.
 
     Raises:
         UserError: the run cannot be read, gsplat is asked for and not usable, or the renderers disagree.

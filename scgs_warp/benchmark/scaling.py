@@ -9,12 +9,12 @@ from typing import Any
 
 from ..errors import UserError
 from ..runtime import environment
+from ..runtime.provenance import provenance
 from ..scene.scene import Scene
 from .memory import resident_mib
 from .plan import MIDDLE, BenchCase, BenchPlan, posed
 from .roofline import Limits, Work, backward_work, draw_work, frame_work, measure_limits
 from .scenes import LARGEST_SIDE, SMALLEST_SIDE, Load, load_of, scene_camera, synthetic_scene
-from .timing import provenance
 from .workloads import frame_rows, raster_rows
 
 
@@ -165,7 +165,10 @@ def work_of(scene: Scene, load: Load, plan: BenchPlan) -> dict[str, dict[str, di
 
 
 def least_times(limit: Limits, works: dict[str, dict[str, dict[str, float]]]) -> dict[str, float]:
-    """Return least milliseconds by row name. Stages follow each other, so a whole's limit is the sum of theirs."""
+    """Return the least milliseconds by row name.
+
+    Stages run one after another, so the limit of a whole frame is the sum of its stages' limits.
+    """
     limits = {}
     for whole, stages in works.items():
         times = {stage: limit.milliseconds(Work(**work)) for stage, work in stages.items()}
@@ -175,7 +178,7 @@ def least_times(limit: Limits, works: dict[str, dict[str, dict[str, float]]]) ->
 
 
 def _weight(plan: BenchPlan) -> float:
-    """Estimate the seconds for a point, up to a factor: making the scene, warm-up, repeats of slow rows."""
+    """Estimate the time for a point, in arbitrary units: making the scene, warm-up, repeats of slow rows."""
     side = plan.size if isinstance(plan.size, int) else max(plan.size)
     return 2.0 + 2.0 * plan.seconds + (1.0 + plan.nodes / 1024) * plan.gaussians / 60_000 + (side / 1000) ** 2
 

@@ -1,21 +1,15 @@
-"""Timing for benchmarks: repeats under a time budget, stages of the code in use, and a description of the machine."""
+"""Timing for benchmarks: repeats under a time budget, and stages of the code in use."""
 
 from __future__ import annotations
 
 import contextlib
 import gc
-import platform
-import shlex
 import statistics
-import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import datetime, timezone
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import torch
-import warp as wp
 
 from ..kernels import benchmark as kernels
 from ..runtime import environment
@@ -185,54 +179,3 @@ def two_thread_scaling() -> float:
                 times[threads].append(time.perf_counter() - began)
     environment.configure(before)
     return statistics.median(times[1]) / statistics.median(times[2])
-
-
-def processor() -> str:
-    """Return the processor's name as the system gives it."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def machine(device: str) -> dict[str, Any]:
-    """Describe the machine, without its name or paths."""
-    import scgs_warp
-
-    return {
-        "processor": processor(),
-        "cores": environment.available_threads(),
-        "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
-        "system": platform.system(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "warp": wp.__version__,
-        "scgs_warp": getattr(scgs_warp, "__version__", None),
-    }
-
-
-def command_line(script: str, words: Sequence[str]) -> str:
-    """Write a command for a checkout; absolute paths keep only their last part, since folders differ by machine."""
-    names = (Path(word).name if Path(word).is_absolute() else word for word in words)
-    return f"python {script} {shlex.join(names)}"
-
-
-def commit() -> str | None:
-    """Return the commit of the measured checkout, with ``-dirty`` if its code was changed; None outside of one."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None
-    code = [".", ":(exclude)docs", ":(exclude)README.md", ":(exclude)benchmarks/results"]
-    try:
-        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
-        differs = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=root, check=False).returncode
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return head.stdout.strip() + ("-dirty" if differs else "")
-
-
-def provenance(device: str) -> dict[str, Any]:
-    """Return ``date``, ``commit`` and ``machine`` of a measurement."""
-    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return {"date": now, "commit": commit(), "machine": machine(device)}

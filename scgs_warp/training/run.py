@@ -17,6 +17,7 @@ from ..errors import UserError, one_line
 from ..evaluation.evaluate import Lpips, metrics_of, write_metrics
 from ..geometry import cameras
 from ..runtime.progress import progress
+from ..runtime.provenance import provenance
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
 from ..visualization import video
@@ -71,6 +72,7 @@ def train_and_evaluate(
     before_training: Callable[[Dataset], None] | None = None,
     tensorboard: bool = False,
     group: ProcessGroup | None = None,
+    command: str | None = None,
 ) -> dict[str, Any]:
     """Load, train and evaluate, as ``apps/train.py`` does.
 
@@ -83,6 +85,7 @@ def train_and_evaluate(
         before_training: called with the training frames.
         tensorboard: also write event files for TensorBoard to ``output``.
         group: the processes that share the training; the first one evaluates.
+        command: the command that trains, for ``provenance`` in ``metrics.json``.
 
     Returns:
         the content of ``metrics.json``; empty in processes other than the first.
@@ -92,6 +95,7 @@ def train_and_evaluate(
             written afterwards.
         KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal; the checkpoint is saved.
     """
+    origin = {"command": command, **provenance(device)}
     train, test = load_splits(config, data)
     if before_training is not None:
         before_training(train)
@@ -109,7 +113,7 @@ def train_and_evaluate(
     if group is not None and not group.first:
         return {}
     try:
-        return write_results(scene, test, output, frames=frames, lpips=lpips)
+        return write_results(scene, test, output, frames=frames, lpips=lpips, origin=origin)
     except (UserError, OSError) as error:
         raise UserError(
             f"{one_line(error)}; the scene is trained and saved: --resume makes the missing scores and pictures"
@@ -117,7 +121,13 @@ def train_and_evaluate(
 
 
 def write_results(
-    scene: Scene, test: Dataset, folder: Path, *, frames: int = FILM_FRAMES, lpips: Lpips | None = None
+    scene: Scene,
+    test: Dataset,
+    folder: Path,
+    *,
+    frames: int = FILM_FRAMES,
+    lpips: Lpips | None = None,
+    origin: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Evaluate the trained scene on the test split, and write metrics and pictures.
 
@@ -128,6 +138,7 @@ def write_results(
             ``evaluation/`` go there.
         frames: length of the turntable; 0: none.
         lpips: the perceptual distance; None: not measured.
+        origin: date, command, commit and machine of the training; ``provenance`` in ``metrics.json``.
 
     Returns:
         the content of ``metrics.json``.
@@ -143,6 +154,8 @@ def write_results(
             render_dir=renders,
             progress=lambda done, total: bar.advance(),
         )
+    if origin is not None:
+        metrics["provenance"] = origin
     sheet = renders / "contact_sheet.png"
     if sheet.is_file():
         write_atomically(folder / "contact_sheet.png", sheet.read_bytes())

@@ -23,6 +23,9 @@ def test_training_leaves_everything(trained):
             "background seed").split()  # fmt: skip
     assert set(keys) <= set(metrics)
     assert metrics["step"] == 60 and metrics["images"] == 3 and metrics["lpips"] is None
+    origin = metrics["provenance"]
+    assert origin["command"].startswith("python apps/train.py --data ") and origin["machine"]["processor"]
+    assert "/" not in origin["command"].removeprefix("python apps/"), "a path of this machine"
     for name in ("checkpoint.safetensors", "log.jsonl", "contact_sheet.png", "curves.png", "turntable.mp4",
                  "previews/latest.png"):  # fmt: skip
         assert (trained / name).stat().st_size > 100, name

@@ -17,7 +17,7 @@ from scgs_warp.benchmark import roofline
 pytestmark = pytest.mark.usefixtures("all_threads")
 
 TINY = ["--gaussians", "120", "--nodes", "12", "--size", "48", "--seconds", "0", "--device", "cpu"]
-COMMIT = "2bd452c78f5ad6c1c2a2f2a4ff6c7f0fd3b2b2fc"
+COMMIT = "2bd452c63deb78b3d9949913ba18313470cbd8f8"
 
 
 @pytest.fixture
@@ -161,14 +161,17 @@ def test_scores_of_a_run_are_recorded(report, tmp_path, capsys):
     results, run = results_with(tmp_path), tmp_path / "run"
     run.mkdir()
     options = [str(run), "--table", "published", "--row", "cpu", "--scene", "hook", "--results", str(results)]
-    options += ["--command", "python apps/train.py --data hook"]
     assert recorder.main(options) == 2 and "name a run folder" in capsys.readouterr().err
     metrics = {"psnr": 39.5, "ssim": 0.99, "gaussians": 1000, "seconds": 90.0, "device": "cpu", "data": "/home/me/hook"}
-    (run / "metrics.json").write_text(json.dumps({**metrics, "per_image": [1]}), encoding="utf-8")
+    (run / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
+    assert recorder.main(options) == 2 and "train it again" in capsys.readouterr().err
+    machine = {"gpu": None, "processor": "x", "cores": 2}
+    origin = {"date": "2026-01-01", "command": "python apps/train.py --data hook", "commit": COMMIT, "machine": machine}
+    (run / "metrics.json").write_text(json.dumps({**metrics, "per_image": [1], "provenance": origin}), encoding="utf-8")
     assert recorder.main(options) == 0
     text = (results / "quality" / "published-cpu-hook.json").read_text(encoding="utf-8")
     assert "/home" not in text and "per_image" not in text
-    assert json.loads(text)["provenance"] == "measured" and {"date", "commit", "machine"} <= json.loads(text).keys()
+    assert json.loads(text)["provenance"] == "measured" and origin.items() <= json.loads(text).items()
     table = report.section("quality-published", results)
     assert "| 39.50 |" in table and "1 min 30 s" in table and "†" not in table
 
@@ -188,7 +191,8 @@ def test_results_of_older_code_are_marked(report):
     assert provenance.changed_since(f"{head}-dirty", provenance.RENDERING)
     assert provenance.changed_since(first, provenance.RENDERING) or first == head
     assert not provenance.changed_since(None, provenance.RENDERING)
-    assert not provenance.changed_since(40 * "0", provenance.RENDERING)
+    with pytest.raises(ValueError, match="not in the history"):
+        provenance.changed_since(40 * "0", provenance.RENDERING)
     marked = f"| frame {provenance.OLDER} | 1 |\n\n{provenance.older_note([first])}\n<!-- /table -->\n"
     assert provenance.without_older_marks(marked) == "| frame | 1 |\n<!-- /table -->\n"
 

@@ -1,0 +1,73 @@
+"""Provenance of a result: date, command, commit, processor and versions."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import platform
+import shlex
+import subprocess
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+
+from . import environment
+
+
+def processor() -> str:
+    """Return the processor's name as the system gives it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def machine(device: str) -> dict[str, Any]:
+    """Describe the machine, without its name or paths."""
+    return {
+        "processor": processor(),
+        "cores": environment.available_threads(),
+        "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "warp": wp.__version__,
+        "scgs_warp": _version(),
+    }
+
+
+def _version() -> str | None:
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version("scgs_warp")
+    return None
+
+
+def command_line(script: str, words: Sequence[str]) -> str:
+    """Write a command for a checkout; absolute paths keep only their last part, since folders differ by machine."""
+    names = (Path(word).name if Path(word).is_absolute() else word for word in words)
+    return f"python {script} {shlex.join(names)}"
+
+
+def commit() -> str | None:
+    """Return the commit of the measured checkout, with ``-dirty`` if its code was changed; None outside of one."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    code = [".", ":(exclude)docs", ":(exclude)README.md", ":(exclude)benchmarks/results"]
+    try:
+        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
+        differs = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=root, check=False).returncode
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head.stdout.strip() + ("-dirty" if differs else "")
+
+
+def provenance(device: str) -> dict[str, Any]:
+    """Return ``date``, ``commit`` and ``machine`` of a measurement."""
+    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return {"date": now, "commit": commit(), "machine": machine(device)}
