@@ -55,12 +55,6 @@ def quat_conjugate(q: wp.vec4) -> wp.vec4:
 
 
 @wp.func
-def quat_multiply_adjoint(a: wp.vec4, b: wp.vec4, v_product: wp.vec4):
-    """Return v_a and v_b, each a product with a conjugate: transposing a multiplication conjugates its factor."""
-    return quat_multiply(v_product, quat_conjugate(b)), quat_multiply(quat_conjugate(a), v_product)
-
-
-@wp.func
 def quat_matrix(q: wp.vec4) -> wp.mat33:
     """Return the rotation matrix of a unit quaternion."""
     w = q[0]
@@ -98,9 +92,3 @@ def quat_matrix_adjoint(q: wp.vec4, v: wp.mat33) -> wp.vec4:
 def quat_rotate(q: wp.vec4, x: wp.vec3) -> wp.vec3:
     """Return R(q) x for a unit quaternion."""
     return quat_matrix(q) * x
-
-
-@wp.func
-def quat_rotate_adjoint(q: wp.vec4, x: wp.vec3, v_rotated: wp.vec3):
-    """Return v_q and v_x."""
-    return quat_matrix_adjoint(q, wp.outer(v_rotated, x)), wp.transpose(quat_matrix(q)) * v_rotated

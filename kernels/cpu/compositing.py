@@ -22,9 +22,6 @@ from ..types import CHANNEL_MAX, LOG2_E, PACKED_GEOMETRY
 
 wp.set_module_options({"enable_backward": False})
 
-TILE_SIDE = 16
-"""Side in pixels of the tiles that this form supports: one row of pixels fills a register."""
-
 
 @wp.kernel
 def pack_splats(

@@ -20,7 +20,7 @@ SEGMENT = 32
 LANES = 8
 """Number of coordinates of a point that one thread sums."""
 
-Lane = wp.types.vector(length=8, dtype=wp.float32)
+Lane = wp.types.vector(length=LANES, dtype=wp.float32)
 
 
 @wp.func

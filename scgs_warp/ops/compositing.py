@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..kernels import compositing as kernels
 from ..kernels.cpu import compositing as cpu_kernels
-from ..kernels.types import CHANNEL_GROUP, PACKED_GEOMETRY, SLOT_GEOMETRY
+from ..kernels.types import CHANNEL_GROUP, PACKED_GEOMETRY, SLOT_GEOMETRY, TILE_SIZE
 from ..runtime import debug, memory
 from ..runtime.launch import launch
 from ..types import Splats, Stats, Tiles
@@ -149,9 +149,9 @@ def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
         raise ValueError(f"form must be auto, pixel, cpu, cuda or blocks, got {form!r}")
     if form == "auto":
         form = "cuda" if device.type == "cuda" else "cpu"
-        return form if tile_size == cpu_kernels.TILE_SIDE else "pixel"
-    if form != "pixel" and tile_size != cpu_kernels.TILE_SIDE:
-        raise ValueError(f"form {form} needs tiles of {cpu_kernels.TILE_SIDE} pixels, got tile_size {tile_size}")
+        return form if tile_size == TILE_SIZE else "pixel"
+    if form != "pixel" and tile_size != TILE_SIZE:
+        raise ValueError(f"form {form} needs tiles of {TILE_SIZE} pixels, got tile_size {tile_size}")
     if form == "cpu" and device.type != "cpu":
         raise ValueError(f"form cpu needs tensors on the CPU, got {device}")
     return form

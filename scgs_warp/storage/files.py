@@ -21,7 +21,7 @@ def read_bytes(path: Path, remedy: str) -> bytes:
     """
     try:
         if not is_regular(path):
-            raise UserError(f"{path}: is no file; {remedy}")
+            raise UserError(f"{path}: not a file; {remedy}")
         return path.read_bytes()
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; {remedy}") from None

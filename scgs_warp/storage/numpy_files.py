@@ -27,7 +27,7 @@ def read_npy(path: Path, member: str | None = None, flags: bool = False) -> np.n
     """
     try:
         if not is_regular(path):
-            raise UserError(f"{path}: is no file; restore it")
+            raise UserError(f"{path}: not a file; restore it")
         if member is None:
             with path.open("rb") as file:
                 array = _read_array(file, path.stat().st_size, flags)

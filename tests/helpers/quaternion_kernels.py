@@ -3,12 +3,13 @@
 import warp as wp
 
 from scgs_warp.kernels.quaternion import (
+    quat_conjugate,
+    quat_matrix,
+    quat_matrix_adjoint,
     quat_multiply,
-    quat_multiply_adjoint,
     quat_normalise,
     quat_normalise_adjoint,
     quat_rotate,
-    quat_rotate_adjoint,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -35,12 +36,11 @@ def products(
     i = first + wp.tid()
     a = a_in[i]
     product_out[i] = quat_multiply(a, b_in[i])
-    v_a, v_b = quat_multiply_adjoint(a, b_in[i], v_quat_in[i])
-    v_a_out[i] = v_a
-    v_b_out[i] = v_b
+    v_a_out[i] = quat_multiply(v_quat_in[i], quat_conjugate(b_in[i]))
+    v_b_out[i] = quat_multiply(quat_conjugate(a), v_quat_in[i])
     unit = quat_normalise(a)
     unit_out[i] = unit
     rotated_out[i] = quat_rotate(unit, x_in[i])
-    v_unit, v_x = quat_rotate_adjoint(unit, x_in[i], v_vec_in[i])
-    v_x_out[i] = v_x
+    v_unit = quat_matrix_adjoint(unit, wp.outer(v_vec_in[i], x_in[i]))
+    v_x_out[i] = wp.transpose(quat_matrix(unit)) * v_vec_in[i]
     v_raw_out[i] = quat_normalise_adjoint(a, v_unit + v_quat_in[i])
