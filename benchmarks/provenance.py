@@ -53,13 +53,17 @@ def _git(*words: str) -> str | None:
 def reported_note(commits: Iterable[str]) -> str:
     """Write the legend of the mark ``REPORTED``; return an empty text if there are no commits."""
     names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
-    return f"{REPORTED} Recorded in commit {names}; the repository holds no result file for it." if names else ""
+    return (
+        f"{REPORTED} First reported in commit {names}; the repository holds no result file for these values."
+        if names
+        else ""
+    )
 
 
 def older_note(commits: Iterable[str]) -> str:
     """Write the legend of the mark ``OLDER``; return an empty text if there are no commits."""
     names = ", ".join(dict.fromkeys(commit[:7] for commit in commits))
-    return f"{OLDER} Recorded at commit {names}; the measured code has changed since." if names else ""
+    return f"{OLDER} Measured at commit {names}; the measured code has changed since." if names else ""
 
 
 def without_older_marks(page: str) -> str:

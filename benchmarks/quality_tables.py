@@ -207,7 +207,7 @@ def arap(source: Source) -> str:
                 thousands(run.get("gaussians")),
             ]
         )
-    share = "of the baseline's"
+    share = "ratio to baseline"
     return table(["", "PSNR", "SSIM", "motion error", share, "jitter", share, "Gaussians"], lines)
 
 

@@ -49,7 +49,7 @@ def sharing_steps(results: Results) -> str:
         ],
         ["averaging, Adam, statistics", *(f"{value:.0f} ms" for value in rest)],
         ["the whole step", *(f"{processor_ms(one, 'step'):.0f} ms" for one in shared)],
-        ["the same with one process and one view", *alone],
+        ["the whole step with one process and one view", *alone],
         ["bytes received per process", *(f"{one['mib_per_step']:.1f} MiB" for one in shared)],
     ]
     return table(["processor time", *COLUMNS.values()], lines)

@@ -4,9 +4,9 @@ The first sort orders the N splats by depth, with keys of 32 bits. Their pairs a
 sort orders the pairs by tile alone, with keys of a dozen bits. Radix sort is stable, so the pairs end up sorted by
 tile, then depth, then index. This takes a third of the memory traffic of one sort by keys of tile and depth.
 
-No kernel waits for a count to reach the host. Lists have room for P pairs; spare room is filled with a tile beyond the
-last, and pairs that do not fit are left out. The caller compares the room with the true total afterwards. The kernels
-are plain Warp and run on a CPU too.
+No kernel waits for a count to reach the host. Lists have room for P pairs; unused entries get the number of a tile
+beyond the last one, and pairs that do not fit are left out. The caller compares the room with the true total
+afterwards. The kernels are plain Warp and run on a CPU too.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ def _short(table: Table, top: Table) -> str:
 
 
 def _same_scale(ours: Any, published: Any, drawn: bool) -> None:
-    """Scale both axes to the same dB per centimetre, and centre each curve vertically."""
+    """Give the y axes of both plots the same dB per centimetre, and centre each curve vertically."""
     limits = [axes.get_ylim() for axes in ((ours, published) if drawn else (published,))]
     span = max(high - low for low, high in limits)
     for axes, (low, high) in zip((ours, published) if drawn else (published,), limits):

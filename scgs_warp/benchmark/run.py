@@ -71,7 +71,7 @@ def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
 
 
 def scenes(plan: BenchPlan, what: What) -> Iterator[Scene]:
-    """Yield the run's scene, or a synthetic one for every motion model; a rasterisation needs no motion."""
+    """Yield the run's scene, or a synthetic one for every motion model; for ``raster``, only a static scene."""
     if plan.run is not None:
         yield Scene.load(plan.run, device=plan.device)
         return

@@ -72,7 +72,7 @@ class FieldReader:
 
     Args:
         value: the object.
-        source: file that errors name.
+        source: file named in error messages.
         path: place of the object in the file, such as ``handles[0]``.
     """
 

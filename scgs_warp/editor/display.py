@@ -1,5 +1,5 @@
-"""Conversion to browser units, in which all scenes have the same size: a picture for the browser encodes depths up to
-167."""
+"""Conversion to browser units, in which all scenes have the same size, because a picture can encode depths
+only up to 167 browser units."""
 
 from __future__ import annotations
 

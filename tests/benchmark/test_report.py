@@ -126,7 +126,7 @@ def test_a_measured_run_replaces_the_reported_one(report, tmp_path):
     results = results_with(tmp_path, {**shared, "provenance": "reported", "runs": reported})
     text = report.section("quality-parts-settling", results)
     assert "| none † | 40.00 | 41.00 | 40.49 |  |" in text and "| settle † | 42.00 | 43.00 | 42.50 | +2.01 |" in text
-    assert f"† Recorded in commit {COMMIT[:7]}; the repository holds no result file for it." in text
+    assert f"† First reported in commit {COMMIT[:7]}; the repository holds no result file for these values." in text
     for scene, psnr in (("mutant", 40.5), ("standup", 41.5)):
         run = {**measured, "scene": scene, "psnr": psnr}
         (results / "quality" / f"a-{scene}.json").write_text(json.dumps(run), encoding="utf-8")
