@@ -79,8 +79,8 @@ def begin(database: Path, frame_files: FrameFiles, model: CameraModel, focal: fl
         focal: focal length in pixels; None if unknown.
     """
     with quiet() as pycolmap:
-        with pycolmap.Database.open(database) as there:
-            if there.num_images():
+        with pycolmap.Database.open(database) as storage:
+            if storage.num_images():
                 return
         options = pycolmap.ImageReaderOptions(camera_model=model, default_focal_length_factor=INITIAL_FOCAL)
         if focal is not None:
@@ -99,21 +99,21 @@ def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[
         most: largest number of features per frame.
         done: called after each frame.
     """
-    with quiet() as pycolmap, pycolmap.Database.open(database) as there:
+    with quiet() as pycolmap, pycolmap.Database.open(database) as storage:
         options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
         options.sift.max_num_features = most
         extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
         for name in frame_files.names:
-            image = there.read_image_with_name(name).image_id
-            if not there.exists_keypoints(image):
+            image = storage.read_image_with_name(name).image_id
+            if not storage.exists_keypoints(image):
                 gray = cv2.cvtColor(read_rgb(frame_files.folder / name), cv2.COLOR_RGB2GRAY)
                 keypoints, descriptors = extractor.extract_from_uint8_array(gray)
                 rows = pycolmap.keypoints_to_matrix(keypoints)
                 if frame_files.masks is not None and len(rows):
                     kept = ~_masked(frame_files.masks / name, rows[:, :2])
                     rows, descriptors.data = rows[kept], descriptors.data[kept]
-                there.write_descriptors(image, descriptors)
-                there.write_keypoints(image, rows)
+                storage.write_descriptors(image, descriptors)
+                storage.write_keypoints(image, rows)
             done()
 
 
@@ -133,9 +133,9 @@ def pairs(count: int, matching: Matching, video: bool) -> list[tuple[int, int]]:
     steps = [*range(1, NEXT_FRAMES + 1)]
     while 2 * steps[-1] < count:
         steps.append(2 * steps[-1])
-    found = {(i, i + step) for i in range(count) for step in steps if i + step < count}
-    found |= {(i, j) for i in range(0, count, LOOP_STRIDE) for j in range(i + LOOP_STRIDE, count, LOOP_STRIDE)}
-    return sorted(found)
+    chosen = {(i, i + step) for i in range(count) for step in steps if i + step < count}
+    chosen |= {(i, j) for i in range(0, count, LOOP_STRIDE) for j in range(i + LOOP_STRIDE, count, LOOP_STRIDE)}
+    return sorted(chosen)
 
 
 def match(
@@ -154,32 +154,32 @@ def match(
         done: called after each pair.
     """
     kept: dict[int, Tensor] = {}
-    with quiet() as pycolmap, pycolmap.Database.open(database) as there:
+    with quiet() as pycolmap, pycolmap.Database.open(database) as storage:
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = seed
-        images = [there.read_image_with_name(name) for name in frame_files.names]
-        points = [there.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
-        camera = there.read_camera(images[0].camera_id)
+        images = [storage.read_image_with_name(name) for name in frame_files.names]
+        points = [storage.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
+        camera = storage.read_camera(images[0].camera_id)
         for a, b in chosen:
             one, two = images[a].image_id, images[b].image_id
-            if not there.exists_two_view_geometry(one, two):
+            if not storage.exists_two_view_geometry(one, two):
                 kept = {k: v for k, v in kept.items() if k >= a}  # Ascending pairs never return to earlier frames.
                 for k in (a, b):
                     if k not in kept:
-                        kept[k] = torch.from_numpy(there.read_descriptors(images[k].image_id).data.copy()).to(device)
-                found = nearest_mutual(kept[a], kept[b])
-                if not there.exists_matches(one, two):
-                    there.write_matches(one, two, found)
-                geometry = pycolmap.estimate_two_view_geometry(camera, points[a], camera, points[b], found, options)
-                there.write_two_view_geometry(one, two, geometry)
+                        kept[k] = torch.from_numpy(storage.read_descriptors(images[k].image_id).data.copy()).to(device)
+                matches = nearest_mutual(kept[a], kept[b])
+                if not storage.exists_matches(one, two):
+                    storage.write_matches(one, two, matches)
+                geometry = pycolmap.estimate_two_view_geometry(camera, points[a], camera, points[b], matches, options)
+                storage.write_two_view_geometry(one, two, geometry)
             done()
 
 
 def forget(database: Path) -> None:
     """Remove all matches but keep the features."""
-    with quiet() as pycolmap, pycolmap.Database.open(database) as there:
-        there.clear_matches()
-        there.clear_two_view_geometries()
+    with quiet() as pycolmap, pycolmap.Database.open(database) as storage:
+        storage.clear_matches()
+        storage.clear_two_view_geometries()
 
 
 def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
@@ -188,11 +188,11 @@ def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
     if len(one) < 2 or len(two) < 2:
         return np.zeros((0, 2), np.uint32)
     cosines = (one.float() @ two.float().T) / DESCRIPTOR_LENGTH**2
-    forth, there = _distinct(cosines)
-    back, here = _distinct(cosines.T)
-    mutual = forth & back[there] & (here[there] == torch.arange(len(one), device=one.device))
+    forth, best_of_one = _distinct(cosines)
+    back, best_of_two = _distinct(cosines.T)
+    mutual = forth & back[best_of_one] & (best_of_two[best_of_one] == torch.arange(len(one), device=one.device))
     chosen = mutual.nonzero()[:, 0]
-    return torch.stack([chosen, there[chosen]], 1).cpu().numpy().astype(np.uint32)
+    return torch.stack([chosen, best_of_one[chosen]], 1).cpu().numpy().astype(np.uint32)
 
 
 def _distinct(cosines: Tensor) -> tuple[Tensor, Tensor]:
@@ -217,16 +217,16 @@ class Links(NamedTuple):
 
 def links(database: Path, frame_files: FrameFiles) -> Links:
     """Compute the statistics of the database."""
-    with quiet() as pycolmap, pycolmap.Database.open(database) as there:
-        images = [there.read_image_with_name(name).image_id for name in frame_files.names]
-        features = [there.num_keypoints_for_image(image) for image in images]
-        found = [
-            there.read_two_view_geometry(a, b) if there.exists_two_view_geometry(a, b) else None
+    with quiet() as pycolmap, pycolmap.Database.open(database) as storage:
+        images = [storage.read_image_with_name(name).image_id for name in frame_files.names]
+        features = [storage.num_keypoints_for_image(image) for image in images]
+        geometries = [
+            storage.read_two_view_geometry(a, b) if storage.exists_two_view_geometry(a, b) else None
             for a, b in pairwise(images)
         ]
-        counts = [0 if pair is None else len(pair.inlier_matches) for pair in found]
+        counts = [0 if pair is None else len(pair.inlier_matches) for pair in geometries]
         flat = _configs(pycolmap, ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC"))
-        planar = [pair.config in flat for pair in there.read_two_view_geometries()[1] if len(pair.inlier_matches)]
+        planar = [pair.config in flat for pair in storage.read_two_view_geometries()[1] if len(pair.inlier_matches)]
     return Links(
         int(np.median(features)) if features else 0,
         int(np.median(counts)) if counts else 0,

@@ -44,7 +44,7 @@ class Journal:
                     f"{folder}: holds the capture of another video; give another --output, or remove the folder"
                 )
             self._stages = {
-                name: found for name, found in content["stages"].items() if isinstance(found, dict) and "key" in found
+                name: entry for name, entry in content["stages"].items() if isinstance(entry, dict) and "key" in entry
             }
         self.finished = (folder / FILE).exists()
 
@@ -70,15 +70,15 @@ class Journal:
             UserError: the folder was finished with other settings.
         """
         self._key = hashlib.sha256((self._key + json.dumps([name, settings], sort_keys=True)).encode()).hexdigest()
-        found = self._stages.get(name)
-        if found is not None and found["key"] == self._key and "result" in found:
-            return found["result"]
-        if self.finished and (found is None or found["key"] != self._key):
+        stored = self._stages.get(name)
+        if stored is not None and stored["key"] == self._key and "result" in stored:
+            return stored["result"]
+        if self.finished and (stored is None or stored["key"] != self._key):
             raise UserError(
                 f"{self.folder}: is a finished capture, made with other settings ({name}); give another --output, or "
                 "remove the folder"
             )
-        if found is None or found["key"] != self._key:
+        if stored is None or stored["key"] != self._key:
             clear()
             self._stages[name] = {"key": self._key}
             self._save()

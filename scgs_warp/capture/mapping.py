@@ -59,10 +59,10 @@ def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done
         options.mapper.random_seed = seed
         options.triangulation.random_seed = seed
         pycolmap.set_random_seed(seed)
-        found = pycolmap.incremental_mapping(
+        models = pycolmap.incremental_mapping(
             database, frame_files.folder, attempts, options, next_image_callback=lambda: _ignore(done())
         )
-        best = max(found.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+        best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
         if best is not None and best.num_reg_images():
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
@@ -81,8 +81,8 @@ def read_solution(folder: Path, frame_files: FrameFiles) -> CameraSolution | Non
         return None
     with quiet() as pycolmap:
         model = pycolmap.Reconstruction(folder)
-        place = {name: number for number, name in enumerate(frame_files.names)}
-        images = {place[image.name]: image for image in model.images.values() if image.has_pose}
+        numbers = {name: number for number, name in enumerate(frame_files.names)}
+        images = {numbers[image.name]: image for image in model.images.values() if image.has_pose}
         places = sorted(images)
         viewmats = np.tile(np.eye(4), (len(places), 1, 1))
         for row, number in enumerate(places):

@@ -81,7 +81,7 @@ def find_moving(load: Callable[[int], np.ndarray], count: int, done: Callable[[]
         masks.append(_tidy(mask, size))
         gone = index + min(STEPS)
         kept.pop(gone, None)
-        flows = {pair: found for pair, found in flows.items() if min(pair) > gone}
+        flows = {pair: vectors for pair, vectors in flows.items() if min(pair) > gone}
         done()
     return masks
 
@@ -103,20 +103,20 @@ def leaves_epipolar_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -
     """
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    there = np.stack([x, y], 2) + forth
-    returned = cv2.remap(back, there[..., 0], there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    inside = (there >= 0).all(2) & (there[..., 0] < width) & (there[..., 1] < height)
+    targets = np.stack([x, y], 2) + forth
+    returned = cv2.remap(back, targets[..., 0], targets[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = (targets >= 0).all(2) & (targets[..., 0] < width) & (targets[..., 1] < height)
     sure = inside & (np.square(forth + returned).sum(2) < MAX_ROUND_TRIP**2) & _textured(one)
     chosen = np.zeros_like(sure)
     chosen[GRID // 2 :: GRID, GRID // 2 :: GRID] = True
     chosen &= sure
     if chosen.sum() < MIN_VECTORS:
         return None
-    here = np.stack([x, y], 2)
-    matrix, _ = cv2.findFundamentalMat(here[chosen], there[chosen], cv2.USAC_MAGSAC, 0.5, 0.999, 2000)
+    starts = np.stack([x, y], 2)
+    matrix, _ = cv2.findFundamentalMat(starts[chosen], targets[chosen], cv2.USAC_MAGSAC, 0.5, 0.999, 2000)
     if matrix is None or matrix.shape != (3, 3):
         return None
-    distance = sampson(matrix, here, there)
+    distance = sampson(matrix, starts, targets)
     limit = max(MIN_LINE_DISTANCE, TYPICAL_FACTOR * float(np.median(distance[sure])))
     return distance > limit, sure
 
@@ -127,10 +127,10 @@ def _textured(gray: np.ndarray) -> np.ndarray:
     return cv2.blur(values * values, (9, 9)) - mean * mean > MIN_CONTRAST**2
 
 
-def sampson(matrix: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+def sampson(matrix: np.ndarray, starts: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return the Sampson distance [...], in pixels, of point pairs [..., 2] under a fundamental matrix."""
-    ones = np.ones((*here.shape[:-1], 1))
-    a, b = np.concatenate([here, ones], -1), np.concatenate([there, ones], -1)
+    ones = np.ones((*starts.shape[:-1], 1))
+    a, b = np.concatenate([starts, ones], -1), np.concatenate([targets, ones], -1)
     lines, back = a @ matrix.T, b @ matrix
     slope = np.square(lines[..., :2]).sum(-1) + np.square(back[..., :2]).sum(-1)
     return np.abs((b * lines).sum(-1)) / np.sqrt(np.maximum(slope, 1e-18))
@@ -174,13 +174,13 @@ def read_masks(path: Path, source: Source, indices: Sequence[int], names: Sequen
         files = _paired(masks, source, indices, names)
         images = [read_rgb(file) for file in files]
     else:
-        found = {still.index: still.image for still in masks.frames(max(size)) if still.index in wanted}
-        missing = sorted(wanted - found.keys())
+        by_index = {still.index: still.image for still in masks.frames(max(size)) if still.index in wanted}
+        missing = sorted(wanted - by_index.keys())
         if missing:
             raise UserError(
                 f"{path}: ends before frame {missing[0]} of {source.path}; give a mask for each frame of the video"
             )
-        images = [found[index] for index in indices]
+        images = [by_index[index] for index in indices]
     return [_given(image, path, size) for image in images]
 
 

@@ -94,21 +94,21 @@ def relative_sharpness(sharp: np.ndarray) -> np.ndarray:
     return np.where(usual > 0, sharp / np.maximum(usual, 1e-12), 1.0)
 
 
-def pick(found: FrameMeasures, count: int) -> Selection:
+def pick(measures: FrameMeasures, count: int) -> Selection:
     """Choose at most ``count`` frames.
 
     The film is cut into ``count`` segments of equal length, where length is the mean of the share of the film's time
     and the share of its motion. The sharpest frame of each segment is picked, unless it is blurred or repeats the
     previously picked one. If there are as many segments as frames, only blurred and repeated frames are omitted.
     """
-    frames = len(found.index)
-    relative = relative_sharpness(found.sharpness)
+    frames = len(measures.index)
+    relative = relative_sharpness(measures.sharpness)
     blurred = relative < MIN_SHARPNESS
-    moved = np.cumsum(np.maximum(found.motion - NOISE_PIXELS, 0.0))
+    moved = np.cumsum(np.maximum(measures.motion - NOISE_PIXELS, 0.0))
     if count >= frames:
         stretch = np.arange(frames)
     else:
-        shares = [way / way[-1] for way in (moved, found.seconds - found.seconds[0]) if way[-1] > 0]
+        shares = [way / way[-1] for way in (moved, measures.seconds - measures.seconds[0]) if way[-1] > 0]
         way = np.mean(shares, axis=0) if shares else np.linspace(0.0, 1.0, frames)
         stretch = np.minimum((way * count).astype(int), count - 1)
     places: list[int] = []

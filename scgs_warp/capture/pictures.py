@@ -48,28 +48,28 @@ def sheet(
     columns = min(COLUMNS, len(cells))
     rows = -(-len(cells) // columns)
     canvas = np.full((GAP + rows * (height + GAP), GAP + columns * (width + GAP), 3), 255, np.uint8)
-    for place, cell in enumerate(cells):
-        top, left = GAP + place // columns * (height + GAP), GAP + place % columns * (width + GAP)
+    for position, cell in enumerate(cells):
+        top, left = GAP + position // columns * (height + GAP), GAP + position % columns * (width + GAP)
         canvas[top : top + height, left : left + width] = cell
     write_png(path, canvas)
 
 
-def _caption(number: int, second: float, found: bool, video: bool) -> str:
+def _caption(number: int, second: float, registered: bool, video: bool) -> str:
     text = f"{number}: {second:.2f} s" if video else f"{number}"
-    return text if found else f"{text}, no camera"
+    return text if registered else f"{text}, no camera"
 
 
-def _cell(image: np.ndarray, mask: np.ndarray | None, text: str, found: bool) -> np.ndarray:
+def _cell(image: np.ndarray, mask: np.ndarray | None, text: str, registered: bool) -> np.ndarray:
     size = (CELL, max(1, round(image.shape[0] * CELL / image.shape[1])))
     picture = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     if mask is not None:
         hidden = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         picture[hidden] = (picture[hidden] // 2 + np.array(MOVING) // 2).astype(np.uint8)
-    if not found:
+    if not registered:
         cv2.line(picture, (0, 0), (size[0] - 1, size[1] - 1), STRUCK_OUT, 2, cv2.LINE_AA)
     cell = np.full((size[1] + CAPTION, CELL, 3), 255, np.uint8)
     cell[: size[1]] = picture
-    color = (40, 40, 40) if found else STRUCK_OUT
+    color = (40, 40, 40) if registered else STRUCK_OUT
     cv2.putText(cell, text, (3, size[1] + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
     return cell
 

@@ -160,34 +160,34 @@ def _enough(request: CaptureRequest, frames: PickedFrames) -> None:
 
 def _frames(request: CaptureRequest, source: Source, journal: Journal, show: ShowProgress) -> PickedFrames:
     """Pick the frames and write them."""
-    place = journal.work / "frames"
+    folder = journal.work / "frames"
 
     def make() -> dict[str, Any]:
         chosen = _choose(request, source, show)
         wanted = dict.fromkeys(chosen.indices)
-        place.mkdir(exist_ok=True)
+        folder.mkdir(exist_ok=True)
         size, names = (0, 0), []
         with show(len(wanted), "writing frames") as bar:
             for still in _until(source.frames(request.size), max(wanted, default=-1)):
                 if still.index in wanted:
-                    write_png(place / f"{moving.frame_name(still.index)}.png", still.image)
+                    write_png(folder / f"{moving.frame_name(still.index)}.png", still.image)
                     size = still.image.shape[1], still.image.shape[0]
                     names.append(still.name)
                     bar.advance()
         return chosen._replace(size=size, names=names)._asdict()
 
     settings = {key: getattr(request, key) for key in ("frames", "start", "end", "size")}
-    found = journal.stage("frames", settings, make, lambda: shutil.rmtree(place, ignore_errors=True))
-    frames = _frames_of(found)
+    stored = journal.stage("frames", settings, make, lambda: shutil.rmtree(folder, ignore_errors=True))
+    frames = _frames_of(stored)
     if frames is None:
         raise journal.damaged("frames")
     return frames
 
 
-def _frames_of(found: Any) -> PickedFrames | None:
+def _frames_of(stored: Any) -> PickedFrames | None:
     """Parse the picked frames from a journal; return None if the entry is malformed."""
     try:
-        frames = PickedFrames(**{**found, "span": tuple(found["span"]), "size": tuple(found["size"])})
+        frames = PickedFrames(**{**stored, "span": tuple(stored["span"]), "size": tuple(stored["size"])})
         counts = (*frames.indices, *frames.size, frames.seen, frames.blurred, frames.alike)
         whole = all(isinstance(count, int) and 0 <= count < 2**31 for count in counts)
         numbers = [as_number(second) for second in (*frames.seconds, *frames.span)]
@@ -212,17 +212,17 @@ def _choose(request: CaptureRequest, source: Source, show: ShowProgress) -> Pick
             for still in takewhile(lambda still: still.seconds <= end or not source.video, _shown(source, bar))
             if still.seconds >= start or not source.video
         )
-        found = picking.measure(within)
-    if not len(found.index):
+        measures = picking.measure(within)
+    if not len(measures.index):
         raise UserError(f"--start {start:g}: {source.path} ends before; give a second of the video")
     if source.video or request.frames is not None:
-        picked = picking.pick(found, request.frames or VIDEO_FRAMES)
+        picked = picking.pick(measures, request.frames or VIDEO_FRAMES)
     else:
-        picked = picking.Selection(list(range(len(found.index))), 0, 0)
-    seconds = found.seconds[picked.places].tolist()
-    span = (float(found.seconds[0]), float(found.seconds[-1]))
-    indices = found.index[picked.places].tolist()
-    return PickedFrames(indices, seconds, [], span, (0, 0), len(found.index), picked.blurred, picked.alike)
+        picked = picking.Selection(list(range(len(measures.index))), 0, 0)
+    seconds = measures.seconds[picked.places].tolist()
+    span = (float(measures.seconds[0]), float(measures.seconds[-1]))
+    indices = measures.index[picked.places].tolist()
+    return PickedFrames(indices, seconds, [], span, (0, 0), len(measures.index), picked.blurred, picked.alike)
 
 
 def _shown(source: Source, bar: Any) -> Iterator[SourceFrame]:
@@ -235,28 +235,28 @@ def _masks(
     request: CaptureRequest, source: Source, frames: PickedFrames, journal: Journal, show: ShowProgress
 ) -> FrameFiles:
     """Write the masks, if requested."""
-    folder, place = journal.work / "frames", journal.work / "masks"
+    folder, mask_folder = journal.work / "frames", journal.work / "masks"
     files = frames.files
     if request.masks == "none":
-        journal.stage("masks", "none", dict, lambda: shutil.rmtree(place, ignore_errors=True))
+        journal.stage("masks", "none", dict, lambda: shutil.rmtree(mask_folder, ignore_errors=True))
         return FrameFiles(folder, files, None)
     path = Path(request.masks)
 
     def make() -> dict[str, Any]:
-        place.mkdir(exist_ok=True)
+        mask_folder.mkdir(exist_ok=True)
         with show(len(files), "finding what moves" if request.masks == "auto" else "reading masks") as bar:
             if request.masks == "auto":
-                found = moving.find_moving(lambda k: read_rgb(folder / files[k]), len(files), bar.advance)
+                masks = moving.find_moving(lambda k: read_rgb(folder / files[k]), len(files), bar.advance)
             else:
-                found = moving.read_masks(path, source, frames.indices, frames.names, frames.size)
+                masks = moving.read_masks(path, source, frames.indices, frames.names, frames.size)
                 bar.advance(len(files))
-        for name, mask in zip(files, found):
-            write_png(place / name, np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, 2))
-        return {"share": float(np.mean([mask.mean() for mask in found]))}
+        for name, mask in zip(files, masks):
+            write_png(mask_folder / name, np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, 2))
+        return {"share": float(np.mean([mask.mean() for mask in masks]))}
 
     kind = "auto" if request.masks == "auto" else open_source(path).digest()
-    journal.stage("masks", kind, make, lambda: shutil.rmtree(place, ignore_errors=True))
-    return FrameFiles(folder, files, place)
+    journal.stage("masks", kind, make, lambda: shutil.rmtree(mask_folder, ignore_errors=True))
+    return FrameFiles(folder, files, mask_folder)
 
 
 def _solve(
@@ -283,14 +283,14 @@ def _solve(
         with show(len(chosen), "matching") as bar:
             features.match(database, frame_files, chosen, request.seed, device, bar.advance)
 
-    def place() -> int:
+    def solve_cameras() -> int:
         with show(count, "cameras") as bar:
             return mapping.solve(database, frame_files, model, request.seed, lambda: bar.done < count and bar.advance())
 
     settings = [request.camera_model, request.fov, request.features]
     journal.stage("features", settings, find, lambda: database.unlink(missing_ok=True))
     journal.stage("matches", [request.matching, request.seed], compare, lambda: features.forget(database))
-    journal.stage("cameras", request.seed, place, lambda: shutil.rmtree(model, ignore_errors=True))
+    journal.stage("cameras", request.seed, solve_cameras, lambda: shutil.rmtree(model, ignore_errors=True))
     solved = mapping.read_solution(model, frame_files)
     masked = 0.0 if frame_files.masks is None else _share(journal)
     registered, arc = (len(solved.places), solved.arc) if solved else (0, 0.0)
@@ -299,8 +299,8 @@ def _solve(
 
 def _share(journal: Journal) -> float:
     """Return the share of masked pixels, read from the journal."""
-    found = journal.result("masks")
-    share = as_number(found.get("share")) if isinstance(found, dict) else None
+    stored = journal.result("masks")
+    share = as_number(stored.get("share")) if isinstance(stored, dict) else None
     if share is None:
         raise journal.damaged("masks")
     return share

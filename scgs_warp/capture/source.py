@@ -205,13 +205,13 @@ def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
 
 def _digest(files: list[Path]) -> str:
     """Hash the sizes and both ends of the files; their names and dates do not matter."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for file in files:
         size = file.stat().st_size
-        found.update(f"{size},".encode())
+        digest.update(f"{size},".encode())
         with file.open("rb") as content:
-            found.update(content.read(DIGEST_BYTES))
+            digest.update(content.read(DIGEST_BYTES))
             if size > 2 * DIGEST_BYTES:
                 content.seek(size - DIGEST_BYTES)
-                found.update(content.read(DIGEST_BYTES))
-    return found.hexdigest()
+                digest.update(content.read(DIGEST_BYTES))
+    return digest.hexdigest()

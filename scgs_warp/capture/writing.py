@@ -76,8 +76,8 @@ def undistort(frame_files: FrameFiles, solved: CameraSolution, folder: Path, don
     (folder / "images").mkdir(exist_ok=True)
     if frame_files.masks is not None:
         (folder / "masks").mkdir(exist_ok=True)
-    for place in solved.places:
-        name = frame_files.names[place]
+    for number in solved.places:
+        name = frame_files.names[number]
         image = cv2.remap(read_rgb(frame_files.folder / name), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         write_png(folder / "images" / name, image)
         if frame_files.masks is not None:
@@ -98,13 +98,13 @@ def scene_of(
     """Turn cameras and points upright, and map times from ``span`` (seconds of the video) to [0, 1]."""
     moved = upright(solved.viewmats, solved.points)
     length = max(span[1] - span[0], 1e-9)
-    chosen = [seconds[place] for place in solved.places]
+    chosen = [seconds[number] for number in solved.places]
     return CapturedScene(
         pinhole,
         moved.viewmats(solved.viewmats),
         [min(max((second - span[0]) / length, 0.0), 1.0) for second in chosen],
         chosen,
-        [frame_files.names[place] for place in solved.places],
+        [frame_files.names[number] for number in solved.places],
         moved.points(solved.points),
         solved.colors,
     )

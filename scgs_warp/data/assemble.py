@@ -168,7 +168,7 @@ def video_border(files: Sequence[Path], times: Sequence[float]) -> np.ndarray | 
     """Detect the black border of the video: return [H, W] bool, False on the border; None without a border. The result
     does not depend on the split."""
     order = sorted(range(len(files)), key=lambda index: times[index])
-    sampled = [files[order[place]] for place in spread(len(order), BORDER_FRAMES)]
+    sampled = [files[order[position]] for position in spread(len(order), BORDER_FRAMES)]
     images = parallel_map(decode, [file for file in sampled if file.is_file()])
     if any(is_transparent(image) for image in images):
         return None  # Alpha marks the border more precisely.

@@ -58,9 +58,9 @@ class ImageCache:
             Any exception that ``read`` raises.
         """
         with self._lock:
-            found, coming = self._kept.get(key), self._coming.pop(key, None)
-        if found is not None:
-            return found
+            kept, coming = self._kept.get(key), self._coming.pop(key, None)
+        if kept is not None:
+            return kept
         pixels = read() if coming is None else coming.result()
         self.offer(key, pixels)
         return pixels
@@ -92,7 +92,7 @@ class ImageCache:
     def strip_alpha(self, key: Hashable) -> None:
         """Drop the alpha of the pixels cached under ``key``."""
         with self._lock:
-            found = self._kept.get(key)
-            if found is not None and found.alpha is not None:
-                self._kept[key] = bare = found._replace(alpha=None)
-                self.used -= found.bytes - bare.bytes
+            kept = self._kept.get(key)
+            if kept is not None and kept.alpha is not None:
+                self._kept[key] = bare = kept._replace(alpha=None)
+                self.used -= kept.bytes - bare.bytes

@@ -139,8 +139,8 @@ def read_image(
     planar = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
     alpha_tensor = None if alpha is None else torch.from_numpy(np.ascontiguousarray(alpha))
     mask_tensor = None if mask is None else torch.from_numpy(reduce_mask(mask, size))
-    found = Pixels(planar.permute(1, 2, 0), alpha_tensor, mask_tensor)
-    return Decoded(found, (width, height), is_transparent(pixels), lens)
+    reduced = Pixels(planar.permute(1, 2, 0), alpha_tensor, mask_tensor)
+    return Decoded(reduced, (width, height), is_transparent(pixels), lens)
 
 
 def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:

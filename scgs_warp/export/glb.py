@@ -62,11 +62,11 @@ def _attributes(document: GltfDocument, gaussians: Gaussians) -> dict[str, int]:
         f"{EXTENSION}:OPACITY": add(arrays["opacities"].astype("<f4").clip(0.0, 1.0)),
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": add(arrays["sh_dc"].astype("<f4")),
     }
-    rest, place = arrays["sh_rest"].astype("<f4"), 0
+    rest, column = arrays["sh_rest"].astype("<f4"), 0
     for degree in range(1, round((rest.shape[1] + 1) ** 0.5)):
         for order in range(2 * degree + 1):
-            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = add(rest[:, place])
-            place += 1
+            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = add(rest[:, column])
+            column += 1
     return attributes
 
 

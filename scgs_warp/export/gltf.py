@@ -129,14 +129,14 @@ def add_skeleton(document: GltfDocument, skeleton: Skeleton, up: tuple[float, fl
     Returns:
         Index of the skin.
     """
-    places = skeleton.positions.transpose(1, 0, 2)
+    positions = skeleton.positions.transpose(1, 0, 2)
     turns = xyzw(skeleton.rotations.transpose(1, 0, 2))
     joints = [
         document.append(
             "nodes",
-            {"name": f"node_{index:04d}", "translation": place[0].tolist(), "rotation": turn[0].tolist()},
+            {"name": f"node_{index:04d}", "translation": position[0].tolist(), "rotation": turn[0].tolist()},
         )
-        for index, (place, turn) in enumerate(zip(places.astype("<f4"), turns))
+        for index, (position, turn) in enumerate(zip(positions.astype("<f4"), turns))
     ]
     root = document.append("nodes", {"name": "control points", "rotation": upright(up), "children": joints})
     document.json["scenes"][0]["nodes"].append(root)
@@ -146,7 +146,7 @@ def add_skeleton(document: GltfDocument, skeleton: Skeleton, up: tuple[float, fl
     if len(skeleton.seconds) > 1:
         when = document.accessor(skeleton.seconds.astype("<f4"), bounds=True)
         samplers, channels = [], []
-        for path, tracks in (("translation", document.tracks(places)), ("rotation", document.tracks(turns))):
+        for path, tracks in (("translation", document.tracks(positions)), ("rotation", document.tracks(turns))):
             for joint, track in zip(joints, tracks):
                 channels.append({"sampler": len(samplers), "target": {"node": joint, "path": path}})
                 samplers.append({"input": when, "output": track, "interpolation": "LINEAR"})

@@ -52,6 +52,6 @@ def gaussian_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         UserError: in the same cases as :func:`read_gaussians`.
     """
-    found = read_gaussians(path)
-    colors = 0.5 + SH_C0 * found.sh_dc.detach().double().numpy()
-    return found.means.detach().double().numpy(), colors.clip(0.0, 1.0)
+    gaussians = read_gaussians(path)
+    colors = 0.5 + SH_C0 * gaussians.sh_dc.detach().double().numpy()
+    return gaussians.means.detach().double().numpy(), colors.clip(0.0, 1.0)

@@ -129,15 +129,15 @@ def unpack_quats(packed: np.ndarray) -> np.ndarray:
     """Unpack to [N, 4] wxyz float64 in the frame of a ``.ply``: the inverse of :func:`pack_quats`."""
     left = packed.astype(np.uint32).copy()
     largest = left >> np.uint32(30)
-    found = np.zeros((len(left), 4))
+    quats = np.zeros((len(left), 4))
     for k in (3, 2, 1, 0):
         size = (left & np.uint32(511)).astype(np.float64) * (SQRT_HALF / 511.0)
         value = np.where(left >> np.uint32(9) & np.uint32(1), -size, size)
-        found[:, k] = np.where(largest == k, 0.0, value)
+        quats[:, k] = np.where(largest == k, 0.0, value)
         left = np.where(largest == k, left, left >> np.uint32(10))
-    remaining = np.sqrt(np.maximum(1.0 - (found**2).sum(axis=1), 0.0))
-    np.put_along_axis(found, largest[:, None].astype(np.int64), remaining[:, None], 1)
-    return (found * (1, -1, -1, 1))[:, [3, 0, 1, 2]]
+    remaining = np.sqrt(np.maximum(1.0 - (quats**2).sum(axis=1), 0.0))
+    np.put_along_axis(quats, largest[:, None].astype(np.int64), remaining[:, None], 1)
+    return (quats * (1, -1, -1, 1))[:, [3, 0, 1, 2]]
 
 
 def _three_bytes(packed: np.ndarray) -> np.ndarray:
@@ -244,20 +244,20 @@ def _read_streams(path: Path, content: bytes) -> tuple[int, int, int, int, list[
     try:
         version, count, degree, bits, _, streams, table = struct.unpack_from("<4xIIBBBBI", content)
         sizes = _sizes(path, version, count, degree)
-        place, decoder = table + 16 * streams, zstandard.ZstdDecompressor()
+        offset, decoder = table + 16 * streams, zstandard.ZstdDecompressor()
         used = [size for size in sizes if size]
         if streams != len(used):
             raise ValueError
         for index, size in enumerate(used):
             packed, plain = struct.unpack_from("<QQ", content, table + 16 * index)
-            if plain != size or place + packed > len(content):
+            if plain != size or offset + packed > len(content):
                 raise ValueError
             # The size claimed by the zstd frame is not trusted: decoding is bounded by the header.
-            with decoder.stream_reader(content[place : place + packed]) as reader:
+            with decoder.stream_reader(content[offset : offset + packed]) as reader:
                 parts.append(np.frombuffer(reader.read(size), "u1"))
             if len(parts[-1]) != size:
                 raise ValueError
-            place += packed
+            offset += packed
     except (struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError):
         raise UserError(f"{path}: damaged; {REMEDY}") from None
     return version, count, degree, bits, [*parts, *[np.zeros(0, "u1")] * (len(sizes) - len(parts))]

@@ -95,9 +95,9 @@ def read_clips(file: GltfFile) -> list[Clip]:
     for index, animation in enumerate(file.document.animations or []):
         channels = []
         for number, channel in enumerate(animation.channels or []):
-            found = _channel(file, animation, channel, f"animations[{index}].channels[{number}]")
-            if found is not None:
-                channels.append(found)
+            parsed = _channel(file, animation, channel, f"animations[{index}].channels[{number}]")
+            if parsed is not None:
+                channels.append(parsed)
         times = [channel.sampler.times for channel in channels]
         start = min((float(t[0]) for t in times), default=0.0)
         end = max((float(t[-1]) for t in times), default=0.0)
@@ -148,9 +148,9 @@ def choose_clip(file: GltfFile, clips: list[Clip], name: str | None) -> Clip | N
         return clips[0] if clips else None
     if not clips:
         raise UserError(f"--clip {name}: {file.path} holds no animation; leave out --clip")
-    found = [clip for clip in clips if clip.name == name]
-    found = found or [clip for clip in clips if clip.name.lower() == name.lower()]
-    if not found:
+    matching = [clip for clip in clips if clip.name == name]
+    matching = matching or [clip for clip in clips if clip.name.lower() == name.lower()]
+    if not matching:
         listed = ", ".join(f"{clip.name} ({clip.end - clip.start:.2f} s)" for clip in clips)
         raise UserError(f"--clip {name}: {file.path} has no such clip; give one of: {listed}")
-    return found[0]
+    return matching[0]

@@ -227,9 +227,9 @@ def _checked(path: Path) -> dict[str, Any]:
         content = parse_json(data.decode("utf-8-sig"))
     except (ValueError, struct.error) as error:
         raise UserError(f"{path}: is not a readable glTF ({str(error)[:80]}); export it again") from None
-    found = find_problem(content)
-    if found is not None:
-        raise UserError(f"{path}: {found[0]} {found[1]}; export the file again")
+    problem = find_problem(content)
+    if problem is not None:
+        raise UserError(f"{path}: {problem[0]} {problem[1]}; export the file again")
     return content
 
 

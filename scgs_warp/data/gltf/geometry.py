@@ -199,10 +199,10 @@ def _carriers(
     indices, weights = [], []
     for number in range(8):  # Sets of four; files rarely have more than two.
         none = np.zeros((count, 0))
-        found, share = numbers(f"JOINTS_{number}", 4, none), numbers(f"WEIGHTS_{number}", 4, none)
-        if found.shape != share.shape:
+        carriers, share = numbers(f"JOINTS_{number}", 4, none), numbers(f"WEIGHTS_{number}", 4, none)
+        if carriers.shape != share.shape:
             raise file.error(f"{where}.attributes.WEIGHTS_{number}", "does not match JOINTS; export the file again")
-        indices.append(found.astype(np.int64))
+        indices.append(carriers.astype(np.int64))
         weights.append(share.astype(np.float64))
     bones, share = np.concatenate(indices, axis=1), np.concatenate(weights, axis=1)
     bones = np.where(share > 0, bones, 0)  # Indices without weight may be out of range.
@@ -236,12 +236,12 @@ def _faces(file: GltfFile, primitive: Any, mode: int, count: int, where: str) ->
 def _targets(file: GltfFile, primitive: Any, count: int, where: str) -> tuple[np.ndarray, np.ndarray] | None:
     if not primitive.targets:
         return None
-    found = []
+    arrays = []
     for number, target in enumerate(primitive.targets):
         for name in ("POSITION", "NORMAL"):
             index, field = _attribute(target, name), f"{where}.targets[{number}].{name}"
             values = np.zeros((count, 3)) if index is None else file.array(index, field, 3).astype(np.float64)
             if len(values) != count:
                 raise file.error(field, f"has {len(values)} rows, the primitive {count}; export the file again")
-            found.append(values)
-    return np.stack(found[0::2]), np.stack(found[1::2])
+            arrays.append(values)
+    return np.stack(arrays[0::2]), np.stack(arrays[1::2])

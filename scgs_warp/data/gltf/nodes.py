@@ -101,12 +101,12 @@ class Nodes:
             return self.order
         index = self.file.document.scene
         scene = self.file.item("scenes", 0 if index is None else index, "scene")
-        found = list(scene.nodes or [])
-        for number in found:
+        nodes = list(scene.nodes or [])
+        for number in nodes:
             self.file.item("nodes", number, "scenes[].nodes")
-        for number in found:
-            found.extend(self.nodes[number].children or [])
-        return list(dict.fromkeys(found))
+        for number in nodes:
+            nodes.extend(self.nodes[number].children or [])
+        return list(dict.fromkeys(nodes))
 
     def world(self, clip: Clip | None, seconds: float) -> np.ndarray:
         """Return node-to-world matrices [nodes, 4, 4] at an instant of a clip, or at rest without a clip."""

@@ -96,9 +96,9 @@ class GltfScene:
         for morph in self.morphs:
             weights = morph.weights
             if morph.node in curves:
-                found = interpolate(curves[morph.node], seconds)
+                values = interpolate(curves[morph.node], seconds)
                 weights = np.zeros(len(weights))
-                weights[: len(found)] = found[: len(weights)]
+                weights[: len(values)] = values[: len(weights)]
             rows = slice(morph.first, morph.first + morph.positions.shape[1])
             rest[rows] += np.tensordot(weights, morph.positions, axes=1)
             normals[rows] += np.tensordot(weights, morph.normals, axes=1)

@@ -76,9 +76,9 @@ def find_problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, st
         if not isinstance(value, list):
             return field, "is not a list"
         for index, inner in enumerate(value):
-            found = find_problem(inner, kind[0], f"{field}[{index}]")
-            if found is not None:
-                return found
+            problem = find_problem(inner, kind[0], f"{field}[{index}]")
+            if problem is not None:
+                return problem
         return None
     if not isinstance(kind, dict):
         return None if _fits(value, kind) else (field, f"is not {kind}")
@@ -91,9 +91,9 @@ def find_problem(value: Any, kind: Any = None, field: str = "") -> tuple[str, st
         wanted = kind.get(name) if name else None
         wanted = kind.get("*") if wanted is None else wanted
         if wanted is not None and inner is not None:
-            found = find_problem(inner, wanted, f"{field}.{name[:40]}".strip("."))
-            if found is not None:
-                return found
+            problem = find_problem(inner, wanted, f"{field}.{name[:40]}".strip("."))
+            if problem is not None:
+                return problem
     return None
 
 

@@ -33,16 +33,16 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
     """
-    place = find_model(folder)
-    assert place is not None, "recognises(folder)"
-    model = read_model(place)
+    model_folder = find_model(folder)
+    assert model_folder is not None, "recognises(folder)"
+    model = read_model(model_folder)
     images = sorted(model.images, key=lambda image: natural(image.name))
-    base = _image_folder(folder, place)
-    files = [_file(base, image, place) for image in images]
-    lenses = [partial(_lens, place, image, model.cameras[image.camera]) for image in images]
+    base = _image_folder(folder, model_folder)
+    files = [_file(base, image, model_folder) for image in images]
+    lenses = [partial(_lens, model_folder, image, model.cameras[image.camera]) for image in images]
     _check_sizes(files, lenses)
     times = times_from_names([image.name for image in images])
-    chosen = held_out(place, range(len(images)), split)
+    chosen = held_out(model_folder, range(len(images)), split)
     records = [
         FrameRecord(
             files[index],
@@ -57,13 +57,13 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     return with_points(data, model.points, model.colors) if len(model.points) else data
 
 
-def _image_folder(folder: Path, place: Path) -> Path:
-    tried = [folder / "images", place / "images", folder / "input", folder]
+def _image_folder(folder: Path, model_folder: Path) -> Path:
+    tried = [folder / "images", model_folder / "images", folder / "input", folder]
     return next((base for base in tried[:-1] if base.is_dir()), tried[-1])
 
 
-def _file(base: Path, image: ModelImage, place: Path) -> Path:
-    return inside(base, image.name, f"{place}: the name of an image", "image")
+def _file(base: Path, image: ModelImage, model_folder: Path) -> Path:
+    return inside(base, image.name, f"{model_folder}: the name of an image", "image")
 
 
 def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Lens]]) -> None:
@@ -84,22 +84,25 @@ def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Len
 def times_from_names(names: list[str]) -> list[float]:
     """Return times in [0, 1]: from the last number in each name if all names have one and the numbers differ, else from
     the order."""
-    found = [re.findall(r"[0-9]{1,15}", PurePosixPath(name).stem) for name in names]
-    if all(found):
-        numbers = [int(digits[-1]) for digits in found]
+    digit_groups = [re.findall(r"[0-9]{1,15}", PurePosixPath(name).stem) for name in names]
+    if all(digit_groups):
+        numbers = [int(digits[-1]) for digits in digit_groups]
         first, last = min(numbers), max(numbers)
         if last > first:
             return [(number - first) / (last - first) for number in numbers]
     return [index / max(len(names) - 1, 1) for index in range(len(names))]
 
 
-def _lens(place: Path, image: ModelImage, camera: ModelCamera, source: tuple[int, int]) -> Lens:
+def _lens(model_folder: Path, image: ModelImage, camera: ModelCamera, source: tuple[int, int]) -> Lens:
     if (camera.width, camera.height) != source:
         raise UserError(
-            f"{place}: camera {image.camera}, of {image.name}, is of {camera.width} x {camera.height} pixels, but the "
-            f"image is {size_text(source)}; give the images that the model was made from, or a model of these images"
+            f"{model_folder}: camera {image.camera}, of {image.name}, is of {camera.width} x {camera.height} pixels, "
+            f"but the image is {size_text(source)}; give the images that the model was made from, or a model of these "
+            "images"
         )
     try:
         return make_lens(camera.model, camera.params)
     except ValueError as error:
-        raise UserError(f"{place}: camera {image.camera}, of {image.name}: {error}; undistort the images") from None
+        raise UserError(
+            f"{model_folder}: camera {image.camera}, of {image.name}: {error}; undistort the images"
+        ) from None

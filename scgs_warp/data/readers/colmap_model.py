@@ -52,37 +52,37 @@ def find_model(folder: Path) -> Path | None:
     without a model."""
     places = [folder, *(folder / name for name in ("sparse", "colmap/sparse", "colmap_sparse", "colmap"))]
     candidates = []
-    for place in places:
-        if place.is_dir():
-            inner = sorted(p for p in place.iterdir() if p.is_dir() and p.name.isdigit()) if place != folder else []
-            candidates += [place, *inner]
-    sizes = {place: max((file.stat().st_size for file in _files(place, "images")), default=-1) for place in candidates}
-    complete = [place for place in candidates if sizes[place] >= 0 and _files(place, "cameras")]
-    return max(complete, key=lambda place: sizes[place], default=None)
+    for path in places:
+        if path.is_dir():
+            inner = sorted(p for p in path.iterdir() if p.is_dir() and p.name.isdigit()) if path != folder else []
+            candidates += [path, *inner]
+    sizes = {path: max((file.stat().st_size for file in _files(path, "images")), default=-1) for path in candidates}
+    complete = [path for path in candidates if sizes[path] >= 0 and _files(path, "cameras")]
+    return max(complete, key=lambda path: sizes[path], default=None)
 
 
-def _files(place: Path, name: str) -> list[Path]:
-    return [place / f"{name}{suffix}" for suffix in (".bin", ".txt") if (place / f"{name}{suffix}").is_file()]
+def _files(folder: Path, name: str) -> list[Path]:
+    return [folder / f"{name}{suffix}" for suffix in (".bin", ".txt") if (folder / f"{name}{suffix}").is_file()]
 
 
-def read_model(place: Path) -> SparseModel:
-    """Read cameras, images and points of the model in ``place``, binary if present, else text.
+def read_model(folder: Path) -> SparseModel:
+    """Read cameras, images and points of the model in ``folder``, binary if present, else text.
 
     Raises:
         UserError: a file is missing or damaged.
     """
-    suffix = ".bin" if _files(place, "cameras")[0].suffix == ".bin" and (place / "images.bin").is_file() else ".txt"
+    suffix = ".bin" if _files(folder, "cameras")[0].suffix == ".bin" and (folder / "images.bin").is_file() else ".txt"
     readers = _BINARY if suffix == ".bin" else _TEXT
-    cameras = _read(place / f"cameras{suffix}", readers[0])
-    images = _read(place / f"images{suffix}", readers[1])
-    file = place / f"points3D{suffix}"
+    cameras = _read(folder / f"cameras{suffix}", readers[0])
+    images = _read(folder / f"images{suffix}", readers[1])
+    file = folder / f"points3D{suffix}"
     points, colors = _read(file, readers[2]) if file.is_file() else (np.zeros((0, 3)), np.zeros((0, 3)))
     if not images:
-        raise UserError(f"{place / f'images{suffix}'}: no image is registered; run COLMAP's mapper on better images")
+        raise UserError(f"{folder / f'images{suffix}'}: no image is registered; run COLMAP's mapper on better images")
     for image in images:
         if image.camera not in cameras:
             raise UserError(
-                f"{place / f'images{suffix}'}: {image.name} is of camera {image.camera}, which cameras{suffix} does "
+                f"{folder / f'images{suffix}'}: {image.name} is of camera {image.camera}, which cameras{suffix} does "
                 "not have; export the model again"
             )
     return SparseModel(cameras, images, points, colors)
@@ -133,40 +133,40 @@ def _parameter_count(model: str) -> int:
 
 def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
     names, cameras = _model_names(), {}
-    (count,), place = struct.unpack_from("<Q", data), 8
-    for _ in range(_plausible_count(count, len(data) - place, 24)):
-        identity, model, width, height = struct.unpack_from("<iiQQ", data, place)
+    (count,), offset = struct.unpack_from("<Q", data), 8
+    for _ in range(_plausible_count(count, len(data) - offset, 24)):
+        identity, model, width, height = struct.unpack_from("<iiQQ", data, offset)
         if model not in names:
             raise _Damaged(f"camera {identity} is of model {model}, which is not known")
-        params = struct.unpack_from(f"<{_parameter_count(names[model])}d", data, place + 24)
-        place += 24 + 8 * len(params)
+        params = struct.unpack_from(f"<{_parameter_count(names[model])}d", data, offset + 24)
+        offset += 24 + 8 * len(params)
         cameras[identity] = ModelCamera(names[model], width, height, params)
     return cameras
 
 
 def _binary_images(data: bytes) -> list[ModelImage]:
     images = []
-    (count,), place = struct.unpack_from("<Q", data), 8
-    for _ in range(_plausible_count(count, len(data) - place, 73)):
-        values = struct.unpack_from("<i7di", data, place)
-        place += 64
-        end = data.index(b"\0", place, place + MAX_NAME_BYTES)
-        name = data[place:end].decode("utf-8")
+    (count,), offset = struct.unpack_from("<Q", data), 8
+    for _ in range(_plausible_count(count, len(data) - offset, 73)):
+        values = struct.unpack_from("<i7di", data, offset)
+        offset += 64
+        end = data.index(b"\0", offset, offset + MAX_NAME_BYTES)
+        name = data[offset:end].decode("utf-8")
         (observations,) = struct.unpack_from("<Q", data, end + 1)
-        place = end + 9 + 24 * _plausible_count(observations, len(data) - end - 9, 24)
+        offset = end + 9 + 24 * _plausible_count(observations, len(data) - end - 9, 24)
         images.append(ModelImage(name, values[8], _pose(np.array(values[1:5]), np.array(values[5:8]), name)))
     return images
 
 
 def _binary_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    (count,), place = struct.unpack_from("<Q", data), 8
-    count = _plausible_count(count, len(data) - place, 51)
+    (count,), offset = struct.unpack_from("<Q", data), 8
+    count = _plausible_count(count, len(data) - offset, 51)
     points, colors = np.empty((count, 3)), np.empty((count, 3))
     unpack = struct.Struct("<Q3d3BdQ").unpack_from
     for index in range(count):
-        values = unpack(data, place)
+        values = unpack(data, offset)
         points[index], colors[index] = values[1:4], values[4:7]
-        place += 51 + 8 * _plausible_count(values[8], len(data) - place - 51, 8)
+        offset += 51 + 8 * _plausible_count(values[8], len(data) - offset - 51, 8)
     return points, colors / 255.0
 
 

@@ -110,16 +110,16 @@ def _times(path: Path, names: list[str]) -> dict[str, float]:
     if not path.is_file():
         return {name: index / max(len(names) - 1, 1) for index, name in enumerate(names)}
     content = read_json(path)
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for name in names:
         entry = content.get(name)
         key = "time_id" if isinstance(entry, dict) and "time_id" in entry else "warp_id"
         value = as_number(entry.get(key)) if isinstance(entry, dict) else None
         if value is None:
             raise UserError(f"{path}: {name}.{key} is missing or not a number; give each frame its instant")
-        found[name] = value
-    first, last = min(found.values()), max(found.values())
-    return {name: (value - first) / (last - first) if last > first else 0.0 for name, value in found.items()}
+        values[name] = value
+    first, last = min(values.values()), max(values.values())
+    return {name: (value - first) / (last - first) if last > first else 0.0 for name, value in values.items()}
 
 
 def _world(path: Path) -> World:
@@ -137,15 +137,15 @@ def _world(path: Path) -> World:
 def _images(folder: Path, downscale: float) -> tuple[Path, int]:
     """Choose the folder of the smallest images that are large enough, or else of the largest images. Return the folder,
     and the ratio of the cameras' image size to the size of its images."""
-    found = {}
-    for place in folder.iterdir() if folder.is_dir() else ():
-        match = re.fullmatch(r"([1-9][0-9]{0,2})x", place.name)
-        if match and place.is_dir():
-            found[int(match[1])] = place
-    if not found:
+    folders = {}
+    for inner in folder.iterdir() if folder.is_dir() else ():
+        match = re.fullmatch(r"([1-9][0-9]{0,2})x", inner.name)
+        if match and inner.is_dir():
+            folders[int(match[1])] = inner
+    if not folders:
         raise UserError(f"{folder}: no folder of images, 1x, 2x, 4x ...; put the full-size images into {folder}/1x")
-    ratio = max([ratio for ratio in found if ratio <= downscale], default=min(found))
-    return found[ratio], ratio
+    ratio = max([ratio for ratio in folders if ratio <= downscale], default=min(folders))
+    return folders[ratio], ratio
 
 
 def _viewmat(path: Path, content: dict[str, Any], world: World) -> np.ndarray:

@@ -81,8 +81,8 @@ def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list
     order = by_name(files)
     last = max(len(files) - 1, 1)
     times = [0.0] * len(files)
-    for place, index in enumerate(order):
-        times[index] = place / last
+    for rank, index in enumerate(order):
+        times[index] = rank / last
     return times
 
 

@@ -49,14 +49,14 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         for key in ("k", "w2c"):
             if len(rows[key]) != len(files) or len(rows[key][instant]) != len(names):
                 raise UserError(f"{path}: {key} and fn list different numbers of frames; give every image one of each")
-        for place, name in enumerate(names):
-            where = f"[{instant}][{place}]"
+        for number, name in enumerate(names):
+            where = f"[{instant}][{number}]"
             if not isinstance(name, str) or not name:
                 raise UserError(f"{path}: fn{where} is not text; name the image file")
-            viewmat = as_array(rows["w2c"][instant][place], (4, 4), (3, 4))
+            viewmat = as_array(rows["w2c"][instant][number], (4, 4), (3, 4))
             if viewmat is None or not is_rotation(viewmat[:3, :3]):
                 raise UserError(f"{path}: w2c{where} is not a rigid 4 x 4 matrix of finite numbers; correct the pose")
-            K = as_array(rows["k"][instant][place], (3, 3))
+            K = as_array(rows["k"][instant][number], (3, 3))
             if K is None or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - (0, 0, 1)).max() > 1e-6:
                 raise UserError(f"{path}: k{where} is not a 3 x 3 matrix of intrinsics in pixels; correct the camera")
             file = inside(folder / "ims", name, f"{path}: fn{where}", "image")

@@ -70,9 +70,9 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         viewmat = _viewmat(path, index, rows[index, :15].reshape(3, 5))
         lens = partial(_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4])
         last = max(len(files[index]) - 1, 1)
-        for place, file in enumerate(files[index]):
+        for instant, file in enumerate(files[index]):
             records.append(
-                FrameRecord(file, viewmat, place / last, lens, f"{_label(folder, cameras[index])}_{file.stem}")
+                FrameRecord(file, viewmat, instant / last, lens, f"{_label(folder, cameras[index])}_{file.stem}")
             )
     data = assemble(records, options, folder=folder, split=split)
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
@@ -88,13 +88,13 @@ def _label(folder: Path, camera: Path) -> str:
 def _cameras(folder: Path) -> list[Path]:
     """Return the cameras' folders of images, in the order of their names."""
     base = folder / "frames" if (folder / "frames").is_dir() else folder
-    found = []
-    for place in sorted((p for p in base.iterdir() if p.is_dir()), key=lambda p: natural(p.name)):
-        inner = place / "images" if (place / "images").is_dir() else place
+    cameras = []
+    for camera in sorted((p for p in base.iterdir() if p.is_dir()), key=lambda p: natural(p.name)):
+        inner = camera / "images" if (camera / "images").is_dir() else camera
         if _files(inner):
-            found.append(inner)
-    if found:
-        return found
+            cameras.append(inner)
+    if cameras:
+        return cameras
     videos = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in VIDEOS)
     if videos:
         stem = Path(videos[0]).stem

@@ -18,7 +18,7 @@ class Joint(NamedTuple):
     """A joint of the skeleton: its parent (None: the world), and its position in the parent's frame."""
 
     parent: str | None
-    place: Vector
+    position: Vector
 
 
 BONES: dict[str, Joint] = {
@@ -88,7 +88,7 @@ def bone_transforms(time: float) -> dict[str, np.ndarray]:
     for name, bone in BONES.items():  # Parents precede children.
         own = np.eye(4)
         own[:3, :3] = rotation(*angles.get(name, (0.0, 0.0, 0.0)))
-        own[:3, 3] = bone.place
+        own[:3, 3] = bone.position
         if bone.parent is None:
             own[2, 3] += 0.035 * math.cos(4.0 * math.pi * time)
             own[0, 3] += 0.03 * math.sin(2.0 * math.pi * time)

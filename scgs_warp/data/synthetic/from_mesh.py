@@ -67,7 +67,7 @@ class SynthesisPlan(NamedTuple):
     @property
     def counts(self) -> dict[str, int]:
         """Number of pictures of each split."""
-        return {split: len(found) for split, found in self.pictures.items()}
+        return {split: len(pictures) for split, pictures in self.pictures.items()}
 
 
 def check(request: SynthesisRequest) -> None:
@@ -138,14 +138,14 @@ def load_subject(request: SynthesisRequest, device: str) -> tuple[Subject, dict[
     span = span_of(scene, request.start, request.end)
     subject = MeshSubject(scene, span, request.shading, device)
     clip = scene.clip
-    found = {
+    identity = {
         "subject": scene.path.name,
         "sha256": scene.digest,
         "clip": clip.name if clip else None,
         "seconds": list(span),
         "world_from_gltf": scene.world_from_gltf.tolist(),
     }
-    return subject, found, describe(scene, span)
+    return subject, identity, describe(scene, span)
 
 
 def describe(scene: GltfScene, span: tuple[float, float]) -> list[str]:
@@ -178,8 +178,8 @@ def plan_synthesis(folder: str | Path, request: SynthesisRequest, device: str = 
     """
     folder = Path(folder)
     check(request)
-    subject, found, lines = load_subject(request, device)
-    recipe = _recipe(request, found)
+    subject, identity, lines = load_subject(request, device)
+    recipe = _recipe(request, identity)
     made = _recipe_of(folder) == recipe
     if not made and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
@@ -221,7 +221,7 @@ def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | No
     return planned.folder
 
 
-def _recipe(request: SynthesisRequest, found: dict[str, Any]) -> dict[str, Any]:
+def _recipe(request: SynthesisRequest, identity: dict[str, Any]) -> dict[str, Any]:
     """Make the content of the marker file, which holds no path, date or host."""
     options = {
         "filming": asdict(request.filming),
@@ -230,7 +230,7 @@ def _recipe(request: SynthesisRequest, found: dict[str, Any]) -> dict[str, Any]:
         "background": request.background,
         "seed": request.seed,
     }
-    return json.loads(json.dumps({"version": VERSION, **found, **options}))
+    return json.loads(json.dumps({"version": VERSION, **identity, **options}))
 
 
 def _recipe_of(folder: Path) -> dict[str, Any] | None:

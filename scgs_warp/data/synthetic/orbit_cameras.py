@@ -121,12 +121,12 @@ def plan_pictures(filming: FilmingSettings, rng: np.random.Generator) -> dict[st
             else:
                 matrix = random_on_sphere(rng, _sines(filming), camera_distance(filming))
             train.append(PlannedPicture(time, matrix, view))
-    found = {"train": train}
+    pictures = {"train": train}
     for split, count in (("test", filming.test), ("val", filming.val)):
         if count:
-            places = [random_on_sphere(rng, _sines(filming), camera_distance(filming)) for _ in range(count)]
-            found[split] = [PlannedPicture(time, place, 0) for time, place in zip(instants(count), places)]
-    return found
+            poses = [random_on_sphere(rng, _sines(filming), camera_distance(filming)) for _ in range(count)]
+            pictures[split] = [PlannedPicture(time, pose, 0) for time, pose in zip(instants(count), poses)]
+    return pictures
 
 
 def camera_of(camera_to_world: np.ndarray, fov: float, width: int, height: int) -> Camera:
