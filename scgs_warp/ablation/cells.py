@@ -151,9 +151,9 @@ def recorded_settings(folder: Path) -> dict[str, Any] | None:
     data = values.get("data")
     data_folder = data.pop("folder", None) if isinstance(data, dict) else None
     settings = to_dict(from_dict(values, str(path)))
-    there = dict(flatten(values))
+    recorded = dict(flatten(values))
     for name, _ in flatten(settings):
-        if name not in there and name not in FREE_TO_CHANGE:
+        if name not in recorded and name not in FREE_TO_CHANGE:
             raise UserError(
                 f"{folder}: made by another version, which had no {name}; remove the folder, and the cell is trained "
                 "again, or give another --output"
@@ -166,10 +166,10 @@ def first_difference(
     actual: dict[str, Any], wanted: dict[str, Any], ignored: Sequence[str] = FREE_TO_CHANGE
 ) -> tuple[str, Any, Any] | None:
     """Return the first field in which two complete settings differ, as its name and both values; None if they agree."""
-    there = dict(flatten(actual))
+    fields = dict(flatten(actual))
     for name, value in flatten(wanted):
-        if name not in ignored and there.get(name) != value:
-            return name, there.get(name), value
+        if name not in ignored and fields.get(name) != value:
+            return name, fields.get(name), value
     return None
 
 

@@ -34,12 +34,12 @@ def number(value: float | None, digits: int, sign: bool = False) -> str:
     return f"{value:{'+' if sign else ''},.{digits}f}"
 
 
-def measured(found: dict[str, Any] | None, digits: int) -> str:
+def measured(statistics: dict[str, Any] | None, digits: int) -> str:
     """Format statistics as ``43.12 ± 0.08``, without the deviation if there is only one seed."""
-    if found is None:
+    if statistics is None:
         return MISSING
-    text = number(found["mean"], digits)
-    return text if found["std"] is None else f"{text} ± {number(found['std'], digits)}"
+    text = number(statistics["mean"], digits)
+    return text if statistics["std"] is None else f"{text} ± {number(statistics['std'], digits)}"
 
 
 def columns(report: dict[str, Any], rows: list[Row]) -> list[Column]:

@@ -185,16 +185,18 @@ def machines(ray: Any) -> list[Machine]:
     return alive
 
 
-def usable_machines(found: Sequence[Machine], cuda: bool) -> list[Machine]:
+def usable_machines(candidates: Sequence[Machine], cuda: bool) -> list[Machine]:
     """Return the machines that can train a cell; a head node often offers no processors and is left out.
 
     Raises:
         UserError: there are none.
     """
-    useful = [machine for machine in found if machine.cpus >= 1 and (machine.gpus >= 1 or not cuda)]
+    useful = [machine for machine in candidates if machine.cpus >= 1 and (machine.gpus >= 1 or not cuda)]
     if not useful:
         lacks = "a GPU and a CPU to give; take --device cpu, or add one" if cuda else "CPUs to give; add one"
-        raise UserError(f"--ray: none of the cluster's {len(found)} machines has {lacks} with 'ray start --address'")
+        raise UserError(
+            f"--ray: none of the cluster's {len(candidates)} machines has {lacks} with 'ray start --address'"
+        )
     return useful
 
 

@@ -165,8 +165,8 @@ def _ask_all(ray: Any, useful: Sequence[Machine], question: dict[str, Any]) -> l
     task = ray.remote(inspect_machine)
     refs = {}
     for machine in useful:
-        there = NodeAffinitySchedulingStrategy(machine.id, soft=False)
-        refs[task.options(num_cpus=0, max_retries=0, scheduling_strategy=there).remote(question)] = machine
+        affinity = NodeAffinitySchedulingStrategy(machine.id, soft=False)
+        refs[task.options(num_cpus=0, max_retries=0, scheduling_strategy=affinity).remote(question)] = machine
     done, late = ray.wait(list(refs), num_returns=len(refs), timeout=INSPECT_SECONDS)
     if late:
         raise UserError(

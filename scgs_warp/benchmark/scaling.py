@@ -123,22 +123,22 @@ def scaling(plan: BenchPlan, points: dict[str, tuple[int, ...]]) -> dict[str, An
     sweeps = Sweeps(replace(plan, motions=plan.motions[:1], threads=plan.threads[-1:]), points)
     todo = [(name, *pair) for name in points for pair in sweeps.plans(name)]
     clock = _Clock([_weight(one) for _, _, one in todo])
-    found: dict[str, list[dict[str, Any]]] = {name: [] for name in points}
+    measured: dict[str, list[dict[str, Any]]] = {name: [] for name in points}
     before = environment.thread_count()
     try:
         for name, point, one in todo:
             plan.report(f"{name} {point:,}: {clock.left()}")
-            found[name].append({"point": point, **_measure(one, sweeps)})
+            measured[name].append({"point": point, **_measure(one, sweeps)})
             clock.done()
     finally:
         environment.configure(before)
-    for entry in (entry for entries in found.values() for entry in entries):
+    for entry in (entry for entries in measured.values() for entry in entries):
         limit = sweeps.limits.get(entry["rows"][0]["threads"])
         entry["limits"] = None if limit is None else least_times(limit, entry["work"])
     base = {"gaussians": plan.gaussians, "nodes": plan.nodes, "threads": sweeps.plan.threads[0]}
     limits = {str(threads): limit._asdict() for threads, limit in sorted(sweeps.limits.items())}
     head = {**provenance(plan.device), "what": "scaling", "base": base}
-    return {**head, "limits": limits, "sweeps": found}
+    return {**head, "limits": limits, "sweeps": measured}
 
 
 def _measure(plan: BenchPlan, sweeps: Sweeps) -> dict[str, Any]:

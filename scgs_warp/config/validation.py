@@ -49,12 +49,12 @@ def _check_rules(config: TrainConfig) -> None:
         raise UserError(f"--max-gaussians {config.densify.max_gaussians}: needs at least 100")
 
 
-def check_sizes(config: TrainConfig, place: str = "") -> None:
+def check_sizes(config: TrainConfig, prefix: str = "") -> None:
     """Refuse numbers that are too large for any run, before arrays of that size are allocated. Also applies to a
     configuration stored in a file.
 
     Args:
-        place: prefix of the message.
+        prefix: start of the message.
 
     Raises:
         UserError: names the field and the remedy.
@@ -63,12 +63,12 @@ def check_sizes(config: TrainConfig, place: str = "") -> None:
         most = bounds.get("most") or MAGNITUDE
         if not -MAGNITUDE <= value <= most:  # refuses NaN, too
             shown = str(value) if isinstance(value, float) else str(value)[:20]
-            raise UserError(f"{place}{name} is {shown}; it must be at most {most:g}")
+            raise UserError(f"{prefix}{name} is {shown}; it must be at most {most:g}")
     motion = config.motion
     if not 0 <= motion.skip < motion.layers or min(motion.width, motion.layers) < 1:
-        raise UserError(f"{place}motion.skip is {motion.skip}; it must be below motion.layers, {motion.layers}")
+        raise UserError(f"{prefix}motion.skip is {motion.skip}; it must be below motion.layers, {motion.layers}")
     if min(motion.time_frequencies, motion.position_frequencies) < 1 or motion.hyper_dim < 0:
-        raise UserError(f"{place}motion.time_frequencies, position_frequencies or hyper_dim are too small; restore it")
+        raise UserError(f"{prefix}motion.time_frequencies, position_frequencies or hyper_dim are too small; restore it")
 
 
 def _numbers(config: Any, prefix: str = "") -> Iterator[tuple[str, int | float, Mapping[str, Any]]]:

@@ -287,8 +287,8 @@ class Editor:
         else:
             target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
             self.gizmo_frame = gizmo_pose.frame_of_handle(self.session, handle, moment.time), target
-        place, target = self.gizmo_frame
-        position, wxyz = place.pose(target)
+        frame, target = self.gizmo_frame
+        position, wxyz = frame.pose(target)
         self.overlays.place_gizmo((self.display.show(position), wxyz))
 
     # What users do in the picture
@@ -329,13 +329,13 @@ class Editor:
     def drag_gizmo(self, phase: str, position: np.ndarray, wxyz: np.ndarray) -> None:
         if self.gizmo_frame is None:
             return
-        place, target = self.gizmo_frame
+        frame, target = self.gizmo_frame
         if phase == "start":
             self.model.grab(target)
         elif phase == "update":
             if self.model.dragging:
                 self._dragged_at = self._dragged_at or time.monotonic()
-                self.model.drag(place.target(position, wxyz))
+                self.model.drag(frame.target(position, wxyz))
         else:
             self._dragged_at = None
             self.model.release()

@@ -69,13 +69,13 @@ def frame_of_selection(session: EditSession, nodes: tuple[int, ...], moment: Mom
     chosen = list(nodes)
     base = session.engine.to_world(session.engine.base_at(session.edit, moment.time).positions)[chosen]
     now = session.node_positions(moment.time, moment.at)[chosen]
-    place = GizmoFrame(base.mean(0), np.array([1.0, 0.0, 0.0, 0.0]))
+    frame = GizmoFrame(base.mean(0), np.array([1.0, 0.0, 0.0, 0.0]))
     if np.allclose(base, now, rtol=0, atol=1e-9):
-        return place, STAY
+        return frame, STAY
     turn, before, after = rigid_fit(base, now)
     if len(chosen) < 3:
         turn = np.array([1.0, 0.0, 0.0, 0.0])
-    return place, Target.of((after - before).tolist(), turn.tolist())
+    return frame, Target.of((after - before).tolist(), turn.tolist())
 
 
 def surface_point(

@@ -153,7 +153,7 @@ def metrics_of(
     measured = evaluate(scene, dataset, lpips=lpips, render_dir=render_dir, progress=progress)
     rows = measured.pop("per_image")
     data = scene.settings.get("data", {})
-    found = {
+    metrics = {
         **{key: measured[key] for key in ("psnr", "ssim", "lpips")},
         "split": dataset.split,
         "images": measured["images"],
@@ -170,8 +170,8 @@ def metrics_of(
     truth = load_ground_truth(dataset.folder)
     if truth is not None:
         opacities = scene.gaussians_at(float(truth.times[0])).opacities
-        found.update(score_motion(truth, lambda time: scene.gaussians_at(time).means, opacities)._asdict())
-    return {**found, "per_image": rows}
+        metrics.update(score_motion(truth, lambda time: scene.gaussians_at(time).means, opacities)._asdict())
+    return {**metrics, "per_image": rows}
 
 
 def _plain(value: Any) -> Any:

@@ -150,13 +150,13 @@ def _read(path: Path) -> dict[str, Tensor]:
 
 def _by_role(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Rename the tensors to a single naming scheme."""
-    found = {}
+    renamed = {}
     for key, tensor in tensors.items():
         if match := re.fullmatch(r"(?:.*\.)?(?:features|slice[1-5])\.(\d+)\.(weight|bias)", key):
-            found[f"features.{match[1]}.{match[2]}"] = tensor
+            renamed[f"features.{match[1]}.{match[2]}"] = tensor
         elif match := re.fullmatch(r"(?:.*\.)?(?:lin|lins\.)([0-4])\.(?:model\.)?(?:[01]\.)?weight", key):
-            found[f"lin{match[1]}.model.1.weight"] = tensor
-    return found
+            renamed[f"lin{match[1]}.model.1.weight"] = tensor
+    return renamed
 
 
 def _take(

@@ -115,8 +115,8 @@ def score_tracks(predicted: Tensor, true: Tensor, height: float) -> MotionScore:
 
 def _nearest(points: Tensor, centres: Tensor) -> Tensor:
     """Return the index [P] of the centre nearest to each point; of equally near centres, the first."""
-    found = [
+    indices = [
         torch.cdist(chunk, centres, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)
         for chunk in points.split(CHUNK)
     ]
-    return torch.cat(found)
+    return torch.cat(indices)

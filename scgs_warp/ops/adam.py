@@ -90,8 +90,8 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
     bad = torch.empty(len(chunks), dtype=torch.int32)
     addresses = _table([tensor.data_ptr() for tensor in tensors], np.int64, tensors[0].device)
     launch(cpu_kernels.find_non_finite, len(chunks), addresses, sizes, chunks, bad, grain=4)
-    found = bad.numpy().nonzero()[0]
-    return int(chunks[found[0], 0]) if len(found) else None
+    bad_chunks = bad.numpy().nonzero()[0]
+    return int(chunks[bad_chunks[0], 0]) if len(bad_chunks) else None
 
 
 def first_not_finite_by_norm(tensors: Sequence[Tensor]) -> int | None:

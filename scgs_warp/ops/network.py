@@ -95,9 +95,9 @@ class Layers:
             launch(kernels_adjoint.network_weights_adjoint, layers * self.panels * parts, *shared, grain=1)
         v_where = None if v_inputs is None or sizes is None else _over_times(v_inputs, *sizes)
         weights, biases = [], []
-        for place, weight in zip(self.gradient_begin, self.weights):
-            end = place + weight.numel()
-            weights.append(flat[place:end].view_as(weight))
+        for start, weight in zip(self.gradient_begin, self.weights):
+            end = start + weight.numel()
+            weights.append(flat[start:end].view_as(weight))
             biases.append(flat[end : end + weight.shape[0]])
         return v_where, weights + biases
 

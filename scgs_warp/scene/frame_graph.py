@@ -188,14 +188,14 @@ class FrameGraph:
 
     def draw_steps(self) -> tuple[Image, Tensor]:
         """Draw the whole frame from ``inputs``; return it with the number of pairs, [1]."""
-        found: list[Tensor] = []
+        totals: list[Tensor] = []
 
         def binned(splats: Splats) -> Tiles:
             tiles, total = bin_within(splats, self.capacity, slots=False)
-            found.append(total)
+            totals.append(total)
             return tiles
 
-        return self._drawn(self.inputs, self._size, binned), found[0]
+        return self._drawn(self.inputs, self._size, binned), totals[0]
 
     @torch.no_grad()
     def _drawn(self, inputs: Tensor, size: tuple[int, int], binned: Callable[[Splats], Tiles] | None = None) -> Image:

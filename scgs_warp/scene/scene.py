@@ -179,15 +179,15 @@ class Scene:
     def frame_graph(self) -> FrameGraph:
         """Return the renderer of this scene's frames on CUDA, which takes cameras in normalised units. It is kept until
         ``gaussians`` or ``motion`` is replaced."""
-        found = self._frames
-        if found is None or found.gaussians is not self.gaussians or found.motion is not self.motion:
-            found = self._frames = FrameGraph(
+        frames = self._frames
+        if frames is None or frames.gaussians is not self.gaussians or frames.motion is not self.motion:
+            frames = self._frames = FrameGraph(
                 self.gaussians,
                 self.motion,
                 antialiased=self.config.antialiased,
                 depth_of=self.normalisation.undo_scale,
             )
-        return found
+        return frames
 
     @torch.no_grad()
     def control_points_at(self, time: float) -> Tensor:
@@ -201,9 +201,9 @@ class Scene:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the scene's tensors by name, for a checkpoint."""
-        found = {f"gaussians.{name}": getattr(self.gaussians, name) for name in GaussianParameters.NAMES}
-        found.update({f"motion.{name}": value for name, value in self.motion.state_dict().items()})
-        return found
+        tensors = {f"gaussians.{name}": getattr(self.gaussians, name) for name in GaussianParameters.NAMES}
+        tensors.update({f"motion.{name}": value for name, value in self.motion.state_dict().items()})
+        return tensors
 
     def metadata(self) -> dict[str, Any]:
         return {

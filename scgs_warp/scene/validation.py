@@ -140,8 +140,8 @@ def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], so
     """
     count = len(tensors["gaussians.means"])
     for name in ("grad_norm", "count", "max_radii"):
-        found = tensors.get(f"stats.{name}")
-        if found is None or found.shape != (count,):
+        statistic = tensors.get(f"stats.{name}")
+        if statistic is None or statistic.shape != (count,):
             raise _unusable(source, f"stats.{name} is missing or not [{count}]")
     for name in ("points", "colors"):
         if name in tensors and (tensors[name].ndim != 2 or tensors[name].shape[1] != 3):

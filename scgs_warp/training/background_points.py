@@ -61,7 +61,7 @@ def background_points(
         is spread over all frames.
     """
     chosen = spread(len(data), MOST_VIEWS)
-    found, colors = [], []
+    positions, colors = [], []
     for ray_set, index in enumerate(chosen):
         frame = data[index]
         share = count * (ray_set + 1) // len(chosen) - count * ray_set // len(chosen)
@@ -79,9 +79,9 @@ def background_points(
         depth = depths[torch.from_numpy(nearest).reshape(share, -1)].median(dim=1).values
         depth = depth * torch.exp(torch.rand(share, generator=random) * math.log(FARTHEST))
         rays = torch.cat([pixels, torch.ones(share, 1)], 1) @ torch.linalg.inv(camera.K).T * depth[:, None]
-        found.append((rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+        positions.append((rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
         colors.append(frame.image[rows, columns])
-    if not found:
+    if not positions:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    order = torch.randperm(sum(map(len, found)), generator=generator(seed, key, len(chosen)))
-    return torch.cat(found)[order], torch.cat(colors)[order]
+    order = torch.randperm(sum(map(len, positions)), generator=generator(seed, key, len(chosen)))
+    return torch.cat(positions)[order], torch.cat(colors)[order]

@@ -125,54 +125,54 @@ def _brightness(frame: Frame, on_white: bool) -> float:
     return float(image.sum()) / max(float(weight.sum()), 1e-9)
 
 
-def advise(found: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str, str]:
+def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str, str]:
     """Write two lines: the data's properties; the expected result and the most useful setting."""
     cameras = (
-        f"{found.views} views of each instant"
-        if found.views > 1
-        else f"one camera, {found.turn:.0f} degrees from frame to frame"
+        f"{facts.views} views of each instant"
+        if facts.views > 1
+        else f"one camera, {facts.turn:.0f} degrees from frame to frame"
     )
-    points = f"{found.points:,} points" if found.points else "no points"
+    points = f"{facts.points:,} points" if facts.points else "no points"
     first = (
-        f"data: {found.frames:,} frames of {found.width} x {found.height} at {found.instants:,} times; {cameras}, "
-        f"{found.arc:.0f} in all; {'cut out by alpha' if found.cut_out else 'filled images'}; {points}"
+        f"data: {facts.frames:,} frames of {facts.width} x {facts.height} at {facts.instants:,} times; {cameras}, "
+        f"{facts.arc:.0f} in all; {'cut out by alpha' if facts.cut_out else 'filled images'}; {points}"
     )
-    return first, f"expect {_expectation(found)}; {_help(found, config, device)}"
+    return first, f"expect {_expectation(facts)}; {_help(facts, config, device)}"
 
 
-def _expectation(found: Survey) -> str:
-    if found.instants < 2:
+def _expectation(facts: Survey) -> str:
+    if facts.instants < 2:
         return "a scene at rest: all frames are of one instant"
-    if found.arc < LITTLE_PARALLAX:
-        return f"good views near the cameras only: they lie within {found.arc:.1f} degrees, which leaves depth unknown"
-    if found.gap[1] - found.gap[0] > max(GAP * found.typical_gap, 0.05):
-        return f"guessed motion from time {found.gap[0]:.2f} to {found.gap[1]:.2f}, where there is no frame"
-    if found.flicker > UNSTEADY:
-        return f"averaged colours: brightness changes by {100 * found.flicker:.0f} % from frame to frame (exposure)"
-    if found.views > 1:
+    if facts.arc < LITTLE_PARALLAX:
+        return f"good views near the cameras only: they lie within {facts.arc:.1f} degrees, which leaves depth unknown"
+    if facts.gap[1] - facts.gap[0] > max(GAP * facts.typical_gap, 0.05):
+        return f"guessed motion from time {facts.gap[0]:.2f} to {facts.gap[1]:.2f}, where there is no frame"
+    if facts.flicker > UNSTEADY:
+        return f"averaged colours: brightness changes by {100 * facts.flicker:.0f} % from frame to frame (exposure)"
+    if facts.views > 1:
         return "good views between the cameras at all times: each instant is seen from several sides"
-    if found.turn > JUMPS:
+    if facts.turn > JUMPS:
         return "good views from all around: the camera stands elsewhere at each instant"
     return "good views near the camera's path; motion along the line of sight stays uncertain"
 
 
-def _help(found: Survey, config: TrainConfig, device: str) -> str:
+def _help(facts: Survey, config: TrainConfig, device: str) -> str:
     """Name the setting that improves the result most."""
-    if found.instants < 2 and config.motion.model != "static":
+    if facts.instants < 2 and config.motion.model != "static":
         return "--motion static is all it needs"
-    if found.width * found.height > LARGE_IMAGE and device == "cpu":
-        factor = math.ceil(math.sqrt(found.width * found.height / LARGE_IMAGE)) * config.data.downscale
+    if facts.width * facts.height > LARGE_IMAGE and device == "cpu":
+        factor = math.ceil(math.sqrt(facts.width * facts.height / LARGE_IMAGE)) * config.data.downscale
         return f"on a CPU, --downscale {factor} makes it several times faster"
-    if config.steps < FEW_VISITS * found.frames:
-        wanted = math.ceil(FEW_VISITS * found.frames / 1000) * 1000
+    if config.steps < FEW_VISITS * facts.frames:
+        wanted = math.ceil(FEW_VISITS * facts.frames / 1000) * 1000
         return (
-            f"each frame is seen {config.steps / found.frames:.0f} times only: --steps {wanted} sees all of them enough"
+            f"each frame is seen {config.steps / facts.frames:.0f} times only: --steps {wanted} sees all of them enough"
         )
-    if found.points < FEWEST_POINTS and not found.cut_out:
+    if facts.points < FEWEST_POINTS and not facts.cut_out:
         return "COLMAP's points (ply_file_path, or its sparse model) begin some 2 dB better than random ones"
-    if not found.cut_out and found.views == 1 and config.optim.cameras == 0.0:
+    if not facts.cut_out and facts.views == 1 and config.optim.cameras == 0.0:
         return "if the poses are off by more than a pixel, --set optim.cameras=2e-4 corrects them"
-    if found.cut_out and not config.pretrain.progressive and found.views == 1:
+    if facts.cut_out and not config.pretrain.progressive and facts.views == 1:
         return "if a fast limb turns transparent, --progressive follows it frame by frame"
     return (
         "the settings fit; --preset paper is the longest and the best" if config.preset != "paper" else "it is set up"

@@ -75,11 +75,11 @@ class Frames:
             if number % 2 and allowed < len(self.frames):
                 first = max(0, allowed - max(1, round(PROGRESSIVE_SHARE * len(self.frames))))
         count = allowed - first
-        epoch, place = divmod(number, count)
+        epoch, position = divmod(number, count)
         if self._order[0] != (epoch, count):
             order = torch.randperm(count, generator=generator(self.config.seed, 41, epoch, count))
             self._order = ((epoch, count), order.tolist())
-        return self.by_time[first + self._order[1][place]]
+        return self.by_time[first + self._order[1][position]]
 
     def halved(self, index: int) -> tuple[Frame, Camera]:
         """Return the frame and its normalised camera at half the size; each pixel is the mean of four."""

@@ -180,8 +180,8 @@ def turntable(scene: Scene, path: Path, frames: int, size: int = FILM_SIZE) -> N
 def summary(metrics: dict[str, Any]) -> str:
     """Format the scores for the terminal, one per line."""
     names = ("psnr", "ssim", "lpips", "epe", "jitter", "seconds", "gaussians", "control_points", "step")
-    found = [(name, metrics[name]) for name in names if metrics.get(name) is not None]
+    scores = [(name, metrics[name]) for name in names if metrics.get(name) is not None]
     return "\n".join(
         f"{name:>15}  {value:.4g}" if isinstance(value, float) else f"{name:>15}  {json.dumps(value)}"
-        for name, value in found
+        for name, value in scores
     )

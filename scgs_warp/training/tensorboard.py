@@ -109,9 +109,9 @@ def newest_steps(folder: Path, step: int) -> dict[str, int]:
 
     if not any(folder.glob("events.out.tfevents.*")):
         return {}
-    found = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
-    found.Reload()
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
+    events.Reload()
     return {
-        tag: max((event.step for event in found.Scalars(tag) if event.step <= step), default=-1)
-        for tag in found.Tags()["scalars"]
+        tag: max((event.step for event in events.Scalars(tag) if event.step <= step), default=-1)
+        for tag in events.Tags()["scalars"]
     }

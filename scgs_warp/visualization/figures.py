@@ -157,23 +157,23 @@ def axis_positions(lines: list[dict[str, Any]]) -> tuple[dict[tuple[str, int], f
         if as_number(line.get("step")) is not None:
             steps.setdefault(str(line.get("stage", "")), []).append(int(line["step"]))
     positions, starts, end = {}, [], 0.0
-    for stage, found in steps.items():
+    for stage, stage_steps in steps.items():
         # A stage that counts from zero again follows the previous one.
-        offset = end if min(found) < end else 0.0
-        starts.append((stage, offset + min(found)))
-        positions.update({(stage, step): step + offset for step in found})
-        end = max(end, offset + max(found))
+        offset = end if min(stage_steps) < end else 0.0
+        starts.append((stage, offset + min(stage_steps)))
+        positions.update({(stage, step): step + offset for step in stage_steps})
+        end = max(end, offset + max(stage_steps))
     return positions, starts
 
 
 def series_of(lines: list[dict[str, Any]], key: str, positions: dict[tuple[str, int], float]) -> dict[float, float]:
     """Return position -> value in ascending order; of several lines for a step (a resumed run), the last one counts."""
-    found = {}
+    series = {}
     for line in lines:
         value = as_number(line.get(key))
         if value is not None and as_number(line.get("step")) is not None:
-            found[positions[str(line.get("stage", "")), int(line["step"])]] = value
-    return dict(sorted(found.items()))
+            series[positions[str(line.get("stage", "")), int(line["step"])]] = value
+    return dict(sorted(series.items()))
 
 
 def curves(log_path: str | Path, out_png: str | Path) -> None:

@@ -44,11 +44,11 @@ def depth_range(images: Iterable[Image]) -> tuple[float, float]:
     The range is the 2nd to 98th percentile of the depth of opaque pixels, slightly widened; (0, 1) without opaque
     pixels.
     """
-    found = []
+    samples = []
     for image in images:
         depth = image.depth[image.alpha > SURFACE_ALPHA].detach().cpu().numpy()
-        found.append(depth[:: max(1, len(depth) // 50_000)])
-    depths = np.concatenate(found) if found else np.zeros(0)
+        samples.append(depth[:: max(1, len(depth) // 50_000)])
+    depths = np.concatenate(samples) if samples else np.zeros(0)
     if len(depths) == 0:
         return 0.0, 1.0
     near, far = np.percentile(depths, (2, 98)).tolist()
@@ -191,10 +191,10 @@ def draw_trails(rgb: np.ndarray, tracks: np.ndarray, camera: Camera, image: Imag
 
 def interpolate_tracks(tracks: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Interpolate ``tracks`` [T, M, 3], at T evenly spaced times from 0 to 1, at ``times`` [S] to [S, M, 3]."""
-    place = np.clip(times, 0.0, 1.0) * (len(tracks) - 1)
-    low = np.minimum(np.floor(place).astype(int), max(len(tracks) - 2, 0))
+    position = np.clip(times, 0.0, 1.0) * (len(tracks) - 1)
+    low = np.minimum(np.floor(position).astype(int), max(len(tracks) - 2, 0))
     high = np.minimum(low + 1, len(tracks) - 1)
-    share = (place - low)[:, None, None]
+    share = (position - low)[:, None, None]
     return tracks[low] * (1.0 - share) + tracks[high] * share
 
 
