@@ -106,8 +106,8 @@ def main(args: list[str] | None) -> None:
     if options.split == "train":
         from scgs_warp.training.camera_refinement import refined
 
-        found = refined(dataset, options.run, scene.normalisation)
-        dataset, poses = (dataset, poses) if found is None else (found, "refined")
+        corrected = refined(dataset, options.run, scene.normalisation)
+        dataset, poses = (dataset, poses) if corrected is None else (corrected, "refined")
     folder = options.run / "evaluation" / options.split
     with progress(len(dataset), "evaluate") as shown:
         metrics = metrics_of(

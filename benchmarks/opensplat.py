@@ -110,8 +110,8 @@ class Theirs:
     def forward(self) -> tuple[Tensor, Tensor, Any]:
         return self.module.forward(*self.size, *self.inputs)
 
-    def backward(self, found: tuple[Tensor, Tensor, Any], v_image: Tensor) -> tuple[Tensor, ...]:
-        return self.module.backward(*self.size, *self.inputs, *found[1:], v_image, self.no_alpha)
+    def backward(self, drawn: tuple[Tensor, Tensor, Any], v_image: Tensor) -> tuple[Tensor, ...]:
+        return self.module.backward(*self.size, *self.inputs, *drawn[1:], v_image, self.no_alpha)
 
 
 class Ours:
@@ -175,12 +175,12 @@ def compare(module: Any, count: int, size: Size, seconds: float) -> dict[str, An
     v_planar = v_image.permute(1, 2, 0).contiguous()
 
     wide = Theirs(module, splats, colors, WIDENED)
-    image, found = ours.forward(), wide.forward()
-    pictures = {"boxes_widened": differences(image.detach(), found[0].permute(2, 0, 1))}
+    image, drawn = ours.forward(), wide.forward()
+    pictures = {"boxes_widened": differences(image.detach(), drawn[0].permute(2, 0, 1))}
     pictures["as_it_is"] = differences(image.detach(), theirs.forward()[0].permute(2, 0, 1))
-    check_agreement(image.detach(), found[0].permute(2, 0, 1), "OpenSplat")
+    check_agreement(image.detach(), drawn[0].permute(2, 0, 1), "OpenSplat")
     v_means, _, v_opacities, v_colors = ours.backward(image, v_image)
-    w_means, _, w_colors, w_opacities = wide.backward(found, v_planar)
+    w_means, _, w_colors, w_opacities = wide.backward(drawn, v_planar)
     pairs = {
         "means2d": (v_means, w_means),
         "opacities": (v_opacities[:, None], w_opacities),
@@ -244,13 +244,13 @@ def main() -> int:
     folder = options.build or Path(tempfile.mkdtemp(prefix="opensplat-"))
     try:
         module = build(options.checkout, folder, options.flags.split())
-        found = compare(module, options.gaussians, camera_size(options.size), options.seconds)
+        comparison = compare(module, options.gaussians, camera_size(options.size), options.seconds)
     finally:
         if options.build is None:
             shutil.rmtree(folder, ignore_errors=True)
     command = command_line("benchmarks/opensplat.py", sys.argv[1:])
     extra = {"opensplat": commit_of(options.checkout), "flags": options.flags}
-    report = {"command": command, **provenance("cpu"), "what": "opensplat", **extra, **found}
+    report = {"command": command, **provenance("cpu"), "what": "opensplat", **extra, **comparison}
     if options.json is not None:
         write(report, options.json)
     print(json.dumps(report, indent=2))

@@ -81,11 +81,11 @@ class Clock:
         self._timed(call, "step")()
 
     def rows(self) -> list[dict[str, Any]]:
-        found: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        samples: dict[str, list[tuple[float, float]]] = defaultdict(list)
         for step in self.steps[len(self.steps) // 5 :]:  # The first steps allocate.
             for name, times in step.items():
-                found[name].append(times)
-        medians = {name: [1e3 * statistics.median(column) for column in zip(*times)] for name, times in found.items()}
+                samples[name].append(times)
+        medians = {name: [1e3 * statistics.median(column) for column in zip(*times)] for name, times in samples.items()}
         return [{"name": name, "ms": round(wall, 2), "cpu_ms": round(cpu, 2)} for name, (wall, cpu) in medians.items()]
 
 

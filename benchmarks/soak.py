@@ -133,20 +133,20 @@ def small(motion: str) -> TrainConfig:
     return from_dict(fields, "soak", with_steps(preset("cpu"), 60))
 
 
-def train_once(place: Path, motion: str, resume: bool = False) -> Path:
-    data = make_synthetic(place / "data", size=96, train=16, test=2)
+def train_once(folder: Path, motion: str, resume: bool = False) -> Path:
+    data = make_synthetic(folder / "data", size=96, train=16, test=2)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        train_and_evaluate(small(motion), data, place / "run", frames=4, resume=resume)
-    return place / "run"
+        train_and_evaluate(small(motion), data, folder / "run", frames=4, resume=resume)
+    return folder / "run"
 
 
-def soak_training(seconds: float, place: Path) -> dict[str, Any]:
+def soak_training(seconds: float, work: Path) -> dict[str, Any]:
     """Train from images to film with each motion model in turn, and resume each run once when it is complete."""
     watch, runs = Watch(seconds), 0
     while not watch.sample():
-        with tempfile.TemporaryDirectory(dir=place) as folder:
+        with tempfile.TemporaryDirectory(dir=work) as folder:
             inner = Path(folder)
-            (inner / "data").symlink_to(place / "data")
+            (inner / "data").symlink_to(work / "data")
             for resume in (False, True):
                 train_once(inner, MOTIONS[runs % len(MOTIONS)], resume)
                 watch.sample()
@@ -154,9 +154,9 @@ def soak_training(seconds: float, place: Path) -> dict[str, Any]:
     return {"runs": runs, **watch.verdict()}
 
 
-def soak_editor(seconds: float, place: Path, run: Path, seed: int) -> dict[str, Any]:
+def soak_editor(seconds: float, work: Path, run: Path, seed: int) -> dict[str, Any]:
     """Send random input of every kind to the editor as fast as it draws."""
-    user = RandomUser(EditSession(Scene.load(run)), place / "edits", seed)
+    user = RandomUser(EditSession(Scene.load(run)), work / "edits", seed)
     watch = Watch(seconds)
     try:
         while not watch.sample(user.rest):
@@ -181,20 +181,20 @@ def main() -> int:
     environment.configure(options.threads)
     parts = ("editor", "training") if options.part == "both" else (options.part,)
     seconds = 60.0 * options.minutes / len(parts)
-    found: dict[str, Any] = {"command": command_line("benchmarks/soak.py", sys.argv[1:]), **provenance("cpu")}
+    report: dict[str, Any] = {"command": command_line("benchmarks/soak.py", sys.argv[1:]), **provenance("cpu")}
     with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
-        run = train_once(place, "control-points")
+        work = Path(folder)
+        run = train_once(work, "control-points")
         for part in parts:
             if part == "editor":
-                found[part] = soak_editor(seconds, place, options.run or run, options.seed)
+                report[part] = soak_editor(seconds, work, options.run or run, options.seed)
             else:
-                found[part] = soak_training(seconds, place)
-            shown = {name: value for name, value in found[part].items() if name != "rows"}
+                report[part] = soak_training(seconds, work)
+            shown = {name: value for name, value in report[part].items() if name != "rows"}
             print(json.dumps({part: shown}, indent=1), flush=True)
             if options.json is not None:
-                options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    wrong = [f"{part}: {line}" for part in parts for line in found[part]["wrong"]]
+                options.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    wrong = [f"{part}: {line}" for part in parts for line in report[part]["wrong"]]
     print("\n".join(wrong) or "nothing grows")
     return 1 if wrong else 0
 

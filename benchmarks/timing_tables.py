@@ -61,12 +61,12 @@ def stages(report: Report) -> str:
             head += [f"{counted(count)}, median ms", "least ms"]
         lines = []
         for name in dict.fromkeys(row["name"] for row in rows):
-            found = {row["threads"]: row for row in rows if row["name"] == name}
-            first = next(iter(found.values()))
+            by_threads = {row["threads"]: row for row in rows if row["name"] == name}
+            first = next(iter(by_threads.values()))
             whole = first["share"] is None
             line = [f"**{name}**" if whole else name]
             for count in threads:
-                row = found.get(count)
+                row = by_threads.get(count)
                 line += ["", ""] if row is None else [number(row["ms_median"]), number(row["ms_min"])]
             lines.append(line)
         parts += [size_line(rows[0]), table(head, lines)]
