@@ -70,7 +70,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
 
 
 def _rows(path: Path, content: dict[str, Any], key: str) -> list[list[Any]]:
-    """Return the field's list of cameras for each instant."""
+    """Return the rows of field ``key``: per instant, one entry per camera."""
     rows = content.get(key)
     if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
         raise UserError(f"{path}: {key} is missing or not a list of lists; give one list of cameras for each instant")
