@@ -50,7 +50,7 @@ def _version() -> str | None:
 def command_line(script: str, words: Sequence[str]) -> str:
     """Write a command for a checkout; absolute paths keep only their last part, since folders differ by machine."""
     names = (Path(word).name if Path(word).is_absolute() else word for word in words)
-    return f"python {script} {shlex.join(names)}"
+    return f"python {script} {shlex.join(names)}".rstrip()
 
 
 def commit() -> str | None:
