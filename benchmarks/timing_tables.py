@@ -54,7 +54,8 @@ def stages(report: Report) -> str:
     """
     parts = [machine_line(report) + scaling_line(report["rows"])]
     for motion in dict.fromkeys(row["motion"] for row in report["rows"]):
-        rows = [row for row in report["rows"] if row["motion"] == motion]
+        # A stage without any time was not measured: it ran inside another one.
+        rows = [row for row in report["rows"] if row["motion"] == motion and row["ms_median"] > 0.0]
         threads = sorted({row["threads"] for row in rows})
         head = [motion if report["what"] != "raster" else "stage"]
         for count in threads:
