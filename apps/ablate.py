@@ -34,7 +34,8 @@ class SweepOptions:
     """Rows of the table to train, separated by commas or spaces; all by default. The table also shows cells that were
     trained before."""
     seeds: tuple[str, ...] = ()
-    """Seeds, separated by commas or spaces. Every cell is trained once with each; the table has standard deviations."""
+    """Seeds, separated by commas or spaces. Every scene and row of the table is trained once with each seed; the
+    table then also gives standard deviations."""
     jobs: int = 1
     """Cells to train at a time, each in its own process with a share of the threads; with --ray, on each machine."""
     ray: str | None = None

@@ -62,7 +62,7 @@ class Raster(Options):
 
 @dataclass(frozen=True)
 class Step(Options):
-    """Measure a training step of the joint phase, with and without the ARAP term."""
+    """Measure a training step of stage 2, with and without the ARAP term."""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,8 @@ class Options:
     share: bool = False
     """Serve the editor to other machines: on all interfaces, behind a proxy that asks for a token."""
     folder: Path | None = None
-    """Folder for the editor's edits, films and exports; by default edits/ in the run folder, or beside the file."""
+    """Folder for the editor's edits, films and exports; by default edits/ in the run folder, or beside the file
+    that --ply names."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None

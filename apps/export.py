@@ -18,8 +18,8 @@ class Options(ExportRequest):
     threads: int | None = None
     """CPU threads; all cores by default."""
     memory_gib: float | None = None
-    """Limit on memory in GiB (on a GPU, on the memory of the GPU); by default all free memory. Large images are drawn
-    in bands, and what does not fit is refused with an error that names its size."""
+    """Limit on memory in GiB; by default all free memory. On a GPU it applies to the GPU's memory. Large images are
+    drawn in bands, and an image that does not fit is refused with an error that names its size."""
 
 
 def main(args: list[str] | None) -> None:

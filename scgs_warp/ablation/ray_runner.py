@@ -38,7 +38,7 @@ from .ray_worker import (
 )
 
 MOST_LOSSES = 3
-"""Number of workers lost without progress after which a cell fails, since the cell itself may be what kills them."""
+"""A cell fails after losing this many workers in a row without progress, because it may itself be what kills them."""
 POLL_SECONDS = 0.5
 INSPECT_SECONDS = 60.0
 """Longest wait for a machine to import the package and answer."""

@@ -173,7 +173,7 @@ class Load(NamedTuple):
 
 @torch.no_grad()
 def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> Load:
-    """Count the load exactly, pixel by pixel; the camera is in the units of the Gaussians."""
+    """Count the compositing work of an image exactly, pixel by pixel; the camera is in the units of the Gaussians."""
     geometry = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     view = camera.viewmat, camera.K, camera.width, camera.height
     splats = project(*geometry, *view, antialiased=antialiased)
@@ -208,7 +208,7 @@ def _background(scene: Scene) -> str:
 
 
 def training_state(scene: Scene, arap: bool) -> TrainState:
-    """Put the scene into the joint phase of training: full harmonics, densification statistics, rates near 0.
+    """Put the scene into stage 2 of training: full harmonics, densification statistics, rates near 0.
 
     With ``arap`` every step has the ARAP term (in training every fifth has it), since a median over steps with and
     without the term would show neither kind. The scene's motion stays in training mode.

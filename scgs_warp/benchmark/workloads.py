@@ -148,7 +148,7 @@ def _this_module() -> Any:
 
 
 def step_rows(case: BenchCase) -> list[dict[str, Any]]:
-    """Measure training steps of the joint phase on images of the scene, without and (if any) with the ARAP term."""
+    """Measure training steps of stage 2 on images of the scene, without and (if any) with the ARAP term."""
     scene = case.scene
     data = training_data(scene, case.plan.size)
     rows = []

@@ -26,7 +26,7 @@ def bounded(default: float, least: float | None = None, most: float | None = Non
 
 
 def chosen(default: int, least: int, most: int) -> Any:
-    """Declare a whole number between two inclusive bounds that are close together."""
+    """Declare a whole number with inclusive bounds, few enough that the error message offers all values as choices."""
     return field(default=default, metadata={"choices": (least, most)})
 
 
@@ -66,7 +66,7 @@ class MotionConfig:
     position_frequencies: int = bounded(10, 1, 32)
     time_frequencies: int = bounded(6, 1, 32)
     train_positions: bool = True
-    """Learn the rest positions of the control points in the joint phase (paper); the official code never moves them."""
+    """Learn the rest positions of the control points in stage 2 (paper); the official code never moves them."""
     hyper_dim: int = bounded(0, 0, 64)
     """Number of hyper-coordinates appended to positions in the neighbour search (8 in the official code)."""
     hyper_dim_filled: int = bounded(4, 0, 64)
@@ -115,11 +115,10 @@ class PretrainConfig:
     clone_share: float = bounded(0.2, 0, 1)
     """Share of the spheres cloned in each round, until the cap: those with the largest gradients."""
     start_ratio: float = bounded(8.0, 1, 1e4)
-    """Number of spheres per control point (at least 256 control points are assumed) at the start; spheres at rest cost
-    little."""
+    """Number of spheres per control point (counting at least 256) at the start; spheres at rest cost little."""
     max_ratio: float = bounded(2.0, 1, 1e4)
-    """Largest number of spheres per control point (at least 256 control points are assumed) once they move: the network
-    is then evaluated at each sphere."""
+    """Once the spheres move, at most this many per control point (counting at least 256), because the network is then
+    evaluated at each sphere."""
     opacity_rate: float = 0.02
     """Learning rate of the spheres' opacities; ``color_rate`` is that of their colours. With the learning rates of the
     Gaussians, spheres would turn transparent before they find their colour."""

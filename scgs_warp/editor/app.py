@@ -64,8 +64,9 @@ class Editor:
         size: upper limit for the longer side of a picture in pixels.
         key: secret of the proxy in front of the editor, if there is one.
 
-    Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``gizmo_frame`` (frame of the visible gizmo and
-    the target at which its drag begins), ``latency`` (seconds from a drag to its picture, the latest hundred).
+    Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``gizmo_frame`` (a pair, or
+    None if no gizmo is shown: the gizmo's frame, and the handle's target, translation and rotation, when a drag
+    begins), ``latency`` (seconds from a drag to its picture, the latest hundred).
 
     Raises:
         UserError: viser is not installed.

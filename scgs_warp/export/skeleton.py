@@ -90,7 +90,7 @@ def at_rest(scene: Scene) -> Gaussians:
 
 
 def finite_rows(gaussians: Gaussians) -> np.ndarray:
-    """Return [N] bool: Gaussians that are finite and have a rotation."""
+    """Return [N] bool: Gaussians that are finite and whose quaternion is not zero."""
     count = len(gaussians.means)
     parts = [part.detach().reshape(count, -1).isfinite().all(dim=1) for part in vars(gaussians).values()]
     return (torch.stack(parts).all(dim=0) & gaussians.quats.any(dim=1)).cpu().numpy()

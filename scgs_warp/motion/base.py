@@ -30,8 +30,8 @@ class Motion(nn.Module):
     name: ClassVar[str]
     moves: ClassVar[bool] = True
     takes_time_tensor: ClassVar[bool] = False
-    """True if :meth:`gaussians_at` also accepts the time as a tensor [1] on its device and then copies nothing between
-    host and device. Such a frame can be recorded once and replayed (``FrameGraph``)."""
+    """True if :meth:`gaussians_at` also accepts the time as a tensor [1] on the model's device and then copies nothing
+    between host and device. Such a frame can be recorded once and replayed (``FrameGraph``)."""
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         """Activate the Gaussians and pose them at ``time``; differentiable."""

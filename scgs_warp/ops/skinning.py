@@ -164,7 +164,11 @@ class Palette(NamedTuple):
 
 
 def pack_palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=None) -> Palette:
-    """Pack contiguous tensors of control points; ``pose``: translations, rotations, shape rotations, log scales."""
+    """Pack tensors of control points, which must be contiguous, into a palette.
+
+    Args:
+        pose: translations, rotations, shape rotations, log scales.
+    """
     translations, rotations, shapes, log_scales = pose
     count = nodes.shape[0]
     motion, reach = (torch.empty(count, skinning_palette.ROW) for _ in range(2))

@@ -166,7 +166,7 @@ class _LogLines(Progress):
 
 
 class _TerminalBar(Progress):
-    """A bar drawn by rich, for terminals. ``advance`` refreshes it, as a separate thread would compete for a core."""
+    """A bar drawn by rich, for terminals. ``advance`` refreshes it: a separate thread would compete for a core."""
 
     def __init__(self, total: int, description: str, stream: TextIO, start: int) -> None:
         super().__init__(total, description, stream, start)

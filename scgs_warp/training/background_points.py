@@ -18,7 +18,7 @@ from ..types import Camera, Frame
 MOST_VIEWS = 100
 """Largest number of frames through which rays are cast."""
 NEAREST = 3
-"""Number of projected points nearest to a pixel; their median depth is the pixel's."""
+"""Number of projected points nearest to a pixel; their median depth is used as that of the pixel."""
 FARTHEST = 1.5
 """Largest ratio of a point's depth to that of nearby texture. The ratio is at least 1, because surfaces without texture
 lie behind texture."""

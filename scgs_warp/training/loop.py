@@ -177,8 +177,8 @@ def _train(
 
 
 def _process_lost(state: TrainState, folder: RunFolder, lost: ProcessLost) -> UserError:
-    """Save the state, if it is consistent, after another process is lost. No further step can be completed, but usually
-    none has begun: parameters change only when the gradients of all views are available."""
+    """Save the state, if it is consistent, after another process has been lost. No further step can be completed, but
+    usually none has begun: parameters change only when the gradients of all views are available."""
     assert state.group is not None
     if state.step == 0:
         return UserError(f"{folder.path}: {lost}; no step was done yet")
