@@ -27,7 +27,7 @@ import scgs_warp
 
 import torch  # isort: skip
 import gpu_trust
-from gpu_rules import compare_gradients, compare_images, time_of
+from gpu_rules import compare_gradients, compare_images, motion_ms, time_of, two_under_way
 from torch import Tensor
 
 from scgs_warp.benchmark.plan import MIDDLE, BenchPlan, posed
@@ -44,9 +44,7 @@ from scgs_warp.ops.projection import project
 from scgs_warp.ops.ssim import photometric_loss
 from scgs_warp.rendering.render import render
 from scgs_warp.runtime import environment
-from scgs_warp.runtime.cuda_graph import CudaGraph
 from scgs_warp.runtime.provenance import provenance
-from scgs_warp.scene.frame_graph import FrameGraph
 from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Camera, Image, Splats
 
@@ -269,31 +267,6 @@ def gsplat(s: Setting) -> Report:
     return report
 
 
-def motion_ms(scene: Scene, s: Setting) -> float:
-    """Return the milliseconds for posing all Gaussians, from a recorded graph if possible."""
-    at = torch.full((1,), 0.4, device=scene.device)
-
-    @torch.no_grad()
-    def pose() -> Any:
-        return scene.motion.gaussians_at(scene.gaussians, at if scene.motion.takes_time_tensor else 0.4)
-
-    recorded = s.device == "cuda" and scene.motion.takes_time_tensor
-    call = CudaGraph(pose, scene.device).replay if recorded else pose
-    return time_of(call, s.device, s.repeats)["ms_in_a_row"]
-
-
-def two_under_way(graph: FrameGraph, scene: Scene, camera: Camera, repeats: int) -> float:
-    """Return milliseconds per frame if each frame is submitted before the previous one is finished."""
-    view, color = scene.normalisation.apply_camera(camera), torch.tensor(scene.background_color)
-    start, last = time.perf_counter(), graph.submit(view, 0.1, color)
-    for index in range(repeats):
-        following = graph.submit(view, (0.37 * index) % 1.0, color)
-        graph.finish(last)
-        last = following
-    graph.finish(last)
-    return 1e3 * (time.perf_counter() - start) / (repeats + 1)
-
-
 def dynamic(s: Setting) -> Report:
     """Time frames of the moving scene with every motion model.
 
@@ -315,7 +288,7 @@ def dynamic_row(motion: str, s: Setting) -> Report:
     camera, repeats, numbers = scene_camera(scene, size), 5 * s.repeats, itertools.count()
     row: Report = {"name": "frame", "motion": motion, "threads": environment.thread_count()}
     row.update(time_of(lambda: scene.render(camera, (0.37 * next(numbers)) % 1.0), s.device, repeats))
-    row["motion_ms"] = motion_ms(scene, s)
+    row["motion_ms"] = motion_ms(scene, s.device, s.repeats)
     row["step_by_step"] = time_of(lambda: stepwise(scene, camera, 0.3), s.device, s.repeats)
     best = row["ms_in_a_row"]
     if scene.motion.takes_time_tensor:

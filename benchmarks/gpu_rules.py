@@ -1,4 +1,4 @@
-"""Timing in ``gpu_check``, and the rules by which two results agree."""
+"""Timings in ``gpu_check``, and the rules by which two results agree."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from scgs_warp.runtime.cuda_graph import CudaGraph
+from scgs_warp.scene.frame_graph import FrameGraph
+from scgs_warp.scene.scene import Scene
+from scgs_warp.types import Camera
 
 PIXEL_TOLERANCE = 1e-4
 LARGEST_DIFFERENCE = 8e-3
@@ -57,3 +62,28 @@ def compare_gradients(ours: Tensor, theirs: Tensor) -> dict[str, Any]:
     error = (a - b).norm(dim=1) / torch.maximum(b.norm(dim=1), 1e-6 * b.norm())
     p99 = float(error.kthvalue(max(1, int(0.99 * len(error)))).values)
     return {"median": float(error.median()), "p99": p99, "passed": p99 <= GRADIENT_TOLERANCE}
+
+
+def motion_ms(scene: Scene, device: str, repeats: int) -> float:
+    """Return the milliseconds for posing all Gaussians, from a recorded graph if possible."""
+    at = torch.full((1,), 0.4, device=scene.device)
+
+    @torch.no_grad()
+    def pose() -> Any:
+        return scene.motion.gaussians_at(scene.gaussians, at if scene.motion.takes_time_tensor else 0.4)
+
+    recorded = device == "cuda" and scene.motion.takes_time_tensor
+    call = CudaGraph(pose, scene.device).replay if recorded else pose
+    return time_of(call, device, repeats)["ms_in_a_row"]
+
+
+def two_under_way(graph: FrameGraph, scene: Scene, camera: Camera, repeats: int) -> float:
+    """Return milliseconds per frame if each frame is submitted before the previous one is finished."""
+    view, color = scene.normalisation.apply_camera(camera), torch.tensor(scene.background_color)
+    start, last = time.perf_counter(), graph.submit(view, 0.1, color)
+    for index in range(repeats):
+        following = graph.submit(view, (0.37 * index) % 1.0, color)
+        graph.finish(last)
+        last = following
+    graph.finish(last)
+    return 1e3 * (time.perf_counter() - start) / (repeats + 1)

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from helpers.paths import ROOT
+from scgs_warp.scene.frame_graph import FrameGraph
 
 FOLDER = ROOT / "benchmarks"
 SCRIPT = FOLDER / "gpu_check.py"
@@ -92,6 +93,6 @@ def test_what_breaks_leaves_its_trace(script: ModuleType):
 def test_a_frame_that_lacks_splats_is_noticed(script: ModuleType, monkeypatch: pytest.MonkeyPatch):
     setting = script.setting("cpu", True)
     assert script.frames_of("static", setting)["passed"]
-    monkeypatch.setattr(script.FrameGraph, "finish", lambda self, pending: pending.image)
+    monkeypatch.setattr(FrameGraph, "finish", lambda self, pending: pending.image)
     report = script.frames_of("static", setting)
     assert not report["passed"] and not report["checks"]["frame 4"] and not report["checks"]["room grew"]
