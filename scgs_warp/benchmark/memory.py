@@ -52,8 +52,8 @@ def reset_peak(device: str) -> None:
 
 
 def peak_mib(device: str) -> float | None:
-    """Return the peak since :func:`reset_peak` (CUDA: allocated by torch; Linux: resident) or since the process began
-    (elsewhere: resident); None if the system does not say."""
+    """Return the peak of memory. CUDA: allocated by torch since :func:`reset_peak`; CPU on Linux: resident since then;
+    other systems: resident since the process began. None if the system does not say."""
     if device == "cuda":
         return torch.cuda.max_memory_allocated() / MIB
     peak = _status("VmHWM")

@@ -20,8 +20,8 @@ BULK = 0.95
 FEWEST_POINTS = 10
 """Smallest number of initial points from which the scene is located; with fewer points the cameras are used."""
 PARALLEL = 1e-4
-"""Smallest eigenvalue of the mean of I - d d^T, over optical axes with directions d, at which the axes define a nearest
-point. It corresponds to angles of about 1 degree between them."""
+"""Threshold for the smallest eigenvalue of the mean of I - d d^T over the directions d of the optical axes. The axes
+define a nearest point if the eigenvalue exceeds it. It corresponds to angles of about 1 degree between them."""
 
 
 @dataclass(frozen=True)

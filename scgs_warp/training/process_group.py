@@ -201,8 +201,8 @@ def _or_lost(call: Callable[[], Any]) -> None:
 
 
 def pieces(vectors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
-    """Distribute the contiguous ``vectors``, of any shape, as flat views over lists of ``PIECE`` elements in total; the
-    last list may have fewer."""
+    """Cut the contiguous ``vectors``, of any shape, into flat views, and yield lists of these. The views of each list
+    have ``PIECE`` elements together; the last list may have fewer."""
     piece: list[Tensor] = []
     room = PIECE
     for vector in vectors:
