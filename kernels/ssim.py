@@ -1,4 +1,4 @@
-"""Photometric loss: L1 and SSIM of two planar images, forward and adjoint.
+"""Photometric loss: L1, squared error and SSIM of two planar images, forward and adjoint.
 
 SSIM is that of Wang et al. 2004 (equation 13), with an 11 x 11 Gaussian of sigma 1.5 and zero padding. The statistics
 of a window follow from four blurred maps, ``x``, ``y``, ``x^2 + y^2`` and ``x y``, because the two variances occur only
@@ -8,7 +8,7 @@ as their sum. The forward pass stores the three partial derivatives of each SSIM
     d/dx = G * d_mean + 2 x (G * d_squares) + y (G * d_product)
 
 This form computes one pixel or one row per grid index and runs on any device; ``cpu/ssim.py`` is the SIMD form. Where
-``mask`` is false, the image counts as equal to the truth, and the pixel's own L1 and SSIM are left out.
+``mask`` is false, the image counts as equal to the truth, and the pixel's own terms are left out.
 """
 
 from __future__ import annotations
@@ -77,10 +77,10 @@ def photometric(
     masked_in: int,  # 1: mask_in is there
     blurred_in: wp.array4d[float],  # [4, C, H, W] of blur_rows
     # Out:
-    values_out: wp.array4d[float],  # [2, C, H, W] |x - y| and SSIM, 0 where masked
+    values_out: wp.array4d[float],  # [3, C, H, W] |x - y|, SSIM and (x - y)^2, 0 where masked
     partials_out: wp.array4d[float],  # [3, C, H, W] of SSIM to blurred x, x^2 + y^2, x y
 ):
-    """Compute a pixel's L1, its SSIM and the partial derivatives of its SSIM. Grid: C x H x W."""
+    """Compute a pixel's L1, squared error, SSIM and the partial derivatives of its SSIM. Grid: C x H x W."""
     i = first + wp.tid()
     height = image_in.shape[1]
     width = image_in.shape[2]
@@ -91,6 +91,7 @@ def photometric(
     if masked_in == 1:
         valid = mask_in[row, column]
     l1 = float(0.0)
+    square = float(0.0)
     ssim = float(0.0)
     partials = wp.vec3(0.0, 0.0, 0.0)
     if valid:
@@ -116,8 +117,10 @@ def photometric(
         )
         difference = image_in[channel, row, column] - truth_in[channel, row, column]
         l1 = wp.where(difference < 0.0, -difference, difference)
+        square = difference * difference
     values_out[0, channel, row, column] = l1
     values_out[1, channel, row, column] = ssim
+    values_out[2, channel, row, column] = square
     for j in range(3):
         partials_out[j, channel, row, column] = partials[j]
 
@@ -173,7 +176,7 @@ def photometric_adjoint(
     mask_in: wp.array2d[bool],  # [H, W], or null
     masked_in: int,  # 1: mask_in is there
     blurred_in: wp.array4d[float],  # [3, C, H, W] of blur_rows_adjoint
-    v_sums_in: wp.array[float],  # [2] of the loss to the sums of L1 and of SSIM
+    v_sums_in: wp.array[float],  # [3] of the loss to the sums of L1, of SSIM and of squared errors
     # Out:
     v_image_out: wp.array3d[float],  # [C, H, W]
 ):
@@ -200,4 +203,5 @@ def photometric_adjoint(
         y = truth_in[channel, row, column]
         slope = wp.where(x > y, 1.0, wp.where(x < y, -1.0, 0.0))
         gradient = v_sums_in[0] * slope + v_sums_in[1] * (total[0] + 2.0 * x * total[1] + y * total[2])
+        gradient += 2.0 * v_sums_in[2] * (x - y)
     v_image_out[channel, row, column] = gradient

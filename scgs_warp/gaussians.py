@@ -6,6 +6,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
+from .ops.correctives import COLUMNS as CORRECTIVE_COLUMNS
 from .ops.shading import COLUMNS as SHADING_COLUMNS
 from .runtime.environment import one_piece
 from .types import Gaussians
@@ -24,10 +25,11 @@ class GaussianParameters(nn.Module):
     """Raw parameters of N Gaussians in the normalised scene; :meth:`activate` makes renderable ones.
 
     Attributes: ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``log_scales`` [N, 3], ``opacity_logits`` [N],
-    ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0), ``shading`` [N, 10] or [N, 0].
+    ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0), ``shading`` [N, 10] or [N, 0],
+    ``correctives`` [N, 27] or [N, 0].
     """
 
-    NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper", "shading")
+    NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper", "shading", "correctives")
 
     def __init__(
         self,
@@ -39,6 +41,7 @@ class GaussianParameters(nn.Module):
         sh_degree: int = 3,
         hyper_dim: int = 0,
         shaded: bool = False,
+        corrected: bool = False,
     ) -> None:
         super().__init__()
         count, device = means.shape[0], means.device
@@ -53,14 +56,17 @@ class GaussianParameters(nn.Module):
         # As in the official code, this differs from the control points' +1e-2, so that the distance has a gradient.
         self.hyper = nn.Parameter(torch.full((count, hyper_dim), -1e-2, device=device))
         self.shading = nn.Parameter(torch.zeros(count, SHADING_COLUMNS if shaded else 0, device=device))
+        self.correctives = nn.Parameter(torch.zeros(count, CORRECTIVE_COLUMNS if corrected else 0, device=device))
 
     @staticmethod
     def empty(
-        count: int, sh_count: int, hyper_dim: int, shaded: bool, device: torch.device | str
+        count: int, sh_count: int, hyper_dim: int, shaded: bool, corrected: bool, device: torch.device | str
     ) -> GaussianParameters:
         """Allocate ``count`` Gaussians to be filled from a checkpoint."""
         zeros = torch.zeros(count, 3, device=device)
-        made = GaussianParameters(zeros, zeros, zeros, sh_degree=0, hyper_dim=hyper_dim, shaded=shaded)
+        made = GaussianParameters(
+            zeros, zeros, zeros, sh_degree=0, hyper_dim=hyper_dim, shaded=shaded, corrected=corrected
+        )
         made.sh_rest = nn.Parameter(torch.zeros(count, sh_count, 3, device=device))
         return made
 
@@ -109,6 +115,7 @@ def gaussians_from_points(
     hyper_dim: int,
     scale: float = 1.0,
     shaded: bool = False,
+    corrected: bool = False,
 ) -> GaussianParameters:
     """Make isotropic Gaussians at points.
 
@@ -117,8 +124,10 @@ def gaussians_from_points(
         colors: [N, 3] in [0, 1]. None: grey.
         scale: standard deviation in units of the distance to the neighbours (:func:`neighbor_distance`).
         shaded: whether the Gaussians have shading parameters.
+        corrected: whether the Gaussians have correctives.
     """
     with one_piece():
         log_scales = (neighbor_distance(points) * scale).log()[:, None].repeat(1, 3)
     sh_dc = torch.zeros_like(points) if colors is None else (colors - 0.5) / SH_C0
-    return GaussianParameters(points, log_scales, sh_dc, sh_degree=sh_degree, hyper_dim=hyper_dim, shaded=shaded)
+    options = {"sh_degree": sh_degree, "hyper_dim": hyper_dim, "shaded": shaded, "corrected": corrected}
+    return GaussianParameters(points, log_scales, sh_dc, **options)

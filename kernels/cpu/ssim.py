@@ -38,7 +38,7 @@ def photometric(
     truth_in: wp.array3d[float],  # [C, H, W]
     mask_in: wp.array2d[bool],  # [H, W], or null: every pixel is valid
     # Out:
-    sums_out: wp.array3d[float],  # [2, C, H] of |x - y| and of SSIM along rows
+    sums_out: wp.array3d[float],  # [3, C, H] of |x - y|, of SSIM and of (x - y)^2 along rows
     partials_out: wp.array4d[float],  # [3, C, H, W] of SSIM to blurred x, x^2 + y^2, x y; or null
 ):
     """Compute row sums and partial derivatives of a band. Grid: C x ceil(H / SSIM_BAND)."""
@@ -53,7 +53,7 @@ def photometric_adjoint(
     truth_in: wp.array3d[float],  # [C, H, W]
     mask_in: wp.array2d[bool],  # [H, W], or null: every pixel is valid
     partials_in: wp.array4d[float],  # [3, C, H, W]
-    v_sums_in: wp.array[float],  # [2] of the loss to the sums of L1 and of SSIM
+    v_sums_in: wp.array[float],  # [3] of the loss to the sums of L1, of SSIM and of squared errors
     # Out:
     v_image_out: wp.array3d[float],  # [C, H, W]
 ):

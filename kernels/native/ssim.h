@@ -155,7 +155,7 @@ static inline void photometric_band(
     };
     auto finish = [&](int row, int left, int vectors, auto blur) __attribute__((always_inline)) {
         const vf ZERO = {};
-        vf l1_sum = {}, ssim_sum = {};
+        vf l1_sum = {}, ssim_sum = {}, square_sum = {};
         for (int v = 0; v < vectors; ++v) {
             vf blurred[4];
             blur(v, blurred);
@@ -174,6 +174,7 @@ static inline void photometric_band(
             const vf difference = p.x - p.y;
             l1_sum += p.valid ? (difference < ZERO ? -difference : difference) : ZERO;
             ssim_sum += p.valid ? ssim : ZERO;
+            square_sum += p.valid ? difference * difference : ZERO;
             if (partials.data) {
                 vf partial[3] = {
                     2.0f * inverse * (blurred[1] * (a2 - a1) + blurred[0] * ssim * (b1 - b2)),
@@ -190,14 +191,13 @@ static inline void photometric_band(
             }
         }
         float* l1_to = sums.data + band.channel * (long long)band.height + row;
-        float* ssim_to = l1_to + (long long)band.channels * band.height;
-        float l1_total = left == 0 ? 0.0f : *l1_to, ssim_total = left == 0 ? 0.0f : *ssim_to;
-        for (int k = 0; k < 16; ++k) {
-            l1_total += l1_sum[k];
-            ssim_total += ssim_sum[k];
+        const vf row_sums[3] = {l1_sum, ssim_sum, square_sum};
+        for (int j = 0; j < 3; ++j) {
+            float* to = l1_to + j * (long long)band.channels * band.height;
+            float total = left == 0 ? 0.0f : *to;
+            for (int k = 0; k < 16; ++k) total += row_sums[j][k];
+            *to = total;
         }
-        *l1_to = l1_total;
-        *ssim_to = ssim_total;
     };
     band_walk()(Maps(), band, read, finish);
 }
@@ -235,6 +235,7 @@ static inline void photometric_band_adjoint(
             const vf slope = p.x > p.y ? ONE : (p.x < p.y ? -ONE : ZERO);
             vf gradient =
                 v_sums.data[0] * slope + v_sums.data[1] * (blurred[0] + 2.0f * p.x * blurred[1] + p.y * blurred[2]);
+            gradient += 2.0f * v_sums.data[2] * (p.x - p.y);
             gradient = p.valid ? gradient : ZERO;
             store(v_image.data + band.channel * band.plane + at, gradient, count);
         }

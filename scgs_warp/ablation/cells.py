@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..config.presets import FREE_TO_CHANGE, TrainConfig, from_dict, read_config, to_dict, with_field
+from ..config.recorded import with_newer_fields
 from ..config.validation import check
 from ..errors import UserError, printable
 from ..storage.checkpoint import FILE as CHECKPOINT
@@ -151,7 +152,7 @@ def recorded_settings(folder: Path) -> dict[str, Any] | None:
     data = values.get("data")
     data_folder = data.pop("folder", None) if isinstance(data, dict) else None
     settings = to_dict(from_dict(values, str(path)))
-    recorded = dict(flatten(values))
+    recorded = dict(flatten(with_newer_fields(values)))
     for name, _ in flatten(settings):
         if name not in recorded and name not in FREE_TO_CHANGE:
             raise UserError(

@@ -30,6 +30,11 @@ def chosen(default: int, least: int, most: int) -> Any:
     return field(default=default, metadata={"choices": (least, most)})
 
 
+def newer(default: Any, before: Any, **bounds: Any) -> Any:
+    """Declare a field that older versions did not have; ``before`` is the value that does what they did."""
+    return bounded(default, before=before, **bounds)
+
+
 def milestone(steps: int, least: int | None = None) -> Any:
     """Declare a step count that scales with the length of the run."""
     return bounded(steps, least, milestone=True)
@@ -82,6 +87,9 @@ class MotionConfig:
     shading: bool = True
     """Let a Gaussian's brightness follow the rotation of its surface (not in the paper): the first-order effect of the
     angle between light and normal."""
+    correctives: bool = newer(False, before=False)
+    """Let a Gaussian's position follow the rotation of its surface (not in the paper): what pose blend shapes are to a
+    body model."""
     mask: bool = False
     """Learn a share of the motion per Gaussian (an option of the official code); hyper-coordinates work better."""
     time_noise: float = bounded(0.0, 0, 1e6)
@@ -96,6 +104,11 @@ class MotionConfig:
     def has_shading(self) -> bool:
         """True if shading is on and the model is control-points: the rival models have no shading."""
         return self.shading and self.model == "control-points"
+
+    @property
+    def has_correctives(self) -> bool:
+        """True if correctives are on and the model is control-points."""
+        return self.correctives and self.model == "control-points"
 
 
 @dataclass(frozen=True)
@@ -146,6 +159,7 @@ class OptimConfig:
     quats: float = 1e-3
     hyper: float = 2.5e-3
     shading: float = bounded(2.5e-3, 0)
+    correctives: float = newer(2.5e-3, before=2.5e-3, least=0)
     network: float = 8e-4
     network_end: float = 1.6e-6
     network_until: int = milestone(66_000, 1)
@@ -214,6 +228,11 @@ class LossConfig:
     """Settings of the losses: L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10)."""
 
     ssim: float = bounded(0.2, 0)
+    log_error: float = newer(0.0, before=0.0, least=0)
+    """Weight of the logarithm of each view's mean squared error (not in the paper), which weighs views by their
+    relative error, as PSNR does."""
+    log_error_from: float = newer(0.5, before=0.5, least=0, most=1)
+    """Share of the main stage after which ``log_error`` applies."""
     arap: float = bounded(1e-2, 0)
     arap_end: float = bounded(1e-2, 0)
     arap_until: int = milestone(80_000)

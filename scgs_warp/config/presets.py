@@ -25,8 +25,10 @@ from .fields import (
     PretrainConfig,
     TrainConfig,
 )
+from .recorded import FREE_TO_CHANGE, with_newer_fields
 
 __all__ = [
+    "FREE_TO_CHANGE",
     "DataConfig",
     "DensifyConfig",
     "LossConfig",
@@ -112,11 +114,6 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds", "data.cache_mib")
-"""Settings that do not affect the result (it stays bit-identical): left out of checkpoints, and free to change when a
-run is resumed."""
-
-
 def lasting(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Drop the settings in ``FREE_TO_CHANGE`` from the result of :func:`to_dict`."""
     return {
@@ -127,7 +124,8 @@ def lasting(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def from_dict(values: dict[str, Any], source: str = "config", base: Any = None, prefix: str = "") -> TrainConfig:
-    """Read a (possibly partial) configuration over ``base`` (default: the preset it names, else ``paper``).
+    """Read a (possibly partial) configuration over ``base`` (default: the preset it names, else ``paper``). A field
+    that is newer than a recorded configuration takes the value that stands for its absence.
 
     Raises:
         UserError: a field is unknown or a value has the wrong type; names the file and the field.
@@ -137,6 +135,7 @@ def from_dict(values: dict[str, Any], source: str = "config", base: Any = None, 
         if name not in PRESETS:
             raise UserError(f"{source}: preset is {name!r}; choose one of {', '.join(PRESETS)}")
         base = preset(name)
+        values = with_newer_fields(values)
     hints = typing.get_type_hints(type(base))
     known = {item.name for item in dataclasses.fields(base)}
     changes: dict[str, Any] = {}

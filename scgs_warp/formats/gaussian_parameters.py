@@ -31,7 +31,7 @@ def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParamete
             good &= (np.abs(value.reshape(total, -1)) <= MAX_VALUES.get(name, 1e6)).all(axis=1)  # False for NaN
     if not good.any():
         raise UserError(f"{path}: none of its {total} Gaussians is finite; export it again")
-    made = GaussianParameters.empty(int(good.sum()), rest, 0, False, "cpu")
+    made = GaussianParameters.empty(int(good.sum()), rest, 0, False, False, "cpu")
     with torch.no_grad():
         for name, value in values.items():
             rows = value if good.all() else value[good]  # Avoid copying large files needlessly.

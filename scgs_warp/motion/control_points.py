@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from ..config.presets import LossConfig, MotionConfig, TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
+from ..ops.correctives import correct
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.shading import shade
 from ..ops.skinning import skin, skin_rbf
@@ -51,10 +52,22 @@ def unit_rotations(raw: Tensor) -> Tensor:
     return F.normalize(raw + torch.eye(1, 4, device=raw.device, dtype=raw.dtype), dim=-1)
 
 
-def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | None], masked: bool) -> Gaussians:
-    """Activate the moved Gaussians. ``masked``: the last hyper-coordinate is the logit of the share of the motion that
-    a Gaussian takes."""
+def _posed(
+    gaussians: GaussianParameters,
+    moved: tuple[Tensor, Tensor, Tensor | None],
+    masked: bool,
+    own: Tensor | None = None,
+) -> Gaussians:
+    """Activate the moved Gaussians.
+
+    Args:
+        masked: the last hyper-coordinate is the logit of the share of the motion that a Gaussian takes.
+        own: [N, 4] rotations that shading and correctives follow in place of the moved ones: those of the trained
+            motion, under an edit.
+    """
     means, quats, log_scales = moved
+    if gaussians.correctives.shape[1]:
+        means = correct(means, gaussians.correctives, gaussians.quats, quats, own)
     if masked:
         with one_piece():
             share = gaussians.hyper[:, -1:].sigmoid()
@@ -62,11 +75,13 @@ def _posed(gaussians: GaussianParameters, moved: tuple[Tensor, Tensor, Tensor | 
         rest = torch.where((rest * quats).sum(1, keepdim=True) < 0, -rest, rest)
         means = gaussians.means + share * (means - gaussians.means)
         quats = rest + share * (quats - rest)
+        if own is not None:
+            own = rest + share * (torch.where((rest * own).sum(1, keepdim=True) < 0, -own, own) - rest)
         log_scales = None if log_scales is None else share * log_scales
     scales = gaussians.scales() if log_scales is None else fixed_exp(gaussians.log_scales + log_scales)
     sh_dc = gaussians.sh_dc
     if gaussians.shading.shape[1]:
-        sh_dc = shade(sh_dc, gaussians.shading, gaussians.quats, quats)
+        sh_dc = shade(sh_dc, gaussians.shading, gaussians.quats, quats if own is None else own)
     return Gaussians(means, quats, scales, gaussians.opacities(), sh_dc, gaussians.sh_rest)
 
 
@@ -134,10 +149,18 @@ class ControlPoints(Motion):
         strengths = self.strength_logits.sigmoid() if self.config.node_weight else None
         return indices, rbf_weights(points, nodes, self.log_radii.exp(), indices, strengths)
 
-    def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
-        """Move all Gaussians by linear blend skinning (Eq. 6-7). Editing replaces only ``pose``."""
+    def apply_pose(
+        self,
+        gaussians: GaussianParameters,
+        pose: Pose,
+        binding: tuple[Tensor, Tensor],
+        own: Pose | None = None,
+    ) -> Gaussians:
+        """Move all Gaussians by linear blend skinning (Eq. 6-7). Editing replaces only ``pose``; shading and
+        correctives follow the rotations of ``own`` if given, those of the trained motion."""
         moved = skin(gaussians.means, gaussians.quats, self.positions, pose, *binding)
-        return _posed(gaussians, moved, self.config.mask)
+        rotations = None if own is None else skin(gaussians.means, gaussians.quats, self.positions, own, *binding)[1]
+        return _posed(gaussians, moved, self.config.mask, rotations)
 
     def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
         """Bind and pose all Gaussians in one pass; ``frozen`` control points receive no gradient."""

@@ -87,9 +87,15 @@ class StaticNodes(Motion):
         return indices, rbf_weights(gaussians.means.detach(), self.positions, self.radii, indices)
 
     @torch.no_grad()
-    def apply_pose(self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor]) -> Gaussians:
+    def apply_pose(
+        self,
+        gaussians: GaussianParameters,
+        pose: Pose,
+        binding: tuple[Tensor, Tensor],
+        own: Pose | None = None,
+    ) -> Gaussians:
         """Move all Gaussians by linear blend skinning (SC-GS, Eq. 6-7). Gaussians whose control points have not moved
-        stay bit-identical."""
+        stay bit-identical. ``own`` has no effect: nothing follows the rotations of a scene that does not move."""
         means, quats, _ = skin(gaussians.means.detach(), gaussians.quats.detach(), self.positions, pose, *binding)
         rest = gaussians.activate()
         moved = pose.translations.any(dim=1) | pose.rotations[:, 1:].any(dim=1)

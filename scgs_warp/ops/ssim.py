@@ -1,4 +1,5 @@
-"""Photometric loss as one autograd op: L1 and SSIM share their passes over the images, and one adjoint."""
+"""Photometric loss as one autograd op: L1, SSIM and squared error share their passes over the images, and one
+adjoint."""
 
 from __future__ import annotations
 
@@ -14,6 +15,8 @@ from ..kernels.types import SSIM_BAND
 from ..runtime import launch
 
 Form = Literal["auto", "pixel", "cpu"]
+LEAST_ERROR = 1e-7
+"""Mean squared error below which its logarithm is constant: 70 dB."""
 
 
 def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form = "auto") -> Tensor:
@@ -36,14 +39,27 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form
 
 
 def photometric_loss(
-    image: Tensor, truth: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.2, *, form: Form = "auto"
+    image: Tensor,
+    truth: Tensor,
+    mask: Tensor | None = None,
+    ssim_weight: float = 0.2,
+    log_weight: float = 0.0,
+    *,
+    form: Form = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, equation 7); arguments as in ``ssim``.
+    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, equation 7), plus ``v log(MSE)`` where asked.
+
+    The logarithm weighs every view by its relative error, as PSNR does: a view that is nearly right still counts.
+
+    Args:
+        image, truth, mask, form: as in ``ssim``.
+        ssim_weight: w.
+        log_weight: v, weight of the logarithm of the mean squared error, which is constant below ``LEAST_ERROR``.
 
     Returns:
         loss, l1 and ssim, scalars, each differentiable in ``image``. L1 is the mean absolute difference over valid
-        pixels and channels. If no pixel is valid they are 0, 0 and 1, and the gradient is zero. Non-finite values
-        make the loss non-finite.
+        pixels and channels. If no pixel is valid, l1 is 0, ssim is 1 and the gradient is zero. Non-finite values make
+        the loss non-finite.
 
     Raises:
         ValueError: a shape, dtype or device is wrong; the message names the argument.
@@ -66,12 +82,13 @@ def photometric_loss(
         raise ValueError(f"form must be auto, pixel or cpu, got {form!r}")
     simd = form == "cpu" or (form == "auto" and image.device.type == "cpu")
     needs_gradient = torch.is_grad_enabled() and image.requires_grad
-    return _Photometric.apply(image, truth.detach(), mask, ssim_weight, simd, needs_gradient)
+    weights = ssim_weight, log_weight
+    return _Photometric.apply(image, truth.detach(), mask, weights, simd, needs_gradient)
 
 
 def _forward_bands(image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor | None) -> Tensor:
     channels, height, _ = image.shape
-    sums = image.new_empty(2, channels, height)
+    sums = image.new_empty(3, channels, height)
     bands = channels * -(-height // SSIM_BAND)
     launch.launch(cpu_kernels.photometric, bands, image, truth, mask, sums, partials, grain=1)
     return sums
@@ -80,14 +97,14 @@ def _forward_bands(image: Tensor, truth: Tensor, mask: Tensor | None, partials: 
 def _forward_pixels(image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor | None) -> Tensor:
     channels, height, width = image.shape
     blurred = image.new_empty(4, *image.shape)
-    values = image.new_empty(2, *image.shape)
+    values = image.new_empty(3, *image.shape)
     partials = image.new_empty(3, *image.shape) if partials is None else partials
-    sums = image.new_empty(2, channels, height)
+    sums = image.new_empty(3, channels, height)
     count, masked = image.numel(), int(mask is not None)
     launch.launch(kernels.blur_rows, count, image, truth, mask, masked, blurred)
     launch.launch(kernels.photometric, count, image, truth, mask, masked, blurred, values, partials)
     launch.launch(
-        kernels.sum_rows, 2 * channels * height, values.view(2 * channels * height, width), sums.view(-1), grain=16
+        kernels.sum_rows, 3 * channels * height, values.view(3 * channels * height, width), sums.view(-1), grain=16
     )
     return sums
 
@@ -108,7 +125,7 @@ class _Photometric(torch.autograd.Function):
         image: Tensor,
         truth: Tensor,
         mask: Tensor | None,
-        weight: float,
+        weights: tuple[float, float],
         simd: bool,
         needs_gradient: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -116,7 +133,7 @@ class _Photometric(torch.autograd.Function):
         mask = None if mask is None else mask.contiguous()
         partials = image.new_empty(3, *image.shape) if needs_gradient else None
         if image.numel() == 0:
-            sums = image.new_zeros(2, 1, 1)
+            sums = image.new_zeros(3, 1, 1)
         else:
             sums = (_forward_bands if simd else _forward_pixels)(image, truth, mask, partials)
         totals = sums.flatten(1).double().sum(1)  # a few thousand values: one thread, one order
@@ -124,23 +141,27 @@ class _Photometric(torch.autograd.Function):
         count: float | Tensor = float(max(image.numel(), 1))
         if mask is not None:
             count = mask.sum().double() * image.shape[0]
-            totals = torch.stack([totals[0], torch.where(count > 0, totals[1], 1.0)])
+            totals = torch.stack([totals[0], torch.where(count > 0, totals[1], 1.0), totals[2]])
             count = count.clamp(min=1.0)
         elif image.numel() == 0:
             totals[1] = 1.0
-        l1, similarity = totals / count
-        loss = (1.0 - weight) * l1 + weight * (1.0 - similarity)
-        ctx.save_for_backward(image, truth, mask, partials)
-        ctx.weight, ctx.simd, ctx.count = weight, simd, count
+        l1, similarity, error = totals / count
+        loss = (1.0 - weights[0]) * l1 + weights[0] * (1.0 - similarity)
+        if weights[1]:
+            loss = loss + weights[1] * error.clamp(min=LEAST_ERROR).log()
+        ctx.save_for_backward(image, truth, mask, partials, error)
+        ctx.weights, ctx.simd, ctx.count = weights, simd, count
         return loss.float(), l1.float(), similarity.float()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_loss: Tensor, v_l1: Tensor, v_ssim: Tensor) -> tuple[Tensor | None, ...]:
-        image, truth, mask, partials = ctx.saved_tensors
+        image, truth, mask, partials, error = ctx.saved_tensors
+        ssim_weight, log_weight = ctx.weights
         v_image = torch.empty_like(image)
         if image.numel():
-            v_means = torch.stack([v_l1 + (1.0 - ctx.weight) * v_loss, v_ssim - ctx.weight * v_loss])
+            v_error = torch.where(error > LEAST_ERROR, log_weight / error, 0.0) * v_loss
+            v_means = torch.stack([v_l1 + (1.0 - ssim_weight) * v_loss, v_ssim - ssim_weight * v_loss, v_error])
             v_sums = (v_means / ctx.count).float()
             if ctx.simd:
                 bands = image.shape[0] * -(-image.shape[1] // SSIM_BAND)

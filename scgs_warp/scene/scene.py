@@ -227,10 +227,12 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
         config = from_dict(metadata["config"], source)
         check_sizes(config, f"{source}: ")
         rows = checkpoint.strip(tensors, "gaussians.")
-        rows.setdefault("shading", torch.zeros(len(rows["means"]), 0))  # Absent from checkpoints of older versions.
-        shaded = rows["shading"].shape[1] > 0
+        count = len(rows["means"])
+        for name in ("shading", "correctives"):  # Absent from checkpoints of older versions.
+            rows.setdefault(name, torch.zeros(count, 0))
+        shaded, corrected = (rows[name].shape[1] > 0 for name in ("shading", "correctives"))
         gaussians = GaussianParameters.empty(
-            len(rows["means"]), rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, "cpu"
+            count, rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, corrected, "cpu"
         )
         gaussians.load_state_dict(rows)
         state = checkpoint.strip(tensors, "motion.")

@@ -51,8 +51,9 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
         raise _unusable(source, f"gaussians.means is {list(means)}, not [N, 3]")
     if len(rest) != 3 or rest[1] not in SH_COUNTS or rest[2] != 3:
         raise _unusable(source, f"gaussians.sh_rest is {list(rest)}, not [N, 0 or 3 or 8 or 15, 3]")
-    if len(hyper) != 2 or len(rows.get("gaussians.shading", (0, 0))) != 2:
-        raise _unusable(source, "gaussians.hyper or gaussians.shading is not [N, ...]")
+    optional = (rows.get(f"gaussians.{name}", (0, 0)) for name in ("shading", "correctives"))
+    if len(hyper) != 2 or any(len(shape) != 2 for shape in optional):
+        raise _unusable(source, "gaussians.hyper, gaussians.shading or gaussians.correctives is not [N, ...]")
     for name, shape in rows.items():
         if not shape or shape[0] != means[0]:
             raise _unusable(source, f"{name} is {list(shape)}, but there are {means[0]} Gaussians")

@@ -152,6 +152,7 @@ def initial_gaussians(
         "sh_degree": config.sh_degree,
         "hyper_dim": config.motion.hyper_dim + config.motion.mask,
         "shaded": config.motion.has_shading,
+        "corrected": config.motion.has_correctives,
     }
     count = min(config.init_points, config.densify.max_gaussians)
     if spheres is None or config.init_from == "points":

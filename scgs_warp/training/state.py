@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..config.presets import FREE_TO_CHANGE, TrainConfig, to_dict
+from ..config.recorded import with_newer_fields
 from ..data.dataset import Dataset
 from ..errors import UserError
 from ..gaussians import GaussianParameters
@@ -158,6 +159,7 @@ class TrainState:
             "sh_rest": rates.sh_rest,
             "hyper": rates.hyper,
             "shading": rates.shading,
+            "correctives": rates.correctives,
         }
 
     def scene(self) -> Scene:
@@ -200,7 +202,7 @@ class TrainState:
         tensors, metadata = checkpoint.read(folder)
         source = str(folder / checkpoint.FILE)
         check_metadata(metadata, source)
-        _check_same_configuration(metadata["config"], to_dict(config), source)
+        _check_same_configuration(with_newer_fields(metadata["config"]), to_dict(config), source)
         if metadata.get("frames") != data.fingerprint:
             raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
         check_tensors(tensors, source)

@@ -86,7 +86,7 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     )
 
     # 4. Compare.
-    loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim)
+    loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim, log_weight(state))
     total = loss if regulariser is None else loss + regulariser
 
     # 5. Backpropagate, unless the loss is non-finite.
@@ -122,6 +122,13 @@ def set_rates(state: TrainState) -> None:
         for name, group in state.motion_optimizer.groups.items():
             group.rate = rates[name]
     state.camera_optimizer.groups["twists"].rate = camera_rate(step, config.optim, config.rest_steps)
+
+
+def log_weight(state: TrainState) -> float:
+    """Return the weight of the logarithm of the squared error: 0 until ``loss.log_error_from`` of the main stage."""
+    config = state.config
+    begins = round(config.loss.log_error_from * config.main_steps)
+    return config.loss.log_error if state.stage == "main" and state.stage_step >= begins else 0.0
 
 
 def settling(step: int, config: TrainConfig) -> float:

@@ -70,3 +70,38 @@ def test_with_a_mask_holds_keep_the_pose_of_their_time():
     before, after = scene.gaussians_at(0.2), session.gaussians_at(0.9)
     torch.testing.assert_close(after.means, before.means, rtol=0, atol=1e-5)
     torch.testing.assert_close(after.quats.abs(), before.quats.abs(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [45, 90, 170])
+def test_correctives_are_carried_along_by_an_edit(degrees):
+    """An edit that turns everything turns the displacements of the motion with it, however far it turns."""
+    scene = bar_scene(shaded=True, corrected=True)
+    plain = bar_scene(shaded=True)
+    turn = from_axis([0, 1, 0], degrees)
+    shifts = []
+    for each in (scene, plain):
+        session = EditSession(each)
+        session.add_handle(range(len(session)), 0.8, "all")
+        session.move("all", [0.3, -0.2, 0.1], turn.tolist())
+        shifts.append((each.gaussians_at(0.8).means.detach().double(), session.gaussians_at(0.8).means.double()))
+    (still, edited), (plain_still, plain_edited) = shifts
+    R = torch.from_numpy(to_matrix(turn))
+    assert float((still - plain_still).norm(dim=1).max()) > 5e-3
+    torch.testing.assert_close(edited - plain_edited, (still - plain_still) @ R.T, rtol=0, atol=2e-5)
+
+
+def test_a_bend_beyond_the_motion_moves_no_corrective_further():
+    scene, plain = bar_scene(corrected=True), bar_scene()
+    lengths = []
+    for time in (0.3, 0.8):
+        own = (scene.gaussians_at(time).means - plain.gaussians_at(time).means).norm(dim=1)
+        bent = []
+        for each in (scene, plain):
+            session = EditSession(each)
+            session.add_handle(part(session, 0.8, 1.0), time, "right")
+            session.pin(part(session, 0.0, 0.5))
+            session.move("right", [0.0, 0.0, 0.0], from_axis([0, 1, 0], 90).tolist())
+            bent.append(session.gaussians_at(time).means)
+        lengths.append((own, (bent[0] - bent[1]).norm(dim=1)))
+    for own, under_edit in lengths:
+        torch.testing.assert_close(under_edit, own, rtol=0, atol=2e-5)

@@ -67,18 +67,24 @@ def bar_points(count: int, seed: int) -> torch.Tensor:
 
 
 def dress(
-    points: torch.Tensor, seed: int = 3, degree: int = 3, shaded: bool = False, hyper_dim: int = 0
+    points: torch.Tensor,
+    seed: int = 3,
+    degree: int = 3,
+    shaded: bool = False,
+    hyper_dim: int = 0,
+    corrected: bool = False,
 ) -> GaussianParameters:
     """Opaque Gaussians of random colours."""
     generator = torch.Generator().manual_seed(seed)
-    made = gaussians_from_points(
-        points, torch.rand(len(points), 3, generator=generator), sh_degree=degree, hyper_dim=hyper_dim, shaded=shaded
-    )
+    colors = torch.rand(len(points), 3, generator=generator)
+    fields = {"sh_degree": degree, "hyper_dim": hyper_dim, "shaded": shaded, "corrected": corrected}
+    made = gaussians_from_points(points, colors, **fields)
     with torch.no_grad():
         made.opacity_logits.fill_(2.0)
         made.quats.copy_(torch.randn(len(points), 4, generator=generator))
         made.sh_rest.copy_(0.2 * torch.randn(made.sh_rest.shape, generator=generator))
         made.shading.copy_(0.2 * torch.randn(made.shading.shape, generator=generator))
+        made.correctives.copy_(0.3 * torch.randn(made.correctives.shape, generator=generator))
     return made
 
 
@@ -90,6 +96,7 @@ def bar_scene(
     scale: float = 2.0,
     stray: tuple[float, float, float] | None = None,
     share: float | None = None,
+    corrected: bool = False,
 ) -> Scene:
     """A bar along x, 2.4 / ``scale`` long in world units, one half of which swings.
 
@@ -107,7 +114,8 @@ def bar_scene(
         places = torch.cat([places, torch.tensor([stray])])
     motion = Swing(places, torch.full((len(places),), 0.12), template.network, config.motion)
     unit = Normalisation(np.array([0.5, -1.0, 0.25]), scale)
-    made = dress(points, shaded=shaded, hyper_dim=config.motion.hyper_dim + (share is not None))
+    hyper_dim = config.motion.hyper_dim + (share is not None)
+    made = dress(points, shaded=shaded, hyper_dim=hyper_dim, corrected=corrected)
     if share is not None:
         with torch.no_grad():
             made.hyper[:, -1] = torch.tensor(share).logit()

@@ -42,7 +42,9 @@ def quaternions(columns: dict[str, np.ndarray]) -> torch.Tensor:
 def gaussians_of(facts: dict[str, Any], columns: dict[str, np.ndarray]) -> GaussianParameters:
     """The page's Gaussians as parameters, normalised units."""
     rest = (facts["sh_degree"] + 1) ** 2 - 1
-    made = GaussianParameters.empty(facts["gaussians"], rest, int(facts["masked"]), facts["shaded"], "cpu")
+    made = GaussianParameters.empty(
+        facts["gaussians"], rest, int(facts["masked"]), facts["shaded"], facts.get("corrected", False), "cpu"
+    )
     with torch.no_grad():
         made.means.copy_(stack(columns, "mean0", "mean1", "mean2"))
         made.quats.copy_(quaternions(columns))
@@ -53,6 +55,8 @@ def gaussians_of(facts: dict[str, Any], columns: dict[str, np.ndarray]) -> Gauss
             made.sh_rest[:, k] = stack(columns, *(f"sh{k}_{c}" for c in range(3)))
         if facts["shaded"]:
             made.shading.copy_(stack(columns, *(f"shading{k}" for k in range(10))))
+        if facts.get("corrected"):
+            made.correctives.copy_(stack(columns, *(f"corrective{k}" for k in range(27))))
         if facts["masked"]:
             made.hyper.copy_(torch.logit(stack(columns, "share"), 1e-6))
     return made

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from reference.ssim import photometric_loss as reference_loss
 from scgs_warp.kernels.types import SSIM_BAND, SSIM_BLOCK
-from scgs_warp.ops.ssim import photometric_loss, ssim
+from scgs_warp.ops.ssim import LEAST_ERROR, photometric_loss, ssim
 from scgs_warp.runtime import environment
 
 SHAPES = [
@@ -36,16 +36,18 @@ def _forms(device: str) -> list[str]:
     return ["pixel", "cpu"] if device == "cpu" else ["pixel"]
 
 
-def _compare(image, truth, mask, weight, device, form):
+def _compare(image, truth, mask, weight, device, form, log_weight=0.0):
     """Values and gradients of all three outputs together against the twin."""
     mix = torch.tensor([1.0, 0.3, -0.7])
     ours = image.to(device).requires_grad_()
     values = torch.stack(
-        photometric_loss(ours, truth.to(device), None if mask is None else mask.to(device), weight, form=form)
+        photometric_loss(
+            ours, truth.to(device), None if mask is None else mask.to(device), weight, log_weight, form=form
+        )
     )
     (gradient,) = torch.autograd.grad(values @ mix.to(device), ours)
     theirs = image.double().requires_grad_()
-    expected = torch.stack(reference_loss(theirs, truth, mask, weight))
+    expected = torch.stack(reference_loss(theirs, truth, mask, weight, log_weight))
     (expected_gradient,) = torch.autograd.grad(expected @ mix.double(), theirs)
     torch.testing.assert_close(values.cpu().double(), expected, rtol=2e-5, atol=2e-6)
     scale = expected_gradient.abs().max()
@@ -68,6 +70,30 @@ def test_value_and_gradient_with_mask(shape, seed, device):
     mask[0, 0] = True
     for form in _forms(device):
         _compare(image, truth, mask, 0.5, device, form)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_logarithm_of_the_squared_error(shape, masked, device):
+    image, truth = _pair(shape, 9)
+    mask = torch.rand(shape[1:], generator=torch.Generator().manual_seed(9)) > 0.3
+    mask[0, 0] = True
+    for form in _forms(device):
+        _compare(image, truth, mask if masked else None, 0.2, device, form, log_weight=0.3)
+
+
+def test_logarithm_is_constant_below_its_least_error(device):
+    """An image that is right has no gradient from it, and no infinite loss."""
+    _, truth = _pair((3, 20, 30), 10)
+    for form in _forms(device):
+        for image in (truth, truth + 2e-4):
+            with_log, without = (image.to(device).clone().requires_grad_() for _ in range(2))
+            loss = photometric_loss(with_log, truth.to(device), None, 0.2, 1.0, form=form)[0]
+            plain = photometric_loss(without, truth.to(device), None, 0.2, form=form)[0]
+            loss.backward()
+            plain.backward()
+            torch.testing.assert_close(loss - plain, torch.tensor(LEAST_ERROR, device=device).log())
+            assert torch.equal(with_log.grad, without.grad)
 
 
 def test_what_lies_under_the_mask_does_not_matter(device):

@@ -124,3 +124,51 @@ def test_a_scene_from_before_shading_still_opens(scene):
     opened = scene_from(tensors, metadata, str(scene.device), "old run")
     assert opened.gaussians.shading.shape == (len(scene.gaussians), 0)
     torch.testing.assert_close(opened.gaussians_at(0.3).sh_dc, scene.gaussians.sh_dc)
+
+
+@pytest.fixture
+def corrected(device):
+    """A moving scene with correctives that differ from Gaussian to Gaussian."""
+    scene = scenes.synthetic_scene("control-points", 700, 40, device)
+    generator = torch.Generator().manual_seed(1)
+    values = 0.2 * torch.randn(len(scene.gaussians), 27, generator=generator)
+    scene.gaussians.correctives = torch.nn.Parameter(values.to(device))
+    return scene
+
+
+def test_correctives_move_means_and_nothing_else(corrected):
+    gaussians = corrected.gaussians
+    moved = fresh(corrected, 0.6)
+    with torch.no_grad():
+        gaussians.correctives.zero_()
+    plain = fresh(corrected, 0.6)
+    assert float((moved.means - plain.means).norm(dim=1).max()) > 1e-3
+    for name in ("quats", "scales", "opacities", "sh_dc", "sh_rest"):
+        assert torch.equal(getattr(moved, name), getattr(plain, name)), name
+
+
+def test_correctives_learn_and_surfaces_do_not_turn_for_them(corrected):
+    gaussians, motion = corrected.gaussians, corrected.motion
+    motion.cache_binding(None)
+    weights = torch.randn(len(gaussians), 3, generator=torch.Generator().manual_seed(2)).to(gaussians.means)
+    (motion.gaussians_at(gaussians, 0.6).means * weights).sum().backward()
+    with_correctives = {name: p.grad.clone() for name, p in motion.named_parameters() if p.grad is not None}
+    assert gaussians.correctives.grad is not None and (gaussians.correctives.grad != 0).any()
+    motion.zero_grad()
+    with torch.no_grad():
+        gaussians.correctives.zero_()
+    (motion.gaussians_at(gaussians, 0.6).means * weights).sum().backward()
+    for name, parameter in motion.named_parameters():
+        if parameter.grad is not None:
+            assert torch.equal(parameter.grad, with_correctives[name]), name
+
+
+def test_a_scene_from_before_correctives_still_opens(scene):
+    names = ("gaussians.correctives",)
+    tensors = {name: value.detach().clone() for name, value in scene.tensors().items() if name not in names}
+    metadata = scene.metadata()
+    del metadata["config"]["motion"]["correctives"], metadata["config"]["optim"]["correctives"]
+    opened = scene_from(tensors, metadata, str(scene.device), "old run")
+    assert opened.gaussians.correctives.shape == (len(scene.gaussians), 0)
+    assert not opened.config.motion.correctives
+    torch.testing.assert_close(opened.gaussians_at(0.3).means, scene.gaussians_at(0.3).means, rtol=1e-5, atol=1e-6)

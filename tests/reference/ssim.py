@@ -28,7 +28,11 @@ def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def photometric_loss(
-    image: Tensor, truth: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.2
+    image: Tensor,
+    truth: Tensor,
+    mask: Tensor | None = None,
+    ssim_weight: float = 0.2,
+    log_weight: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """loss, l1, ssim in float64; invalid pixels are replaced by the truth and left out of the means."""
     image, truth = image.double(), truth.double()
@@ -38,4 +42,6 @@ def photometric_loss(
     image = torch.where(mask, image, truth)
     l1 = (image - truth).abs()[:, mask].mean()
     ssim = ssim_map(image, truth)[:, mask].mean()
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim
+    error = ((image - truth) ** 2)[:, mask].mean()
+    logarithm = log_weight * error.clamp(min=1e-7).log()
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim) + logarithm, l1, ssim

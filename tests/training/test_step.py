@@ -12,7 +12,16 @@ from scgs_warp.config import presets as C
 from scgs_warp.training.density_control import control_density
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.step import SETTLED, motion_frozen, noisy_time, set_rates, settling, sh_degree, training_step
+from scgs_warp.training.step import (
+    SETTLED,
+    log_weight,
+    motion_frozen,
+    noisy_time,
+    set_rates,
+    settling,
+    sh_degree,
+    training_step,
+)
 
 
 def test_constant_rates_settle_in_the_last_share_of_the_run():
@@ -22,6 +31,42 @@ def test_constant_rates_settle_in_the_last_share_of_the_run():
     assert factors[begin // 500] == 1.0 and factors == sorted(factors, reverse=True)
     assert factors[-1] == SETTLED < settling(begin + 100, config) < 1.0
     assert settling(config.main_steps, C.with_field(config, "optim.settle", 0.0, "test")) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("begin", "step", "weight"),
+    [
+        *((0.5, step, 0.0) for step in (0, 9, 10, 29)),
+        *((0.5, step, 2e-3) for step in (30, 49)),
+        *((0.0, 9, 0.0), (0.0, 10, 2e-3), (1.0, 49, 0.0)),
+    ],
+)
+def test_logarithm_of_the_error_begins_within_the_main_stage(begin, step, weight):
+    """Stage 1 has 10 steps, the main stage 40."""
+    schedule = {**SCHEDULE, "loss": {"log_error": 2e-3, "log_error_from": begin}}
+    state = TrainState.begin(tiny_config(50, **schedule), tiny_dataset(3), "cpu")
+    if step >= 10:
+        state.begin_main()
+    state.step = step
+    assert log_weight(state) == weight
+
+
+def test_logarithm_of_the_error_reaches_the_gradients():
+    """The step's loss holds the term, and its gradient is that of the sum."""
+    losses, gradients = [], []
+    for weight in (0.0, 0.1):
+        config = tiny_config(50, **SCHEDULE, loss={"log_error": weight, "log_error_from": 0.0})
+        data = tiny_dataset(3)
+        state = TrainState.begin(config, data, "cpu")
+        state.begin_main()
+        state.step = 10
+        before = state.gaussians.sh_dc.detach().clone()
+        result = training_step(state, Frames(data, state.normalisation, config, "cpu"))
+        error = (result.render - result.truth).square().mean()
+        losses.append(float(result.loss) - weight * float(error.log()))
+        gradients.append(state.gaussians.sh_dc.detach() - before)
+    assert losses[0] == pytest.approx(losses[1], abs=1e-5)
+    assert not torch.equal(*gradients)
 
 
 SCHEDULE = {

@@ -1,0 +1,67 @@
+"""Pose-dependent correctives: displacements that follow the rotation of their surface, with gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..kernels import correctives as kernels
+from ..runtime.launch import launch
+
+COLUMNS = 27
+"""Number of corrective parameters per Gaussian: a 3 x 9 matrix."""
+
+
+class _Correct(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, correctives: Tensor, quats: Tensor, quats_t: Tensor, quats_own: Tensor):
+        corrected = torch.empty_like(means)
+        launch(kernels.correct, means.shape[0], means, correctives, quats, quats_t, quats_own, corrected)
+        ctx.save_for_backward(correctives, quats, quats_t, quats_own)
+        return corrected
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_corrected: Tensor):  # type: ignore[override]
+        correctives, *quats = ctx.saved_tensors
+        v_corrected, v_correctives = v_corrected.contiguous(), torch.empty_like(correctives)
+        launch(kernels.correct_adjoint, len(correctives), correctives, *quats, v_corrected, v_correctives)
+        return v_corrected, v_correctives, None, None, None
+
+
+def correct(
+    means: Tensor, correctives: Tensor, quats: Tensor, quats_t: Tensor, quats_own: Tensor | None = None
+) -> Tensor:
+    """Move skinned means by ``0.1 R C vec(R - I)``, where R turns ``quats`` to ``quats_t``.
+
+    Args:
+        means: [N, 3] skinned.
+        correctives: [N, 27] the matrices C [3, 9], row by row, in the frame at rest.
+        quats: [N, 4] wxyz at rest, any norm.
+        quats_t: [N, 4] wxyz at the rendered instant, any norm.
+        quats_own: [N, 4] wxyz that take the place of ``quats_t`` in R - I: those of the motion, where ``quats_t``
+            includes an edit. None: ``quats_t``.
+
+    Returns:
+        [N, 3] means. Gradients reach ``means`` and ``correctives``, but not the rotations, so that training does not
+        turn surfaces to move them. A non-finite displacement is left out.
+
+    Raises:
+        ValueError: a shape is wrong.
+    """
+    quats_own = quats_t if quats_own is None else quats_own
+    count = means.shape[0]
+    expected = {
+        "means": (means, 3),
+        "correctives": (correctives, COLUMNS),
+        "quats": (quats, 4),
+        "quats_t": (quats_t, 4),
+        "quats_own": (quats_own, 4),
+    }
+    for name, (value, width) in expected.items():
+        if tuple(value.shape) != (count, width):
+            raise ValueError(f"{name} must be [{count}, {width}], got {tuple(value.shape)}")
+    rotations = (value.detach().contiguous() for value in (quats, quats_t, quats_own))
+    return _Correct.apply(means.contiguous(), correctives.contiguous(), *rotations)  # type: ignore[return-value]

@@ -1,0 +1,66 @@
+"""Configurations of older versions: newer fields take the value that does what those versions did."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from helpers.paths import ROOT
+from scgs_warp.config import presets, recorded
+from scgs_warp.config.fields import LossConfig, TrainConfig
+
+OLD = Path(ROOT / "tests/fixtures/config-3132a41")
+"""Files that 3132a41 wrote with ``to_dict`` of its presets."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Loss(LossConfig):
+    log_error: float = dataclasses.field(default=0.002, metadata={"before": 0.0})
+
+
+@dataclasses.dataclass(frozen=True)
+class Train(TrainConfig):
+    loss: Loss = dataclasses.field(default_factory=Loss)  # type: ignore[assignment]
+
+
+@pytest.fixture
+def switched_on(monkeypatch):
+    """Presets of a version in which a newer field is on by default."""
+    monkeypatch.setattr(presets, "preset", lambda name: Train(preset=name))
+
+
+@pytest.mark.parametrize("name", ["quick", "cpu", "paper"])
+def test_a_recorded_configuration_keeps_what_it_did(name, switched_on):
+    values = json.loads((OLD / f"{name}.json").read_text())
+    read = presets.to_dict(presets.from_dict(values))
+    assert read["loss"].pop("log_error") == 0.0
+    for section, fields in values.items():
+        own = read[section]
+        assert (own if not isinstance(fields, dict) else {name: own[name] for name in fields}) == fields
+
+
+def test_a_partial_configuration_follows_its_preset(switched_on):
+    assert presets.from_dict({"preset": "cpu", "motion": {"nodes": 64}}).loss.log_error == 0.002
+    values = presets.to_dict(presets.preset("cpu"))
+    assert presets.from_dict(values).loss.log_error == 0.002
+
+
+def test_values_that_are_given_stay():
+    values = presets.to_dict(presets.preset("cpu"))
+    values["loss"]["log_error"] = 0.004
+    assert recorded.with_newer_fields(values) == values
+
+
+def test_what_changes_no_bit_may_be_missing():
+    values = json.loads((OLD / "cpu.json").read_text())
+    del values["evaluate_every"], values["data"]["cache_mib"]
+    assert recorded.with_newer_fields(values)["loss"]["log_error"] == 0.0
+
+
+def test_a_file_without_an_older_field_is_partial():
+    values = json.loads((OLD / "cpu.json").read_text())
+    del values["half_size"]
+    assert recorded.with_newer_fields(values) == values
