@@ -24,6 +24,7 @@ def write_npz(
     skeleton: Skeleton,
     *,
     shading: np.ndarray | None = None,
+    correctives: np.ndarray | None = None,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> None:
     """Write a moving scene, world units, float32, compressed; the same scene gives the same bytes.
@@ -32,6 +33,8 @@ def write_npz(
         rest: activated Gaussians before any motion.
         skeleton: motion of the same Gaussians.
         shading: [N, 10] coefficients of the brightness that follows the surface's rotation; None: no shading.
+        correctives: [N, 27] coefficients of the displacement that follows the surface's rotation, world units; None: no
+            correctives.
         up: unit vector.
 
     Raises:
@@ -55,8 +58,12 @@ def write_npz(
     }
     if shading is not None and shading.shape[1]:
         arrays["shading"] = shading
+    if correctives is not None and correctives.shape[1]:
+        arrays["correctives"] = correctives
     if skeleton.shape_rotations is not None:
         arrays["node_shape_rotations"] = skeleton.shape_rotations
+    if skeleton.own_rotations is not None and {"shading", "correctives"} & arrays.keys():
+        arrays["node_own_rotations"] = skeleton.own_rotations
     if skeleton.log_scales is not None:
         arrays["node_log_scales"] = skeleton.log_scales
     arrays = {name: np.asarray(value, "<f4") for name, value in arrays.items()}

@@ -35,6 +35,7 @@ STEPS = {
     "sh_dc": 6e-3,
     "sh_rest": 9e-3,
     "shading": 0.07,
+    "corrective": 5e-3,
     "weight": 2e-3,
     "rest": 1e-6,
     "pose": 1e-4,
@@ -88,7 +89,7 @@ def visible(gaussians: GaussianParameters) -> Tensor:
     """Return indices [V] int64 of the Gaussians that are finite and opaque enough to change an 8-bit picture."""
     parts = (
         gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest.flatten(1),
-        gaussians.shading, gaussians.hyper,
+        gaussians.shading, gaussians.correctives, gaussians.hyper,
     )  # fmt: skip
     finite = torch.stack([part.isfinite().all(dim=1) for part in parts]).all(dim=0)
     solid = gaussians.opacities() >= float(ALPHA_MIN)
@@ -123,6 +124,7 @@ def _facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
         "gaussians": count,
         "sh_degree": sh_degree,
         "shaded": scene.gaussians.shading.shape[1] > 0,
+        "corrected": scene.gaussians.correctives.shape[1] > 0,
         "antialiased": bool(scene.config.antialiased),
         "background": list(scene.background_color),
         "overview": scene.overview.to_dict(),
@@ -149,6 +151,9 @@ def _gaussian_columns(gaussians: GaussianParameters, kept: Tensor, sh_degree: in
         columns += [quantise(f"sh{k}_{c}", rest[:, k, c], STEPS["sh_rest"], most_bits=BYTE) for c in range(3)]
     shading = _array(gaussians.shading[kept])
     columns += [quantise(f"shading{k}", shading[:, k], STEPS["shading"]) for k in range(shading.shape[1])]
+    correctives = _array(gaussians.correctives[kept])
+    for k in range(correctives.shape[1]):
+        columns.append(quantise(f"corrective{k}", correctives[:, k], STEPS["corrective"]))
     return columns
 
 

@@ -187,9 +187,9 @@ def _write_skeleton(request: ExportRequest, session: EditSession, moments: list[
         rest = Gaussians(rest.means, rest.quats, rest.scales, rest.opacities, torch.from_numpy(colors), rest.sh_rest)
         write_glb(request.output, rest, up, skeleton)
     else:
-        edited = request.edit is not None  # shading has not been trained on an edit's rotations
-        shading = None if edited else scene.gaussians.shading.detach().cpu().numpy()[rows]
-        write_npz(request.output, rest, skeleton, shading=shading, up=up)
+        shading = scene.gaussians.shading.detach().cpu().numpy()[rows]
+        correctives = scene.normalisation.undo_scale(scene.gaussians.correctives.detach()).cpu().numpy()[rows]
+        write_npz(request.output, rest, skeleton, shading=shading, correctives=correctives, up=up)
     return f"{len(rest.means):,} Gaussians, {length}"
 
 
@@ -204,7 +204,7 @@ def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Sk
 def _usable(scene: Scene) -> np.ndarray:
     """Return [N] bool: Gaussians whose parameters are all finite."""
     rows = finite_rows(at_rest(scene))
-    for part in (scene.gaussians.shading, scene.gaussians.hyper):
+    for part in (scene.gaussians.shading, scene.gaussians.correctives, scene.gaussians.hyper):
         rows &= part.detach().isfinite().all(dim=1).cpu().numpy()
     return rows
 

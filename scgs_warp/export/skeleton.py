@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..edit import EditSession
-from ..edit.pose import compose
+from ..edit.pose import compose, own_pose
 from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..scene.scene import Scene
@@ -55,6 +55,8 @@ class Skeleton:
     """[N, K] int32"""
     weights: np.ndarray
     """[N, K] rows sum to 1."""
+    own_rotations: np.ndarray | None = None
+    """[T, M, 4] rotations of the motion, which shading and correctives follow where an edit turns joints further."""
 
     def select(self, rows: np.ndarray) -> Skeleton:
         """Restrict the binding to the Gaussians of ``rows`` [N] bool."""
@@ -130,9 +132,11 @@ def build_skeleton(
     """
     engine, scene = session.engine, session.scene
     masked = bool(scene.config.motion.mask) and engine.rig.moves
-    poses = []
+    poses, own = [], []
     for moment in moments:
-        poses.append(_pose(session, moment, masked))
+        pose, motion = _pose(session, moment, masked)
+        poses.append(pose)
+        own.append(pose if motion is None else motion)
         if advance is not None:
             advance()
     rest = engine.rig.positions.detach().cpu().double()
@@ -149,13 +153,17 @@ def build_skeleton(
         None if poses[0].log_scales is None else _stack([_require(pose.log_scales) for pose in poses]),
         indices,
         weights,
+        None if all(a is b for a, b in zip(own, poses)) else _unit([_turns(pose) for pose in own]),
     )
     _check_finite(skeleton)
     return _with_rest(skeleton, scene.gaussians) if masked else skeleton
 
 
 def _check_finite(skeleton: Skeleton) -> None:
-    tracks = skeleton.positions, skeleton.rotations, skeleton.shape_rotations, skeleton.log_scales
+    tracks = (
+        *(skeleton.positions, skeleton.rotations, skeleton.shape_rotations, skeleton.log_scales),
+        skeleton.own_rotations,
+    )
     for track in tracks:
         good = track is None or np.isfinite(track).all(axis=(1, 2))
         if not np.all(good):
@@ -169,7 +177,13 @@ def _not_finite(time: float) -> UserError:
     )
 
 
-def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> Pose:
+def _turns(pose: Pose) -> Tensor:
+    """Return the rotations of the Gaussians' shapes."""
+    return pose.rotations if pose.shape_rotations is None else pose.shape_rotations
+
+
+def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> tuple[Pose, Pose | None]:
+    """Return the pose at a moment, and the result of ``own_pose``."""
     engine, edit = session.engine, session.edit
     motion = engine.motion_at(moment.time)
     fields = motion.pose.translations, motion.pose.rotations, motion.pose.shape_rotations, motion.pose.log_scales
@@ -177,10 +191,10 @@ def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> Pose:
         raise _not_finite(moment.time)
     bent = engine.bend(edit, moment.time, moment.at, frame=edit.reach)
     if bent is None:
-        return motion.pose
+        return motion.pose, None
     if masked:
         raise UserError("--edit: this scene's motion has a mask (motion.mask); write the edit as a ply-sequence")
-    return compose(motion, bent)
+    return compose(motion, bent), own_pose(motion, bent)
 
 
 def _require(value: Tensor | None) -> Tensor:

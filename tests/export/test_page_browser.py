@@ -112,6 +112,7 @@ def plain(scene: Scene) -> Scene:
 
 SCENES = {
     "shaded": lambda: bar_scene(shaded=True),
+    "corrected": lambda: bar_scene(shaded=True, corrected=True),
     "rich": rich_scene,
     "one neighbour": lambda: with_neighbors(bar_scene(), 1),
     "static": lambda: plain(bar_scene()),

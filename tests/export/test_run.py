@@ -56,8 +56,8 @@ def save(scene: Scene, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    """A run whose network moves things a little, with shading."""
-    like = bar_scene(nodes=24, gaussians=120, shaded=True)
+    """A run whose network moves things a little, with shading and correctives."""
+    like = bar_scene(nodes=24, gaussians=120, shaded=True, corrected=True)
     fields = {"nodes": 24, "layers": 3, "width": 32, "skip": 2}
     config = from_dict({"motion": fields})
     template = build_motion("control-points", config)
@@ -89,7 +89,7 @@ def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
     path = tmp_path / "a.npz"
     export("--run", run, "--output", path, "--frames", 5, "--fps", 4)
     scene, data = Scene.load(run), dict(np.load(path))
-    assert str(data["format"]) == "scgs-warp motion" and "shading" in data
+    assert str(data["format"]) == "scgs-warp motion" and {"shading", "correctives"} <= data.keys()
     means, quats, scales, sh_dc = (None,) * 4
     for seconds, time in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
         means, quats, scales, sh_dc = player()["play"](data, seconds)
@@ -195,10 +195,12 @@ def test_an_edit_is_exported(run, tmp_path):
     assert np.abs(data["z"] - scene.gaussians_at(session.scene_time(0.1)).means[:, 2].numpy()).max() > 0.02
     export("--run", run, "--edit", content, "--output", tmp_path / "a.npz")
     played = dict(np.load(tmp_path / "a.npz"))
-    assert len(played["seconds"]) == 4 and "shading" not in played
+    assert len(played["seconds"]) == 4 and {"shading", "correctives", "node_own_rotations"} <= played.keys()
     for second in (0.0, 0.1):
         truth = session.gaussians_at(session.scene_time(second), second)
-        np.testing.assert_allclose(player()["play"](played, second)[0], truth.means, atol=2e-6)
+        means, _, _, sh_dc = player()["play"](played, second)
+        np.testing.assert_allclose(means, truth.means, atol=2e-6)
+        np.testing.assert_allclose(sh_dc, truth.sh_dc, atol=2e-5)
 
 
 def test_files_are_filmed_and_edited(run, tmp_path):

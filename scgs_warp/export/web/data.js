@@ -109,7 +109,7 @@ async function readModel(text) {
   const count = facts.gaussians, stride = 4 * Math.ceil(facts.neighbors / 4);
   const colorStride = facts.shaded ? 16 : 4;
   const model = {
-    facts, count, stride, nodes: facts.nodes, shares: null,
+    facts, count, stride, nodes: facts.nodes, shares: null, correctives: null,
     means: room(Float32Array, count, 4),
     quats: room(Float32Array, count, 4),
     scales: room(Float32Array, count, 4),
@@ -124,6 +124,10 @@ async function readModel(text) {
   if (facts.shaded) {
     fill(model.colors, colorStride, 3, [columns.shading9]);
     fill(model.colors, colorStride, 4, named("shading", 9));
+  }
+  if (facts.corrected) {
+    model.correctives = room(Float32Array, count, 28);
+    fill(model.correctives, 28, 0, named("corrective", 27));
   }
   readQuaternions(columns, model.quats, 4);
   readHarmonics(facts, columns, model);

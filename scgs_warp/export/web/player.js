@@ -41,8 +41,8 @@ class Player {
   }
 
   startSorter() {
-    const { count, stride, nodes, means, indices, weights, shares } = this.model;
-    const model = { count, stride, nodes, means, indices, weights, shares };
+    const { count, stride, nodes, means, indices, weights, shares, correctives } = this.model;
+    const model = { count, stride, nodes, means, indices, weights, shares, correctives };
     this.sort = makeSorter(model);
     this.sorting = false;
     try {

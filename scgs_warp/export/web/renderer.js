@@ -35,7 +35,7 @@ class Renderer {
       NODES: model.nodes, BLOCKS: model.stride / 4, DEGREE: facts.sh_degree, SH_TEXELS: texels,
       COLOR_TEXELS: facts.shaded ? 4 : 1,
     };
-    for (const name of ["shaded", "masked", "antialiased"]) if (facts[name]) defines[name.toUpperCase()] = 1;
+    for (const name of ["shaded", "corrected", "masked", "antialiased"]) if (facts[name]) defines[name.toUpperCase()] = 1;
     this.splat = compile(gl, SHADERS["screen.vert"], SHADERS["splat.frag"], defines);
     this.draw = compile(gl, SHADERS["draw.vert"], SHADERS["draw.frag"], {});
     this.screen = compile(gl, SHADERS["screen.vert"], SHADERS["screen.frag"], {});
@@ -83,6 +83,7 @@ class Renderer {
       u_harmonics: this.upload(gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, model.harmonics),
       u_indices: this.upload(gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, model.indices),
     };
+    if (model.correctives) this.data.u_correctives = this.upload(gl.RGBA16F, gl.RGBA, gl.FLOAT, model.correctives);
     this.table = room(Float32Array, Math.max(model.nodes, 1), 20);
     this.data.u_nodes = floats(this.table);
     this.rows = Math.ceil(model.count / WIDTH);

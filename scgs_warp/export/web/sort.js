@@ -1,8 +1,9 @@
 // Farthest first. The same text runs in a worker, beside the page, and in the page where an exact frame is asked for.
 
-// model: count, stride (neighbours a Gaussian, padded), nodes, means [N * 4], indices, weights [N * stride], shares
+// model: count, stride (neighbours a Gaussian, padded), nodes, means [N * 4], indices, weights [N * stride], shares,
+// correctives [N * 28]
 function makeSorter(model) {
-  const { count, stride, nodes, means, indices, weights, shares } = model;
+  const { count, stride, nodes, means, indices, weights, shares, correctives } = model;
   const BINS = 4096; // 12 bits a pass, two passes: as fine as depths in float32 are over a scene
   const depths = new Float32Array(count), keys = new Uint32Array(count);
   const ids = new Uint32Array(count), half = new Uint32Array(count);
@@ -18,6 +19,31 @@ function makeSorter(model) {
         planes[4 * m + c] = sum;
       }
     }
+  }
+
+  // What a corrective adds to the depth: as corrective() in splat.frag.glsl.
+  const turn = new Float64Array(9);
+  function correctiveDepth(i, row, table) {
+    const quat = [0, 0, 0, 0], reference = 20 * indices[stride * i] + 12;
+    for (let k = stride * i; k < stride * (i + 1); k++) {
+      const at = 20 * indices[k] + 12;
+      let dot = 0;
+      for (let a = 0; a < 4; a++) dot += table[at + a] * table[reference + a];
+      const weight = dot < 0 ? -weights[k] : weights[k];
+      for (let a = 0; a < 4; a++) quat[a] += weight * table[at + a];
+    }
+    const norm = Math.hypot(quat[0], quat[1], quat[2], quat[3]);
+    const w = quat[0] / norm, x = quat[1] / norm, y = quat[2] / norm, z = quat[3] / norm;
+    turn[0] = -2 * (y * y + z * z), turn[1] = 2 * (x * y - w * z), turn[2] = 2 * (x * z + w * y);
+    turn[3] = 2 * (x * y + w * z), turn[4] = -2 * (x * x + z * z), turn[5] = 2 * (y * z - w * x);
+    turn[6] = 2 * (x * z - w * y), turn[7] = 2 * (y * z + w * x), turn[8] = -2 * (x * x + y * y);
+    let depth = 0;
+    for (let a = 0; a < 3; a++) {
+      let shift = 0;
+      for (let k = 0; k < 9; k++) shift += correctives[28 * i + 9 * a + k] * turn[k];
+      depth += shift * (row[a] + row[0] * turn[a] + row[1] * turn[3 + a] + row[2] * turn[6 + a]);
+    }
+    return 0.1 * depth;
   }
 
   function pass(from, to, amount, bits) {
@@ -47,6 +73,7 @@ function makeSorter(model) {
           const m = 4 * indices[k];
           moved += weights[k] * (planes[m] * x + planes[m + 1] * y + planes[m + 2] * z + planes[m + 3]);
         }
+        if (correctives) moved += correctiveDepth(i, row, table);
         depth = shares ? depth + shares[i] * (moved - depth) : moved;
       }
       depth = Math.fround(depth); // as it is stored: the farthest must not lie beyond `most`

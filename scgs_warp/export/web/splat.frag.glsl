@@ -4,6 +4,7 @@ uniform sampler2D u_means;      // x y z, opacity
 uniform sampler2D u_quats;      // w x y z, unit
 uniform sampler2D u_scales;     // logarithms, share of the motion
 uniform sampler2D u_colors;     // degree 0 and the bend of the shading; with SHADED its matrix, by rows, in three more
+uniform sampler2D u_correctives; // with CORRECTED, seven a Gaussian: the matrix of its corrective, by rows
 uniform usampler2D u_harmonics; // SH_TEXELS a Gaussian, a word a coefficient, a byte a channel
 uniform vec3 u_sh_low[15], u_sh_step[15];
 uniform usampler2D u_indices;   // BLOCKS a Gaussian
@@ -32,6 +33,20 @@ mat3 matrix(vec4 q) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
+// Displacement that follows a rotation since rest.
+vec3 corrective(int i, vec4 quat) {
+#ifdef CORRECTED
+  mat3 rotation = matrix(quat), turn = rotation - mat3(1.0);
+  vec4 values[7];
+  for (int t = 0; t < 7; t++) values[t] = texelFetch(u_correctives, at(7 * i + t), 0);
+  vec3 shift = vec3(0.0);
+  for (int n = 0; n < 27; n++) shift[n / 9] += values[n / 4][n % 4] * turn[n % 3][(n % 9) / 3];
+  return 0.1 * (rotation * shift);
+#else
+  return vec3(0.0);
+#endif
+}
+
 void follow(int i, inout vec3 mean, inout vec4 quat, inout vec3 scale, float share) {
 #if NODES > 0
   vec3 moved = vec3(0.0), grown = vec3(0.0);
@@ -53,7 +68,9 @@ void follow(int i, inout vec3 mean, inout vec4 quat, inout vec3 scale, float sha
       grown += w * texelFetch(u_nodes, at(m + 4), 0).xyz;
     }
   }
-  vec4 turned = multiply(normalize(blend), quat);
+  blend = normalize(blend);
+  moved += corrective(i, blend);
+  vec4 turned = multiply(blend, quat);
 #ifdef MASKED
   moved = mean + share * (moved - mean);
   turned = normalize(quat + share * ((dot(quat, turned) < 0.0 ? -1.0 : 1.0) * turned - quat));
