@@ -1,13 +1,16 @@
 """The built-in synthetic scene, written in the D-NeRF layout together with its true motion.
 
-The scene is monocular like D-NeRF: each training frame has its own time and its own camera, drawn from the upper
-hemisphere. Test frames are spread over time and have other cameras. The same arguments give the same bytes.
+The scene is monocular like D-NeRF: each training frame has its own time and its own camera. Consecutive cameras
+surround the figure, so that no side of it is unseen for long: cameras drawn at random leave its face unseen for a tenth
+of the motion. Test frames are spread over time and have other cameras, drawn at random from the upper hemisphere. The
+same arguments give the same bytes.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,11 +20,11 @@ import numpy as np
 from ...errors import UserError
 from ...storage.json_files import parse_json
 from .figure import Figure, build_figure
-from .orbit_cameras import PlannedPicture, instants, random_on_sphere
+from .orbit_cameras import PlannedPicture, instants, random_on_sphere, surrounding
 from .raycast import Raycaster
 from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_folder_atomically, write_pictures
 
-VERSION = 4
+VERSION = 5
 """Version of the pictures and the ground truth; folders with another version are replaced."""
 MARKER = "synthetic.json"
 RADIUS = 4.0311
@@ -113,9 +116,14 @@ def _write_scene(work: Path, recipe: dict[str, Any], progress: Callable[[int, in
     subject = FigureSubject(device)
     rng = np.random.default_rng(recipe["seed"])
     points = subject.sample(SURFACE_POINTS, rng)
+    start = float(rng.uniform(0.0, 2.0 * math.pi))
+    cameras = {
+        "train": surrounding(recipe["train"], SINE_OF_ELEVATION, RADIUS, start),
+        "test": [random_camera(rng) for _ in range(recipe["test"])],
+    }
     pictures = {
-        split: [PlannedPicture(time, random_camera(rng), 0) for time in instants(recipe[split])]
-        for split in ("train", "test")
+        split: [PlannedPicture(time, camera, 0) for time, camera in zip(instants(len(own)), own)]
+        for split, own in cameras.items()
     }
     total = recipe["train"] + recipe["test"]
     counter = itertools.count(1)

@@ -20,6 +20,9 @@ FRAMED_RADIUS = 1.365
 """Radius of the largest ball around the origin that fits into the pictures; it determines the distance of the
 cameras."""
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+ELEVATION_STRIDE = math.sqrt(2.0) - 1.0
+"""Share of the range of elevations between two consecutive cameras of ``surrounding``. It is far from all fractions, so
+elevations are even, and unrelated to the golden angle."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,26 @@ def random_on_sphere(rng: np.random.Generator, sines: tuple[float, float], radiu
     """Draw a camera uniformly over the area of the sphere between two sines of elevation."""
     azimuth = rng.uniform(0.0, 2.0 * math.pi)
     return camera_at(azimuth, rng.uniform(*sines), radius)
+
+
+def surrounding(count: int, sines: tuple[float, float], radius: float, start: float) -> list[np.ndarray]:
+    """Place one camera per frame such that consecutive frames look from all sides.
+
+    Azimuths follow the golden angle, elevations a second sequence of low discrepancy. Any nine consecutive cameras (any
+    five at the ends) include one within 60 degrees of every horizontal direction, for elevations up to 58 degrees.
+
+    Args:
+        count: number of cameras.
+        sines: sines of the lowest and highest elevation.
+        radius: distance from the origin.
+        start: azimuth of the first camera, radians.
+    """
+    low, high = sines
+    cameras = []
+    for index in range(count):
+        share = ELEVATION_STRIDE * index % 1.0
+        cameras.append(camera_at(start + GOLDEN_ANGLE * index, low + (high - low) * share, radius))
+    return cameras
 
 
 def _sines(filming: FilmingSettings) -> tuple[float, float]:

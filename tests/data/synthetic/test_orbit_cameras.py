@@ -7,7 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from scgs_warp.data.synthetic.orbit_cameras import FilmingSettings, along_path, camera_distance, plan_pictures
+from scgs_warp.data.synthetic.orbit_cameras import (
+    FilmingSettings,
+    along_path,
+    camera_distance,
+    plan_pictures,
+    surrounding,
+)
 
 
 def test_cameras_of_every_arrangement():
@@ -54,3 +60,17 @@ def test_cameras_of_every_arrangement():
         assert np.allclose(
             picture.camera_to_world[:3, 3] / camera_distance(FilmingSettings()), rotation[:, 2]
         )  # looks at the origin
+
+
+@pytest.mark.parametrize("start", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("count", [20, 100, 400])
+def test_consecutive_cameras_surround_the_subject(count, start):
+    cameras = np.stack(surrounding(count, (0.05, 0.85), 4.0, start))
+    views = cameras[:, :3, 3] / 4.0
+    assert np.allclose(np.linalg.norm(views, axis=1), 1) and np.allclose(cameras[:, :3, 2], views)
+    assert views[:, 2].min() >= 0.05 and views[:, 2].max() <= 0.85 and np.ptp(views[:, 2]) > 0.7
+    azimuths = np.radians(np.arange(0, 360, 2))
+    fronts = np.stack([np.cos(azimuths), np.sin(azimuths), np.zeros_like(azimuths)])
+    angles = np.degrees(np.arccos(np.clip(views @ fronts, -1, 1)))
+    for index in range(count):
+        assert angles[max(0, index - 4) : index + 5].min(0).max() < 60
