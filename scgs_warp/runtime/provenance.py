@@ -58,7 +58,7 @@ def commit() -> str | None:
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
-    code = [".", ":(exclude)docs", ":(exclude)README.md", ":(exclude)benchmarks/results"]
+    code = [".", ":(exclude)docs", ":(exclude)*.md", ":(exclude)benchmarks/results"]
     try:
         head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
         differs = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=root, check=False).returncode
