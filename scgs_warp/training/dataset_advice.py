@@ -156,8 +156,20 @@ def _expectation(facts: Survey) -> str:
     return "good views near the camera's path; motion along the line of sight stays uncertain"
 
 
+def _replaces_stage_1(facts: Survey, config: TrainConfig) -> bool:
+    """Return True if control points start as a sample of the data's points (``state.resolve_auto``)."""
+    return facts.points >= max(FEWEST_POINTS, config.motion.neighbors + 1)
+
+
 def _help(facts: Survey, config: TrainConfig, device: str) -> str:
-    """Name the setting that improves the result most."""
+    """Name the setting that improves the result most, or one that was asked for and has no effect."""
+    if config.pretrain.progressive and config.motion.model != "control-points":
+        return f"--progressive has no effect with --motion {config.motion.model}, which has no stage 1"
+    if config.pretrain.progressive and not config.pretrain.with_points and _replaces_stage_1(facts, config):
+        return (
+            "--progressive has no effect: the data's points take the place of stage 1; "
+            "--set pretrain.with_points=true keeps that stage"
+        )
     if facts.instants < 2 and config.motion.model != "static":
         return "--motion static is all it needs"
     if facts.width * facts.height > LARGE_IMAGE and device == "cpu":

@@ -14,6 +14,7 @@ from helpers.tiny import tiny_dataset
 from scgs_warp.config.presets import preset
 from scgs_warp.data import Dataset, load
 from scgs_warp.training.dataset_advice import Survey, advise, survey
+from scgs_warp.training.state import resolve_auto
 
 
 def lines(data: Dataset, **changes) -> tuple[str, str]:
@@ -112,3 +113,26 @@ def test_the_app_says_it(tmp_path, capsys):
     assert cli([*arguments, "--device", "cpu", "--set", "init_points=200"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("data: 12 frames of 80 x 60") and said[1].startswith("expect ")
+
+
+def test_progressive_is_never_ignored_in_silence():
+    """Where there is no stage 1, the line says so, and the reason is the one by which training leaves it out."""
+    asked = dataclasses.replace(preset("cpu").pretrain, progressive=True)
+    kept = dataclasses.replace(asked, with_points=True)
+    data = handheld(41, 2.0)
+    with_points = Dataset([data[i] for i in range(len(data))], folder=Path("points"), split="train")
+    with_points.points = torch.rand(500, 3)
+    config = preset("cpu")
+    for given, pretrain, motion, silent in (
+        (data, asked, "control-points", True),
+        (with_points, asked, "control-points", False),
+        (with_points, kept, "control-points", True),
+        (data, asked, "hexplane", False),
+        (with_points, config.pretrain, "control-points", True),
+    ):
+        model = dataclasses.replace(config.motion, model=motion)
+        own = dataclasses.replace(config, pretrain=pretrain, motion=model)
+        said = advise(survey(given), own)[1]
+        assert ("--progressive has no effect" in said) is not silent
+        if pretrain.progressive:
+            assert (resolve_auto(own, given).pretrain_steps > 0) is silent
