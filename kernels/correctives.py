@@ -11,18 +11,12 @@ displacement along.
 
 import warp as wp
 
-from .quaternion import quat_conjugate, quat_matrix, quat_multiply, quat_normalise
+from .quaternion import rotation_between
 
 wp.set_module_options({"enable_backward": False})
 
 SCALE = wp.constant(0.1)
 """Scale of the displacement, chosen so that C learns about as fast as the means."""
-
-
-@wp.func
-def rotation_since(quat: wp.vec4, quat_t: wp.vec4) -> wp.mat33:
-    """Return the rotation R from ``quat`` to ``quat_t``."""
-    return quat_matrix(quat_multiply(quat_normalise(quat_t), quat_conjugate(quat_normalise(quat))))
 
 
 @wp.kernel
@@ -39,13 +33,13 @@ def correct(
 ):
     """Add the corrective to a mean; a non-finite one is left out. Grid: N."""
     i = first + wp.tid()
-    turn = rotation_since(quats_in[i], quats_own_in[i]) - wp.identity(n=3, dtype=float)
+    turn = rotation_between(quats_in[i], quats_own_in[i]) - wp.identity(n=3, dtype=float)
     shift = wp.vec3(0.0, 0.0, 0.0)
     for a in range(3):
         for r in range(3):
             for c in range(3):
                 shift[a] = shift[a] + correctives_in[i, 9 * a + 3 * r + c] * turn[r, c]
-    moved = means_in[i] + SCALE * (rotation_since(quats_in[i], quats_t_in[i]) * shift)
+    moved = means_in[i] + SCALE * (rotation_between(quats_in[i], quats_t_in[i]) * shift)
     if not wp.isfinite(wp.dot(moved - means_in[i], wp.vec3(1.0, 1.0, 1.0))):
         moved = means_in[i]
     means_out[i] = moved
@@ -65,8 +59,8 @@ def correct_adjoint(
 ):
     """Compute the gradient of C; a non-finite displacement passes none. Grid: N."""
     i = first + wp.tid()
-    turn = rotation_since(quats_in[i], quats_own_in[i]) - wp.identity(n=3, dtype=float)
-    v_shift = SCALE * (wp.transpose(rotation_since(quats_in[i], quats_t_in[i])) * v_means_t_in[i])
+    turn = rotation_between(quats_in[i], quats_own_in[i]) - wp.identity(n=3, dtype=float)
+    v_shift = SCALE * (wp.transpose(rotation_between(quats_in[i], quats_t_in[i])) * v_means_t_in[i])
     total = float(0.0)
     for a in range(3):
         for r in range(3):

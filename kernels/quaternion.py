@@ -92,3 +92,9 @@ def quat_matrix_adjoint(q: wp.vec4, v: wp.mat33) -> wp.vec4:
 def quat_rotate(q: wp.vec4, x: wp.vec3) -> wp.vec3:
     """Return R(q) x for a unit quaternion."""
     return quat_matrix(q) * x
+
+
+@wp.func
+def rotation_between(quat: wp.vec4, quat_t: wp.vec4) -> wp.mat33:
+    """Return the rotation R from ``quat`` to ``quat_t``, of any norm."""
+    return quat_matrix(quat_multiply(quat_normalise(quat_t), quat_conjugate(quat_normalise(quat))))

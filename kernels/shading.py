@@ -7,7 +7,7 @@ combines light and normal. A term quadratic in x approximates the cut-off of a l
 
 import warp as wp
 
-from .quaternion import quat_conjugate, quat_matrix, quat_multiply, quat_normalise
+from .quaternion import rotation_between
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,8 +22,7 @@ GREY = wp.constant(1.7724538509055159)
 @wp.func
 def turned(quat: wp.vec4, quat_t: wp.vec4) -> wp.mat33:
     """Return R - I for the rotation R from ``quat`` to ``quat_t``."""
-    rotation = quat_matrix(quat_multiply(quat_normalise(quat_t), quat_conjugate(quat_normalise(quat))))
-    return rotation - wp.identity(n=3, dtype=float)
+    return rotation_between(quat, quat_t) - wp.identity(n=3, dtype=float)
 
 
 @wp.func
