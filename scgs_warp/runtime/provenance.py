@@ -49,7 +49,8 @@ def _version() -> str | None:
 
 def command_line(script: str, words: Sequence[str]) -> str:
     """Write a command for a checkout; absolute paths keep only their last part, since folders differ by machine."""
-    names = (Path(word).name if Path(word).is_absolute() else word for word in words)
+    parts = (word.rpartition("=") for word in words)  # --data DIR as well as --data=DIR
+    names = (f"{name}{sign}{Path(value).name if Path(value).is_absolute() else value}" for name, sign, value in parts)
     return f"python {script} {shlex.join(names)}".rstrip()
 
 
