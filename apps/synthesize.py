@@ -1,4 +1,4 @@
-"""Make a data set with known motion: ``python apps/synthesize.py --mesh figure.glb --output data/figure``."""
+"""Make a data set with known motion: ``python apps/synthesize.py --subject balls --output data/balls``."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from scgs_warp.apps.cli import Device, prepare, run
 
 @dataclass(frozen=True)
 class Options:
-    """Render an animated mesh: images in D-NeRF layout and the true motion of its surface, for train.py --data."""
+    """Render a built-in subject or an animated mesh: images in D-NeRF layout and the true motion of the surface, for
+    train.py --data."""
 
     output: Path
     """Folder to make, with transforms_train.json, train/ and so on, ground_truth.npz, contact_sheet.png."""
     mesh: Path | None = None
-    """File .glb or .gltf; skins, moving nodes and morph targets are animated. By default the built-in figure."""
+    """File .glb or .gltf; skins, moving nodes and morph targets are animated."""
+    subject: str | None = None
+    """Built-in subject instead of a file: robot (the default), rods, rods-dark, balls, cloth, fan, touch, opening,
+    still."""
     clip: str | None = None
     """Name of the animation; the first one by default. With an unknown name, the command lists all names."""
     start: float | None = None
@@ -26,8 +30,8 @@ class Options:
     """Second of the clip that becomes time 1; its last keyframe by default."""
     size: tuple[int, ...] = (400,)
     """Size of the images in pixels: one number, or width and height."""
-    train: int = 150
-    """Training times, spread over the motion; each gives one image per camera."""
+    train: int | None = None
+    """Training times, spread over the motion; each gives one image per camera. 100 with --subject, otherwise 150."""
     test: int = 20
     """Test images, spread over the motion, each from its own position."""
     val: int = 10
@@ -50,9 +54,9 @@ class Options:
     light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
     """Direction to the light; z is up and the figure faces -y."""
     ambient: float = 0.5
-    """Strength of ambient light."""
+    """Strength of ambient light; 0.5 is normal."""
     diffuse: float = 0.5
-    """Strength of the light from --light, multiplied by the cosine with the surface normal."""
+    """Strength of the light from --light, multiplied by the cosine with the surface normal; 0.5 is normal."""
     unlit: bool = False
     """Show textures and colours without lighting."""
     seed: int = 0
@@ -78,18 +82,22 @@ def main(args: list[str] | None) -> None:
     if len(options.size) not in (1, 2):
         raise UserError(f"--size {' '.join(map(str, options.size))}: give one number, or width and height")
     o = options
+    train = o.train if o.train is not None else 150 if o.subject is None else 100
     filming = FilmingSettings(
-        o.size[0], o.size[-1], o.train, o.test, o.val, o.cameras, o.views, o.fov, o.elevation, o.turns
+        o.size[0], o.size[-1], train, o.test, o.val, o.cameras, o.views, o.fov, o.elevation, o.turns
     )
     shading = Shading(o.light, o.ambient, o.diffuse, o.unlit)
-    request = SynthesisRequest(o.mesh, o.clip, o.start, o.end, filming, shading, o.samples, o.background, o.seed)
+    request = SynthesisRequest(
+        o.mesh, o.clip, o.start, o.end, filming, shading, o.samples, o.background, o.seed, o.subject
+    )
     planned = plan_synthesis(o.output, request, device)
     print("\n".join(planned.lines), flush=True)
     if not planned.made:
         with progress(sum(planned.counts.values()), "filming") as bar:
             synthesize(planned, lambda done, total: bar.advance())
     pictures = ", ".join(f"{count} {split}" for split, count in planned.counts.items())
-    print(f"{o.output}: {pictures}; ground_truth.npz, {SHEET}{' (made before)' if planned.made else ''}")
+    files = ", ".join([*planned.truth_files, SHEET])
+    print(f"{o.output}: {pictures}; {files}{' (made before)' if planned.made else ''}")
     print(f"next: python apps/train.py --data {o.output}")
 
 

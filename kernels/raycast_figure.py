@@ -1,165 +1,18 @@
-"""Ray casting of a small textured triangle mesh, for the built-in synthetic scene. Forward only.
+"""Ray casting of a triangle mesh with solid textures, for the built-in synthetic subjects. Forward only.
 
-The textures are solid: functions of the position in the rest frame of a body part, so they move with the surface.
-``visible`` and ``light_vertices`` serve every mesh; ``albedo`` draws the patterns of the figure in
-``scgs_warp/data/synthetic/figure.py``.
+Colour is albedo (``solid_textures``) times light, plus a highlight of the key light. Light is computed per vertex and
+interpolated, so pixels show no sampling noise. ``visible`` serves every mesh.
 """
 
 import warp as wp
 
 from .rays import eye_of, eye_of_view, in_view, ray_through
+from .solid_textures import albedo, mix
 
 wp.set_module_options({"enable_backward": False})
 
-STRIPES = wp.constant(0)
-CHECKS = wp.constant(1)
-DOTS = wp.constant(2)
-CLOUDS = wp.constant(3)
-FACE = wp.constant(4)
-SEGMENTS = wp.constant(5)
-CANDY = wp.constant(6)
-CHEST = wp.constant(7)
-
 FAR = wp.constant(100.0)
-TWO_PI = wp.constant(6.283185307179586)
 GOLDEN = wp.constant(2.399963229728653)
-
-
-@wp.func
-def fractal_noise(p: wp.vec3, seed: int):
-    """Return the sum of two octaves of gradient noise, about [-1, 1]."""
-    state = wp.rand_init(seed)
-    return wp.noise(state, p) + 0.5 * wp.noise(state, p * 2.17)
-
-
-@wp.func
-def wobble(p: wp.vec3, seed: int):
-    """Return the noise that makes stripes uneven."""
-    return 0.15 * wp.noise(wp.rand_init(seed), p * 6.0)
-
-
-@wp.func
-def fraction(x: float):
-    return x - wp.floor(x)
-
-
-@wp.func
-def turn(p: wp.vec3):
-    """Return the angle about z in turns, [0, 1)."""
-    return fraction(wp.atan2(p[1], p[0]) / TWO_PI + 1.0)
-
-
-@wp.func
-def mix(a: wp.vec3, b: wp.vec3, share: float):
-    return a + (b - a) * share
-
-
-@wp.func
-def in_heart(x: float, z: float):
-    """Return whether a point is inside the sextic (x^2 + z^2 - 1)^3 = x^2 z^3, about 1.2 in radius."""
-    q = x * x + z * z - 1.0
-    return q * q * q - x * x * z * z * z < 0.0
-
-
-@wp.func
-def face(p: wp.vec3, shell: wp.vec3, visor: wp.vec3, glow: wp.vec3):
-    """Draw a visor with eyes, a smile and cheeks on the side y < 0, rivets and a seam elsewhere."""
-    color = shell
-    if wp.abs(p[2] + 0.17) < 0.018 or (p[1] > 0.0 and wp.abs(p[0]) < 0.018):
-        color = shell * 0.55
-    rivet = wp.vec2(fraction(p[0] * 9.0 + 0.5) - 0.5, fraction(p[1] * 9.0 + 0.5) - 0.5)
-    if wp.length(rivet) < 0.2 and p[2] > 0.1:
-        color = mix(shell, visor, 0.6)
-    if p[1] > 0.1 and wp.abs(wp.abs(p[0]) - 0.15) < 0.07 and p[2] < 0.12 and fraction(p[2] * 14.0) < 0.5:
-        color = mix(visor, glow, 0.25)
-    if p[1] > -0.1:
-        return color
-    corner = wp.vec2(wp.max(wp.abs(p[0]) - 0.17, 0.0), wp.max(wp.abs(p[2]) - 0.09, 0.0))
-    if wp.length(corner) > 0.105:
-        return color
-    if wp.length(corner) > 0.085:
-        return mix(shell, wp.vec3(1.0, 1.0, 1.0), 0.75)
-    color = visor
-    grid = wp.vec2(fraction(p[0] * 24.0) - 0.5, fraction(p[2] * 24.0) - 0.5)
-    if wp.length(grid) < 0.24:
-        color = mix(visor, glow, 0.2)
-    eye = wp.vec2((wp.abs(p[0]) - 0.11) / 0.052, (p[2] - 0.03) / 0.078)
-    if wp.length(eye) < 1.0:
-        color = glow
-        if wp.length(wp.vec2(wp.abs(p[0]) - 0.105, p[2] - 0.02)) < 0.03:
-            color = visor
-        if wp.length(wp.vec2(wp.abs(p[0] - 0.015) - 0.11, p[2] - 0.06)) < 0.016:
-            color = wp.vec3(1.0, 1.0, 1.0)
-    smile = wp.length(wp.vec2(p[0], p[2] + 0.02))
-    if wp.abs(smile - 0.095) < 0.014 and p[2] < -0.07:
-        color = glow
-    if wp.length(wp.vec2(wp.abs(p[0]) - 0.19, (p[2] + 0.075) * 1.4)) < 0.04:
-        color = wp.vec3(0.95, 0.45, 0.47)
-    return color
-
-
-SOFTNESS = wp.constant(0.3)
-"""Fraction of the ground colour mixed into a pattern's other colours: motion stays visible, and training is short."""
-
-
-@wp.func
-def albedo(p: wp.vec3, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, frequency: wp.vec3, part: int):
-    """Return the colour of a surface point from its rest position in the part's frame."""
-    color = a
-    if kind == STRIPES:
-        phase = fraction(p[2] * frequency[2] + wobble(p, part))
-        if phase < 0.45:
-            color = b
-        elif phase > 0.62 and phase < 0.78:
-            color = c
-    elif kind == CHECKS:
-        cell = int(wp.floor(p[0] * frequency[0] + 0.5)) + int(wp.floor(p[1] * frequency[1] + 0.5))
-        cell += int(wp.floor(p[2] * frequency[2] + 0.5))
-        if cell % 2 != 0:
-            color = b
-    elif kind == DOTS:
-        row = wp.floor(p[2] * frequency[2])
-        u = fraction(turn(p) * frequency[0] + 0.5 * row) - 0.5
-        v = p[2] * frequency[2] - row - 0.5
-        distance = wp.sqrt(u * u + v * v)
-        if distance < 0.2:
-            color = c
-        elif distance < 0.36:
-            color = b
-    elif kind == CLOUDS:
-        color = mix(a, b, wp.clamp(0.5 + 1.4 * fractal_noise(p * frequency[0], part + 50), 0.0, 1.0))
-    elif kind == FACE:
-        color = face(p, a, b, c)
-    elif kind == SEGMENTS:
-        phase = fraction(turn(p) * frequency[0])
-        if phase < 0.5:
-            color = b
-        if frequency[2] > 0.0 and fraction(p[2] * frequency[2]) < 0.22:
-            color = c
-    elif kind == CANDY:
-        phase = fraction(turn(p) * frequency[0] + p[2] * frequency[2])
-        if phase < 0.5:
-            color = b
-        elif phase > 0.68 and phase < 0.82:
-            color = c
-    elif kind == CHEST:
-        phase = fraction(p[2] * frequency[2] + wobble(p, part))
-        if phase < 0.5:
-            color = b
-        if p[1] < 0.0:
-            x = p[0] / 0.105
-            z = (p[2] - 0.05) / 0.105
-            if x * x + z * z < 3.0:
-                color = wp.vec3(0.97, 0.94, 0.86)
-                if x * x + z * z > 2.55:
-                    color = c
-                if in_heart(x, z + 0.1):
-                    color = wp.vec3(0.87, 0.16, 0.24)
-    if kind != FACE and kind != CHEST:
-        color = mix(color, a, SOFTNESS)
-    state = wp.rand_init(part + 100)
-    shade = 1.0 + 0.18 * wp.noise(state, p * 9.0) + 0.06 * wp.noise(state, p * 18.0)
-    return color * shade
 
 
 @wp.func
@@ -193,13 +46,13 @@ def light_vertices(
     sky_rays: int,
     key_rays: int,
     reach: float,  # occluders farther away do not darken the sky
+    ambient: float,  # strength of the sky
+    diffuse: float,  # strength of the key light
     # Out:
     light_out: wp.array[wp.vec3],  # [P] irradiance that multiplies the albedo
+    key_out: wp.array[float],  # [P] strength of the key light times its visible share, for highlights
 ):
-    """Compute sky light with ambient occlusion and a broad key light with a soft shadow. Grid: P.
-
-    Light is computed per vertex and interpolated, so pixels show no sampling noise.
-    """
+    """Compute sky light with ambient occlusion and a broad key light with a soft shadow. Grid: P."""
     i = first + wp.tid()
     normal = normals_in[i]
     key = light_in[0]
@@ -207,6 +60,7 @@ def light_vertices(
     sky = float(0.0)
     weight = float(0.0)
     sun = float(0.0)
+    reached = float(0.0)
     for r in range(sky_rays):
         direction = sphere_direction(r, sky_rays, 0.0)
         cosine = wp.dot(direction, normal)
@@ -220,10 +74,19 @@ def light_vertices(
         if lambert > 0.0:
             if not blocked(mesh, origin, toward, FAR):
                 sun += lambert
+                reached += 1.0
     openness = sky / wp.max(weight, 1.0e-6)
     up = 0.5 + 0.5 * normal[2]
-    ambient = mix(wp.vec3(0.47, 0.43, 0.42), wp.vec3(0.66, 0.69, 0.74), up) * (0.45 + 0.55 * openness)
-    light_out[i] = ambient + wp.vec3(0.50, 0.47, 0.41) * (sun / float(key_rays))
+    dome = mix(wp.vec3(0.47, 0.43, 0.42), wp.vec3(0.66, 0.69, 0.74), up) * (0.45 + 0.55 * openness) * ambient
+    light_out[i] = dome + wp.vec3(0.50, 0.47, 0.41) * (sun / float(key_rays)) * diffuse
+    key_out[i] = reached / float(key_rays) * diffuse
+
+
+@wp.func
+def highlight(normal: wp.vec3, toward_light: wp.vec3, toward_eye: wp.vec3, exponent: float):
+    """Return the highlight of Blinn and Phong: a power of the cosine between the normal and the half vector."""
+    half = wp.normalize(toward_light + toward_eye)
+    return wp.pow(wp.max(wp.dot(normal, half), 0.0), exponent)
 
 
 @wp.kernel
@@ -233,16 +96,20 @@ def raycast(
     mesh: wp.uint64,
     faces_in: wp.array[wp.int32],  # [3 F]
     rest_in: wp.array[wp.vec3],  # [P] vertices in their part's frame
-    light_in: wp.array[wp.vec3],  # [P]
+    light_in: wp.array[wp.vec3],  # [P] irradiance
+    normals_in: wp.array[wp.vec3],  # [P] posed, unit
+    key_in: wp.array[float],  # [P] key light for highlights
+    toward_light_in: wp.array[wp.vec3],  # [1] unit direction to the key light
     part_in: wp.array[wp.int32],  # [F] part of each triangle
     kind_in: wp.array[wp.int32],  # [parts] pattern
     colors_in: wp.array2d[wp.vec3],  # [parts, 3]
     frequency_in: wp.array[wp.vec3],  # [parts]
+    shine_in: wp.array[wp.vec2],  # [parts] strength and exponent of the highlight
     camera_in: wp.array2d[float],  # [3, 4] camera-to-world, OpenCV
     K_in: wp.array2d[float],  # [3, 3]
     left: int,
     top: int,
-    columns: int,  # of the window that holds the figure
+    columns: int,  # of the window that holds the mesh
     samples: int,  # per pixel and axis
     # Out:
     image_out: wp.array3d[float],  # [H, W, 4] premultiplied colour and coverage
@@ -280,6 +147,12 @@ def raycast(
                     part,
                 )
                 shaded = wp.cw_mul(base, light)
+                shine = shine_in[part]
+                if shine[0] > 0.0:
+                    normal = wp.normalize(normals_in[a] * query.u + normals_in[b] * query.v + normals_in[c] * w)
+                    key = key_in[a] * query.u + key_in[b] * query.v + key_in[c] * w
+                    gloss = highlight(normal, toward_light_in[0], -direction, shine[1])
+                    shaded += wp.vec3(1.0, 0.97, 0.9) * (shine[0] * key * gloss)
                 color += wp.min(wp.max(shaded, wp.vec3(0.0, 0.0, 0.0)), wp.vec3(1.0, 1.0, 1.0))
                 hits += 1.0
     share = step * step

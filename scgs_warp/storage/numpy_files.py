@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zipfile
 from pathlib import Path
-from typing import IO
+from typing import IO, Literal
 
 import numpy as np
 
@@ -15,12 +15,15 @@ from .safe_paths import is_regular
 MAX_ARRAY_BYTES = 2**28
 """Largest array accepted. A larger one means a damaged header, or a small archive that unpacks to a huge array."""
 
+Content = Literal["numbers", "flags", "texts"]
+_KINDS: dict[Content, str] = {"numbers": "fiu", "flags": "b", "texts": "U"}
 
-def read_npy(path: Path, member: str | None = None, flags: bool = False) -> np.ndarray:
-    """Read a numeric array as float64 from a .npy file, or from a ``member`` of a .npz file.
+
+def read_npy(path: Path, member: str | None = None, content: Content = "numbers") -> np.ndarray:
+    """Read an array from a .npy file, or from a ``member`` of a .npz file.
 
     Args:
-        flags: read an array of booleans instead, as it is.
+        content: ``numbers``, returned as float64; ``flags``, booleans; or ``texts``.
 
     Raises:
         UserError: the file is missing or damaged, or its header announces more data than it holds.
@@ -30,12 +33,12 @@ def read_npy(path: Path, member: str | None = None, flags: bool = False) -> np.n
             raise UserError(f"{path}: not a file; restore it")
         if member is None:
             with path.open("rb") as file:
-                array = _read_array(file, path.stat().st_size, flags)
+                array = _read_array(file, path.stat().st_size, content)
         else:
             with zipfile.ZipFile(path) as archive:
                 info = archive.getinfo(f"{member}.npy")
                 with archive.open(info) as file:
-                    array = _read_array(file, info.file_size, flags)
+                    array = _read_array(file, info.file_size, content)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; restore it") from None
     except OSError as error:
@@ -49,7 +52,7 @@ def read_npy(path: Path, member: str | None = None, flags: bool = False) -> np.n
     return array
 
 
-def _read_array(file: IO[bytes], size: int, flags: bool) -> np.ndarray:
+def _read_array(file: IO[bytes], size: int, content: Content) -> np.ndarray:
     """Read an array as NumPy does, but check that the header is plausible before allocating memory."""
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -57,9 +60,11 @@ def _read_array(file: IO[bytes], size: int, flags: bool) -> np.ndarray:
         raise ValueError("version")
     shape, fortran, kind = readers[version](file)
     count = math.prod(shape)
-    if kind.kind not in ("b" if flags else "fiu") or not 0 <= count * kind.itemsize <= min(size, MAX_ARRAY_BYTES):
+    if kind.kind not in _KINDS[content] or not 0 <= count * kind.itemsize <= min(size, MAX_ARRAY_BYTES):
         raise ValueError("size")
     data = file.read(count * kind.itemsize)
     array = np.frombuffer(data, kind, count).reshape(shape, order="F" if fortran else "C")
+    if content == "texts":
+        array.tolist()  # Bytes that are no characters raise an error here, not where a text is used.
     with np.errstate(invalid="ignore"):  # signalling NaN would warn
-        return array.copy() if flags else array.astype(np.float64)
+        return array.astype(np.float64) if content == "numbers" else array.copy()

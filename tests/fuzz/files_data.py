@@ -16,7 +16,9 @@ from helpers.nerfstudio_files import write as write_nerfstudio_plain
 from helpers.tiny import write_dnerf
 from scgs_warp.data import load
 from scgs_warp.evaluation.motion_metrics import load_ground_truth, score_motion
+from scgs_warp.evaluation.thin_structures import RodCheck, load_rods
 from scgs_warp.geometry.normalisation import Normalisation
+from scgs_warp.types import Camera, Frame
 
 PICTURES = (".png", ".jpg", ".webp")
 
@@ -89,6 +91,31 @@ def load_truth(folder: Path) -> None:
         finite("score", *score)
 
 
+def write_rods(folder: Path) -> None:
+    folder.mkdir()
+    random = np.random.default_rng(4)
+    np.savez(
+        folder / "rods.npz",
+        names=np.array(["arm", "leg"]),
+        radii=np.array([0.3, 0.4], np.float32),
+        test_ends=random.uniform(-1, 1, (3, 2, 2, 3)).astype(np.float32),
+    )
+
+
+def load_rod_ratios(folder: Path) -> None:
+    rods = load_rods(folder, "test", 3)
+    if rods is None:
+        return
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 4.0
+    K = torch.tensor([[60.0, 0.0, 24.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
+    alpha, check = torch.full((48, 48), 0.7), RodCheck(rods)
+    for index in range(3):
+        check.add(index, Frame(Camera(viewmat, K, 48, 48), 0.0, alpha.expand(3, 48, 48), alpha), 0.5 * alpha)
+    finite("ratios", *(segment.ratio for *_, segment in check.rows))
+    expect(check.summary()["rods_segments"] == len(check.rows), "number of tenths")
+
+
 NOT_PICTURES = suffixed(".json", ".npy", ".npz", ".ply", ".bin", ".txt")
 
 FORMATS = (
@@ -102,4 +129,5 @@ FORMATS = (
     Format("colmap-binary", lambda folder: write_colmap(folder, 6), load_train, NOT_PICTURES),
     Format("colmap-text", lambda folder: write_colmap(folder, 6, "OPENCV", True), load_train, NOT_PICTURES),
     Format("ground-truth", write_truth, load_truth),
+    Format("rods", write_rods, load_rod_ratios),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -183,9 +184,35 @@ def write_cells(folder: Path) -> None:
             craft(folder, "nodes", value, seed, psnr=psnr + 0.1 * seed, epe=1.2, jitter=0.3)
 
 
+def write_zoo(folder: Path) -> None:
+    """Cells, and the table of another zoo beside them."""
+    worst = {
+        "name": "r_019",
+        "time": 1.0,
+        "missing": 0.041,
+        "region": {"share": 0.02, "pixels": 86.0, "x": 120.0, "y": 31.0},
+        "images": 1,
+    }
+    shared = {"psnr_worst_time": 0.5, "missing": 0.01, "missing_worst": worst, "split": "test", "images": 20}
+    for scene, psnr in (("rods", 24.0), ("hook", 36.0)):
+        craft(folder / "now", "zoo", "zoo", scene=scene, psnr=psnr, psnr_worst=psnr - 3.0, **shared)
+        craft(folder / "before", "zoo", "zoo", scene=scene, psnr=psnr, psnr_worst=psnr - 4.0, **shared)
+    found = ablate_table.build("zoo", folder / "before")
+    shutil.rmtree(folder / "before")
+    (folder / "before").mkdir()
+    (folder / "before" / "zoo.json").write_text(json.dumps(found))
+
+
+def load_zoo(folder: Path) -> None:
+    check_table(ablate_table.build("zoo", folder / "now", compare=folder / "before"))
+
+
 def load_table(folder: Path) -> None:
     """Build the table as ``apps/ablate.py --table-only`` does."""
-    found = ablate_table.build("nodes", folder)
+    check_table(ablate_table.build("nodes", folder))
+
+
+def check_table(found: dict[str, Any]) -> None:
     for table in found["tables"]:
         check_numbers(table["rows"], "table")
     expect(bool(markdown(found)), "no table")
@@ -210,4 +237,5 @@ FORMATS = (
     Format("log", write_log, load_log, named(("log.jsonl",)), share=0.3),
     Format("config", write_config, load_config, share=1.5),
     Format("ablation", write_cells, load_table),
+    Format("ablation-zoo", write_zoo, load_zoo),
 )

@@ -19,10 +19,13 @@ import numpy as np
 
 from ...errors import UserError
 from ...storage.json_files import parse_json
-from .figure import Figure, build_figure
+from .figure import build_figure
+from .figure_motion import bone_transforms
 from .orbit_cameras import PlannedPicture, instants, random_on_sphere, surrounding
 from .raycast import Raycaster
 from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_folder_atomically, write_pictures
+from .shading import Shading
+from .surface import PartMesh, RigidParts
 
 VERSION = 5
 """Version of the pictures and the ground truth; folders with another version are replaced."""
@@ -91,10 +94,11 @@ def _check_replaceable(folder: Path) -> None:
 class FigureSubject:
     """The built-in figure as a ``Subject`` of the renderer."""
 
-    def __init__(self, device: str = "cpu") -> None:
+    def __init__(self, device: str = "cpu", shading: Shading | None = None) -> None:
         self.device = device
         self.figure = build_figure()
-        self.raycaster = Raycaster(self.figure, device)
+        self.surface = RigidParts(self.figure, bone_transforms)
+        self.raycaster = Raycaster(self.surface, device, shading)
         self.pose, self.render, self.visible = self.raycaster.pose, self.raycaster.render, self.raycaster.visible
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +111,7 @@ class FigureSubject:
         part, local = points
         tracks = []
         for time in times:
-            transforms = self.raycaster.part_transforms(float(time))[part]
+            transforms = self.surface.part_transforms(float(time))[part]
             tracks.append(np.einsum("pij,pj->pi", transforms[:, :3, :3], local) + transforms[:, :3, 3])
         return np.stack(tracks)
 
@@ -142,7 +146,7 @@ def random_camera(rng: np.random.Generator) -> np.ndarray:
     return random_on_sphere(rng, SINE_OF_ELEVATION, RADIUS)
 
 
-def sample_surface(figure: Figure, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def sample_surface(figure: PartMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Sample points evenly by area over all parts: return the part [P], and the position in its bone's frame [P, 3].
 
     Some points lie inside a neighbouring part; these are never visible.

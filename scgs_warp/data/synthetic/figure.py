@@ -7,14 +7,11 @@ texture is defined, has the same axes and its origin at the part's centre.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
-from ...kernels import raycast_figure as patterns
-
-Vector = tuple[float, float, float]
+from ...kernels import solid_textures as patterns
+from .solids import Vector, rounded_box, torus
+from .surface import Material, PartMesh, Piece, merge, placed
 
 CREAM, WHITE = (0.97, 0.90, 0.76), (0.97, 0.96, 0.92)
 CORAL, RED, PINK = (0.96, 0.44, 0.32), (0.82, 0.19, 0.22), (0.97, 0.62, 0.60)
@@ -162,112 +159,14 @@ PARTS: tuple[Part, ...] = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Figure:
-    """All parts as one triangle mesh."""
-
-    rest: np.ndarray
-    """[P, 3] float64 vertices in their part's frame."""
-    local: np.ndarray
-    """[P, 3] float64 vertices in their bone's frame."""
-    faces: np.ndarray
-    """[F, 3] int32, counter-clockwise from outside."""
-    vertex_part: np.ndarray
-    """[P] int32, part of each vertex."""
-    face_part: np.ndarray
-    """[F] int32, part of each face."""
-    normals: np.ndarray
-    """[P, 3] unit, in the bone's frame."""
-
-
-def _cube(divisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tessellate the surface of [-1, 1]^3 with welded seams: return vertices [P, 3] and outward faces [F, 3]."""
-    ticks = np.tan(np.linspace(-1, 1, divisions + 1) * np.pi / 4)  # Even angles avoid crowding at the corners.
-    u, v = np.meshgrid(ticks, ticks, indexing="ij")
-    corner = np.arange(divisions)[:, None] * (divisions + 1) + np.arange(divisions)
-    a, b, c, d = corner, corner + divisions + 1, corner + divisions + 2, corner + 1
-    quads = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    vertices, faces = [], []
-    for axis in range(3):
-        for sign in (1.0, -1.0):
-            side = np.empty((u.size, 3))
-            side[:, axis] = sign
-            side[:, (axis + 1) % 3], side[:, (axis + 2) % 3] = u.ravel(), v.ravel()
-            faces.append((quads if sign > 0 else quads[:, ::-1]) + len(vertices) * u.size)
-            vertices.append(side)
-    points = np.concatenate(vertices)
-    _, index, inverse = np.unique(np.round(points, 9), axis=0, return_index=True, return_inverse=True)
-    return points[index], inverse.reshape(-1)[np.concatenate(faces)]
-
-
-def rounded_box(half: Vector, radius: float, divisions: int = 10, taper: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Make a box with rounded edges: the points at distance ``radius`` from an inner box. A capsule and a ball are
-    limiting cases.
-
-    Returns:
-        vertices [P, 3] and faces [F, 3], counter-clockwise from outside.
-    """
-    cube, faces = _cube(divisions)
-    extent = np.asarray(half, np.float64)
-    core = np.maximum(extent - radius, 0.0)
-    # A third of the grid lines goes to the flat centre, two thirds at even angles to the rounded edges.
-    share = np.arctan(np.abs(cube)) * (4.0 / np.pi)
-    edge = core + (extent - core) * np.tan(np.clip(1.5 * share - 0.5, 0.0, 1.0) * np.pi / 4)
-    beyond = np.where(share < 1.0 / 3.0, 3.0 * share * core, edge)
-    points = np.where(core > 0, np.sign(cube) * beyond, cube * extent)
-    inner = np.clip(points, -core, core)
-    away = points - inner
-    vertices = inner + away / np.linalg.norm(away, axis=1, keepdims=True) * radius
-    vertices[:, :2] *= 1.0 + taper * vertices[:, 2:] / (2.0 * extent[2])
-    return vertices, faces
-
-
-def torus(radius: float, tube: float, divisions: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Make a torus about z: return vertices [P, 3] and faces [F, 3]."""
-    rings, sides = 2 * divisions, divisions
-    around, across = np.meshgrid(
-        np.arange(rings) * 2 * np.pi / rings, np.arange(sides) * 2 * np.pi / sides, indexing="ij"
-    )
-    distance = radius + tube * np.cos(across)
-    vertices = np.stack([distance * np.cos(around), distance * np.sin(around), tube * np.sin(across)], -1)
-    i, j = np.meshgrid(np.arange(rings), np.arange(sides), indexing="ij")
-    a, b = i * sides + j, (i + 1) % rings * sides + j
-    c, d = (i + 1) % rings * sides + (j + 1) % sides, i * sides + (j + 1) % sides
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    return vertices.reshape(-1, 3), faces
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Compute unit vertex normals [P, 3], weighted by area."""
-    corners = vertices[faces]
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices)
-    for column in range(3):
-        np.add.at(normals, faces[:, column], crosses)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
-def build_figure(parts: tuple[Part, ...] = PARTS) -> Figure:
+def build_figure(parts: tuple[Part, ...] = PARTS) -> PartMesh:
     """Build the mesh of all parts."""
-    rest, local, faces, normals, vertex_part, face_part = [], [], [], [], [], []
-    count = 0
-    for index, part in enumerate(parts):
+    pieces = []
+    for part in parts:
         if part.hole > 0:
-            vertices, triangles = torus(part.hole, part.half[2], part.divisions)
+            vertices, faces = torus(part.hole, part.half[2], part.divisions)
         else:
-            vertices, triangles = rounded_box(part.half, part.radius, part.divisions, part.taper)
-        rest.append(vertices)
-        local.append(vertices + np.asarray(part.offset))
-        faces.append(triangles + count)
-        normals.append(vertex_normals(vertices, triangles))
-        vertex_part.append(np.full(len(vertices), index, np.int32))
-        face_part.append(np.full(len(triangles), index, np.int32))
-        count += len(vertices)
-    return Figure(
-        rest=np.concatenate(rest),
-        local=np.concatenate(local),
-        faces=np.concatenate(faces).astype(np.int32),
-        vertex_part=np.concatenate(vertex_part),
-        face_part=np.concatenate(face_part),
-        normals=np.concatenate(normals),
-    )
+            vertices, faces = rounded_box(part.half, part.radius, part.divisions, part.taper)
+        material = Material(part.kind, part.colors, part.frequency)
+        pieces.append(Piece(vertices, faces, material, part.bone, placed(*part.offset)))
+    return merge(pieces)

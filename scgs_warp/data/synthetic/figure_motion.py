@@ -7,19 +7,11 @@ a step on the spot and looks from one side to the other; its scarf and antenna f
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-Vector = tuple[float, float, float]
-
-
-class Joint(NamedTuple):
-    """A joint of the skeleton: its parent (None: the world), and its position in the parent's frame."""
-
-    parent: str | None
-    position: Vector
-
+from .joints import Joint, pose_joints, smoother_step
+from .solids import Vector
 
 BONES: dict[str, Joint] = {
     "hips": Joint(None, (0.0, 0.0, -0.40)),
@@ -38,24 +30,6 @@ BONES: dict[str, Joint] = {
     "hip_right": Joint("hips", (-0.145, 0.0, -0.06)),
     "knee_right": Joint("hip_right", (0.0, 0.0, -0.26)),
 }
-
-
-def smoother_step(x: float) -> float:
-    """Interpolate from 0 to 1 with zero first and second derivatives at both ends (Perlin's quintic)."""
-    x = min(max(x, 0.0), 1.0)
-    return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
-
-
-def rotation(x: float, y: float, z: float) -> np.ndarray:
-    """Return the rotation matrix [3, 3], Rz Ry Rx, of angles in degrees about x, y, z."""
-    result = np.eye(3)
-    for axis, degrees in ((2, z), (1, y), (0, x)):
-        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        turn = np.eye(3)
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
-        result = result @ turn
-    return result
 
 
 def joint_angles(time: float) -> dict[str, Vector]:
@@ -83,14 +57,5 @@ def joint_angles(time: float) -> dict[str, Vector]:
 
 def bone_transforms(time: float) -> dict[str, np.ndarray]:
     """Return bone-to-world [4, 4] of every bone at ``time`` in [0, 1]."""
-    angles = joint_angles(time)
-    transforms: dict[str, np.ndarray] = {}
-    for name, bone in BONES.items():  # Parents precede children.
-        own = np.eye(4)
-        own[:3, :3] = rotation(*angles.get(name, (0.0, 0.0, 0.0)))
-        own[:3, 3] = bone.position
-        if bone.parent is None:
-            own[2, 3] += 0.035 * math.cos(4.0 * math.pi * time)
-            own[0, 3] += 0.03 * math.sin(2.0 * math.pi * time)
-        transforms[name] = own if bone.parent is None else transforms[bone.parent] @ own
-    return transforms
+    shift = (0.03 * math.sin(2.0 * math.pi * time), 0.0, 0.035 * math.cos(4.0 * math.pi * time))
+    return pose_joints(BONES, joint_angles(time), shift)

@@ -1,4 +1,4 @@
-"""Data sets made from a glTF file or the built-in figure: ``plan_synthesis`` checks a request, ``synthesize`` writes
+"""Data sets made from a glTF file or a built-in subject: ``plan_synthesis`` checks a request, ``synthesize`` writes
 the data set."""
 
 from __future__ import annotations
@@ -15,11 +15,15 @@ import numpy as np
 from ...errors import UserError
 from ...storage.json_files import parse_json
 from ..gltf.scene import GltfScene, read_scene
-from .builtin import FigureSubject
 from .contact_sheet import ContactSheet
-from .mesh import MeshSubject, Shading
+from .mesh import MeshSubject
 from .orbit_cameras import FilmingSettings, PlannedPicture, plan_pictures
 from .renderer import SURFACE_POINTS, Background, Optics, Subject, write_folder_atomically, write_pictures, write_png
+from .shading import Shading
+from .zoo import SUBJECTS
+from .zoo import VERSION as ZOO_VERSION
+from .zoo.rods import FILE as RODS_FILE
+from .zoo.rods import RodsSubject
 
 MARKER = "synthesis.json"
 SHEET = "contact_sheet.png"
@@ -33,7 +37,7 @@ class SynthesisRequest:
     """Settings of a data set: everything that determines its bytes, except the contents of the mesh file."""
 
     mesh: Path | None = None
-    """A glTF file; None: the built-in figure."""
+    """A glTF file; None: a built-in subject."""
     clip: str | None = None
     """Name of the clip; None: the file's first."""
     start: float | None = None
@@ -46,6 +50,8 @@ class SynthesisRequest:
     """Number of rays per pixel along each axis."""
     background: Background = "transparent"
     seed: int = 0
+    subject: str | None = None
+    """Name of a built-in subject, a key of ``zoo.SUBJECTS``; None: ``robot``, unless there is a mesh."""
 
 
 class SynthesisPlan(NamedTuple):
@@ -68,6 +74,11 @@ class SynthesisPlan(NamedTuple):
     def counts(self) -> dict[str, int]:
         """Number of pictures of each split."""
         return {split: len(pictures) for split, pictures in self.pictures.items()}
+
+    @property
+    def truth_files(self) -> list[str]:
+        """Names of the files with the true motion."""
+        return ["ground_truth.npz", *([RODS_FILE] if isinstance(self.subject, RodsSubject) else [])]
 
 
 def check(request: SynthesisRequest) -> None:
@@ -96,11 +107,21 @@ def check(request: SynthesisRequest) -> None:
     for name in ("ambient", "diffuse"):
         if not 0.0 <= getattr(request.shading, name) <= 100.0:
             raise UserError(f"--{name} {getattr(request.shading, name):g}: give 0 to 100 (1 is full daylight)")
+    direction = np.asarray(request.shading.light, np.float64)
+    if not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
+        raise UserError("--light: give a direction that is not zero, as --light -0.4 -0.6 0.7")
+    _check_subject(request)
+
+
+def _check_subject(request: SynthesisRequest) -> None:
+    if request.mesh is not None and request.subject is not None:
+        raise UserError(f"--subject {request.subject}: give either --subject or --mesh")
+    if request.subject is not None and request.subject not in SUBJECTS:
+        raise UserError(f"--subject {request.subject}: give one of: {', '.join(SUBJECTS)}")
     if request.mesh is None:
-        set_anyway = [name for name in ("clip", "start", "end") if getattr(request, name) is not None]
-        if set_anyway or request.shading != Shading():
-            name = set_anyway[0] if set_anyway else "light, --ambient, --diffuse, --unlit"
-            raise UserError(f"--{name}: is for glTF files; give one with --mesh, or leave it out")
+        for name in ("clip", "start", "end"):
+            if getattr(request, name) is not None:
+                raise UserError(f"--{name}: is for glTF files; give one with --mesh, or leave it out")
 
 
 def span_of(scene: GltfScene, start: float | None, end: float | None) -> tuple[float, float]:
@@ -133,7 +154,7 @@ def load_subject(request: SynthesisRequest, device: str) -> tuple[Subject, dict[
         UserError: the mesh, the clip or the time range is invalid.
     """
     if request.mesh is None:
-        return FigureSubject(device), {"subject": "built-in figure"}, ["the built-in figure"]
+        return _load_builtin(request.subject or "robot", request.shading, device)
     scene = read_scene(request.mesh, request.clip)
     span = span_of(scene, request.start, request.end)
     subject = MeshSubject(scene, span, request.shading, device)
@@ -146,6 +167,13 @@ def load_subject(request: SynthesisRequest, device: str) -> tuple[Subject, dict[
         "world_from_gltf": scene.world_from_gltf.tolist(),
     }
     return subject, identity, describe(scene, span)
+
+
+def _load_builtin(name: str, shading: Shading, device: str) -> tuple[Subject, dict[str, Any], list[str]]:
+    subject = SUBJECTS[name](device, shading)
+    if name == "robot":
+        return subject, {"subject": "built-in figure"}, ["the built-in figure"]
+    return subject, {"subject": f"built-in {name}", "subject_version": ZOO_VERSION}, [f"the built-in subject {name}"]
 
 
 def describe(scene: GltfScene, span: tuple[float, float]) -> list[str]:
@@ -215,6 +243,9 @@ def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | No
     def write(work: Path) -> None:
         write_pictures(work, planned.subject, planned.points, planned.pictures, optics, done, sheet)
         write_png(work / SHEET, cv2.cvtColor(sheet.draw(), cv2.COLOR_RGB2BGR))
+        if isinstance(planned.subject, RodsSubject):
+            times = {split: [picture.time for picture in own] for split, own in planned.pictures.items()}
+            planned.subject.write_rods(work, times)
         (work / MARKER).write_text(json.dumps(planned.recipe, indent=1) + "\n")
 
     write_folder_atomically(planned.folder, write)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,26 +16,13 @@ from ...types import Camera
 from ..gltf.scene import GltfScene
 from .raycast import TOLERANCE, mesh_over, pixel_window
 from .renderer import ROOM_RADIUS, SurfacePoints, points_on_triangles
+from .shading import Shading
 
 FIT_TIMES = 101
 """Number of instants of the clip at which the extent of the mesh is measured."""
 RAY_OFFSET = 1e-5
 """Distance behind a transparent surface at which a ray continues, in room radii."""
 MAX_RAY_LENGTH = 1000.0
-
-
-@dataclass(frozen=True)
-class Shading:
-    """Settings of light and diffuse shading."""
-
-    light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
-    """Direction to the light, world (z up, the subject faces -y)."""
-    ambient: float = 0.5
-    diffuse: float = 0.5
-    """Factor of the diffuse light. Light of a surface = ambient x (0.75 .. 1, more from above) + diffuse x cosine, in
-    linear light."""
-    unlit: bool = False
-    """Show base colours without shading."""
 
 
 class PosedMesh(NamedTuple):
@@ -61,7 +47,7 @@ class MeshSubject:
     def __init__(self, scene: GltfScene, span: tuple[float, float], shading: Shading, device: str = "cpu") -> None:
         """
         Raises:
-            UserError: the scene has no extent, or the light has no direction.
+            UserError: the scene has no extent.
         """
         self.scene = scene
         self.span = span
@@ -69,8 +55,6 @@ class MeshSubject:
         self.device = device
         self._fit()
         direction = np.asarray(shading.light, np.float64)
-        if not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
-            raise UserError("--light: give a direction that is not zero, as --light -0.4 -0.6 0.7")
         triangles = scene.triangles
         self.faces = torch.from_numpy(triangles.faces.reshape(-1).copy()).to(device)
         self.material = torch.from_numpy(triangles.material).to(device)

@@ -1,7 +1,8 @@
-"""Ray casting of the built-in figure with Warp's mesh queries, on tensors."""
+"""Ray casting of a moving surface with Warp's mesh queries, on tensors."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,78 +14,89 @@ from ...kernels import raycast_figure as kernels
 from ...runtime.cuda_graph import warp_stream
 from ...runtime.launch import launch, warp_view
 from ...types import Camera
-from .figure import PARTS, Figure, Part
-from .figure_motion import bone_transforms
+from .shading import Shading
+from .surface import Surface
 
-LIGHT = (-0.42, -0.62, 0.66)
-"""Direction to the key light: above and in front of the figure, on its right."""
-LIGHT_SPREAD = 0.35
-SKY_RAYS, KEY_RAYS = 40, 16
-OCCLUSION_REACH = 0.5
 TOLERANCE = 2e-3
 """Largest distance behind the first hit of a ray at which a point counts as visible, world units."""
 
 
-class PosedFigure(NamedTuple):
-    """The figure at one time, ready for ray queries."""
+@dataclass(frozen=True)
+class Lamp:
+    """Quality of the light."""
+
+    spread: float = 0.35
+    """Radius of the key light over its distance: larger makes softer shadows."""
+    sky_rays: int = 40
+    key_rays: int = 16
+    reach: float = 0.5
+    """Distance beyond which an occluder does not darken the sky, world units."""
+
+
+class PosedSurface(NamedTuple):
+    """A surface at one time, ready for ray queries."""
 
     mesh: wp.Mesh
     vertices: Tensor
     """[P, 3] world; the mesh shares this memory."""
+    normals: Tensor
+    """[P, 3] unit."""
     light: Tensor
     """[P, 3] irradiance."""
+    key: Tensor
+    """[P] strength of the key light times its visible share."""
 
 
 class Raycaster:
-    """Ray caster for one figure on one device; constant data is uploaded once."""
+    """Ray caster for one moving surface on one device; constant data is uploaded once."""
 
-    def __init__(self, figure: Figure, device: str = "cpu", parts: tuple[Part, ...] = PARTS) -> None:
-        self.figure = figure
+    def __init__(
+        self, surface: Surface, device: str = "cpu", shading: Shading | None = None, lamp: Lamp | None = None
+    ) -> None:
+        self.surface = surface
         self.device = device
-        self.bones = [part.bone for part in parts]
-        self.rest = self._tensor(figure.rest)
-        self.faces = torch.from_numpy(figure.faces.reshape(-1)).to(device)
-        self.face_part = torch.from_numpy(figure.face_part).to(device)
-        self.kinds = torch.tensor([part.kind for part in parts], dtype=torch.int32, device=device)
-        self.colors = self._tensor([part.colors for part in parts])
-        self.frequencies = self._tensor([part.frequency for part in parts])
-        self.light_direction = torch.nn.functional.normalize(self._tensor([LIGHT]), dim=1)
+        self.shading = shading or Shading()
+        self.lamp = lamp or Lamp()
+        self.rest = self._tensor(surface.rest)
+        self.faces = torch.from_numpy(surface.faces.reshape(-1)).to(device)
+        self.face_part = torch.from_numpy(surface.face_part).to(device)
+        materials = surface.materials
+        self.kinds = torch.tensor([material.kind for material in materials], dtype=torch.int32, device=device)
+        self.colors = self._tensor([material.colors for material in materials])
+        self.frequencies = self._tensor([material.frequency for material in materials])
+        self.shine = self._tensor([(material.shine, material.exponent) for material in materials])
+        self.light_direction = torch.nn.functional.normalize(self._tensor([self.shading.light]), dim=1)
 
     def _tensor(self, values) -> Tensor:
         return torch.as_tensor(np.asarray(values, np.float32)).to(self.device)
 
-    def part_transforms(self, time: float) -> np.ndarray:
-        """Return bone-to-world [parts, 4, 4] of each part."""
-        transforms = bone_transforms(time)
-        return np.stack([transforms[bone] for bone in self.bones])
-
-    def pose(self, time: float) -> PosedFigure:
-        """Pose and light the figure at ``time`` in [0, 1]."""
-        transforms = self.part_transforms(time)[self.figure.vertex_part]
-        vertices = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.local) + transforms[:, :3, 3]
-        normals = np.einsum("pij,pj->pi", transforms[:, :3, :3], self.figure.normals)
-        points, directions = self._tensor(vertices), self._tensor(normals)
+    def pose(self, time: float) -> PosedSurface:
+        """Pose and light the surface at ``time`` in [0, 1]."""
+        points, normals = (self._tensor(values) for values in self.surface.posed(time))
         mesh = mesh_over(points, self.faces)
-        light = torch.empty_like(points)
-        launch(
-            kernels.light_vertices, len(points), mesh.id, points, directions, self.light_direction, LIGHT_SPREAD,
-            SKY_RAYS, KEY_RAYS, OCCLUSION_REACH, light, grain=64,
-        )  # fmt: skip
-        return PosedFigure(mesh, points, light)
+        light, key = torch.ones_like(points), torch.zeros(len(points), device=self.device)
+        if not self.shading.unlit:
+            lamp, shading = self.lamp, self.shading
+            launch(
+                kernels.light_vertices, len(points), mesh.id, points, normals, self.light_direction, lamp.spread,
+                lamp.sky_rays, lamp.key_rays, lamp.reach, shading.ambient / 0.5, shading.diffuse / 0.5, light, key,
+                grain=64,
+            )  # fmt: skip
+        return PosedSurface(mesh, points, normals, light, key)
 
-    def render(self, posed: PosedFigure, camera: Camera, samples: int = 4) -> Tensor:
+    def render(self, posed: PosedSurface, camera: Camera, samples: int = 4) -> Tensor:
         """Render [H, W, 4] premultiplied colour and coverage with ``samples`` x ``samples`` rays per pixel."""
         image = torch.zeros(camera.height, camera.width, 4, device=self.device)
         left, top, columns, rows = pixel_window(posed.vertices, camera)
         camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
         launch(
-            kernels.raycast, columns * rows, posed.mesh.id, self.faces, self.rest, posed.light, self.face_part,
-            self.kinds, self.colors, self.frequencies, camera_to_world, camera.K.to(self.device), left, top, columns,
-            samples, image, grain=64,
+            kernels.raycast, columns * rows, posed.mesh.id, self.faces, self.rest, posed.light, posed.normals,
+            posed.key, self.light_direction, self.face_part, self.kinds, self.colors, self.frequencies, self.shine,
+            camera_to_world, camera.K.to(self.device), left, top, columns, samples, image, grain=64,
         )  # fmt: skip
         return image
 
-    def visible(self, posed: PosedFigure, camera: Camera, points: Tensor) -> Tensor:
+    def visible(self, posed: PosedSurface, camera: Camera, points: Tensor) -> Tensor:
         """Return [P] bool, True for surface points [P, 3] that the camera sees."""
         seen = torch.empty(len(points), dtype=torch.int32, device=self.device)
         launch(

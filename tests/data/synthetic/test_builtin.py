@@ -13,11 +13,12 @@ import torch
 from reference.raycast import first_hit
 from scgs_warp.data import load
 from scgs_warp.data.synthetic.builtin import FIELD_OF_VIEW, make_synthetic, random_camera, sample_surface
-from scgs_warp.data.synthetic.figure import PARTS, build_figure, rounded_box, torus, vertex_normals
+from scgs_warp.data.synthetic.figure import PARTS, build_figure
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
 from scgs_warp.data.synthetic.orbit_cameras import camera_of
 from scgs_warp.data.synthetic.raycast import Raycaster
 from scgs_warp.data.synthetic.renderer import write_rgba
+from scgs_warp.data.synthetic.surface import RigidParts
 from scgs_warp.errors import UserError
 from scgs_warp.evaluation.motion_metrics import load_ground_truth, score_motion
 from scgs_warp.runtime import environment
@@ -35,28 +36,6 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-@pytest.mark.parametrize(
-    "mesh", [rounded_box((0.3, 0.2, 0.4), 0.1), rounded_box((0.2, 0.2, 0.2), 0.2, 12), torus(0.4, 0.1, 24)]
-)
-def test_solids_are_closed_and_face_outward(mesh):
-    vertices, faces = mesh
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    assert len(np.unique(edges, axis=0)) == len(edges)  # each directed edge once ...
-    assert {tuple(edge) for edge in edges} == {tuple(edge[::-1]) for edge in edges}  # ... and once the other way
-    corners = vertices[faces]
-    volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    assert volume > 0
-    assert np.abs(np.linalg.norm(vertex_normals(vertices, faces), axis=1) - 1).max() < 1e-9
-
-
-def test_ball_has_its_volume():
-    vertices, faces = rounded_box((0.2, 0.2, 0.2), 0.2, 12)
-    assert np.abs(np.linalg.norm(vertices, axis=1) - 0.2).max() < 1e-12
-    corners = vertices[faces]
-    volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    assert volume == pytest.approx(4 / 3 * np.pi * 0.2**3, rel=0.02)
-
-
 def test_motion_is_rigid_smooth_and_large():
     times = np.linspace(0, 1, 101)
     poses = np.stack([np.stack(list(bone_transforms(float(time)).values())) for time in times])
@@ -71,7 +50,7 @@ def test_motion_is_rigid_smooth_and_large():
 def test_every_part_has_a_bone_and_fits():
     figure = build_figure()
     assert {part.bone for part in PARTS} <= set(BONES)
-    caster = Raycaster(figure)
+    caster = Raycaster(RigidParts(figure, bone_transforms))
     for time in (0.0, 0.3, 0.7, 1.0):
         vertices = caster.pose(time).vertices
         assert vertices.norm(dim=1).max() < 1.36  # the sphere that every camera sees whole
@@ -81,7 +60,8 @@ def test_every_part_has_a_bone_and_fits():
 @pytest.mark.parametrize("seed", range(2))
 def test_rays_match_float64(device, seed):
     figure = build_figure()
-    caster = Raycaster(figure, device)
+    surface = RigidParts(figure, bone_transforms)
+    caster = Raycaster(surface, device)
     posed = caster.pose(0.2 + 0.5 * seed)
     camera = camera_of(random_camera(np.random.default_rng(seed)), FIELD_OF_VIEW, 20, 20)
     image = caster.render(posed, camera, samples=1).cpu()
@@ -100,11 +80,12 @@ def test_rays_match_float64(device, seed):
 
 def test_visibility_matches_float64(device):
     figure = build_figure()
-    caster = Raycaster(figure, device)
+    surface = RigidParts(figure, bone_transforms)
+    caster = Raycaster(surface, device)
     posed = caster.pose(0.4)
     camera = camera_of(random_camera(np.random.default_rng(3)), FIELD_OF_VIEW, 64, 64)
     part, local = sample_surface(figure, 200, np.random.default_rng(0))
-    transforms = caster.part_transforms(0.4)[part]
+    transforms = surface.part_transforms(0.4)[part]
     points = np.einsum("pij,pj->pi", transforms[:, :3, :3], local) + transforms[:, :3, 3]
     tensor = torch.from_numpy(points.astype(np.float32)).to(device)
     seen = caster.visible(posed, camera, tensor).cpu()

@@ -23,9 +23,10 @@ from scgs_warp.data import load
 from scgs_warp.data.gltf.scene import read_scene
 from scgs_warp.data.synthetic.contact_sheet import project
 from scgs_warp.data.synthetic.from_mesh import SynthesisRequest, check, plan_synthesis, synthesize
-from scgs_warp.data.synthetic.mesh import MeshSubject, Shading, srgb_to_linear
+from scgs_warp.data.synthetic.mesh import MeshSubject, srgb_to_linear
 from scgs_warp.data.synthetic.orbit_cameras import FilmingSettings, camera_at, camera_distance, camera_of
 from scgs_warp.data.synthetic.renderer import ROOM_RADIUS, subject_height
+from scgs_warp.data.synthetic.shading import Shading
 from scgs_warp.errors import UserError
 from scgs_warp.evaluation.motion_metrics import load_ground_truth, score_motion
 from scgs_warp.runtime import environment
@@ -342,7 +343,7 @@ def test_wrong_requests_are_explained(tmp_path, fields, message):
 
 
 def test_options_of_files_need_a_file():
-    for fields, name in (({"clip": "Walk"}, "--clip"), ({"end": 1.0}, "--end"), ({"shading": UNLIT}, "--light")):
+    for fields, name in (({"clip": "Walk"}, "--clip"), ({"end": 1.0}, "--end")):
         with pytest.raises(UserError, match=f"{name}.*give one with --mesh"):
             check(SynthesisRequest(**fields))
 
