@@ -74,12 +74,20 @@ def show(metrics: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table(title=f"{metrics['split']}, {metrics['images']} images, step {metrics['step']}")
-    columns = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "epe": "EPE [%]", "jitter": "jitter [%]"}
+    columns = {
+        "psnr": "PSNR [dB]",
+        "psnr_median": "median",
+        "psnr_worst": "worst",
+        "ssim": "SSIM",
+        "lpips": "LPIPS",
+        "epe": "EPE [%]",
+        "jitter": "jitter [%]",
+    }
     columns.update(gaussians="Gaussians", control_points="control points")
     present = [key for key in columns if metrics.get(key) is not None]
     for key in present:
         table.add_column(columns[key], justify="right")
-    digits = {"psnr": 2, "ssim": 4, "lpips": 4, "epe": 3, "jitter": 4}
+    digits = {"psnr": 2, "psnr_median": 2, "psnr_worst": 2, "ssim": 4, "lpips": 4, "epe": 3, "jitter": 4}
     cells = [f"{metrics[key]:.{digits[key]}f}" if key in digits else f"{metrics[key]:,}" for key in present]
     table.add_row(*cells)
     Console().print(table)
@@ -91,6 +99,7 @@ def main(args: list[str] | None) -> None:
     options = tyro.cli(Options, args=args, prog="evaluate.py")
     device = prepare(options.device, options.threads, options.memory_gib)
 
+    from scgs_warp.evaluation.coverage import coverage_line
     from scgs_warp.evaluation.evaluate import metrics_of, write_metrics
     from scgs_warp.runtime.progress import progress
     from scgs_warp.scene.scene import Scene
@@ -122,6 +131,9 @@ def main(args: list[str] | None) -> None:
     target = options.json or folder / "metrics.json"
     write_metrics(metrics, target)
     show(metrics)
+    uncovered = coverage_line(metrics)
+    if uncovered is not None:
+        print(uncovered)
     print("poses: as training refined them" if poses == "refined" else "poses: as the data give them")
     print(f"renders and ground truth: {folder}; metrics: {target}")
 

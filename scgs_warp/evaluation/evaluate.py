@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import statistics
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,10 @@ from ..scene.scene import Scene
 from ..types import Frame
 from ..visualization.figures import contact_sheet, to_bytes
 from ..visualization.video import write_png
+from .coverage import compare_alpha, coverage_row, summarise
 from .image_metrics import psnr, ssim
 from .motion_metrics import load_ground_truth, score_motion
+from .thin_structures import RodCheck, load_rods
 
 SHEET_ROWS = 8
 """Number of images on a contact sheet, evenly spread over the split."""
@@ -33,8 +36,9 @@ def _mean(values: list[float]) -> float | None:
     return math.fsum(values) / len(values) if values else None
 
 
-def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, Any]:
-    """Measure one image; ``image`` and ``truth`` are [H, W, 3] in [0, 1] on the scene's device."""
+def _measure(frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, Any]:
+    """Measure one image; ``image`` and ``truth`` are [H, W, 3] in [0, 1], ``alpha`` is [H, W], on the scene's
+    device."""
     mask = None if frame.mask is None else frame.mask.to(image.device)
     row: dict[str, Any] = {"name": frame.name, "time": float(frame.time)}
     row["psnr"] = float(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
@@ -43,6 +47,8 @@ def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) ->
         if mask is not None:  # outside the mask the truth is unknown: show no difference
             image = torch.where(mask[..., None], image, truth)
         row["lpips"] = float(lpips(image, truth))
+    if frame.alpha is not None:
+        row.update(coverage_row(compare_alpha(alpha, frame.alpha.to(alpha.device), mask)))
     return row
 
 
@@ -96,6 +102,7 @@ def evaluate(
     lpips: Lpips | None = None,
     render_dir: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[int, Frame, Tensor], None] | None = None,
 ) -> dict[str, Any]:
     """Render every frame of a split and compare it with the truth; a metric is the mean over the clamped images.
 
@@ -106,10 +113,13 @@ def evaluate(
         lpips: function from (image, truth), both [H, W, 3] in [0, 1], to their perceptual distance; None: not measured.
         render_dir: folder for ``renders/NAME.png``, ``truth/NAME.png`` and ``contact_sheet.png``; None: not written.
         progress: called with (done, total) after each image.
+        watch: called with (index, frame, rendered alpha [H, W]) after each image.
 
     Returns:
-        ``psnr`` [dB], ``ssim``, ``lpips`` (None if not measured), ``images``, and ``per_image``, a list of
-        ``name``, ``time``, ``psnr``, ``ssim`` (and ``lpips``). The metrics of an empty split are None.
+        ``psnr`` [dB], ``ssim``, ``lpips`` (None if not measured), ``images``; ``psnr_median``; ``psnr_worst`` and
+        ``psnr_worst_time``, the lowest PSNR of an image and the image's time; the fields of ``coverage.summarise``; and
+        ``per_image``, a list of ``name``, ``time``, ``psnr``, ``ssim`` (``lpips``; ``missing``, ``extra``,
+        ``missing_region``, ``extra_region`` if the image has alpha). The metrics of an empty split are None.
 
     Raises:
         UserError: ``render_dir`` cannot be written.
@@ -118,17 +128,26 @@ def evaluate(
     background = dataset.background_color
     rows = []
     for index, frame in enumerate(dataset):
-        image = scene.render(frame.camera, frame.time, background).rgb.clamp(0.0, 1.0)
+        rendered = scene.render(frame.camera, frame.time, background)
+        image = rendered.rgb.clamp(0.0, 1.0)
         truth = frame.image.to(image.device).clamp(0.0, 1.0)
-        rows.append(_measure(frame, image, truth, lpips))
+        rows.append(_measure(frame, image, rendered.alpha, truth, lpips))
         if renders is not None:
             renders.add(index, frame, image, truth, rows[-1]["psnr"])
+        if watch is not None:
+            watch(index, frame, rendered.alpha)
         if progress is not None:
             progress(index + 1, len(dataset))
     if renders is not None:
         renders.finish()
     means = {name: _mean([row[name] for row in rows if name in row]) for name in ("psnr", "ssim", "lpips")}
-    return {**means, "images": len(rows), "per_image": rows}
+    return {**means, **_spread_of_psnr(rows), **summarise(rows), "images": len(rows), "per_image": rows}
+
+
+def _spread_of_psnr(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    worst = min(rows, key=lambda row: row["psnr"], default={})
+    median = statistics.median(row["psnr"] for row in rows) if rows else None
+    return {"psnr_median": median, "psnr_worst": worst.get("psnr"), "psnr_worst_time": worst.get("time")}
 
 
 def metrics_of(
@@ -142,7 +161,8 @@ def metrics_of(
 ) -> dict[str, Any]:
     """Make the content of ``metrics.json``: the metrics of ``evaluate``, and a description of scene and data.
 
-    If the data folder has ``ground_truth.npz``, the content includes ``epe`` and ``jitter`` of the motion.
+    If the data folder has ``ground_truth.npz``, the content includes ``epe`` and ``jitter`` of the motion; if it has
+    ``rods.npz``, the fields of ``RodCheck.summary``.
 
     Args:
         seconds: duration of the training, if known.
@@ -150,13 +170,15 @@ def metrics_of(
     Raises:
         UserError: ``render_dir`` cannot be written, or the ground truth cannot be read.
     """
-    measured = evaluate(scene, dataset, lpips=lpips, render_dir=render_dir, progress=progress)
+    rods = load_rods(dataset.folder, dataset.split, len(dataset))
+    check = None if rods is None else RodCheck(rods)
+    watch = None if check is None else check.add
+    measured = evaluate(scene, dataset, lpips=lpips, render_dir=render_dir, progress=progress, watch=watch)
     rows = measured.pop("per_image")
     data = scene.settings.get("data", {})
     metrics = {
-        **{key: measured[key] for key in ("psnr", "ssim", "lpips")},
+        **measured,
         "split": dataset.split,
-        "images": measured["images"],
         "step": scene.step,
         "seconds": seconds,
         "gaussians": scene.gaussian_count,
@@ -171,6 +193,8 @@ def metrics_of(
     if truth is not None:
         opacities = scene.gaussians_at(float(truth.times[0])).opacities
         metrics.update(score_motion(truth, lambda time: scene.gaussians_at(time).means, opacities)._asdict())
+    if check is not None:
+        metrics.update(check.summary())
     return {**metrics, "per_image": rows}
 
 

@@ -56,7 +56,7 @@ def load_ground_truth(folder: str | Path) -> GroundTruth | None:
     if not path.is_file():
         return None
     points, times, height = (read_npy(path, name) for name in ("points", "times", "height"))
-    visible = read_npy(path, "visible", flags=True)
+    visible = read_npy(path, "visible", "flags")
     if points.ndim != 3 or points.shape[2] != 3 or len(points) < 1 or times.shape != points.shape[:1]:
         raise UserError(f"{path}: points {points.shape} and times {times.shape} must be [T, P, 3] and [T]")
     if visible.ndim != 2 or visible.shape[1] != points.shape[1] or visible.dtype != bool:

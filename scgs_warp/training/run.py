@@ -14,6 +14,7 @@ from ..config.presets import TrainConfig, to_dict
 from ..data import ImageCache, load
 from ..data.dataset import Dataset
 from ..errors import UserError, one_line
+from ..evaluation.coverage import coverage_line
 from ..evaluation.evaluate import Lpips, metrics_of, write_metrics
 from ..geometry import cameras
 from ..runtime.progress import progress
@@ -178,10 +179,12 @@ def turntable(scene: Scene, path: Path, frames: int, size: int = FILM_SIZE) -> N
 
 
 def summary(metrics: dict[str, Any]) -> str:
-    """Format the scores for the terminal, one per line."""
-    names = ("psnr", "ssim", "lpips", "epe", "jitter", "seconds", "gaussians", "control_points", "step")
+    """Format the scores for the terminal, one per line; the last line says where the subject is not covered, if it is
+    not."""
+    names = ("psnr", "psnr_worst", "ssim", "lpips", "epe", "jitter", "seconds", "gaussians", "control_points", "step")
     scores = [(name, metrics[name]) for name in names if metrics.get(name) is not None]
-    return "\n".join(
+    lines = [
         f"{name:>15}  {value:.4g}" if isinstance(value, float) else f"{name:>15}  {json.dumps(value)}"
         for name, value in scores
-    )
+    ]
+    return "\n".join([*lines, *filter(None, [coverage_line(metrics)])])
