@@ -12,32 +12,40 @@ import re
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from ..config.presets import FREE_TO_CHANGE, TrainConfig, from_dict, read_config, to_dict, with_field
 from ..config.recorded import with_newer_fields
 from ..config.validation import check
 from ..errors import UserError, printable
+from ..evaluation.coverage import coverage_line
 from ..storage.checkpoint import FILE as CHECKPOINT
 from ..storage.checkpoint import PREVIOUS
 from ..storage.json_files import as_number, parse_json
 
-AblationName = Literal["nodes", "motion", "arap"]
+if TYPE_CHECKING:
+    from ..data.dataset import Dataset
+
+AblationName = Literal["nodes", "motion", "arap", "zoo"]
 ABLATIONS: tuple[str, ...] = get_args(AblationName)
 VALUES = {
     "nodes": ("64", "128", "256", "512", "1024", "2048", "4096"),
     "motion": ("static", "hexplane", "per-gaussian", "control-points"),
     "arap": ("on", "off", "per-gaussian"),
+    "zoo": ("zoo",),
 }
-"""Rows of each table; ``nodes`` also takes other numbers."""
+"""Rows of each table; ``nodes`` also takes other numbers, and the rows of ``zoo`` are its scenes."""
 VARIED = {
     "nodes": ("motion.nodes", "motion.model"),
     "motion": ("motion.model",),
     "arap": ("motion.model", "loss.arap", "pretrain.arap_weight"),
+    "zoo": ("data.downscale",),
 }
 """Fields in which the cells of an ablation may differ."""
-NUMBERS = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds")
+NUMBERS = ("control_points", "gaussians", "psnr", "psnr_median", "psnr_worst", "psnr_worst_time", "ssim", "lpips",
+           "epe", "jitter", "missing", "rods_within", "seconds")  # fmt: skip
 """Metrics of ``metrics.json`` that tables show."""
 NUMBER_LIMIT = 1e12
 """Magnitude at and above which a metric counts as damaged."""
@@ -106,6 +114,8 @@ def sort_values(ablation: str, values: Sequence[str]) -> tuple[str, ...]:
 
 def fields_of_row(ablation: str, value: str) -> dict[str, Any]:
     """Return the fields that define a row, by their dotted names."""
+    if ablation == "zoo":
+        return {}
     if ablation == "nodes":
         return {"motion.model": "control-points", "motion.nodes": int(value)}
     if ablation == "motion" or value == "per-gaussian":
@@ -212,6 +222,7 @@ def read_metrics(folder: Path) -> dict[str, Any] | None:
         not isinstance(values, dict)
         or not all(_is_sound(values.get(name)) for name in NUMBERS)
         or not isinstance(values.get("device", ""), (str, type(None)))
+        or not _is_presentable(values)
     ):
         raise UserError(f"{path}: damaged; remove it, and the cell is measured again")
     return values
@@ -221,6 +232,16 @@ def _is_sound(value: Any) -> bool:
     """Tell whether a table can show ``value``: a finite number, or None."""
     number = as_number(value)
     return value is None or (number is not None and abs(number) < NUMBER_LIMIT)
+
+
+def _is_presentable(values: dict[str, Any]) -> bool:
+    """Tell whether a table can say where the subject is not covered, and whether all numbers are finite."""
+    try:
+        coverage_line(values)
+        json.dumps(values, allow_nan=False)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return False
+    return True
 
 
 def is_done(cell: Cell) -> bool:
@@ -256,8 +277,19 @@ def run_cell(cell: Cell) -> Path:
             data = Path(settings["data"].pop("folder"))
             config = from_dict(settings, cell.name)
             resume = any((folder / name).is_file() for name in (CHECKPOINT, PREVIOUS))
-            train_and_evaluate(config, data, folder, device=cell.device, resume=resume, frames=0, lpips=lpips)
+            options = {"device": cell.device, "resume": resume, "frames": 0, "lpips": lpips}
+            train_and_evaluate(config, data, folder, before_training=partial(_remark, cell, config), **options)
     return folder / "metrics.json"
+
+
+def _remark(cell: Cell, config: TrainConfig, data: Dataset) -> None:
+    """Print a line if a setting has no effect on the cell's data."""
+    from ..runtime.progress import say
+    from ..training.dataset_advice import progressive_without_effect
+
+    line = progressive_without_effect(config, len(data), 0 if data.points is None else len(data.points))
+    if line is not None:
+        say(f"{cell.name}: {line}")
 
 
 def _measure_again(cell: Cell, lpips: Any) -> None:

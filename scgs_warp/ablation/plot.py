@@ -33,13 +33,13 @@ Table = dict[str, Any]
 def picture(report: dict[str, Any]) -> bytes:
     """Draw the plot and return it as a PNG.
 
-    For ``nodes`` it shows PSNR and the final number of control points over the requested number, otherwise bars for
-    each scene.
+    For ``nodes`` it shows PSNR and the final number of control points over the requested number, for ``zoo`` a bar for
+    each scene with its worst image, otherwise bars for each scene.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # no display, no global backend
     from matplotlib.figure import Figure
 
-    draw = {"nodes": _nodes, "motion": _motion, "arap": _arap}[report["ablation"]]
+    draw = {"nodes": _nodes, "motion": _motion, "arap": _arap, "zoo": _zoo}[report["ablation"]]
     figure = Figure(dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     draw(figure, report)
@@ -192,3 +192,39 @@ def _arap(figure: Any, report: dict[str, Any]) -> None:
         axes.set_title(title)
     handles, texts = _handles(report)
     figure.legend(handles, texts, loc="outside lower center", ncols=len(handles), frameon=False)
+
+
+def _zoo(figure: Any, report: dict[str, Any]) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    rows = report["tables"][0]["rows"]
+    figure.set_size_inches(max(5.5, 1.6 + 0.75 * len(rows)), HEIGHT)
+    axes = figure.add_subplot()
+    heights: list[float] = []
+    for place, row in enumerate(rows):
+        if row["psnr"] is not None:
+            mean = top = row["psnr"]["mean"]
+            axes.bar(place, mean, 0.6, yerr=row["psnr"]["std"], color=OURS, error_kw={"linewidth": 1})
+            if row.get("psnr_change") is not None:
+                other = mean - row["psnr_change"]
+                axes.plot([place - 0.36, place + 0.36], [other, other], color="black", linewidth=1.4)
+                top = max(mean, other)
+            axes.text(place, top + 0.1, f"{mean:.1f}", ha="center", va="bottom", fontsize=7)
+            heights.append(top)
+        if row["psnr_worst"] is not None:
+            axes.plot(place, row["psnr_worst"]["mean"], "o", color=PUBLISHED, markersize=5)
+            heights.append(row["psnr_worst"]["mean"])
+    axes.set_ylabel("PSNR [dB]")
+    _psnr_axis(axes, heights)
+    axes.set_xticks(range(len(rows)), [row["value"] for row in rows])
+    axes.set_xlim(-0.6, len(rows) - 0.4)
+    axes.tick_params(axis="x", length=0, labelsize=8)
+    axes.grid(axis="y", alpha=0.3, linewidth=0.5)
+    axes.set_axisbelow(True)
+    handles = [Patch(color=OURS), Line2D([], [], color=PUBLISHED, marker="o", linestyle="")]
+    texts = ["mean", "worst image"]
+    if report.get("compared"):
+        handles.append(Line2D([], [], color="black", linewidth=1.4))
+        texts.append(f"mean in {report['compared']['folder']}")
+    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, fontsize=9)

@@ -9,31 +9,44 @@ from pathlib import Path
 from typing import Any
 
 from ..config.presets import FREE_TO_CHANGE
+from ..data.synthetic.zoo import SUBJECTS
 from ..errors import UserError
 from ..storage.files import write_atomically
-from .cells import VARIED, Cell, cell_folder, discover, first_difference, read_metrics, recorded_settings, sort_values
+from .cells import (
+    NUMBERS,
+    VARIED,
+    Cell,
+    cell_folder,
+    discover,
+    first_difference,
+    read_metrics,
+    recorded_settings,
+    sort_values,
+)
 from .markdown import markdown
 from .plot import picture
 from .published import PUBLISHED_PSNR, TABLE_S1
+from .zoo import compare_rows, read_table
 
-METRICS = ("control_points", "gaussians", "psnr", "ssim", "lpips", "epe", "jitter", "seconds")
 REFERENCE = {"motion": "control-points", "arap": "per-gaussian"}
 """Row of each table that the others are compared with."""
 
 Row = dict[str, Any]
 
 
-def build(ablation: str, output: Path, planned: Sequence[Cell] = ()) -> dict[str, Any]:
+def build(ablation: str, output: Path, planned: Sequence[Cell] = (), compare: Path | None = None) -> dict[str, Any]:
     """Collect the cells and compute the tables.
 
     Args:
         output: Folder of the cells, ``SCENE/VALUE[-seedN]``.
         planned: Cells that have an entry even while they are missing.
+        compare: Output folder of another zoo, whose scores are subtracted.
 
     Returns:
         ``ablation``, ``settings`` (shared by the cells), ``scenes``, ``values``, ``seeds``, ``cells`` (one entry each,
         metrics None while missing) and ``tables``: the mean over several scenes, then one table for each scene, with
-        ``rows`` of statistics {mean, std, count}, None for missing cells.
+        ``rows`` of statistics {mean, std, count}, None for missing cells. For ``zoo`` it is one table, whose rows are
+        the scenes and their mean; with ``compare`` there is ``compared``, the other folder and its settings.
 
     Raises:
         UserError: there are no cells, a file is damaged, or cells differ in more than the ablation varies.
@@ -56,6 +69,8 @@ def build(ablation: str, output: Path, planned: Sequence[Cell] = ()) -> dict[str
         "seeds": sorted({cell["seed"] for cell in cells}),
         "cells": [_without_images(cell) for cell in cells],
     }
+    if ablation == "zoo":
+        return _zoo_report(report, cells, compare)
     tables = [_table(report, cells, [scene]) for scene in scenes]
     if len(scenes) > 1:
         tables.insert(0, _table(report, cells, scenes))
@@ -92,7 +107,8 @@ def _shared_settings(ablation: str, output: Path, cells: list[Row], planned: Seq
             )
     if shared is None:
         return {}
-    data = {name: shared["data"][name] for name in ("downscale", "resample", "background")}
+    names = ("resample", "background") if ablation == "zoo" else ("downscale", "resample", "background")
+    data = {name: shared["data"][name] for name in names}
     return {"preset": shared["preset"], "steps": shared["steps"], **data}
 
 
@@ -134,7 +150,7 @@ def _table(report: dict[str, Any], cells: list[Row], scenes: list[str]) -> dict[
     rows: list[Row] = []
     for value in report["values"]:
         own = [cell for cell in cells if cell["value"] == value and cell["scene"] in scenes]
-        rows.append({"value": value, **{key: _over_scenes(own, scenes, key) for key in METRICS}})
+        rows.append({"value": value, **{key: _over_scenes(own, scenes, key) for key in NUMBERS}})
     _compare(ablation, rows)
     if ablation == "nodes" and not alone:
         for row in rows:
@@ -145,6 +161,34 @@ def _table(report: dict[str, Any], cells: list[Row], scenes: list[str]) -> dict[
             _published_leads(rows, ["mean"], "published_mean")
     name = scenes[0] if len(scenes) == 1 else f"mean of {', '.join(scenes)}"
     return {"name": name, "scenes": scenes, "rows": rows}
+
+
+def _zoo_report(report: dict[str, Any], cells: list[Row], compare: Path | None) -> dict[str, Any]:
+    """Add the one table of the zoo to its report."""
+    order = list(SUBJECTS)
+    scenes = sorted(report["scenes"], key=lambda scene: order.index(scene) if scene in order else len(order))
+    rows: list[Row] = []
+    for scene in scenes:
+        own = [cell for cell in cells if cell["scene"] == scene]
+        worst = min((cell["metrics"] for cell in own if _has(cell, "psnr_worst")), key=_worst_psnr, default={})
+        rows.append({"value": scene, **{key: _over_scenes(own, [scene], key) for key in NUMBERS}})
+        rows[-1]["psnr_worst_time"] = worst.get("psnr_worst_time")
+    if len(scenes) > 1:
+        rows.append({"value": "mean", **{key: _over_scenes(cells, scenes, key) for key in NUMBERS}})
+        rows[-1]["psnr_worst_time"] = None
+    compared = None if compare is None else read_table(compare)
+    if compared is not None:
+        compare_rows(rows, compared.pop("rows"))
+    return {
+        **report,
+        "scenes": scenes,
+        "compared": compared,
+        "tables": [{"name": "subjects", "scenes": scenes, "rows": rows}],
+    }
+
+
+def _worst_psnr(metrics: Row) -> float:
+    return metrics["psnr_worst"]
 
 
 def _compare(ablation: str, rows: list[Row]) -> None:

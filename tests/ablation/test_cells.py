@@ -54,6 +54,13 @@ def test_cells_differ_in_what_is_varied_alone(blobs, tmp_path):
         assert len({cell.folder for cell in cells}) == len(cells)
 
 
+def test_a_cell_says_where_progressive_has_no_effect(blobs, tmp_path, capsys):
+    arguments = options(blobs, tmp_path / "motion", "--values", "static,control-points", "--progressive")
+    assert app.cli(["motion", *arguments]) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if "--progressive" in line]
+    assert said == ["blobs/static: --progressive has no effect with --motion static, which has no stage 1"]
+
+
 def test_arap_off_is_off_in_both_stages(blobs, tmp_path):
     base = presets.preset("cpu")
     on, off = ablate.plan("arap", base, {"blobs": blobs}, tmp_path)

@@ -84,10 +84,12 @@ def test_ablations_share_a_folder(tmp_path):
     craft(tmp_path, "nodes", "64", psnr=30.0)
     craft(tmp_path, "motion", "static", psnr=20.0)
     craft(tmp_path, "arap", "off", psnr=29.0)
+    craft(tmp_path, "zoo", "zoo", psnr=28.0)
     assert [table.build(name, tmp_path)["values"] for name in ablate.ABLATIONS] == [
         ("64",),
         ("static",),
         ("off",),
+        ("zoo",),
     ]
 
 
