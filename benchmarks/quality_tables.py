@@ -1,10 +1,11 @@
 """Tables of quality from ``results/quality/*.json``, and tables that were reported without a committed run.
 
 A file in ``results/quality/`` holds one run, or fields that several runs share and a list ``runs``. A run has
-``table``, ``row``, ``scene``, ``provenance`` (``measured``, ``reported`` or ``published``), ``commit``, ``command``,
-``processor`` and the figures of ``metrics.json``; ``label`` is the text of a row for which the writer has none. A
-measured run replaces the reported one of the same table, row and scene. A run of the scene ``mean`` holds the reported
-mean of a row whose runs are not known to more digits; it counts until all scenes of the row are measured.
+``table``, ``row``, ``scene``, ``provenance`` (``measured`` or ``reported``), ``commit``, ``command``, ``processor`` and
+the figures of ``metrics.json``; ``label`` is the text of a row for which the writer has none. A measured run replaces
+the reported one of the same table, row and scene. A run of the scene ``mean`` holds the reported mean of a row whose
+runs are not known to more digits; it counts until all scenes of the row are measured. Published figures come from
+``results/literature/``. Reported runs of the preset ``paper`` are rows of ``best``, as it is called now.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from literature_tables import Column, Literature, literature_table, read_literature
 from markdown_table import number, table
 from provenance import OLDER, REPORTED, TRAINING, changed_since, older_note, reported_note
 
@@ -22,6 +24,11 @@ from scgs_warp.ablation.published import PUBLISHED_PSNR, TABLE_S1
 
 DNERF = ("jumpingjacks", "hook", "mutant", "standup")
 TWO = DNERF[:2]
+ALL_DNERF = (*DNERF, "trex", "bouncingballs", "hellwarrior")
+NERF_DS = ("as", "basin", "bell", "cup", "plate", "press", "sieve")
+VRIG = ("broom", "3dprinter", "chicken", "peel-banana")
+FORMER_ROWS = {"paper": "best", "paper-less-pruning": "best-less-pruning"}
+"""Present names of the rows that reported runs call after the former name of a preset."""
 
 Run = dict[str, Any]
 Runs = dict[tuple[str, str, str], Run]
@@ -29,13 +36,15 @@ Runs = dict[tuple[str, str, str], Run]
 
 
 def read_runs(results: Path) -> Runs:
-    """Read all runs; a measured one replaces a reported one."""
+    """Read all runs; a measured one replaces a reported one. Runs of a renamed row have the key ``formerly``."""
     runs: Runs = {}
     for path in sorted((results / "quality").glob("*.json")):
         values = json.loads(path.read_text(encoding="utf-8"))
         shared = {key: value for key, value in values.items() if key != "runs"}
         for own in values.get("runs", [{}]):
             run = {**shared, **own}
+            if run["provenance"] == "reported" and run["row"] in FORMER_ROWS:
+                run = {**run, "row": FORMER_ROWS[run["row"]], "formerly": "paper"}
             key = run["table"], run["row"], run["scene"]
             if key not in runs or run["provenance"] == "measured":
                 runs[key] = run
@@ -45,8 +54,8 @@ def read_runs(results: Path) -> Runs:
 class Source:
     """The runs of one table, and the marks of the rows that were written from them."""
 
-    def __init__(self, runs: Runs, name: str) -> None:
-        self.runs, self.name = runs, name
+    def __init__(self, runs: Runs, name: str, literature: Literature | None = None) -> None:
+        self.runs, self.name, self.literature = runs, name, literature
         self.reported: list[str] = []
         self.older: list[str] = []
 
@@ -62,8 +71,10 @@ class Source:
         return self.run(row, "mean").get(key)
 
     def label(self, row: str, text: str) -> str:
-        """Add the marks of the row's runs to ``text``, and remember their commits for the notes."""
+        """Add the former name of the row's preset and the marks of its runs to ``text``, and remember their commits for
+        the notes."""
         runs = [run for (name, own, _), run in self.runs.items() if (name, own) == (self.name, row)]
+        text += "".join(f", then called `{name}`" for name in {run["formerly"] for run in runs if "formerly" in run})
         reported = [run["commit"] for run in runs if run["provenance"] == "reported"]
         measured = (run["commit"] for run in runs if run["provenance"] == "measured")
         older = [commit for commit in measured if changed_since(commit, TRAINING)]
@@ -108,25 +119,58 @@ def cost(run: Run) -> str:
     return f"{training_time(run)}, {thousands(run['gaussians'])}" if run else ""
 
 
-def beside_published(source: Source) -> str:
-    """Write the scenes of D-NeRF beside published figures, with the cost of each measured row below it."""
-    lines = []
-    for row, text in (
-        ("sc-gs", "SC-GS, published (80,000 steps)"),
-        ("sc-gs-rerun", "SC-GS, independent rerun"),
-        ("deformable-3d-gs", "Deformable-3D-GS"),
-        ("4d-gs", "4D-GS"),
-        ("cpu", "**`cpu`** (24,000 steps, two CPU cores)"),
-        ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
-        ("paper", "**`paper`** (80,000 steps, one CPU core)"),
-        ("paper-less-pruning", "`paper` with `densify.min_contribution=0.02`"),
-    ):
-        runs = [source.run(row, scene) for scene in DNERF]
-        mean = source.mean(row, DNERF, "psnr")
-        lines.append([source.label(row, text), *(number(run.get("psnr"), 2) for run in runs), number(mean, 2)])
-        if any("seconds" in run for run in runs):
-            lines.append(["time, processor, Gaussians", *map(cost, runs), ""])
-    return table(["PSNR in dB", *DNERF, "mean"], lines)
+def beside(columns: tuple[Column, ...], rows: tuple[tuple[str, str], ...]) -> Callable[[Source], str]:
+    """Make a writer for scores of this project below published figures.
+
+    Args:
+        columns: scenes, and tuples of scenes whose mean is shown.
+        rows: names and texts of this project's rows; scenes without a run are ``not run``.
+    """
+    scenes = [column for column in columns if isinstance(column, str)]
+
+    def cell(source: Source, row: str, column: Column) -> str:
+        if isinstance(column, str):
+            return number(source.run(row, column).get("psnr"), 2) or "not run"
+        if column == DNERF:
+            return number(source.mean(row, DNERF, "psnr"), 2)
+        values = [run["psnr"] for scene in column if (run := source.run(row, scene))]
+        return number(math.fsum(values) / len(values), 2) if len(values) == len(column) else ""
+
+    def ssim(source: Source, row: str) -> str:
+        values = [run["ssim"] for scene in scenes if "ssim" in (run := source.run(row, scene))]
+        count = "" if len(values) == len(scenes) else f" ({len(values)} {'scenes' if len(values) > 1 else 'scene'})"
+        return number(math.fsum(values) / len(values), 3) + count if values else ""
+
+    def write(source: Source) -> str:
+        own = [
+            [source.label(row, text), *(cell(source, row, column) for column in columns), ssim(source, row)]
+            for row, text in rows
+        ]
+        return literature_table(source.literature, columns, own)
+
+    return write
+
+
+OWN_ROWS = (
+    ("cpu", "**`cpu`** (24,000 steps, two CPU cores)"),
+    ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
+    ("best", "**`best`** (80,000 steps, one CPU core)"),
+    ("best-less-pruning", "`best` with `densify.min_contribution=0.02`"),
+    ("paper", "`paper` (the supplement's schedule, 80,000 steps)"),
+)
+"""Rows of this project on D-NeRF at 400 x 400."""
+
+
+def own_cost(source: Source) -> str:
+    """Write the cost of the rows ``OWN_ROWS``."""
+    published = Source(source.runs, "published")
+    lines = [
+        [published.label(row, text), *(cost(published.run(row, scene)) for scene in DNERF)]
+        for row, text in OWN_ROWS
+        if any("seconds" in published.run(row, scene) for scene in DNERF)
+    ]
+    source.reported, source.older = published.reported, published.older
+    return table(["time, processor, Gaussians", *DNERF], lines)
 
 
 def node_counts(source: Source) -> str:
@@ -256,7 +300,7 @@ def overview(source: Source) -> str:
     for row, scene, text in (
         ("arap/on", "figure", "built-in scene, 400 x 400, `quick` (7,000 steps)"),
         *(("published/cpu", scene, f"D-NeRF {scene}, `--downscale 2`, `cpu` (24,000 steps)") for scene in DNERF),
-        *(("published/paper", scene, f"D-NeRF {scene}, `--downscale 2`, `paper` (80,000 steps)") for scene in DNERF),
+        *(("published/best", scene, f"D-NeRF {scene}, `--downscale 2`, `best` (80,000 steps)") for scene in DNERF),
     ):
         name, _, own = row.partition("/")
         run = source.runs.get((name, own, scene), {})
@@ -279,7 +323,11 @@ def overview(source: Source) -> str:
 
 
 WRITERS: dict[str, Callable[[Source], str]] = {
-    "published": beside_published,
+    "published": beside((*DNERF, DNERF, *ALL_DNERF[4:], ALL_DNERF), OWN_ROWS),
+    "published-cost": own_cost,
+    "published-800": beside((*DNERF, DNERF, *ALL_DNERF[4:], ALL_DNERF), (("cpu", "**`cpu`**"),)),
+    "published-nerf-ds": beside((*NERF_DS, NERF_DS), (("cpu", "**`cpu`**"),)),
+    "published-hypernerf": beside((*VRIG, VRIG), (("cpu", "**`cpu`**"),)),
     "nodes": node_counts,
     "motion": motion_models,
     "arap": arap,
@@ -294,7 +342,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
 
 
 def quality_table(name: str, results: Path) -> str:
-    source = Source(read_runs(results), name)
+    source = Source(read_runs(results), name, read_literature(results, name))
     text = WRITERS[name](source)
     return "\n\n".join(part for part in (text, source.notes()) if part)
 

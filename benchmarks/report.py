@@ -4,10 +4,10 @@
     python benchmarks/report.py --check    # write nothing; exit with status 1 where a table is not what its JSON gives
 
 A table NAME stands between ``<!-- table: NAME -->`` and ``<!-- /table -->``, in any page, once or more. Timings come
-from results/NAME.json, scores of training runs from results/quality/, and results/reported/NAME.json holds tables that
-were reported without a committed run. Rows of reported figures are marked with a dagger. A double dagger marks rows
-whose code was changed after they were measured; ``--check`` ignores it, since it depends on the history and not on the
-result.
+from results/NAME.json, scores of training runs from results/quality/, figures of other projects from
+results/literature/, and results/reported/NAME.json holds tables that were reported without a committed run. Rows of
+reported figures are marked with a dagger. A double dagger marks rows whose code was changed after they were measured;
+``--check`` ignores it, since it depends on the history and not on the result.
 """
 
 from __future__ import annotations
