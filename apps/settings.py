@@ -22,8 +22,9 @@ class Settings:
     """Settings of a training run."""
 
     preset: PresetName | None = None
-    """Schedule. quick: a few minutes on two cores; cpu: about 15 minutes, most of the quality; paper: the full one.
-    By default quick for the built-in scene and cpu for others."""
+    """Schedule. quick: a few minutes on two cores; cpu: about 15 minutes, most of the quality; best: hours, the highest
+    scores; paper: hours, the schedule of the SC-GS supplement. By default quick for the built-in scene and cpu for
+    others."""
     config: Path | None = None
     """config.json of an earlier run, or a part of one; options override it."""
     downscale: int | None = None
@@ -38,8 +39,9 @@ class Settings:
     """Steps of both stages together; every milestone of the schedule scales with it."""
     nodes: int | None = None
     """Number of control points."""
-    progressive: bool = False
-    """Pre-train on the first fifth of the frames, then on more and more; for large motions."""
+    progressive: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Pre-train on the first fifth of the frames, then on more and more; for large motions. --set
+    pretrain.progressive=false turns it off for the preset quick."""
     max_gaussians: int | None = None
     """Largest number of Gaussians at any time, which bounds memory."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -87,9 +89,10 @@ def configuration(
     steps = values.pop("steps", None) if "pretrain" not in values else None
     made = presets.from_dict(values, str(file or "options"))
     if steps is not None:
-        made = presets.with_steps(made, presets.whole_number(steps, f"{file}: steps"))
-    if options.steps is not None and options.steps != made.steps:
-        made = presets.with_steps(made, options.steps)
+        steps = presets.whole_number(steps, f"{file}: steps")
+    wanted_steps = steps if options.steps is None else options.steps
+    if wanted_steps is not None and wanted_steps != made.steps:
+        made = presets.with_steps(made, wanted_steps)
     wanted = {
         "data.downscale": options.downscale,
         "data.resample": options.resample,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 MotionName = Literal["control-points", "per-gaussian", "hexplane", "static"]
-PresetName = Literal["quick", "cpu", "paper"]
+PresetName = Literal["quick", "cpu", "best", "paper"]
 CACHE_MIB = 2048
 """Default size of the cache of decoded images: 200 images of 800 x 800 pixels with alpha."""
 
@@ -125,13 +125,23 @@ class PretrainConfig:
     warm_up: int = milestone(500, 0)
     """Number of steps before the network starts to move the spheres."""
     densify_every: int = bounded(100, 1)
+    densify_by: Literal["share", "gradient"] = newer("share", before="share")
+    """Choice of the spheres that are cloned. share: a fixed share of them. gradient: those whose gradient reaches
+    ``grad_threshold``, and otherwise as Gaussians in stage 2: split if they are large, pruned below
+    ``densify.min_opacity``, with opacity resets (official code)."""
     clone_share: float = bounded(0.2, 0, 1)
     """Share of the spheres cloned in each round, until the cap: those with the largest gradients."""
+    grad_threshold: float = newer(2e-4, before=2e-4, least=0)
+    """Gradient of the loss with respect to the 2D mean, in normalised device coordinates, for ``densify_by``
+    gradient."""
     start_ratio: float = bounded(8.0, 1, 1e4)
-    """Number of spheres per control point (counting at least 256) at the start; spheres at rest cost little."""
+    """Number of spheres per control point (with ``densify_by`` share counting at least 256) at the start; spheres at
+    rest cost little."""
     max_ratio: float = bounded(2.0, 1, 1e4)
-    """Once the spheres move, at most this many per control point (counting at least 256), because the network is then
+    """Once the spheres move, at most this many per control point (counted likewise), because the network is then
     evaluated at each sphere."""
+    grey: bool = newer(False, before=False)
+    """Start with grey spheres (official code), not with the colours of the points."""
     opacity_rate: float = 0.02
     """Learning rate of the spheres' opacities; ``color_rate`` is that of their colours. With the learning rates of the
     Gaussians, spheres would turn transparent before they find their colour."""
@@ -140,9 +150,21 @@ class PretrainConfig:
     random_background: bool = True
     """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
     space."""
+    silhouette: float = newer(0.5, before=0.0, least=0)
+    """Weight of the distance between the spheres' projected centres and the silhouette (not in the paper), in units of
+    the image's width; needs alpha. It brings spheres to thin and fast parts, which the photometric loss makes
+    transparent. If above 0, spheres are not larger than thin subjects are thick."""
     progressive: bool = False
     """Begin with the first 20 % of the frames and add 20 % every ``progressive_every`` steps."""
     progressive_every: int = milestone(1_000, 1)
+    progressive_by: Literal["frame", "fifth"] = newer("frame", before="frame")
+    """How frames are added. frame: one by one at that pace, with every other step on one of the newest 20 %, and
+    spheres that begin in the first pose. fifth: 20 % at a time, all frames equally often (supplement)."""
+    solid_opacity: float = newer(0.1, before=0.1, least=0, most=1)
+    """Opacity below which a sphere is not used to place control points or Gaussians, if there are enough others."""
+    least_radius: float = newer(1.0, before=1.0, least=0)
+    """Smallest radius of control points after stage 1, as a share of their typical spacing, so that neighbours blend.
+    Their radius is otherwise that of the spheres."""
 
 
 @dataclass(frozen=True)
@@ -163,9 +185,15 @@ class OptimConfig:
     network: float = 8e-4
     network_end: float = 1.6e-6
     network_until: int = milestone(66_000, 1)
+    network_from: Literal["motion", "stage"] = newer("motion", before="motion")
+    """Step from which ``network_until`` counts. motion: the first that trains the network. stage: the first of each
+    stage (official code)."""
     nodes: float = 8e-4
     """Learning rate of the radii, weights and hyper-coordinates of the control points."""
     node_positions: float = 8e-5
+    nodes_decay: bool = newer(True, before=True)
+    """Let ``nodes`` decay like the network's rate; otherwise it is constant (official code). ``node_positions`` always
+    decays like it."""
     settle: float = bounded(0.15, 0)
     """Share of the main stage, at its end, over which the otherwise constant rates of the Gaussians decay to a
     twentieth."""
@@ -184,9 +212,9 @@ class DensifyConfig:
     until: int = milestone(40_000, 0)
     every: int = bounded(100, 1)
     """Smallest number of steps between two rounds: fewer steps see too few views to decide by."""
-    rounds: int = bounded(132, 1)
-    """Largest number of rounds in total: three times as many double the number of Gaussians without improving the
-    images."""
+    rounds: int = bounded(132, 0)
+    """Largest number of rounds in total (0: no limit): three times as many double the number of Gaussians without
+    improving the images."""
     grad_threshold: float = bounded(1.4e-4, 0)
     """Gradient of the loss with respect to the 2D mean above which Gaussians are densified, in normalised device
     coordinates, at 800 pixels (official code: 2e-4 at any size)."""
@@ -206,7 +234,7 @@ class DensifyConfig:
     """Apply max_screen and max_scale. auto: only if the images have alpha, because images without alpha show bare
     walls, which need large Gaussians."""
     max_screen: float = 0.05
-    """Prune Gaussians that cover more than this share of the image (after the first opacity reset)."""
+    """Prune Gaussians that cover more than this share of the image (after the first opacity reset). 0: off."""
     max_scale: float = 0.1
     """Prune Gaussians larger than this share of the extent (after the first opacity reset)."""
     opacity_reset_every: int = milestone(10_000, 1)
@@ -215,12 +243,18 @@ class DensifyConfig:
     nodes_every: int = milestone(5_000, 1)
     nodes_until: int = milestone(25_000)
     node_grad_threshold: float = 2e-4
+    """Weighted mean gradient of the Gaussians that a control point moves above which it is cloned, in the units of
+    ``grad_threshold`` and scaled likewise."""
+    node_impact: float = newer(1e-2, before=1e-2, least=0)
+    """Prune control points whose weights, summed over all Gaussians, are less than this."""
+    node_growth: float = newer(0.1, before=0.1, least=0, most=1)
+    """Clone at most this share of the control points at a time, those with the largest gradients."""
     max_gaussians: int = bounded(300_000, most=100_000_000)
 
     @property
     def interval(self) -> int:
         """Number of steps from one round to the next."""
-        return max(self.every, -(-(self.until - self.start) // self.rounds))
+        return max(self.every, -(-(self.until - self.start) // self.rounds) if self.rounds else 0)
 
 
 @dataclass(frozen=True)
@@ -258,18 +292,25 @@ class LossConfig:
 class TrainConfig:
     """A complete run. ``steps`` is the total of both stages; every milestone is a number of steps."""
 
-    preset: PresetName = "paper"
+    preset: PresetName = "best"
     steps: int = bounded(80_000, most=100_000_000)
     freeze: int = milestone(3_000, 0)
     """Number of main steps at the beginning in which control points and network stay as stage 1 left them."""
     coarse: int = milestone(6_000, 0)
     """Number of main steps at the beginning in which models without stage 1 learn a static scene."""
+    shortest: int = newer(0, before=0, least=0)
+    """Number of steps to which ``freeze``, ``coarse`` and ``densify.opacity_reset_every`` shrink at most in a shorter
+    run: Gaussians need about so many to turn transparent or opaque."""
     init_points: int = bounded(20_000, 1, 10_000_000)
     """Number of initial Gaussians. If the data has more points, only this many are used; if it has fewer and the images
     have no alpha, points behind the data's points are added up to this number."""
     init_from: Literal["points", "spheres"] = "spheres"
     """Placement of the initial Gaussians. points: at the data's points or, without any, at random where the images'
     alpha shows an object. spheres: around the control points that stage 1 found."""
+    init_random: Literal["covered", "cube"] = newer("covered", before="covered")
+    """Random initial points. covered: where the images' alpha shows an object or, without alpha, where the cameras'
+    views overlap; where the data has points, behind them. cube: grey and uniformly in a cube around the scene, only if
+    the data has no points (official code)."""
     sh_degree: int = chosen(3, 0, 3)
     antialiased: bool = False
     seed: int = bounded(0, 0)

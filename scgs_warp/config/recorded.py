@@ -17,8 +17,9 @@ def with_newer_fields(values: Mapping[str, Any]) -> dict[str, Any]:
     """Add the fields that are newer than a recorded configuration, with the values declared as ``before``.
 
     A recorded configuration holds every field of its version, so an absent newer field did not exist, and the default
-    of a preset must not stand in for it. A configuration that lacks an older field was written by hand, and is returned
-    as it is: presets complete it.
+    of a preset must not stand in for it. The name of the preset does not matter then: ``paper`` once had the values of
+    ``best``. A configuration that lacks an older field was written by hand, and is returned as it is: presets complete
+    it.
     """
     newer: dict[str, Any] = {}
     for name, default in _fields(TrainConfig()):

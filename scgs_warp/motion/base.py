@@ -7,9 +7,9 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..config.presets import TrainConfig
+from ..config.presets import OptimConfig, TrainConfig
 from ..gaussians import GaussianParameters
-from ..optim import Adam
+from ..optim import Adam, log_linear
 from ..types import Gaussians
 
 
@@ -19,6 +19,17 @@ class TrainingPose(NamedTuple):
     gaussians: Gaussians
     regulariser: Tensor | None
     """Weighted scalar to add to the loss; None in steps without the term."""
+
+
+def decay_steps(step: int, still: int, optim: OptimConfig) -> int:
+    """Return the number of steps for which the learning rates of the motion have decayed, at this step of a stage that
+    trains the motion after ``still`` steps."""
+    return step if optim.network_from == "stage" else max(0, step - still)
+
+
+def network_rate(step: int, still: int, optim: OptimConfig) -> float:
+    """Return the network's learning rate at this step of a stage that trains the network after ``still`` steps."""
+    return log_linear(optim.network, optim.network_end, decay_steps(step, still, optim), optim.network_until)
 
 
 class Motion(nn.Module):

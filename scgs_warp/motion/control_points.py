@@ -12,11 +12,10 @@ from ..ops.correctives import correct
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.shading import shade
 from ..ops.skinning import skin, skin_rbf
-from ..optim import log_linear
 from ..runtime.environment import one_piece
 from ..seeding import generator
 from ..types import Gaussians, Pose
-from .base import Motion, TrainingPose
+from .base import Motion, TrainingPose, network_rate
 from .network import DeformationNetwork
 from .rigidity import Graph, arap_times, arap_weight, build_graph, rigidity
 
@@ -242,12 +241,11 @@ class ControlPoints(Motion):
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
         optim = config.optim
-        joint = max(0, step - config.freeze)
-        network = log_linear(optim.network, optim.network_end, joint, optim.network_until)
+        network = network_rate(step, config.freeze, optim)
         decay = network / optim.network
         rates = {name: network for name, _ in self.named_parameters() if name.startswith("network.")}
         positions = optim.node_positions * decay if config.motion.train_positions else 0.0
-        nodes = optim.nodes * decay
+        nodes = optim.nodes * (decay if optim.nodes_decay else 1.0)
         return {**rates, "positions": positions, "log_radii": nodes, "hyper": nodes, "strength_logits": nodes}
 
     def extra_state(self) -> dict[str, Tensor]:

@@ -15,7 +15,7 @@ from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_vari
 from ..optim import log_linear
 from ..seeding import generator
 from ..types import Gaussians
-from .base import Motion, TrainingPose
+from .base import Motion, TrainingPose, decay_steps
 
 SPATIAL = 64
 TEMPORAL = 25
@@ -121,9 +121,8 @@ class HexPlane(Motion):
         return weights, biases
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
-        joint = max(0, step - config.coarse)
         optim = config.optim
-        decay = log_linear(1.0, 0.01, joint, optim.network_until)
+        decay = log_linear(1.0, 0.01, decay_steps(step, config.coarse, optim), optim.network_until)
         return {
             name: (optim.planes if name.startswith("planes.") else optim.network) * decay
             for name, _ in self.named_parameters()

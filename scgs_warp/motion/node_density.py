@@ -13,12 +13,6 @@ from ..gaussians import GaussianParameters
 from ..optim import Adam
 from .control_points import NODE_NAMES, ControlPoints
 
-PRUNE_IMPACT = 1e-2
-"""Smallest sum of a control point's weights over all Gaussians. A control point with a smaller sum moves nothing
-visible and is pruned."""
-MOST_NEW = 0.1
-"""Largest number of control points cloned at a time (those with the largest gradients), as a share of all."""
-
 
 class Influence(NamedTuple):
     """Statistics of the Gaussians that each control point moves, float64."""
@@ -54,25 +48,29 @@ def adapt_control_points(
     gradient: Tensor,
     *,
     grad_threshold: float,
+    least_impact: float = 1e-2,
+    growth: float = 0.1,
 ) -> tuple[int, int]:
-    """Change the number of control points in place.
+    """Change the number of control points in place. At least K + 1 remain, those with the largest impact.
 
     Args:
         motion, optimizer: changed; clones inherit radius, weight and hyper-coordinates, with zero moments.
         gaussians: bound to the control points.
         gradient: [N] mean screen-space gradient of each Gaussian, normalised device coordinates.
         grad_threshold: clone a control point whose weighted mean gradient exceeds this.
+        least_impact: prune a control point whose weights sum to less than this.
+        growth: clone at most this share of the control points, those with the largest gradients, but at least one.
 
     Returns:
         Number of clones, and number of pruned control points.
     """
     sums = influence(motion, gaussians, gradient)
-    keep = sums.impact >= PRUNE_IMPACT
+    keep = sums.impact >= least_impact
     fewest = motion.config.neighbors + 1
     if keep.sum() < fewest:
         keep[np.argsort(-sums.impact, kind="stable")[:fewest]] = True
     wanted = keep & (sums.gradient > grad_threshold) & np.isfinite(sums.centre).all(axis=1)
-    most = max(1, int(MOST_NEW * len(motion)))
+    most = max(1, int(growth * len(motion)))
     cloned = np.argsort(-np.where(wanted, sums.gradient, -1.0), kind="stable")[: min(most, int(wanted.sum()))]
     kept = np.nonzero(keep)[0]
     if len(cloned) == 0 and len(kept) == len(motion):

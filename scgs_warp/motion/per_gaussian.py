@@ -7,9 +7,8 @@ from torch import Tensor
 
 from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
-from ..optim import log_linear
 from ..types import Gaussians
-from .base import Motion, TrainingPose
+from .base import Motion, TrainingPose, network_rate
 from .network import DeformationNetwork
 
 
@@ -44,8 +43,7 @@ class PerGaussian(Motion):
         return TrainingPose(self.gaussians_at(gaussians, time), None)
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
-        joint = max(0, step - config.coarse)
-        rate = log_linear(config.optim.network, config.optim.network_end, joint, config.optim.network_until)
+        rate = network_rate(step, config.coarse, config.optim)
         return {name: rate for name, _ in self.named_parameters()}
 
 

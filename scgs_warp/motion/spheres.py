@@ -7,10 +7,9 @@ from torch import Tensor, nn
 
 from ..config.presets import LossConfig, TrainConfig
 from ..gaussians import GaussianParameters
-from ..optim import log_linear
 from ..seeding import generator
 from ..types import Gaussians
-from .base import Motion, TrainingPose
+from .base import Motion, TrainingPose, network_rate
 from .network import DeformationNetwork
 from .rigidity import Graph, arap_times, build_graph, rigidity
 
@@ -65,8 +64,7 @@ class Spheres(Motion):
             self.graph = build_graph(lambda times: gaussians.means + self.translations(gaussians.means, times), loss)
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
-        moving = max(0, step - config.pretrain.warm_up)
-        rate = log_linear(config.optim.network, config.optim.network_end, moving, config.optim.network_until)
+        rate = network_rate(step, config.pretrain.warm_up, config.optim)
         rates = {name: rate for name, _ in self.named_parameters() if name.startswith("network.")}
         return {**rates, "log_radius": config.optim.scales}
 

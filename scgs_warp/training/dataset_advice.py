@@ -156,20 +156,29 @@ def _expectation(facts: Survey) -> str:
     return "good views near the camera's path; motion along the line of sight stays uncertain"
 
 
-def _replaces_stage_1(facts: Survey, config: TrainConfig) -> bool:
-    """Return True if control points start as a sample of the data's points (``state.resolve_auto``)."""
-    return facts.points >= max(FEWEST_POINTS, config.motion.neighbors + 1)
-
-
-def _help(facts: Survey, config: TrainConfig, device: str) -> str:
-    """Name the setting that improves the result most, or one that was asked for and has no effect."""
-    if config.pretrain.progressive and config.motion.model != "control-points":
+def progressive_without_effect(config: TrainConfig, frames: int, points: int) -> str | None:
+    """Say why progressive pre-training has no effect on data with so many ``frames`` and initial ``points``. None: it
+    has an effect, or is off."""
+    pretrain, enough = config.pretrain, max(FEWEST_POINTS, config.motion.neighbors + 1)
+    if not pretrain.progressive:
+        return None
+    if config.motion.model != "control-points":
         return f"--progressive has no effect with --motion {config.motion.model}, which has no stage 1"
-    if config.pretrain.progressive and not config.pretrain.with_points and _replaces_stage_1(facts, config):
+    if pretrain.steps == 0:
+        return "--progressive has no effect without stage 1: pretrain.steps is 0"
+    if points >= enough and not pretrain.with_points:  # as state.resolve_auto
         return (
             "--progressive has no effect: the data's points take the place of stage 1; "
             "--set pretrain.with_points=true keeps that stage"
         )
+    return "--progressive has no effect: there is only one frame" if frames < 2 else None
+
+
+def _help(facts: Survey, config: TrainConfig, device: str) -> str:
+    """Name the setting that improves the result most, or one that was asked for and has no effect."""
+    without_effect = progressive_without_effect(config, facts.frames, facts.points)
+    if without_effect is not None:
+        return without_effect
     if facts.instants < 2 and config.motion.model != "static":
         return "--motion static is all it needs"
     if facts.width * facts.height > LARGE_IMAGE and device == "cpu":
@@ -184,8 +193,4 @@ def _help(facts: Survey, config: TrainConfig, device: str) -> str:
         return "COLMAP's points (ply_file_path, or its sparse model) begin some 2 dB better than random ones"
     if not facts.cut_out and facts.views == 1 and config.optim.cameras == 0.0:
         return "if the poses are off by more than a pixel, --set optim.cameras=2e-4 corrects them"
-    if facts.cut_out and not config.pretrain.progressive and facts.views == 1:
-        return "if a fast limb turns transparent, --progressive follows it frame by frame"
-    return (
-        "the settings fit; --preset paper is the longest and the best" if config.preset != "paper" else "it is set up"
-    )
+    return "the settings fit; --preset best has the highest scores" if config.preset != "best" else "it is set up"

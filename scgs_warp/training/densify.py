@@ -1,4 +1,4 @@
-"""Row operations on Gaussians and their optimiser: clone, split, prune, reset (3D-GS section 5).
+"""Row operations on Gaussians and their optimiser: grow, clone, split, prune, reset (3D-GS section 5).
 
 ``density_control.py`` decides when and on which rows.
 """
@@ -10,6 +10,7 @@ import math
 import torch
 from torch import Tensor
 
+from ..config.presets import DensifyConfig
 from ..gaussians import GaussianParameters
 from ..geometry.rotation import rotate
 from ..optim import Adam
@@ -23,6 +24,57 @@ RESET_OPACITY = 0.01
 def mean_gradient(stats: Stats) -> Tensor:
     """Return the [N] mean norm of the screen-space gradient over the images in which the Gaussian was drawn."""
     return torch.nan_to_num(stats.grad_norm / stats.count.clamp(min=1.0), nan=0.0, posinf=0.0)
+
+
+def grow_and_prune(
+    gaussians: GaussianParameters,
+    optimizer: Adam,
+    stats: Stats,
+    config: DensifyConfig,
+    *,
+    grad_threshold: float,
+    extent: float,
+    prune_large: bool,
+    random: torch.Generator,
+) -> None:
+    """Clone small Gaussians and split large ones whose mean gradient reaches the threshold, then prune.
+
+    Args:
+        gaussians, optimizer: changed in place; new rows start with zero moments.
+        stats: statistics accumulated since the last round; the caller resets them.
+        grad_threshold: norm of the screen-space gradient, normalised device coordinates.
+        extent: radius of the cameras, normalised units.
+        prune_large: also remove Gaussians that are too large on screen or in space; True only after the first opacity
+            reset.
+        random: generator for the positions of split halves.
+    """
+    with torch.no_grad():
+        # Grow, within the budget.
+        gradient = mean_gradient(stats)
+        growing = _within_budget(gradient, gradient >= grad_threshold, config.max_gaussians - len(gaussians))
+        large = gaussians.scales().amax(1) > config.percent_dense * extent
+        index, fresh = clone_and_split(gaussians, optimizer, growing & ~large, growing & large, random)
+
+        # Prune by opacity and by size.
+        keep, scales = gaussians.opacities() >= config.min_opacity, gaussians.scales()
+        if prune_large:
+            if config.max_screen > 0:
+                keep &= (stats.max_radii[index] <= config.max_screen) | fresh
+            keep &= scales.amax(1) <= config.max_scale * extent
+        # A non-finite Gaussian is never drawn, so no gradient could correct it.
+        for values in (*(getattr(gaussians, name) for name in GaussianParameters.NAMES), scales):
+            keep &= torch.isfinite(values).flatten(1).all(dim=1) if values.ndim > 1 else torch.isfinite(values)
+    prune(gaussians, optimizer, keep)
+
+
+def _within_budget(gradient: Tensor, chosen: Tensor, budget: int) -> Tensor:
+    """Reduce ``chosen`` [N] bool to at most ``budget`` rows, those with the largest gradients."""
+    if int(chosen.sum()) <= budget:
+        return chosen
+    best = torch.where(chosen, gradient, gradient.new_tensor(-1.0)).argsort(descending=True, stable=True)
+    allowed = torch.zeros_like(chosen)
+    allowed[best[: max(budget, 0)]] = True
+    return allowed & chosen
 
 
 def clone_and_split(

@@ -7,7 +7,7 @@
    split; transparent, oversized and non-finite ones are removed;
 3. an opacity reset.
 
-After a step of stage 1, spheres are cloned and pruned, and finally thinned to the number of control points.
+After a step of stage 1, spheres are cloned or split and pruned, and finally thinned to the number of control points.
 
 The operations on rows are those of ``densify.py`` (Gaussians), ``pretrain.py`` (spheres) and ``motion/node_density.py``
 (control points); ``visibility.py`` measures contributions.
@@ -26,13 +26,11 @@ from ..gaussians import GaussianParameters
 from ..motion.control_points import ControlPoints
 from ..motion.node_density import adapt_control_points
 from ..motion.spheres import Spheres
-from ..optim import Adam
 from ..runtime import memory
 from ..seeding import generator
-from ..types import Stats
-from .densify import clone_and_split, mean_gradient, prune, reset_opacities
+from .densify import grow_and_prune, mean_gradient, prune, reset_opacities
 from .frames import Frames
-from .pretrain import densify_spheres, thin_spheres
+from .pretrain import densify_spheres, densify_spheres_by_gradient, thin_spheres
 from .state import TrainState
 from .visibility import contributions
 
@@ -83,6 +81,13 @@ def control_points_due(config: TrainConfig, done: int) -> bool:
 def spheres_due(config: PretrainConfig, done: int) -> bool:
     """Decide whether spheres are densified after ``done`` steps of stage 1."""
     return done < config.densify_until and (done % config.densify_every == 0 or done == config.warm_up)
+
+
+def sphere_reset_due(config: TrainConfig, done: int) -> bool:
+    """Decide whether the spheres' opacities are reset after ``done`` steps of stage 1: at the interval of stage 2, if
+    spheres are densified by gradient."""
+    pretrain, every = config.pretrain, config.densify.opacity_reset_every
+    return pretrain.densify_by == "gradient" and done < pretrain.densify_until and done % every == 0
 
 
 # Thresholds and limits
@@ -154,12 +159,18 @@ def control_density(state: TrainState, size: tuple[int, int], visible: Tensor | 
 def _control_spheres(state: TrainState) -> None:
     assert isinstance(state.motion, Spheres)
     config, done = state.config, state.stage_step + 1
+    spheres = (state.gaussians, state.gaussian_optimizer, state.motion)
     if done == config.pretrain.densify_until:
-        thin_spheres(state.gaussians, state.gaussian_optimizer, state.motion, config.motion.nodes)
+        thin_spheres(*spheres, config.motion.nodes, config.pretrain.solid_opacity)
         state.reset_stats()
     elif spheres_due(config.pretrain, done):
-        densify_spheres(state.gaussians, state.gaussian_optimizer, state.motion, state.stats, config, state.step)
+        if config.pretrain.densify_by == "gradient":
+            densify_spheres_by_gradient(*spheres, state.stats, config, state.extent, state.step)
+        else:
+            densify_spheres(*spheres, state.stats, config, state.step)
         state.reset_stats()
+    if sphere_reset_due(config, done):
+        reset_opacities(state.gaussians, state.gaussian_optimizer)
 
 
 def _control_gaussians(state: TrainState, size: tuple[int, int], visible: Tensor | None) -> str | None:
@@ -180,6 +191,8 @@ def _control_gaussians(state: TrainState, size: tuple[int, int], visible: Tensor
                 state.gaussians,
                 mean_gradient(state.stats),
                 grad_threshold=threshold * config.node_grad_threshold / config.grad_threshold,
+                least_impact=config.node_impact,
+                growth=config.node_growth,
             )
         most = affordable_count(state.gaussians, config.max_gaussians)
         most = most if state.group is None else state.group.minimum(most)
@@ -202,53 +215,3 @@ def _control_gaussians(state: TrainState, size: tuple[int, int], visible: Tensor
     if opacity_reset_due(config, done):
         reset_opacities(state.gaussians, state.gaussian_optimizer)
     return note
-
-
-def grow_and_prune(
-    gaussians: GaussianParameters,
-    optimizer: Adam,
-    stats: Stats,
-    config: DensifyConfig,
-    *,
-    grad_threshold: float,
-    extent: float,
-    prune_large: bool,
-    random: torch.Generator,
-) -> None:
-    """Clone small Gaussians and split large ones whose mean gradient reaches the threshold, then prune.
-
-    Args:
-        gaussians, optimizer: changed in place; new rows start with zero moments.
-        stats: statistics accumulated since the last round; the caller resets them.
-        grad_threshold: norm of the screen-space gradient, normalised device coordinates.
-        extent: radius of the cameras, normalised units.
-        prune_large: also remove Gaussians that are too large on screen or in space; True only after the first opacity
-            reset.
-        random: generator for the positions of split halves.
-    """
-    with torch.no_grad():
-        # Grow, within the budget.
-        gradient = mean_gradient(stats)
-        growing = _within_budget(gradient, gradient >= grad_threshold, config.max_gaussians - len(gaussians))
-        large = gaussians.scales().amax(1) > config.percent_dense * extent
-        index, fresh = clone_and_split(gaussians, optimizer, growing & ~large, growing & large, random)
-
-        # Prune by opacity and by size.
-        keep, scales = gaussians.opacities() >= config.min_opacity, gaussians.scales()
-        if prune_large:
-            keep &= (stats.max_radii[index] <= config.max_screen) | fresh
-            keep &= scales.amax(1) <= config.max_scale * extent
-        # A non-finite Gaussian is never drawn, so no gradient could correct it.
-        for values in (*(getattr(gaussians, name) for name in GaussianParameters.NAMES), scales):
-            keep &= torch.isfinite(values).flatten(1).all(dim=1) if values.ndim > 1 else torch.isfinite(values)
-    prune(gaussians, optimizer, keep)
-
-
-def _within_budget(gradient: Tensor, chosen: Tensor, budget: int) -> Tensor:
-    """Reduce ``chosen`` [N] bool to at most ``budget`` rows, those with the largest gradients."""
-    if int(chosen.sum()) <= budget:
-        return chosen
-    best = torch.where(chosen, gradient, gradient.new_tensor(-1.0)).argsort(descending=True, stable=True)
-    allowed = torch.zeros_like(chosen)
-    allowed[best[: max(budget, 0)]] = True
-    return allowed & chosen

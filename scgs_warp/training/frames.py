@@ -13,6 +13,7 @@ from ..errors import FrameError, UserError
 from ..geometry.normalisation import Normalisation
 from ..seeding import generator
 from ..types import Camera, Frame
+from .silhouettes import Silhouettes
 
 PROGRESSIVE_SHARE = 0.2
 """Share of the frames with which progressive pre-training begins and by which it grows."""
@@ -54,6 +55,7 @@ class Frames:
         self.cameras = [normalisation.apply_camera(frame.camera).to(device) for frame in data.entries]
         self.background = data.background_color.to(device)
         self.random_background = data.background == "random"
+        self.silhouettes = Silhouettes(device)
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
         self.by_time = sorted(range(len(self.frames)), key=lambda i: data.entries[i].time)
 
@@ -65,14 +67,17 @@ class Frames:
 
         Args:
             progressive: draw from the first 20 % of the frames by time at first; every ``progressive_every`` steps
-                another 20 % is added, one frame at a time. Every other view is then one of the newest 20 %, so that the
-                spheres follow a moving limb before views of its earlier positions make them transparent.
+                another 20 % is added, at once with ``progressive_by`` fifth. Otherwise they are added one by one, and
+                every other view is one of the newest 20 %, so that the spheres follow a moving limb before views of its
+                earlier positions make them transparent.
         """
         first, allowed, number = 0, len(self.frames), view_number(step, self.config, view)
         if progressive:
-            grown = PROGRESSIVE_SHARE * (1.0 + step / self.config.pretrain.progressive_every)
-            allowed = min(allowed, max(1, round(grown * allowed)))
-            if number % 2 and allowed < len(self.frames):
+            pretrain = self.config.pretrain
+            by_frame = pretrain.progressive_by == "frame"
+            added = step / pretrain.progressive_every if by_frame else step // pretrain.progressive_every
+            allowed = min(allowed, max(1, round(PROGRESSIVE_SHARE * (1.0 + added) * allowed)))
+            if by_frame and number % 2 and allowed < len(self.frames):
                 first = max(0, allowed - max(1, round(PROGRESSIVE_SHARE * len(self.frames))))
         count = allowed - first
         epoch, position = divmod(number, count)

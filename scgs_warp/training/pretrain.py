@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -16,44 +18,59 @@ from ..ops.sampling import farthest_points
 from ..optim import Adam
 from ..seeding import generator
 from ..types import Stats
-from .densify import mean_gradient
+from .densify import SPLIT_SHRINK, grow_and_prune, mean_gradient
 
 TRAJECTORY_TIMES = 16
 """Number of instants in a trajectory. Farthest-point sampling chooses control points in the space of trajectories."""
 START_RADIUS = 0.5
 """Radius of the spheres at the start of progressive pre-training, as a share of their spacing."""
 DEAD_OPACITY = 0.01
-"""Opacity below which a sphere is removed."""
-SOLID_OPACITY = 0.1
-"""Opacity below which a sphere is not used to place control points or Gaussians, if there are enough others."""
+"""Opacity below which a sphere is removed where a fixed share is cloned."""
 FEWEST_SPHERES = 256
 """Smallest number of control points from which sphere counts are derived: fewer spheres cannot represent a figure."""
 
 
 def sphere_unit(config: TrainConfig) -> int:
-    """Return the number of control points from which sphere counts are derived: N_p, but at least
-    ``FEWEST_SPHERES``."""
-    return max(config.motion.nodes, FEWEST_SPHERES)
+    """Return the number of control points from which sphere counts are derived: N_p, but at least ``FEWEST_SPHERES``
+    where a fixed share is cloned."""
+    return max(config.motion.nodes, FEWEST_SPHERES if config.pretrain.densify_by == "share" else 1)
+
+
+def sphere_limit(config: TrainConfig) -> int:
+    """Return the largest number of moving spheres, at least N_p."""
+    return max(round(sphere_unit(config) * config.pretrain.max_ratio), config.motion.nodes)
+
+
+def starts_in_first_pose(config: TrainConfig) -> bool:
+    """Decide whether spheres begin in the pose of the first frames, from which they follow the motion frame by
+    frame."""
+    return config.pretrain.progressive and config.pretrain.progressive_by == "frame"
 
 
 def initial_spheres(
-    config: TrainConfig, points: Tensor, colors: Tensor, device: str
+    config: TrainConfig, points: Tensor, colors: Tensor, device: str, largest: float = math.inf
 ) -> tuple[GaussianParameters, Spheres]:
     """Make spheres at a sample of ``points`` [P, 3] (``start_ratio`` per control point) with ``colors`` [P, 3], and a
     network without motion.
 
-    The sample is spread evenly, because over all frames a limb may be anywhere. Progressive pre-training starts with
-    the first pose: there the sample is as dense as the points, and the spheres are smaller than their spacing, because
-    a sphere that sticks out of a thin limb would turn transparent before it shrinks.
+    The sample is spread evenly, because over all frames a limb may be anywhere. Progressive pre-training frame by frame
+    starts with the first pose: there the sample is as dense as the points, and the spheres are smaller than their
+    spacing, because a sphere that sticks out of a thin limb would turn transparent before it shrinks.
+
+    Args:
+        largest: limit on the radius of the spheres, normalised.
     """
-    count = min(round(sphere_unit(config) * config.pretrain.start_ratio), len(points))
+    pretrain = config.pretrain
+    count = min(round(sphere_unit(config) * pretrain.start_ratio), len(points))
     index = torch.arange(count, device=points.device)
-    if not config.pretrain.progressive and count < len(points):
+    first_pose = starts_in_first_pose(config)
+    if not first_pose and count < len(points):
         index = farthest_points(points, count)
     chosen = points[index]
-    gaussians = gaussians_from_points(chosen, colors[index], sh_degree=0, hyper_dim=0)
-    share = START_RADIUS if config.pretrain.progressive else 1.0
-    radius = share * float(neighbor_distance(chosen).median())
+    shown = None if pretrain.grey else colors[index]
+    gaussians = gaussians_from_points(chosen, shown, sh_degree=0, hyper_dim=0)
+    share = START_RADIUS if first_pose else 1.0
+    radius = min(share * float(neighbor_distance(chosen).median()), largest)
     network = make_network(config.motion, heads_of(config.motion), config.seed).to(device)
     return gaussians, Spheres(network, radius).to(device)
 
@@ -83,11 +100,8 @@ def densify_spheres(
     config: TrainConfig,
     step: int,
 ) -> None:
-    """Remove transparent spheres and clone those with the largest gradients, keeping between N_p and the cap.
-
-    The gradient threshold for Gaussians does not suit large spheres, so a fixed share is cloned. Each clone is
-    displaced at random, by about one radius. If fewer than N_p spheres are left (a short stage 1 can leave a dozen),
-    more are cloned.
+    """Remove transparent spheres and clone a fixed share, those with the largest gradients, keeping between N_p and the
+    cap. If fewer than N_p spheres are left (a short stage 1 can leave a dozen), more are cloned.
     """
     with torch.no_grad():
         opacities = gaussians.opacities()
@@ -95,34 +109,90 @@ def densify_spheres(
         if not bool(alive.any()):
             alive[:] = True
         kept = torch.where(alive)[0]
-        limit = round(sphere_unit(config) * config.pretrain.max_ratio)
+        limit = sphere_limit(config)
         if len(kept) > limit and step + 1 >= config.pretrain.warm_up:
             kept = kept[opacities[kept].argsort(descending=True, stable=True)[:limit]].sort().values
         gradient = mean_gradient(stats)[kept]
         wanted = min(round(config.pretrain.clone_share * len(kept)), max(limit - len(kept), 0))
         wanted = max(wanted, config.motion.nodes - len(kept))
         parents = kept[gradient.argsort(descending=True, stable=True)]
-        clones = parents[torch.arange(wanted, device=kept.device) % len(parents)]
-        index = torch.cat([kept, clones])
-        fresh = torch.arange(len(index), device=index.device) >= len(kept)
-        optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
-        if wanted:
-            noise = torch.randn(wanted, 3, generator=generator(config.seed, 32, step)).to(clones.device)
-            gaussians.means.data[len(kept) :] += noise * spheres.log_radius.exp()
-        spheres.graph = None
+        clone_spheres(gaussians, optimizer, spheres, kept, parents, wanted, generator(config.seed, 32, step))
 
 
-def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Spheres, nodes: int) -> None:
+def densify_spheres_by_gradient(
+    gaussians: GaussianParameters,
+    optimizer: Adam,
+    spheres: Spheres,
+    stats: Stats,
+    config: TrainConfig,
+    extent: float,
+    step: int,
+) -> None:
+    """Clone or split the spheres whose mean gradient reaches ``pretrain.grad_threshold``, as Gaussians of stage 2, and
+    remove transparent ones, keeping between N_p and the cap.
+
+    As all spheres have one size, a round either clones or splits. A split shrinks that size as much as the halves
+    shrink the geometric mean of all sizes. Pruning by size would remove all spheres at once, so there is none.
+
+    Args:
+        extent: radius of the cameras, normalised units.
+    """
+    with torch.no_grad():
+        gaussians.log_scales.copy_(spheres.log_radius.expand(len(gaussians), 3))
+    grow_and_prune(
+        gaussians,
+        optimizer,
+        stats,
+        replace(config.densify, max_gaussians=sphere_limit(config)),
+        grad_threshold=config.pretrain.grad_threshold,
+        extent=extent,
+        prune_large=False,
+        random=generator(config.seed, 33, step),
+    )
+    with torch.no_grad():
+        halves = int((gaussians.log_scales[:, :1] < spheres.log_radius).sum())
+        spheres.log_radius.data -= math.log(SPLIT_SHRINK) * halves / len(gaussians)
+        kept = torch.arange(len(gaussians), device=gaussians.means.device)
+        parents = gaussians.opacities().argsort(descending=True, stable=True)
+        missing = max(config.motion.nodes - len(kept), 0)
+        clone_spheres(gaussians, optimizer, spheres, kept, parents, missing, generator(config.seed, 32, step))
+
+
+def clone_spheres(
+    gaussians: GaussianParameters,
+    optimizer: Adam,
+    spheres: Spheres,
+    kept: Tensor,
+    parents: Tensor,
+    count: int,
+    random: torch.Generator,
+) -> None:
+    """Reduce spheres to the rows ``kept`` [N] and append ``count`` clones of the rows ``parents`` in their order, again
+    from the first after the last. Each clone is displaced at random, by about one radius."""
+    clones = parents[torch.arange(count, device=kept.device) % len(parents)]
+    index = torch.cat([kept, clones])
+    fresh = torch.arange(len(index), device=index.device) >= len(kept)
+    optimizer.regather(gaussians, GaussianParameters.NAMES, index, fresh)
+    if count:
+        noise = torch.randn(count, 3, generator=random).to(clones.device)
+        gaussians.means.data[len(kept) :] += noise * spheres.log_radius.detach().exp()
+    spheres.graph = None
+
+
+def thin_spheres(
+    gaussians: GaussianParameters, optimizer: Adam, spheres: Spheres, nodes: int, solid_opacity: float = 0.1
+) -> None:
     """Reduce spheres to N_p by farthest-point sampling in trajectory space, so that parts that move apart are both
     sampled.
 
-    Only solid spheres are sampled if there are enough, because the farthest spheres are often strays in empty space.
+    Only spheres of at least ``solid_opacity`` are sampled if there are enough, because the farthest spheres are often
+    strays in empty space.
     """
     if len(gaussians) <= nodes:
         return
     with torch.no_grad():
         opacities = gaussians.opacities()
-        count = max(int((opacities >= SOLID_OPACITY).sum()), nodes)
+        count = max(int((opacities >= solid_opacity).sum()), nodes)
         kept = opacities.argsort(descending=True, stable=True)[:count].sort().values
         times = torch.linspace(0.0, 1.0, TRAJECTORY_TIMES)
         tracks = gaussians.means + spheres.translations(gaussians.means, times)
@@ -135,11 +205,11 @@ def thin_spheres(gaussians: GaussianParameters, optimizer: Adam, spheres: Sphere
 def control_points_from_spheres(gaussians: GaussianParameters, spheres: Spheres, config: TrainConfig) -> ControlPoints:
     """Make control points at the spheres' centres, all with the same initial radius.
 
-    The radius is that of the spheres, but at least their typical spacing, so that neighbours blend.
+    The radius is that of the spheres, but at least ``pretrain.least_radius`` times their typical spacing.
     """
     positions = gaussians.means.detach()
     spacing = float(neighbor_distance(positions).median())
-    radius = max(float(spheres.log_radius.detach().exp()), spacing)
+    radius = max(float(spheres.log_radius.detach().exp()), config.pretrain.least_radius * spacing)
     radii = torch.full((len(positions),), radius, device=positions.device)
     return ControlPoints(positions, radii, spheres.network, config.motion)
 
@@ -159,10 +229,13 @@ def initial_gaussians(
         return gaussians_from_points(points[:count], colors[:count], **options)
     parents, motion = spheres
     with torch.no_grad():
-        opaque = torch.where(parents.opacities() >= SOLID_OPACITY)[0]
+        opaque = torch.where(parents.opacities() >= config.pretrain.solid_opacity)[0]
         opaque = opaque if len(opaque) else torch.arange(len(parents), device=opaque.device)
         random = generator(config.seed, 34)
         chosen = opaque[torch.randint(len(opaque), (count,), generator=random).to(opaque.device)]
         offsets = torch.randn(count, 3, generator=random).to(chosen.device) * motion.log_radius.exp()
         colors = (parents.sh_dc[chosen] * SH_C0 + 0.5).clamp(0.0, 1.0)
-        return gaussians_from_points(parents.means[chosen] + offsets, colors, **options)
+        gaussians = gaussians_from_points(parents.means[chosen] + offsets, colors, **options)
+        if config.pretrain.silhouette > 0:  # Splats larger than a thin part would turn transparent before they shrink.
+            torch.minimum(gaussians.log_scales, motion.log_radius, out=gaussians.log_scales.data)
+        return gaussians

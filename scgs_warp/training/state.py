@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -27,18 +28,22 @@ from ..types import Stats
 from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .frames import first_frames
-from .initial_points import sample_initial_points
+from .initial_points import random_points, sample_initial_points
 from .pretrain import (
     control_points_from_spheres,
     initial_gaussians,
     initial_motion,
     initial_spheres,
     sphere_unit,
+    starts_in_first_pose,
     thin_spheres,
 )
 from .process_group import ProcessGroup
+from .silhouettes import half_thickness
 
 Stage = Literal["pretrain", "main"]
+THICKEST = 2.0
+"""Largest radius of the spheres at the start, in units of half the subject's thickness."""
 
 
 class StepResult(NamedTuple):
@@ -110,7 +115,8 @@ class TrainState:
         rest = (normalisation, overview(data.cameras), extent, points, colors)
         identity = {"fingerprint": data.fingerprint, "frames": len(data)}
         if config.pretrain_steps > 0:
-            spheres = initial_spheres(config, points, colors, device)
+            wide = THICKEST * half_thickness(data, normalisation) if config.pretrain.silhouette > 0 else math.inf
+            spheres = initial_spheres(config, points, colors, device, wide)
             return TrainState(config, *spheres, *rest, stage="pretrain", **identity)
         gaussians = initial_gaussians(config, points, colors)
         # Control points start on the data's points, not on those of bare walls.
@@ -121,7 +127,8 @@ class TrainState:
     def begin_main(self) -> None:
         """Enter stage 2: spheres become control points, and Gaussians are made."""
         assert isinstance(self.motion, Spheres)
-        thin_spheres(self.gaussians, self.gaussian_optimizer, self.motion, self.config.motion.nodes)
+        nodes, solid = self.config.motion.nodes, self.config.pretrain.solid_opacity
+        thin_spheres(self.gaussians, self.gaussian_optimizer, self.motion, nodes, solid)
         points = control_points_from_spheres(self.gaussians, self.motion, self.config)
         gaussians = initial_gaussians(self.config, self.points, self.colors, (self.gaussians, self.motion))
         self.stage = "main"
@@ -275,18 +282,22 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
 
 def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
     """Choose initial points [P, 3], normalised, and colours [P, 3]: the data's own in random order, followed by points
-    behind them for surfaces without texture; without points in the data, points sampled where the images are
-    covered."""
+    behind them for surfaces without texture; without points in the data, points sampled where the images are covered.
+    With ``init_random`` cube, nothing follows the data's own points, and others are random in a cube."""
     count = max(config.init_points, round(sphere_unit(config) * config.pretrain.start_ratio))
+    cube = config.init_random == "cube"
     if data.points is None or not has_initial_points(data, config):
-        # Progressive pre-training starts from the pose of the first frames, so only they are sampled.
-        frames = first_frames(data) if config.pretrain.progressive and config.pretrain_steps else data
+        if cube:
+            points = random_points(count, config.seed, 31)
+            return points, torch.full_like(points, 0.5)
+        # Spheres that start in the pose of the first frames are sampled from these frames only.
+        frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
         points, colors = sample_initial_points(count, frames, normalisation, config.seed, 31)
         return points, torch.full_like(points, 0.5) if colors is None else colors
     order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
     points = normalisation.apply(data.points)[order].float().contiguous()
     colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
-    if data.with_alpha:  # with alpha, no background lies behind the points
+    if cube or data.with_alpha:  # with alpha, no background lies behind the points
         return points, colors
     behind = background_points(count - len(points), points, data, normalisation, config.seed, 35)
     return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]])

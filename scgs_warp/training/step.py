@@ -13,10 +13,11 @@ from ..ops.ssim import photometric_loss
 from ..optim import log_linear
 from ..rendering.render import draw
 from ..seeding import generator
-from ..types import Stats
+from ..types import Camera, Frame, Gaussians, Stats
 from .camera_refinement import camera_rate
 from .frames import Frames, view_number
 from .multi_view import all_views
+from .silhouettes import silhouette_term
 from .state import StepResult, TrainState
 
 SETTLED = 0.05
@@ -73,6 +74,8 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     # 2. Pose: the Gaussians at the frame's time, and the regulariser of the motion.
     time = noisy_time(frame.time, state, len(frames), view)
     posed, regulariser = state.motion.train_at(state.gaussians, time, step, config, config.seed, view)
+    if pretraining and step >= config.pretrain.warm_up and config.pretrain.silhouette > 0:
+        regulariser = _add_silhouette(regulariser, state, frames, frame, index, posed, camera, view)
 
     # 3. Render. Statistics for densification are collected until it ends.
     collecting = pretraining or step < config.densify.until
@@ -96,6 +99,26 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     weighted = 0.0 if regulariser is None else float(regulariser.detach())
     losses, size = (loss.detach(), l1.detach(), ssim.detach(), weighted), (truth.shape[2], truth.shape[1])
     return StepResult(*losses, picture.detach(), truth, mask, failed, size)
+
+
+def _add_silhouette(
+    regulariser: Tensor | None,
+    state: TrainState,
+    frames: Frames,
+    frame: Frame,
+    index: int,
+    posed: Gaussians,
+    camera: Camera,
+    view: int,
+) -> Tensor | None:
+    """Add the silhouette term of stage 1 to the regulariser, if the frame has a silhouette."""
+    config = state.config
+    distances = frames.silhouettes.of(frame, index)
+    if distances is None:
+        return regulariser
+    random = generator(config.seed, 45, view_number(state.step, config, view))
+    term = config.pretrain.silhouette * silhouette_term(posed.means, camera, distances, random)
+    return term if regulariser is None else regulariser + term
 
 
 def sh_degree(state: TrainState, step: int) -> int:

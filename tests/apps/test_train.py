@@ -23,6 +23,7 @@ def test_training_leaves_everything(trained):
             "background seed").split()  # fmt: skip
     assert set(keys) <= set(metrics)
     assert metrics["step"] == 60 and metrics["images"] == 3 and metrics["lpips"] is None
+    assert metrics["psnr_worst"] <= metrics["psnr_median"] and 0 <= metrics["missing"] <= 1, "the images have alpha"
     origin = metrics["provenance"]
     assert origin["command"].startswith("python apps/train.py --data ") and origin["machine"]["processor"]
     assert "/" not in origin["command"].removeprefix("python apps/"), "a path of this machine"

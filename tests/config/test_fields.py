@@ -17,7 +17,7 @@ def test_interval_of_densification_rounds():
             made = C.with_steps(made, count)
         return made.densify.interval
 
-    assert [interval("paper", steps) for steps in (160_000, 80_000, 40_000, 8_000)] == [599, 300, 150, 100]
+    assert [interval("best", steps) for steps in (160_000, 80_000, 40_000, 8_000)] == [599, 300, 150, 100]
     assert [interval("cpu", steps) for steps in (48_000, 24_000, 4_000)] == [176, 100, 100]
     assert interval("quick") == interval("quick", 24_000) == interval("cpu", 4_000, 24_000) == 100
     few = C.with_field(C.preset("cpu"), "densify.every", 20, "test")
@@ -25,12 +25,12 @@ def test_interval_of_densification_rounds():
 
 
 def test_only_control_points_have_a_first_stage():
-    made = C.with_field(C.preset("paper"), "motion.model", "static", "test")
+    made = C.with_field(C.preset("best"), "motion.model", "static", "test")
     assert made.pretrain_steps == 0 and made.main_steps == 80_000
 
 
 def test_rest_steps_follow_the_model():
-    made = C.preset("paper")
+    made = C.preset("best")
     assert made.rest_steps == made.freeze and made.motion.has_shading
     planes = C.with_field(made, "motion.model", "hexplane", "test")
     assert planes.rest_steps == planes.coarse and not planes.motion.has_shading

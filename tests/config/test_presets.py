@@ -18,8 +18,8 @@ def test_presets_are_complete_and_round_trip(name):
     assert C.from_dict(json.loads(json.dumps(C.to_dict(made)))) == made
 
 
-def test_paper_preset_is_the_supplements_where_that_measured_best():
-    made = C.preset("paper")
+def test_best_preset_is_the_supplements_where_that_measured_best():
+    made = C.preset("best")
     assert (made.pretrain.steps, made.pretrain.densify_until, made.main_steps) == (10_000, 7_500, 70_000)
     assert (made.freeze, made.motion.nodes, made.motion.neighbors) == (3_000, 512, 4)
     assert made.loss.arap_until >= made.main_steps, "rigidity to the end: docs/quality.md"
@@ -28,7 +28,7 @@ def test_paper_preset_is_the_supplements_where_that_measured_best():
 
 
 def test_steps_scale_every_milestone():
-    made = C.with_steps(C.preset("paper"), 8_000)
+    made = C.with_steps(C.preset("best"), 8_000)
     assert made.steps == 8_000
     assert (made.pretrain.steps, made.pretrain.densify_until, made.freeze) == (1_000, 750, 300)
     assert (made.densify.until, made.optim.means_until, made.loss.arap_until) == (4_000, 6_600, 8_000)
@@ -73,6 +73,6 @@ def test_too_few_steps():
 
 def test_presets_begin_at_rest_for_as_long_as_the_published_ones():
     """3,000 of 40,000 steps (Deformable-3D-GS) to 3,000 of 23,000 (4D-GS)."""
-    for config in (C.preset("paper"), C.preset("cpu"), C.preset("quick"), C.with_steps(C.preset("cpu"), 900)):
+    for config in (C.preset("best"), C.preset("cpu"), C.preset("quick"), C.with_steps(C.preset("cpu"), 900)):
         assert 0.07 <= config.coarse / config.steps <= 0.13
         assert config.rest_steps == config.freeze

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from helpers.paths import ROOT
+from scgs_warp.ablation.cells import flatten
 from scgs_warp.config import presets, recorded
 from scgs_warp.config.fields import LossConfig, TrainConfig
 
@@ -24,6 +25,27 @@ class Loss(LossConfig):
 @dataclasses.dataclass(frozen=True)
 class Train(TrainConfig):
     loss: Loss = dataclasses.field(default_factory=Loss)  # type: ignore[assignment]
+
+
+def test_a_run_of_the_former_paper_stays_what_it_was():
+    """Every recorded field, and for the newer ones the value that stands for their absence."""
+    old = json.loads((OLD / "paper.json").read_text())
+    values = dict(flatten(old))
+    before = {name: default["before"] for name, default in recorded._fields(TrainConfig()) if "before" in default}
+    read = dict(flatten(presets.to_dict(presets.from_dict(old))))
+    assert before and not before.keys() & values.keys()
+    assert read == {**values, **before}
+    assert read != dict(flatten(presets.to_dict(presets.preset("paper")))), "paper has other values today"
+
+
+def test_best_is_the_former_paper():
+    """Field by field; whoever tunes ``best`` names the changed fields here."""
+    values = dict(flatten(json.loads((OLD / "paper.json").read_text())))
+    best = dict(flatten(presets.to_dict(presets.preset("best"))))
+    assert {name for name, value in values.items() if best[name] != value} == {"preset"}
+    newer = {name: default["before"] for name, default in recorded._fields(TrainConfig()) if "before" in default}
+    changed = {"pretrain.silhouette": 0.5}
+    assert {name: best[name] for name in best.keys() - values.keys()} == {**newer, **changed}
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ def put(config: Any, name: str, value: float) -> Any:
     return dataclasses.replace(config, **{first: put(getattr(config, first), rest, value) if rest else value})
 
 
-FIELDS = dict(numbers(C.preset("paper")))
+FIELDS = dict(numbers(C.preset("best")))
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -39,24 +39,24 @@ def test_no_number_is_too_large_or_nan(name):
     most = FIELDS[name].get("most") or MAGNITUDE
     for value in (most + 1, math.nan, math.inf, -2 * MAGNITUDE):
         with pytest.raises(UserError, match=f"^file: {name} is .*; it must be at most {most:g}".replace("+", r"\+")):
-            check_sizes(put(C.preset("paper"), name, value), "file: ")
+            check_sizes(put(C.preset("best"), name, value), "file: ")
 
 
 @pytest.mark.parametrize("name", [name for name, bounds in FIELDS.items() if bounds.get("least") is not None])
 def test_no_number_is_below_its_bound(name):
     least = FIELDS[name]["least"]
     with pytest.raises(UserError, match=f"^{name} is .*; it must be at least {least}$|skip|frequencies"):
-        check(put(C.preset("paper"), name, least - 1))
+        check(put(C.preset("best"), name, least - 1))
 
 
 @pytest.mark.parametrize("name", [name for name, bounds in FIELDS.items() if "choices" in bounds])
 def test_choices_are_inclusive(name):
     low, high = FIELDS[name]["choices"]
     for value in (low, high):
-        check(put(C.preset("paper"), name, value))
+        check(put(C.preset("best"), name, value))
     for value in (low - 1, high + 1):
         with pytest.raises(UserError, match=f"^{name} is {value}; choose {low} to {high}$"):
-            check(put(C.preset("paper"), name, value))
+            check(put(C.preset("best"), name, value))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_choices_are_inclusive(name):
 )
 def test_rules_name_the_field_and_the_remedy(name, value, message):
     with pytest.raises(UserError) as caught:
-        check(C.with_field(C.preset("paper"), name, value, "test"))
+        check(C.with_field(C.preset("best"), name, value, "test"))
     assert str(caught.value).startswith(message)
 
 

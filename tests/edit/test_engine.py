@@ -95,7 +95,7 @@ def test_a_static_scene_is_given_control_points():
 
 
 def test_other_motion_models_say_so():
-    config = from_dict({"preset": "paper"})
+    config = from_dict({"preset": "best"})
     scene = bar_scene()
     motion = PerGaussian.__new__(PerGaussian)
     torch.nn.Module.__init__(motion)

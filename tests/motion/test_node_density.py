@@ -2,12 +2,42 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from helpers.tiny import tiny_config
 from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.motion.control_points import ControlPoints, heads_of, make_network
 from scgs_warp.motion.node_density import adapt_control_points
+
+
+def motion_and_gaussians(counts: list[int]):
+    """Control points far from each other, with ``counts`` Gaussians at each; their optimiser, and gradients of 1."""
+    config = tiny_config().motion
+    positions = torch.tensor([[10.0 * i, 0.0, 0.0] for i in range(len(counts))])
+    network = make_network(config, heads_of(config), 0)
+    motion = ControlPoints(positions, torch.full((len(counts),), 0.2), network, config)
+    points = positions.repeat_interleave(torch.tensor(counts), dim=0)
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=0)
+    optimizer = motion.optimizer(tiny_config())
+    assert optimizer is not None
+    return motion, optimizer, gaussians, torch.ones(len(points))
+
+
+@pytest.mark.parametrize(("least_impact", "left"), [(0.0, 9), (1.0, 8), (2.0, 7), (3.5, 6), (100.0, 5)])
+def test_control_points_that_move_too_few_gaussians_go(least_impact, left):
+    """Their weights sum to the number of Gaussians beside them; K + 1 stay in any case."""
+    motion, optimizer, gaussians, gradient = motion_and_gaussians([0, 1, 3, 4, 5, 6, 7, 8, 9])
+    pruned = adapt_control_points(motion, optimizer, gaussians, gradient, grad_threshold=2.0, least_impact=least_impact)
+    assert pruned == (0, 9 - left)
+    assert motion.positions[:, 0].tolist() == [10.0 * i for i in range(9 - left, 9)]
+
+
+@pytest.mark.parametrize(("growth", "clones"), [(0.1, 1), (0.5, 5), (1.0, 10)])
+def test_growth_is_a_share_of_the_control_points(growth, clones):
+    motion, optimizer, gaussians, gradient = motion_and_gaussians([2] * 10)
+    changed = adapt_control_points(motion, optimizer, gaussians, gradient, grad_threshold=0.5, growth=growth)
+    assert changed == (clones, 0) and len(motion) == 10 + clones
 
 
 def test_control_points_clone_where_the_image_pulls_and_idle_ones_go(device):

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
 import torch
+import tyro
 
 from helpers.handheld import handheld
 from helpers.layouts import write_colmap, write_poses_bounds
-from helpers.tiny import tiny_dataset
-from scgs_warp.config.presets import preset
+from helpers.tiny import tiny_dataset, write_dnerf
+from scgs_warp.config.presets import MOTIONS, PRESETS, preset
 from scgs_warp.data import Dataset, load
 from scgs_warp.training.dataset_advice import Survey, advise, survey
 from scgs_warp.training.state import resolve_auto
@@ -77,7 +79,7 @@ def test_frames_of_one_instant():
 
 def test_a_camera_that_is_elsewhere_at_each_instant():
     first, second = lines(tiny_dataset(16))
-    assert "cut out by alpha" in first and "stands elsewhere" in second and "--progressive" in second
+    assert "cut out by alpha" in first and "stands elsewhere" in second and "--progressive" not in second
 
 
 def test_steps_and_sizes():
@@ -115,6 +117,30 @@ def test_the_app_says_it(tmp_path, capsys):
     assert said[0].startswith("data: 12 frames of 80 x 60") and said[1].startswith("expect ")
 
 
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("points", [0, 9, 500])
+@pytest.mark.parametrize("steps", [None, 0])
+def test_progressive_acts_or_a_line_says_that_it_does_not(name, motion, points, steps):
+    """With every preset and motion model, with few and enough points, with stage 1 and without."""
+    data = handheld(6, 2.0)
+    if points:
+        data.points = torch.rand(points, 3)
+    config = preset(name)
+    pretrain = dataclasses.replace(config.pretrain, progressive=True)
+    pretrain = pretrain if steps is None else dataclasses.replace(pretrain, steps=steps)
+    model = dataclasses.replace(config.motion, model=motion)
+    config = dataclasses.replace(config, pretrain=pretrain, motion=model)
+    acts = resolve_auto(config, data).pretrain_steps > 0
+    assert ("--progressive has no effect" in advise(survey(data), config)[1]) is not acts
+    assert acts == (motion == "control-points" and steps is None and (points < 10 or name == "paper"))
+
+
+def test_progressive_on_a_single_frame():
+    pretrain = dataclasses.replace(preset("cpu").pretrain, progressive=True)
+    assert "only one frame" in lines(handheld(1), pretrain=pretrain)[1]
+
+
 def test_progressive_is_never_ignored_in_silence():
     """Where there is no stage 1, the line says so, and the reason is the one by which training leaves it out."""
     asked = dataclasses.replace(preset("cpu").pretrain, progressive=True)
@@ -136,3 +162,35 @@ def test_progressive_is_never_ignored_in_silence():
         assert ("--progressive has no effect" in said) is not silent
         if pretrain.progressive:
             assert (resolve_auto(own, given).pretrain_steps > 0) is silent
+
+
+def test_a_resumed_run_is_progressive_as_it_began(tmp_path, capsys):
+    """The option need not be repeated, and a run that began without it refuses it."""
+    from scgs_warp.apps.train import cli
+
+    data = write_dnerf(tmp_path / "scene", 32)
+    small = ["--steps", "20", "--nodes", "16", "--device", "cpu", "--set", "init_points=200"]
+
+    def run(name: str, *more: str) -> int:
+        return cli(["--data", str(data), "--output", str(tmp_path / name), *small, *more])
+
+    assert run("with", "--progressive") == run("without") == 0
+    recorded = json.loads((tmp_path / "with/config.json").read_text())
+    assert recorded["pretrain"]["progressive"] is True
+    assert run("with", "--resume") == 0
+    assert json.loads((tmp_path / "with/config.json").read_text()) == recorded
+    capsys.readouterr()
+    assert run("without", "--resume", "--progressive") == 2
+    assert "pretrain.progressive = False, now True" in capsys.readouterr().err
+
+
+def test_progressive_cannot_be_denied_in_vain():
+    """--no-progressive would not turn it off where the preset turns it on."""
+    from scgs_warp.apps.settings import Settings, configuration
+
+    with pytest.raises(SystemExit) as caught:
+        tyro.cli(Settings, args=["--no-progressive"])
+    assert caught.value.code == 2
+    options = tyro.cli(Settings, args=["--preset", "quick", "--set", "pretrain.progressive=false"])
+    assert not configuration(options, None, {})[0].pretrain.progressive
+    assert configuration(tyro.cli(Settings, args=["--progressive"]), None, {})[0].pretrain.progressive

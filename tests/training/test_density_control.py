@@ -44,7 +44,8 @@ def test_schedule_of_a_short_run():
 @pytest.mark.parametrize(
     "name, first, last, rounds, resets",
     [
-        ("paper", 600, 39_900, 132, [10_000, 20_000, 30_000]),
+        ("best", 600, 39_900, 132, [10_000, 20_000, 30_000]),
+        ("paper", 500, 50_000, 496, list(range(3_000, 48_001, 3_000))),
         ("cpu", 400, 12_000, 117, [3_000, 6_000, 9_000]),
         ("quick", 200, 3_500, 34, [875, 1_750, 2_625]),
     ],
@@ -60,9 +61,10 @@ def test_schedule_of_the_presets(name, first, last, rounds, resets):
 @pytest.mark.parametrize(
     "name, steps, due",
     [
-        ("paper", 80_000, [5_100, 10_200, 15_000, 20_100, 25_200]),
-        ("paper", 40_000, [2_550, 5_100, 7_500, 10_050, 12_600]),
+        ("best", 80_000, [5_100, 10_200, 15_000, 20_100, 25_200]),
+        ("best", 40_000, [2_550, 5_100, 7_500, 10_050, 12_600]),
         ("cpu", 24_000, [2_000, 4_000, 6_000, 8_000]),
+        ("paper", 80_000, [10_000]),
     ],
 )
 def test_control_points_change_at_the_first_round_after_each_milestone(name, steps, due):
@@ -116,6 +118,18 @@ def test_transparent_large_and_broken_ones_go(device):
         gaussians.means[2, 1] = float("nan")
     run_round(gaussians, optimizer, torch.zeros(5, device=device), DensifyConfig(), prune_large=True)
     assert len(gaussians) == 2
+
+
+@pytest.mark.parametrize(("max_screen", "left"), [(0.05, 3), (0.4, 4), (0.0, 5)])
+def test_size_on_screen_may_be_of_no_account(max_screen, left):
+    gaussians, optimizer = make(5, "cpu")
+    with torch.no_grad():
+        gaussians.log_scales.fill_(-4.0)
+    stats = Stats.zeros(5, "cpu")
+    stats.max_radii[:] = torch.tensor([0.01, 0.02, 0.04, 0.3, 9.0])
+    options = {"grad_threshold": 0.5, "extent": 1.0, "prune_large": True, "random": generator(0, 1)}
+    grow_and_prune(gaussians, optimizer, stats, DensifyConfig(max_screen=max_screen), **options)
+    assert len(gaussians) == left
 
 
 def test_the_look_takes_views_at_random_and_not_more_than_it_may(monkeypatch):
@@ -200,7 +214,7 @@ def test_switched_off_everything_stays(monkeypatch):
 
 @pytest.mark.parametrize(
     "name, steps, looks",
-    [("paper", 80_000, (10, 20, 30, 40)), ("cpu", 24_000, (3, 6, 9, 12)), ("quick", 7_000, (3.5,))],
+    [("best", 80_000, (10, 20, 30, 40)), ("cpu", 24_000, (3, 6, 9, 12)), ("quick", 7_000, (3.5,))],
 )
 def test_when_the_presets_look(name, steps, looks, monkeypatch):
     """In thousands of main steps, with 150 frames; ``quick`` is too short for more than one."""

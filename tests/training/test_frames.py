@@ -34,6 +34,16 @@ def test_progressive_starts_with_the_first_fifth_and_grows_to_all():
     assert set(seen[2]) == set(times)
 
 
+def test_progressive_by_fifths_adds_them_at_once():
+    """As in the supplement: no frame of the next fifth before the interval ends, and all frames equally often."""
+    made = frames(pretrain={"progressive_every": 50, "progressive_by": "fifth"})
+    times = sorted(frame.time for frame in made.frames)
+    for window, count in ((range(0, 50), 2), (range(50, 100), 4), (range(152, 200), 8), (range(200, 250), 10)):
+        seen = [made.frames[made.index_at(step, True)].time for step in window]
+        assert set(seen) == set(times[:count])
+        assert max(seen.count(time) for time in set(seen)) - min(seen.count(time) for time in set(seen)) <= 2
+
+
 def test_random_background_is_under_the_image_alone():
     made = frames()
     frame, _, truth, background, mask = made.view(3, 7, True)

@@ -57,7 +57,8 @@ def test_the_log_shows_the_regulariser(batch, tmp_path, monkeypatch):
         return result
 
     monkeypatch.setattr(loop, "training_step", recorded)
-    fit(tiny_config(100, batch=batch), tiny_dataset(4), output=tmp_path / "run")
+    config = tiny_config(100, batch=batch, pretrain={"silhouette": 0.0})
+    fit(config, tiny_dataset(4), output=tmp_path / "run")
     log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
     rows = {entry["step"]: entry["regulariser"] for entry in log if "loss" in entry}
     assert rows.keys() == {50, 100} and all(value > 0.0 for value in rows.values())

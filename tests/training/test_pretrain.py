@@ -8,7 +8,13 @@ import torch
 from helpers.gaussian_rows import RATES
 from helpers.tiny import tiny_config
 from scgs_warp.optim import Adam
-from scgs_warp.training.pretrain import control_points_from_spheres, densify_spheres, initial_spheres, thin_spheres
+from scgs_warp.training.pretrain import (
+    control_points_from_spheres,
+    densify_spheres,
+    densify_spheres_by_gradient,
+    initial_spheres,
+    thin_spheres,
+)
 from scgs_warp.types import Stats
 
 
@@ -57,3 +63,89 @@ def test_few_control_points_begin_among_as_many_spheres_as_more_would(device):
         config = tiny_config(motion={"nodes": nodes})
         counts.append(len(initial_spheres(config, points, points, device)[0]))
     assert counts == [2048, 2048, 3200]
+
+
+def by_gradient(**pretrain):
+    """Settings of the official form of stage 1, with 16 control points."""
+    return tiny_config(pretrain={"densify_by": "gradient", "start_ratio": 1.0, "max_ratio": 4.0, **pretrain})
+
+
+def round_by_gradient(config, gradient, extent, radius, opacities=0.9):
+    """One round over spheres in a row whose mean gradients are ``gradient``; returns them, with the common radius."""
+    count = len(gradient)
+    points = torch.linspace(-1.0, 1.0, count)[:, None].repeat(1, 3)
+    gaussians, spheres = initial_spheres(config, points, points, "cpu")
+    optimizer = Adam(dict(gaussians.named_parameters()), RATES)
+    with torch.no_grad():
+        gaussians.means.copy_(points)
+        gaussians.opacity_logits.copy_(torch.as_tensor(opacities).expand(count).logit())
+        spheres.log_radius.fill_(radius).log_()
+    stats = Stats.zeros(count, "cpu")
+    stats.grad_norm += 3.0 * torch.as_tensor(gradient)
+    stats.count += 3.0
+    densify_spheres_by_gradient(gaussians, optimizer, spheres, stats, config, extent, 3)
+    return gaussians, float(spheres.log_radius.detach().exp())
+
+
+def test_small_spheres_are_cloned_by_their_gradient():
+    gradient = torch.full((16,), 1.99e-4)
+    gradient[[2, 5]] = 2.01e-4
+    gaussians, radius = round_by_gradient(by_gradient(), gradient, 4.0, 0.039)
+    assert len(gaussians) == 18 and radius == pytest.approx(0.039)
+    assert torch.equal(gaussians.means[16:], gaussians.means[[2, 5]])
+    assert len(round_by_gradient(by_gradient(grad_threshold=1e-4), gradient, 4.0, 0.039)[0]) == 32
+
+
+def test_large_spheres_are_split_and_all_of_them_shrink():
+    """The common size is the geometric mean of 14 whole ones and 4 halves."""
+    gradient = torch.zeros(16)
+    gradient[[2, 5]] = 1.0
+    gaussians, radius = round_by_gradient(by_gradient(), gradient, 4.0, 0.041)
+    assert len(gaussians) == 18 and radius == pytest.approx(0.041 * 1.6 ** (-4 / 18))
+    kept = [index for index in range(16) if index not in (2, 5)]
+    assert torch.equal(gaussians.means[:14], torch.linspace(-1.0, 1.0, 16)[kept, None].repeat(1, 3))
+
+
+@pytest.mark.parametrize("opaque", [0, 1, 15, 16])
+def test_a_round_by_gradient_leaves_enough_spheres(opaque):
+    """Also where one size for all would prune all of them: spheres larger than a tenth of the extent stay."""
+    opacities = torch.full((16,), 0.0049)
+    opacities[:opaque] = 0.0051
+    gaussians, _ = round_by_gradient(by_gradient(), torch.zeros(16), 1.0, 0.5, opacities)
+    assert len(gaussians) == 16
+    assert opaque == 0 or bool((gaussians.opacities() > 0.005).all())
+
+
+def test_a_round_by_gradient_keeps_the_cap():
+    gaussians, _ = round_by_gradient(by_gradient(max_ratio=1.5), torch.ones(16), 4.0, 0.01)
+    assert len(gaussians) == 24
+    gaussians, _ = round_by_gradient(by_gradient(max_ratio=1.0, start_ratio=2.0), torch.ones(32), 4.0, 0.01)
+    assert len(gaussians) == 32, "a start above the cap is kept, but does not grow"
+
+
+def test_the_official_start_is_grey_and_has_as_many_spheres_as_control_points(device):
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(1)).to(device)
+    gaussians, _ = initial_spheres(by_gradient(grey=True), points, points, device)
+    assert len(gaussians) == 16 and not gaussians.sh_dc.any()
+    assert initial_spheres(by_gradient(), points, points, device)[0].sh_dc.any()
+
+
+def test_radius_of_control_points():
+    points = torch.linspace(0.0, 1.5, 16)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    for share, radius in ((1.0, 0.1414), (0.5, 0.0707), (0.0, 0.01)):
+        config = by_gradient(least_radius=share)
+        gaussians, spheres = initial_spheres(config, points, points, "cpu")
+        with torch.no_grad():
+            spheres.log_radius.fill_(0.01).log_()
+        radii = control_points_from_spheres(gaussians, spheres, config).log_radii.detach().exp()
+        assert radii.tolist() == pytest.approx([radius] * 16, rel=1e-3)
+
+
+def test_progressive_by_fifths_begins_like_all_frames():
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(1))
+    whole, frame, fifth = (
+        initial_spheres(by_gradient(progressive=on, progressive_by=how), points, points, "cpu")
+        for on, how in ((False, "frame"), (True, "frame"), (True, "fifth"))
+    )
+    assert torch.equal(whole[0].means, fifth[0].means) and torch.equal(whole[1].log_radius, fifth[1].log_radius)
+    assert not torch.equal(whole[0].means, frame[0].means)

@@ -6,10 +6,12 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.errors import UserError
 from scgs_warp.storage import checkpoint
+from scgs_warp.training.initial_points import HALF_SIZE
 from scgs_warp.training.loop import fit
 from scgs_warp.training.state import TrainState, has_initial_points, resolve_auto
 
@@ -74,3 +76,23 @@ def test_the_main_stage_begins_with_control_points():
     state.begin_main()
     assert (state.stage, state.motion.name, state.stage_step) == ("main", "control-points", 0)
     assert len(state.gaussians) == len(state.stats.count) == state.config.init_points
+
+
+def test_random_points_of_the_official_code_are_grey_in_a_cube():
+    """Whatever alpha shows; and nothing is added to the points that the data has."""
+    data = tiny_dataset(3)
+    cube, covered = (
+        TrainState.begin(tiny_config(20, init_points=1000, init_random=way), data, "cpu") for way in ("cube", "covered")
+    )
+    count = round(256 * cube.config.pretrain.start_ratio)
+    assert cube.points.shape == covered.points.shape == (count, 3)
+    assert bool((cube.colors == 0.5).all()) and not bool((covered.colors == 0.5).all())
+    assert float(cube.points.std()) == pytest.approx(HALF_SIZE / 3**0.5, rel=0.05)
+    assert float(covered.points.std()) < 0.9 * float(cube.points.std())
+    filled = type(data)([dataclasses.replace(f, alpha=None) for f in data], folder=Path("filled"), split="train")
+    filled.points = torch.randn(40, 3)
+    counts = [
+        len(TrainState.begin(tiny_config(20, init_points=1000, init_random=way), filled, "cpu").points)
+        for way in ("cube", "covered")
+    ]
+    assert counts[0] == 40 < counts[1]

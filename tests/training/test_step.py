@@ -25,7 +25,7 @@ from scgs_warp.training.step import (
 
 
 def test_constant_rates_settle_in_the_last_share_of_the_run():
-    config = C.preset("paper")
+    config = C.preset("best")
     begin = round(0.85 * config.main_steps)
     factors = [settling(step, config) for step in range(0, config.main_steps + 1, 500)]
     assert factors[begin // 500] == 1.0 and factors == sorted(factors, reverse=True)

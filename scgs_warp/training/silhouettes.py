@@ -1,0 +1,165 @@
+"""Silhouettes in stage 1: the images' alpha draws spheres to where the subject is, and limits their size.
+
+The photometric loss moves a sphere only as far as the sphere reaches. Where a thin or fast part has left its spheres,
+this loss makes them transparent instead of moving them, and the part is lost. The distance between projected centres
+and the silhouette has a gradient at any range.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from ..data.dataset import Dataset
+from ..geometry.normalisation import Normalisation
+from ..runtime.environment import one_piece
+from ..types import Camera, Frame
+
+COVERED = 0.3
+"""Alpha from which a pixel belongs to the silhouette. Below one half, because rods thinner than a pixel count, too."""
+FILLED = 0.95
+"""Share of covered pixels above which an image is taken for a filled one with an alpha channel, without silhouette."""
+LONGEST_SIDE = 256
+"""Silhouettes of larger images are reduced to at most this many pixels per side."""
+PIXELS = 512
+"""Number of silhouette pixels that are compared in each step."""
+NEAREST_DEPTH = 1e-2
+"""Depth, normalised, below which a centre is treated as if it had this depth."""
+MEASURED_VIEWS = 50
+"""Largest number of images in which the subject's thickness is measured."""
+
+
+def distances_to(alpha: Tensor) -> Tensor | None:
+    """Measure the distance of each pixel to the silhouette in coverage [H, W].
+
+    Returns:
+        [h, w] distances in units of the image's width, 0 in the silhouette; None if nothing or almost everything is
+        covered.
+    """
+    covered = alpha.detach().cpu() >= COVERED
+    if float(covered.float().mean()) > FILLED:
+        return None
+    reduction = -(-max(covered.shape) // LONGEST_SIDE)
+    # A reduced pixel is covered if any of its pixels is, so thin parts stay.
+    outside = (F.max_pool2d(covered[None].float(), reduction, ceil_mode=True)[0] == 0).numpy()
+    if outside.all():
+        return None
+    distances = _distances(outside)
+    return torch.from_numpy(distances * (reduction / covered.shape[1])).float()
+
+
+def _distances(mask: np.ndarray) -> np.ndarray:
+    """Return the distance of each True pixel to the nearest False one, pixels. OpenCV's transform is not used, because
+    its last bits differ from call to call."""
+    return np.asarray(distance_transform_edt(mask))
+
+
+def silhouette_term(means: Tensor, camera: Camera, distances: Tensor, random: torch.Generator) -> Tensor:
+    """Return the mean distance of projected centres to the silhouette, plus the mean distance of its pixels to the
+    nearest centre.
+
+    Args:
+        means: [N, 3] centres at the time of the image, normalised.
+        camera: camera of the image, normalised.
+        distances: [h, w] of the image (:func:`distances_to`), on the device of the centres.
+        random: generator that chooses ``PIXELS`` of the silhouette.
+
+    Returns:
+        Scalar, in units of the image's width. Gradients flow to ``means``.
+    """
+    return _Term.apply(means, camera, distances, random)  # type: ignore[return-value]
+
+
+class _Term(torch.autograd.Function):
+    """The term with its gradient, both computed in one thread: in several, torch rounds differently."""
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, camera: Camera, distances: Tensor, random: torch.Generator) -> Tensor:
+        with one_piece(), torch.enable_grad():
+            leaf = means.detach().requires_grad_()
+            term = _term(leaf, camera, distances, random)
+            (gradient,) = torch.autograd.grad(term, leaf)
+        ctx.save_for_backward(gradient)
+        return term.detach()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_term: Tensor):  # type: ignore[override]
+        (gradient,) = ctx.saved_tensors
+        return v_term * gradient, None, None, None
+
+
+def _term(means: Tensor, camera: Camera, distances: Tensor, random: torch.Generator) -> Tensor:
+    points = _project(means, camera)
+    # Distance of the centres to the silhouette.
+    height, width = distances.shape
+    grid = torch.stack([2.0 * points[:, 0] - 1.0, 2.0 * points[:, 1] * (width / height) - 1.0], dim=1)
+    strayed = F.grid_sample(distances[None, None], grid[None, None], align_corners=False, padding_mode="border")
+    # Distance of the silhouette's pixels to the centres.
+    inside = (distances == 0).nonzero()
+    chosen = torch.randint(len(inside), (PIXELS,), generator=random).to(inside.device)
+    pixels = (inside[chosen].flip(1).float() + 0.5) / width
+    with torch.no_grad():
+        nearest = torch.cdist(pixels, points, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)
+    uncovered = (pixels - points[nearest]).norm(dim=1)
+    return strayed.mean() + uncovered.mean()
+
+
+def _project(means: Tensor, camera: Camera) -> Tensor:
+    """Project centres [N, 3] to [N, 2], in units of the image's width."""
+    local = _product(means, camera.viewmat[:3, :3]) + camera.viewmat[:3, 3]
+    homogeneous = _product(local, camera.K)
+    return homogeneous[:, :2] / local[:, 2:].clamp_min(NEAREST_DEPTH) / camera.width
+
+
+def _product(rows: Tensor, matrix: Tensor) -> Tensor:
+    """Multiply each of ``rows`` [N, 3] by a matrix [3, 3]. Torch's own product rounds differently for each number of
+    threads."""
+    return (rows[:, None, :] * matrix).sum(dim=2)
+
+
+class Silhouettes:
+    """Distances to the silhouettes of the training images, each measured at its first use."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self._measured: dict[tuple[int, int], Tensor | None] = {}
+
+    def of(self, frame: Frame, index: int) -> Tensor | None:
+        """Return [h, w] distances (:func:`distances_to`) for the frame with this index; None if it has no
+        silhouette."""
+        if frame.alpha is None:
+            return None
+        key = index, frame.alpha.shape[1]
+        if key not in self._measured:
+            distances = distances_to(frame.alpha)
+            self._measured[key] = None if distances is None else distances.to(self.device)
+        return self._measured[key]
+
+
+def half_thickness(data: Dataset, normalisation: Normalisation) -> float:
+    """Measure half the typical thickness of the subject, normalised: the median over images of a strip's half width.
+
+    In a strip of half width w, pixels are w / 2 from the border on average.
+
+    Returns:
+        Infinity if no frame has a silhouette.
+    """
+    chosen, found = data.with_alpha, []
+    for index in chosen[:: max(1, len(chosen) // MEASURED_VIEWS)]:
+        frame = data[index]
+        assert frame.alpha is not None
+        covered = (frame.alpha.cpu() >= COVERED).numpy()
+        if not 0.0 < covered.mean() <= FILLED:
+            continue
+        inside = _distances(covered)[covered]
+        camera = normalisation.apply_camera(frame.camera)
+        # The subject surrounds the origin of the normalised scene.
+        depth = max(float(camera.viewmat[2, 3]), NEAREST_DEPTH)
+        found.append(2.0 * (float(inside.mean()) - 0.5) * depth / float(camera.K[0, 0]))
+    return float(np.median(found)) if found else float("inf")

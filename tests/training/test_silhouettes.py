@@ -1,0 +1,173 @@
+"""Silhouettes of stage 1: distances, the term against float64, and spheres drawn to far parts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.tiny import tiny_config
+from scgs_warp.config.presets import from_dict, preset, to_dict
+from scgs_warp.training import silhouettes
+from scgs_warp.training.pretrain import initial_gaussians, initial_spheres
+from scgs_warp.training.silhouettes import Silhouettes, distances_to, silhouette_term
+from scgs_warp.types import Camera, Frame
+
+WIDTH, HEIGHT = 48, 32
+
+
+def camera(width: int = WIDTH, height: int = HEIGHT) -> Camera:
+    """Make a camera at distance 4 from the origin."""
+    view = torch.eye(4)
+    view[2, 3] = 4.0
+    K = torch.tensor([[60.0, 0.0, width / 2], [0.0, 60.0, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(view, K, width, height)
+
+
+def alpha_of(rows: slice, columns: slice, height: int = HEIGHT, width: int = WIDTH) -> torch.Tensor:
+    alpha = torch.zeros(height, width)
+    alpha[rows, columns] = 1.0
+    return alpha
+
+
+def slow_term(means: torch.Tensor, view: Camera, alpha: np.ndarray, chosen: np.ndarray) -> torch.Tensor:
+    """Compute the term pixel by pixel in float64; ``chosen`` indexes the covered pixels, row by row."""
+    rows, columns = np.nonzero(alpha >= 0.3)
+    inside = np.stack([columns, rows], axis=1)
+    grid_y, grid_x = np.mgrid[: alpha.shape[0], : alpha.shape[1]]
+    grid = np.stack([grid_x, grid_y], axis=-1).reshape(-1, 1, 2)
+    distances = np.sqrt(((grid - inside[None]) ** 2).sum(-1)).min(1).reshape(alpha.shape) / alpha.shape[1]
+    table = torch.from_numpy(distances)
+    local = means @ view.viewmat[:3, :3].double().T + view.viewmat[:3, 3].double()
+    pixels = (local @ view.K.double().T)[:, :2] / local[:, 2:]
+    total = torch.zeros((), dtype=torch.float64)
+    for x, y in pixels:
+        u, v = (x - 0.5).clamp(0, alpha.shape[1] - 1), (y - 0.5).clamp(0, alpha.shape[0] - 1)
+        i, j = min(int(u), alpha.shape[1] - 2), min(int(v), alpha.shape[0] - 2)
+        a, b = u - i, v - j
+        top = (1 - a) * table[j, i] + a * table[j, i + 1]
+        bottom = (1 - a) * table[j + 1, i] + a * table[j + 1, i + 1]
+        total = total + ((1 - b) * top + b * bottom) / len(pixels)
+    targets = torch.from_numpy(inside[chosen] + 0.5)
+    nearest = torch.stack([(pixels - target).norm(dim=1).min() for target in targets])
+    return total + nearest.mean() / alpha.shape[1]
+
+
+def test_distances_are_zero_in_the_silhouette_and_grow_with_the_distance_in_image_widths():
+    distances = distances_to(alpha_of(slice(10, 20), slice(8, 16)))
+    assert distances is not None
+    assert bool((distances[10:20, 8:16] == 0).all())
+    assert float(distances[12, 40]) == pytest.approx(25 / WIDTH, abs=1e-6)
+    assert float(distances[25, 20]) == pytest.approx(math.hypot(5, 6) / WIDTH, abs=1e-3)
+    assert distances_to(torch.zeros(4, 4)) is None
+    assert distances_to(torch.ones(4, 4)) is None, "a filled image with an alpha channel has no silhouette"
+
+
+def test_lines_of_half_a_pixel_stay_in_reduced_silhouettes():
+    alpha = torch.zeros(700, 1200)
+    alpha[:, 601] = 0.4
+    distances = distances_to(alpha)
+    assert distances is not None
+    assert max(distances.shape) <= silhouettes.LONGEST_SIDE
+    assert bool((distances == 0).any(1).all())
+    assert float(distances[0, 0]) == pytest.approx(0.5, abs=0.01)
+
+
+def test_term_and_gradients_agree_with_float64(device):
+    random = torch.Generator().manual_seed(5)
+    means = torch.randn(40, 3, generator=random) * torch.tensor([1.2, 0.8, 0.5])
+    alpha = alpha_of(slice(6, 17), slice(20, 31)).to(device)
+    distances = distances_to(alpha)
+    assert distances is not None
+    chosen = torch.randint(11 * 11, (silhouettes.PIXELS,), generator=torch.Generator().manual_seed(9)).numpy()
+    fast = means.clone().to(device).requires_grad_()
+    term = silhouette_term(fast, camera().to(device), distances.to(device), torch.Generator().manual_seed(9))
+    term.backward()
+    slow = means.double().requires_grad_()
+    expected = slow_term(slow, camera(), alpha.cpu().numpy(), chosen)
+    expected.backward()
+    assert float(term.detach()) == pytest.approx(float(expected.detach()), rel=2e-5)
+    assert fast.grad is not None and slow.grad is not None
+    torch.testing.assert_close(fast.grad.cpu().double(), slow.grad, rtol=2e-4, atol=2e-6)
+
+
+def test_a_far_part_draws_the_nearest_centre(device):
+    """The centre and the part are 20 standard deviations of any splat apart; the gradient still points there."""
+    alpha = alpha_of(slice(14, 18), slice(4, 8)) + alpha_of(slice(14, 18), slice(40, 44))
+    distances = distances_to(alpha)
+    assert distances is not None
+    means = torch.tensor([[-1.2, 0.0, 0.0], [-1.1, 0.0, 0.0], [0.2, 0.0, 0.0]], device=device, requires_grad=True)
+    term = silhouette_term(means, camera().to(device), distances.to(device), torch.Generator().manual_seed(1))
+    (gradient,) = torch.autograd.grad(term, means)
+    assert float(gradient[2, 0]) < 0.0  # descent moves it to the right, where nothing is covered yet
+    assert float(gradient[2, 0].abs()) > 2 * float(gradient[:2, 0].abs().max())
+
+
+def test_descent_covers_two_parts_and_leaves_no_stray(device):
+    alpha = alpha_of(slice(4, 8), slice(4, 10)) + alpha_of(slice(24, 28), slice(38, 44))
+    distances = distances_to(alpha)
+    assert distances is not None
+    start = torch.randn(30, 3, generator=torch.Generator().manual_seed(2)) * 0.4
+    means = start.to(device).requires_grad_()
+    optimizer = torch.optim.Adam([means], 2e-2)
+    random, view = torch.Generator().manual_seed(3), camera().to(device)
+    for _ in range(300):
+        optimizer.zero_grad()
+        silhouette_term(means, view, distances.to(device), random).backward()
+        optimizer.step()
+    local = means.detach().cpu() + torch.tensor([0.0, 0.0, 4.0])
+    x = 60.0 * local[:, 0] / local[:, 2] + WIDTH / 2
+    assert int((x < 14).sum()) >= 5 and int((x > 34).sum()) >= 5
+    assert int(((x > 14) & (x < 34)).sum()) == 0
+
+
+def test_frames_without_alpha_or_subject_have_no_term():
+    found = Silhouettes("cpu")
+    image = torch.zeros(HEIGHT, WIDTH, 3)
+    assert found.of(Frame(camera(), 0.0, image), 0) is None
+    assert found.of(Frame(camera(), 0.0, image, alpha=torch.zeros(HEIGHT, WIDTH)), 1) is None
+    whole = Frame(camera(), 0.0, image, alpha=alpha_of(slice(0, 4), slice(0, 4)))
+    first = found.of(whole, 2)
+    assert first is not None and found.of(whole, 2) is first
+    half = Frame(camera(), 0.0, image, alpha=alpha_of(slice(0, 4), slice(0, 4), HEIGHT // 2, WIDTH // 2))
+    assert found.of(half, 2) is not first, "half-size images have silhouettes of their own"
+
+
+@pytest.mark.parametrize("half_width", [1.5, 3.0, 6.0])
+def test_half_thickness_of_a_strip(half_width):
+    class Strip:
+        with_alpha = (0,)
+
+        def __getitem__(self, index):
+            alpha = alpha_of(slice(0, 64), slice(20, 20 + round(2 * half_width)), 64, 64)
+            return Frame(camera(64, 64), 0.0, torch.zeros(64, 64, 3), alpha=alpha)
+
+    class Same:
+        def apply_camera(self, view):
+            return view
+
+    found = silhouettes.half_thickness(Strip(), Same())  # type: ignore[arg-type]
+    assert found * 60.0 / 4.0 == pytest.approx(half_width, abs=0.6)
+
+
+def test_spheres_and_gaussians_are_no_larger_than_thin_subjects(device):
+    points = torch.rand(400, 3, generator=torch.Generator().manual_seed(1)).to(device)
+    config = tiny_config()
+    gaussians, spheres = initial_spheres(config, points, points, device, largest=0.01)
+    assert float(spheres.log_radius.detach().exp()) == pytest.approx(0.01, rel=1e-5)
+    made = initial_gaussians(config, points, points, (gaussians, spheres))
+    assert float(made.scales().detach().max()) <= 0.0101
+    wide, unlimited = initial_spheres(config, points, points, device)
+    assert float(unlimited.log_radius.detach().exp()) > 0.02
+    before = from_dict({"pretrain": {"silhouette": 0.0}}, base=config)
+    assert float(initial_gaussians(before, points, points, (gaussians, spheres)).scales().detach().max()) > 0.0101
+    assert len(wide) == len(gaussians)
+
+
+def test_recorded_configurations_without_the_field_have_no_silhouettes():
+    recorded = to_dict(preset("cpu"))
+    del recorded["pretrain"]["silhouette"]
+    assert from_dict(recorded).pretrain.silhouette == 0.0
+    assert preset("cpu").pretrain.silhouette == 0.5
