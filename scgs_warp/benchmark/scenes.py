@@ -219,7 +219,7 @@ def training_state(scene: Scene, arap: bool) -> TrainState:
     slow = {
         item.name: RATES * getattr(rates, item.name)
         for item in dataclasses.fields(rates)
-        if not item.metadata.get("milestone")
+        if isinstance(getattr(rates, item.name), float)
     }
     loss = dataclasses.replace(base.loss, arap_every=1) if arap else dataclasses.replace(base.loss, arap=0.0)
     config = dataclasses.replace(base, optim=dataclasses.replace(rates, **slow), loss=loss)
