@@ -7,7 +7,7 @@ and the silhouette has a gradient at any range.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -34,23 +34,31 @@ MEASURED_VIEWS = 50
 """Largest number of images in which the subject's thickness is measured."""
 
 
-def distances_to(alpha: Tensor) -> Tensor | None:
-    """Measure the distance of each pixel to the silhouette in coverage [H, W].
+class Silhouette(NamedTuple):
+    """The silhouette in one image. Lengths are in units of the image's width."""
 
-    Returns:
-        [h, w] distances in units of the image's width, 0 in the silhouette; None if nothing or almost everything is
-        covered.
-    """
+    distances: Tensor
+    """[h, w] distance of each pixel to the silhouette, 0 inside."""
+    pixels: Tensor
+    """[P, 2] centres (x, y) of the pixels inside, row by row."""
+    pixel: float
+    """Side of a pixel of ``distances``. Pixels of a reduced silhouette cover several of the image's."""
+
+
+def silhouette_of(alpha: Tensor, device: str = "cpu") -> Silhouette | None:
+    """Find the silhouette in coverage [H, W]; None if nothing or almost everything is covered."""
     covered = alpha.detach().cpu() >= COVERED
     if float(covered.float().mean()) > FILLED:
         return None
     reduction = -(-max(covered.shape) // LONGEST_SIDE)
     # A reduced pixel is covered if any of its pixels is, so thin parts stay.
-    outside = (F.max_pool2d(covered[None].float(), reduction, ceil_mode=True)[0] == 0).numpy()
-    if outside.all():
+    inside = F.max_pool2d(covered[None].float(), reduction, ceil_mode=True)[0] > 0
+    if not inside.any():
         return None
-    distances = _distances(outside)
-    return torch.from_numpy(distances * (reduction / covered.shape[1])).float()
+    pixel = reduction / covered.shape[1]
+    distances = torch.from_numpy(_distances((~inside).numpy()) * pixel).float()
+    centres = (inside.nonzero().flip(1).float() + 0.5) * pixel
+    return Silhouette(distances.to(device), centres.to(device), pixel)
 
 
 def _distances(mask: np.ndarray) -> np.ndarray:
@@ -59,30 +67,30 @@ def _distances(mask: np.ndarray) -> np.ndarray:
     return np.asarray(distance_transform_edt(mask))
 
 
-def silhouette_term(means: Tensor, camera: Camera, distances: Tensor, random: torch.Generator) -> Tensor:
+def silhouette_term(means: Tensor, camera: Camera, silhouette: Silhouette, random: torch.Generator) -> Tensor:
     """Return the mean distance of projected centres to the silhouette, plus the mean distance of its pixels to the
     nearest centre.
 
     Args:
         means: [N, 3] centres at the time of the image, normalised.
         camera: camera of the image, normalised.
-        distances: [h, w] of the image (:func:`distances_to`), on the device of the centres.
+        silhouette: of the image, on the device of the centres.
         random: generator that chooses ``PIXELS`` of the silhouette.
 
     Returns:
         Scalar, in units of the image's width. Gradients flow to ``means``.
     """
-    return _Term.apply(means, camera, distances, random)  # type: ignore[return-value]
+    return _Term.apply(means, camera, silhouette, random)  # type: ignore[return-value]
 
 
 class _Term(torch.autograd.Function):
     """The term with its gradient, both computed in one thread: in several, torch rounds differently."""
 
     @staticmethod
-    def forward(ctx: Any, means: Tensor, camera: Camera, distances: Tensor, random: torch.Generator) -> Tensor:
+    def forward(ctx: Any, means: Tensor, camera: Camera, silhouette: Silhouette, random: torch.Generator) -> Tensor:
         with one_piece(), torch.enable_grad():
             leaf = means.detach().requires_grad_()
-            term = _term(leaf, camera, distances, random)
+            term = _term(leaf, camera, silhouette, random)
             (gradient,) = torch.autograd.grad(term, leaf)
         ctx.save_for_backward(gradient)
         return term.detach()
@@ -94,16 +102,17 @@ class _Term(torch.autograd.Function):
         return v_term * gradient, None, None, None
 
 
-def _term(means: Tensor, camera: Camera, distances: Tensor, random: torch.Generator) -> Tensor:
+def _term(means: Tensor, camera: Camera, silhouette: Silhouette, random: torch.Generator) -> Tensor:
     points = _project(means, camera)
     # Distance of the centres to the silhouette.
-    height, width = distances.shape
-    grid = torch.stack([2.0 * points[:, 0] - 1.0, 2.0 * points[:, 1] * (width / height) - 1.0], dim=1)
-    strayed = F.grid_sample(distances[None, None], grid[None, None], align_corners=False, padding_mode="border")
+    height, width = silhouette.distances.shape
+    size = points.new_tensor([width, height]) * silhouette.pixel
+    grid = 2.0 * points / size - 1.0
+    table = silhouette.distances[None, None]
+    strayed = F.grid_sample(table, grid[None, None], align_corners=False, padding_mode="border")
     # Distance of the silhouette's pixels to the centres.
-    inside = (distances == 0).nonzero()
-    chosen = torch.randint(len(inside), (PIXELS,), generator=random).to(inside.device)
-    pixels = (inside[chosen].flip(1).float() + 0.5) / width
+    chosen = torch.randint(len(silhouette.pixels), (PIXELS,), generator=random)
+    pixels = silhouette.pixels[chosen.to(points.device)]
     with torch.no_grad():
         nearest = torch.cdist(pixels, points, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)
     uncovered = (pixels - points[nearest]).norm(dim=1)
@@ -124,22 +133,20 @@ def _product(rows: Tensor, matrix: Tensor) -> Tensor:
 
 
 class Silhouettes:
-    """Distances to the silhouettes of the training images, each measured at its first use."""
+    """Silhouettes of the training images, each found at its first use."""
 
     def __init__(self, device: str) -> None:
         self.device = device
-        self._measured: dict[tuple[int, int], Tensor | None] = {}
+        self._found: dict[tuple[int, int], Silhouette | None] = {}
 
-    def of(self, frame: Frame, index: int) -> Tensor | None:
-        """Return [h, w] distances (:func:`distances_to`) for the frame with this index; None if it has no
-        silhouette."""
+    def of(self, frame: Frame, index: int) -> Silhouette | None:
+        """Return the silhouette of the frame with this index; None if it has none."""
         if frame.alpha is None:
             return None
         key = index, frame.alpha.shape[1]
-        if key not in self._measured:
-            distances = distances_to(frame.alpha)
-            self._measured[key] = None if distances is None else distances.to(self.device)
-        return self._measured[key]
+        if key not in self._found:
+            self._found[key] = silhouette_of(frame.alpha, self.device)
+        return self._found[key]
 
 
 def half_thickness(data: Dataset, normalisation: Normalisation) -> float:

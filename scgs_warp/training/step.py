@@ -13,7 +13,7 @@ from ..ops.ssim import photometric_loss
 from ..optim import log_linear
 from ..rendering.render import draw
 from ..seeding import generator
-from ..types import Camera, Frame, Gaussians, Stats
+from ..types import Stats
 from .camera_refinement import camera_rate
 from .frames import Frames, view_number
 from .multi_view import all_views
@@ -74,8 +74,11 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     # 2. Pose: the Gaussians at the frame's time, and the regulariser of the motion.
     time = noisy_time(frame.time, state, len(frames), view)
     posed, regulariser = state.motion.train_at(state.gaussians, time, step, config, config.seed, view)
-    if pretraining and step >= config.pretrain.warm_up and config.pretrain.silhouette > 0:
-        regulariser = _add_silhouette(regulariser, state, frames, frame, index, posed, camera, view)
+    silhouette = frames.silhouettes.of(frame, index) if seeks_silhouettes(state) else None
+    if silhouette is not None:
+        random = generator(config.seed, 45, view_number(state.step, config, view))
+        sought = config.pretrain.silhouette * silhouette_term(posed.means, camera, silhouette, random)
+        regulariser = sought if regulariser is None else regulariser + sought
 
     # 3. Render. Statistics for densification are collected until it ends.
     collecting = pretraining or step < config.densify.until
@@ -101,24 +104,10 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     return StepResult(*losses, picture.detach(), truth, mask, failed, size)
 
 
-def _add_silhouette(
-    regulariser: Tensor | None,
-    state: TrainState,
-    frames: Frames,
-    frame: Frame,
-    index: int,
-    posed: Gaussians,
-    camera: Camera,
-    view: int,
-) -> Tensor | None:
-    """Add the silhouette term of stage 1 to the regulariser, if the frame has a silhouette."""
-    config = state.config
-    distances = frames.silhouettes.of(frame, index)
-    if distances is None:
-        return regulariser
-    random = generator(config.seed, 45, view_number(state.step, config, view))
-    term = config.pretrain.silhouette * silhouette_term(posed.means, camera, distances, random)
-    return term if regulariser is None else regulariser + term
+def seeks_silhouettes(state: TrainState) -> bool:
+    """Return True during the steps of stage 1 in which silhouettes draw the spheres: once the spheres move."""
+    pretrain = state.config.pretrain
+    return state.stage == "pretrain" and state.stage_step >= pretrain.warm_up and pretrain.silhouette > 0
 
 
 def sh_degree(state: TrainState, step: int) -> int:

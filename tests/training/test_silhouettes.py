@@ -12,7 +12,7 @@ from helpers.tiny import tiny_config
 from scgs_warp.config.presets import from_dict, preset, to_dict
 from scgs_warp.training import silhouettes
 from scgs_warp.training.pretrain import initial_gaussians, initial_spheres
-from scgs_warp.training.silhouettes import Silhouettes, distances_to, silhouette_term
+from scgs_warp.training.silhouettes import Silhouettes, silhouette_of, silhouette_term
 from scgs_warp.types import Camera, Frame
 
 WIDTH, HEIGHT = 48, 32
@@ -56,34 +56,58 @@ def slow_term(means: torch.Tensor, view: Camera, alpha: np.ndarray, chosen: np.n
 
 
 def test_distances_are_zero_in_the_silhouette_and_grow_with_the_distance_in_image_widths():
-    distances = distances_to(alpha_of(slice(10, 20), slice(8, 16)))
-    assert distances is not None
+    found = silhouette_of(alpha_of(slice(10, 20), slice(8, 16)))
+    assert found is not None
+    distances = found.distances
     assert bool((distances[10:20, 8:16] == 0).all())
     assert float(distances[12, 40]) == pytest.approx(25 / WIDTH, abs=1e-6)
     assert float(distances[25, 20]) == pytest.approx(math.hypot(5, 6) / WIDTH, abs=1e-3)
-    assert distances_to(torch.zeros(4, 4)) is None
-    assert distances_to(torch.ones(4, 4)) is None, "a filled image with an alpha channel has no silhouette"
+    assert len(found.pixels) == 80 and found.pixel == 1 / WIDTH
+    torch.testing.assert_close(found.pixels[0] * WIDTH, torch.tensor([8.5, 10.5]))
+    assert silhouette_of(torch.zeros(4, 4)) is None
+    assert silhouette_of(torch.ones(4, 4)) is None, "a filled image with an alpha channel has no silhouette"
 
 
 def test_lines_of_half_a_pixel_stay_in_reduced_silhouettes():
     alpha = torch.zeros(700, 1200)
     alpha[:, 601] = 0.4
-    distances = distances_to(alpha)
-    assert distances is not None
+    found = silhouette_of(alpha)
+    assert found is not None
+    distances = found.distances
     assert max(distances.shape) <= silhouettes.LONGEST_SIDE
     assert bool((distances == 0).any(1).all())
     assert float(distances[0, 0]) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_reduced_silhouette_lies_where_the_image_s_does():
+    """1030 x 730 is no multiple of the reduction by 5; the last reduced pixels reach beyond the image."""
+    alpha = alpha_of(slice(700, 730), slice(1000, 1030), 730, 1030)
+    found = silhouette_of(alpha)
+    assert found is not None and found.pixel == pytest.approx(5 / 1030)
+    assert found.distances.shape == (146, 206)
+    centre = found.pixels.mean(0) * 1030
+    assert centre.tolist() == pytest.approx([1015.0, 715.0], abs=0.01)
+    view = camera(1030, 730)
+
+    def strayed(x: float, y: float) -> float:
+        mean = torch.tensor([[(x - 515.0) * 4 / 60, (y - 365.0) * 4 / 60, 0.0]])
+        term = float(silhouette_term(mean, view, found, torch.Generator().manual_seed(1)))
+        pixels = found.pixels[torch.randint(len(found.pixels), (512,), generator=torch.Generator().manual_seed(1))]
+        return 1030 * (term - float((pixels - mean[:, :2].new_tensor([x, y]) / 1030).norm(dim=1).mean()))
+
+    assert strayed(1002.5, 702.5) == pytest.approx(0.0, abs=1e-2)
+    assert strayed(502.5, 702.5) == pytest.approx(500.0, abs=1e-2)
 
 
 def test_term_and_gradients_agree_with_float64(device):
     random = torch.Generator().manual_seed(5)
     means = torch.randn(40, 3, generator=random) * torch.tensor([1.2, 0.8, 0.5])
     alpha = alpha_of(slice(6, 17), slice(20, 31)).to(device)
-    distances = distances_to(alpha)
-    assert distances is not None
+    silhouette = silhouette_of(alpha, str(device))
+    assert silhouette is not None
     chosen = torch.randint(11 * 11, (silhouettes.PIXELS,), generator=torch.Generator().manual_seed(9)).numpy()
     fast = means.clone().to(device).requires_grad_()
-    term = silhouette_term(fast, camera().to(device), distances.to(device), torch.Generator().manual_seed(9))
+    term = silhouette_term(fast, camera().to(device), silhouette, torch.Generator().manual_seed(9))
     term.backward()
     slow = means.double().requires_grad_()
     expected = slow_term(slow, camera(), alpha.cpu().numpy(), chosen)
@@ -96,10 +120,10 @@ def test_term_and_gradients_agree_with_float64(device):
 def test_a_far_part_draws_the_nearest_centre(device):
     """The centre and the part are 20 standard deviations of any splat apart; the gradient still points there."""
     alpha = alpha_of(slice(14, 18), slice(4, 8)) + alpha_of(slice(14, 18), slice(40, 44))
-    distances = distances_to(alpha)
-    assert distances is not None
+    silhouette = silhouette_of(alpha, str(device))
+    assert silhouette is not None
     means = torch.tensor([[-1.2, 0.0, 0.0], [-1.1, 0.0, 0.0], [0.2, 0.0, 0.0]], device=device, requires_grad=True)
-    term = silhouette_term(means, camera().to(device), distances.to(device), torch.Generator().manual_seed(1))
+    term = silhouette_term(means, camera().to(device), silhouette, torch.Generator().manual_seed(1))
     (gradient,) = torch.autograd.grad(term, means)
     assert float(gradient[2, 0]) < 0.0  # descent moves it to the right, where nothing is covered yet
     assert float(gradient[2, 0].abs()) > 2 * float(gradient[:2, 0].abs().max())
@@ -107,15 +131,15 @@ def test_a_far_part_draws_the_nearest_centre(device):
 
 def test_descent_covers_two_parts_and_leaves_no_stray(device):
     alpha = alpha_of(slice(4, 8), slice(4, 10)) + alpha_of(slice(24, 28), slice(38, 44))
-    distances = distances_to(alpha)
-    assert distances is not None
+    silhouette = silhouette_of(alpha, str(device))
+    assert silhouette is not None
     start = torch.randn(30, 3, generator=torch.Generator().manual_seed(2)) * 0.4
     means = start.to(device).requires_grad_()
     optimizer = torch.optim.Adam([means], 2e-2)
     random, view = torch.Generator().manual_seed(3), camera().to(device)
     for _ in range(300):
         optimizer.zero_grad()
-        silhouette_term(means, view, distances.to(device), random).backward()
+        silhouette_term(means, view, silhouette, random).backward()
         optimizer.step()
     local = means.detach().cpu() + torch.tensor([0.0, 0.0, 4.0])
     x = 60.0 * local[:, 0] / local[:, 2] + WIDTH / 2
