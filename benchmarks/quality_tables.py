@@ -322,6 +322,24 @@ def overview(source: Source) -> str:
     return table(["", "PSNR", "SSIM", "motion error", "training"], lines)
 
 
+ZOO = ("robot", "rods", "rods-dark", "balls", "cloth", "fan", "touch", "opening", "still", *DNERF)
+
+
+def change_of_defaults(source: Source) -> str:
+    """Write mean and worst PSNR of each scene before and after a change of defaults, and the mean over the scenes."""
+    scenes = [scene for scene in ZOO if source.run("before", scene) and source.run("after", scene)]
+    rows = []
+    for scene in scenes:
+        before, after = source.run("before", scene), source.run("after", scene)
+        pairs = [(before[key], after[key]) for key in ("psnr", "psnr_worst")]
+        rows.append([value for old, new in pairs for value in (old, new, new - old)])
+    rows.append([math.fsum(column) / len(scenes) for column in zip(*rows)])
+    marked = [source.label(row, row) for row in ("before", "after")]
+    head = ["", *marked, "difference", *(f"worst image, {text}" for text in marked), "difference"]
+    cells = [[signed(value) if i % 3 == 2 else number(value, 2) for i, value in enumerate(row)] for row in rows]
+    return table(head, [[name, *row] for name, row in zip((*scenes, "mean"), cells)])
+
+
 WRITERS: dict[str, Callable[[Source], str]] = {
     "published": beside((*DNERF, DNERF, *ALL_DNERF[4:], ALL_DNERF), OWN_ROWS),
     "published-cost": own_cost,
@@ -331,6 +349,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "nodes": node_counts,
     "motion": motion_models,
     "arap": arap,
+    "defaults": change_of_defaults,
     "parts": changes(TWO, "none"),
     "parts-shading": changes(TWO, "parts/shading"),
     "parts-threshold": changes(TWO, "parts-shading/threshold"),

@@ -76,7 +76,7 @@ def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> 
     colors = (0.5 + 0.4 * torch.sin(5.0 * means + torch.tensor([0.0, 2.0, 4.0]))).clamp(0.0, 1.0)
     own = motion or MotionConfig(shading=False)
     made = GaussianParameters(
-        means, log_scales, (colors - 0.5) / SH_C0, hyper_dim=own.hyper_dim, shaded=own.has_shading
+        means, log_scales, (colors - 0.5) / SH_C0, hyper_dim=own.hyper_columns, shaded=own.has_shading
     )
     low, high = OPACITIES
     opacities = low + (high - low) * torch.rand(count, generator=random) ** OPACITY_POWER

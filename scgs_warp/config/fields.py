@@ -72,12 +72,12 @@ class MotionConfig:
     time_frequencies: int = bounded(6, 1, 32)
     train_positions: bool = True
     """Learn the rest positions of the control points in stage 2 (paper); the official code never moves them."""
-    hyper_dim: int = bounded(0, 0, 64)
-    """Number of hyper-coordinates appended to positions in the neighbour search (8 in the official code)."""
+    hyper_dim: int = bounded(8, 0, 64)
+    """Number of hyper-coordinates appended to positions in the neighbour search (official code). They separate parts
+    that lie side by side and move apart, such as a shadow and the table on which it falls."""
     hyper_dim_filled: int = bounded(4, 0, 64)
-    """Minimum of hyper_dim if no image has alpha: hyper-coordinates separate moving surfaces from static ones beside
-    them."""
-    node_weight: bool = False
+    """Minimum of hyper_dim if no image has alpha."""
+    node_weight: bool = True
     """Learn a weight per control point in the RBF (official code)."""
     shape_rotation: bool = False
     """Use a second rotation head for the Gaussians' shape (official code); otherwise one rotation serves positions and
@@ -99,6 +99,12 @@ class MotionConfig:
     """Compute the hidden layers in bfloat16 while training."""
     plane_times: int = 0
     """Number of texels of the feature planes along t; 0: half the number of training times (4D-GS)."""
+
+    @property
+    def hyper_columns(self) -> int:
+        """Number of hyper-coordinates of each Gaussian, the mask's logit included; 0 for the rival models, which have
+        no neighbours to find."""
+        return self.hyper_dim + self.mask if self.model == "control-points" else 0
 
     @property
     def has_shading(self) -> bool:
@@ -267,11 +273,11 @@ class LossConfig:
     relative error, as PSNR does."""
     log_error_from: float = newer(0.5, before=0.5, least=0, most=1)
     """Share of the main stage after which ``log_error`` applies."""
-    arap: float = bounded(1e-2, 0)
-    arap_end: float = bounded(1e-2, 0)
-    arap_until: int = milestone(80_000)
+    arap: float = bounded(1e-4, 0)
+    arap_end: float = bounded(1e-7, 0)
+    arap_until: int = milestone(10_000)
     """Main step until which the ARAP weight changes exponentially from ``arap`` to ``arap_end``; afterwards the term is
-    off (paper: from 1e-4 to 1e-7 over 10,000 steps)."""
+    off."""
     arap_every: int = bounded(5, 1)
     """Apply the ARAP term in every n-th step only, with n times the weight."""
     arap_pair: Literal["frame", "random"] = "frame"

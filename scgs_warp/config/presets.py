@@ -70,7 +70,7 @@ def preset(name: PresetName) -> TrainConfig:
             nodes_every=2_000,
             nodes_until=9_000,
         ),
-        loss=LossConfig(arap_until=24_000),
+        loss=LossConfig(arap_until=3_000),
     )
     if name == "cpu":
         return cpu

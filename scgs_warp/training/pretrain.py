@@ -220,7 +220,7 @@ def initial_gaussians(
     """Make the Gaussians of stage 2 at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
     options: dict[str, Any] = {
         "sh_degree": config.sh_degree,
-        "hyper_dim": config.motion.hyper_dim + config.motion.mask,
+        "hyper_dim": config.motion.hyper_columns,
         "shaded": config.motion.has_shading,
         "corrected": config.motion.has_correctives,
     }

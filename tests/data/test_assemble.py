@@ -39,7 +39,7 @@ def test_opaque_rgba_is_rgb(tmp_path, bits, background):
     for plain, frame in zip(expected, data):
         assert frame.alpha is None and torch.allclose(frame.image, plain.image, rtol=0, atol=1e-6)
         assert frame.mask is not None and torch.equal(frame.mask, plain.mask)
-    config = tiny_config(20, data={"background": background})
+    config = tiny_config(20, data={"background": background}, motion={"hyper_dim": 2})
     state = TrainState.begin(config, data, "cpu")
     assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 4)
     assert len(state.gaussians) == config.init_points > len(data.points)
@@ -58,8 +58,8 @@ def test_one_image_that_an_object_fills_keeps_its_alpha(tmp_path):
     data = load(tmp_path)
     assert all(frame.alpha is not None and frame.mask is None for frame in data)
     assert (data[1].alpha == 1).all() and (data[0].alpha[:4] < 0.8).all()
-    kept = TrainState.begin(tiny_config(20), data, "cpu").config
-    assert (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 0)
+    kept = TrainState.begin(tiny_config(20, motion={"hyper_dim": 2}), data, "cpu").config
+    assert (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 2)
 
 
 @pytest.mark.parametrize("count", [47, 49])

@@ -209,8 +209,9 @@ def motion_of(name: str) -> Motion:
 def case_scene(d: Draw, device: str) -> None:
     """A scene with arbitrary parameters renders to finite pixels at any finite time."""
     name = d.pick(("control-points", "control-points", "static", "per-gaussian", "hexplane"))
-    made, motion = dress(bar_points(int(d.pick((1, 17, 60))), 0), shaded=d.chance()), motion_of(name).to(device)
-    config = from_dict({"motion": {"nodes": 20, "layers": 2, "width": 32, "skip": 1}})
+    config = from_dict({"motion": {"model": name, "nodes": 20, "layers": 2, "width": 32, "skip": 1}})
+    points, columns = bar_points(int(d.pick((1, 17, 60))), 0), config.motion.hyper_columns
+    made, motion = dress(points, shaded=d.chance(), hyper_dim=columns), motion_of(name).to(device)
     hit = d.rows(len(made))
     with torch.no_grad():
         for parameter in (made.means, made.quats, made.log_scales, made.opacity_logits, made.sh_dc, made.shading):

@@ -114,8 +114,7 @@ def bar_scene(
         places = torch.cat([places, torch.tensor([stray])])
     motion = Swing(places, torch.full((len(places),), 0.12), template.network, config.motion)
     unit = Normalisation(np.array([0.5, -1.0, 0.25]), scale)
-    hyper_dim = config.motion.hyper_dim + (share is not None)
-    made = dress(points, shaded=shaded, hyper_dim=hyper_dim, corrected=corrected)
+    made = dress(points, shaded=shaded, hyper_dim=config.motion.hyper_columns, corrected=corrected)
     if share is not None:
         with torch.no_grad():
             made.hyper[:, -1] = torch.tensor(share).logit()
@@ -157,7 +156,8 @@ def figure_scene(nodes: int = 256, points: int = 12000) -> tuple[Scene, np.ndarr
     places = surface[chosen]
     motion = Puppet(places, spacing(places) * 0.5, template.network, config.motion)
     motion.bones = [str(bone) for bone in bones[chosen.numpy()]]
-    scene = Scene(dress(surface, degree=0), motion, Normalisation.identity(), config, OVERVIEW)
+    made = dress(surface, degree=0, hyper_dim=config.motion.hyper_columns)
+    scene = Scene(made, motion, Normalisation.identity(), config, OVERVIEW)
     scene.motion.eval()
     scene.freeze_binding()
     return scene, world, bones

@@ -81,7 +81,8 @@ def test_training_sees_the_neighbours_of_the_step(scene):
     generator = torch.Generator().manual_seed(0)
     for step in range(12):
         found = motion.neighbors(scene.gaussians)
-        distances = torch.cdist(scene.gaussians.means.double(), motion.positions.double())
+        points = torch.cat([scene.gaussians.means, scene.gaussians.hyper], dim=1)
+        distances = torch.cdist(points.double(), torch.cat([motion.positions, motion.hyper], dim=1).double())
         nearest = distances.gather(1, found.long())
         torch.testing.assert_close(
             nearest, distances.topk(found.shape[1], dim=1, largest=False)[0], rtol=1e-4, atol=1e-5

@@ -16,7 +16,7 @@ from scgs_warp.types import Pose
 def posed(mask: bool, logit: float, seed: int):
     """Gaussians turned and moved by control points that all turn and move alike; and the pose."""
     random = torch.Generator().manual_seed(seed)
-    config = tiny_config(20, motion={"mask": mask})
+    config = tiny_config(20, motion={"mask": mask, "hyper_dim": 0})
     motion = build_motion("control-points", config)
     assert isinstance(motion, ControlPoints)
     motion.positions.data[:] = torch.rand(16, 3, generator=random)

@@ -13,7 +13,7 @@ from scgs_warp.motion.node_density import adapt_control_points
 
 def motion_and_gaussians(counts: list[int]):
     """Control points far from each other, with ``counts`` Gaussians at each; their optimiser, and gradients of 1."""
-    config = tiny_config().motion
+    config = tiny_config(motion={"hyper_dim": 0}).motion
     positions = torch.tensor([[10.0 * i, 0.0, 0.0] for i in range(len(counts))])
     network = make_network(config, heads_of(config), 0)
     motion = ControlPoints(positions, torch.full((len(counts),), 0.2), network, config)
@@ -41,7 +41,7 @@ def test_growth_is_a_share_of_the_control_points(growth, clones):
 
 
 def test_control_points_clone_where_the_image_pulls_and_idle_ones_go(device):
-    config = tiny_config().motion
+    config = tiny_config(motion={"hyper_dim": 0}).motion
     positions = torch.tensor([[float(i), 0.0, 0.0] for i in range(6)] + [[0.0, 0.0, 90.0]], device=device)
     motion = ControlPoints(
         positions, torch.full((7,), 0.2, device=device), make_network(config, heads_of(config), 0), config
