@@ -16,6 +16,7 @@ from ..config.presets import TrainConfig
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Frame
+from .silhouettes import is_thin
 
 MOST_PAIRS = 12
 FEWEST_PAIRS = 6
@@ -59,6 +60,8 @@ class Survey:
     """Median interval between neighbouring instants."""
     cut_out: bool
     """True where alpha separates objects from the background."""
+    thin: bool
+    """True if the subject is thin (:func:`silhouettes.is_thin`)."""
     flicker: float
     """Relative change of brightness between successive frames (the ninth decile), measured where the camera hardly
     moves."""
@@ -89,6 +92,7 @@ def survey(data: Dataset) -> Survey:
         gap=(float(instants[widest]), float(instants[widest + 1])) if len(steps) else (0.0, 0.0),
         typical_gap=float(np.median(steps)) if len(steps) else 0.0,
         cut_out=bool(data.with_alpha),
+        thin=is_thin(data),
         flicker=_flicker(data, [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(following < SAME_PLACE)]),
         points=0 if data.points is None else len(data.points),
     )
@@ -135,9 +139,16 @@ def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str
     points = f"{facts.points:,} points" if facts.points else "no points"
     first = (
         f"data: {facts.frames:,} frames of {facts.width} x {facts.height} at {facts.instants:,} times; {cameras}, "
-        f"{facts.arc:.0f} in all; {'cut out by alpha' if facts.cut_out else 'filled images'}; {points}"
+        f"{facts.arc:.0f} in all; {_content(facts)}; {points}"
     )
     return first, f"expect {_expectation(facts)}; {_help(facts, config, device)}"
+
+
+def _content(facts: Survey) -> str:
+    """Say what the images show: it decides how parts that do not fit are treated (``state.resolve_auto``)."""
+    if not facts.cut_out:
+        return "filled images"
+    return "cut out by alpha, a thin subject" if facts.thin else "cut out by alpha"
 
 
 def _expectation(facts: Survey) -> str:

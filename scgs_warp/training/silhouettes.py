@@ -7,6 +7,7 @@ and the silhouette has a gradient at any range.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,10 @@ NEAREST_DEPTH = 1e-2
 """Depth, normalised, below which a centre is treated as if it had this depth."""
 MEASURED_VIEWS = 50
 """Largest number of images in which the subject's thickness is measured."""
+THIN = 0.02
+"""Half width of the silhouette, as a share of the image's width, below which a subject is thin."""
+THIN_VIEWS = 10
+"""Largest number of images from which thin subjects are told."""
 
 
 class Silhouette(NamedTuple):
@@ -149,24 +154,36 @@ class Silhouettes:
         return self._found[key]
 
 
-def half_thickness(data: Dataset, normalisation: Normalisation) -> float:
-    """Measure half the typical thickness of the subject, normalised: the median over images of a strip's half width.
+def is_thin(data: Dataset) -> bool:
+    """Decide whether the subject is thin: the median over images of the silhouette's half width is below ``THIN``."""
+    shares = [width / data.entries[index].camera.width for index, width in _half_widths(data, THIN_VIEWS)]
+    return bool(shares) and float(np.median(shares)) < THIN
 
-    In a strip of half width w, pixels are w / 2 from the border on average.
+
+def half_thickness(data: Dataset, normalisation: Normalisation) -> float:
+    """Measure half the typical thickness of the subject, normalised: the median over images of the silhouette's half
+    width.
 
     Returns:
         Infinity if no frame has a silhouette.
     """
-    chosen, found = data.with_alpha, []
-    for index in chosen[:: max(1, len(chosen) // MEASURED_VIEWS)]:
-        frame = data[index]
-        assert frame.alpha is not None
-        covered = (frame.alpha.cpu() >= COVERED).numpy()
-        if not 0.0 < covered.mean() <= FILLED:
-            continue
-        inside = _distances(covered)[covered]
-        camera = normalisation.apply_camera(frame.camera)
+    found = []
+    for index, width in _half_widths(data, MEASURED_VIEWS):
+        camera = normalisation.apply_camera(data.entries[index].camera)
         # The subject surrounds the origin of the normalised scene.
         depth = max(float(camera.viewmat[2, 3]), NEAREST_DEPTH)
-        found.append(2.0 * (float(inside.mean()) - 0.5) * depth / float(camera.K[0, 0]))
+        found.append(width * depth / float(camera.K[0, 0]))
     return float(np.median(found)) if found else float("inf")
+
+
+def _half_widths(data: Dataset, most: int) -> Iterator[tuple[int, float]]:
+    """Measure the silhouette's half width, pixels, in at most about ``most`` images; yield it with the image's index.
+
+    In a strip of half width w, pixels are w / 2 from the border on average.
+    """
+    for index in data.with_alpha[:: max(1, len(data.with_alpha) // most)]:
+        alpha = data[index].alpha
+        assert alpha is not None
+        covered = (alpha.cpu() >= COVERED).numpy()
+        if 0.0 < covered.mean() <= FILLED:
+            yield index, 2.0 * (float(_distances(covered)[covered].mean()) - 0.5)

@@ -39,7 +39,7 @@ from .pretrain import (
     thin_spheres,
 )
 from .process_group import ProcessGroup
-from .silhouettes import half_thickness
+from .silhouettes import half_thickness, is_thin
 
 Stage = Literal["pretrain", "main"]
 THICKEST = 2.0
@@ -275,6 +275,12 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
         config = replace(config, motion=replace(motion, hyper_dim=hyper_dim))
     if growth.prune_large == "auto":
         config = replace(config, densify=replace(growth, prune_large="never" if filled else "always"))
+    if "auto" in (config.loss.pooled, config.pretrain.fade):
+        thin, drawn = is_thin(data), config.pretrain.silhouette > 0 and not filled
+        pooled = config.loss.pooled if config.loss.pooled != "auto" else "always" if thin else "never"
+        fade = config.pretrain.fade if config.pretrain.fade != "auto" else "always" if thin or not drawn else "never"
+        loss, pretrain = replace(config.loss, pooled=pooled), replace(config.pretrain, fade=fade)
+        config = replace(config, loss=loss, pretrain=pretrain)
     if has_initial_points(data, config) and not config.pretrain.with_points:
         config = replace(config, init_from="points", pretrain=replace(config.pretrain, steps=0))
     return config

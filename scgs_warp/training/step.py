@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..config.presets import TrainConfig
 from ..ops.adam import first_not_finite
+from ..ops.pooled import pooled_residual
 from ..ops.ssim import photometric_loss
 from ..optim import log_linear
 from ..rendering.render import draw
@@ -22,6 +23,8 @@ from .state import StepResult, TrainState
 
 SETTLED = 0.05
 """Factor on the constant learning rates at the last step."""
+ALMOST = 0.9
+"""Least opacity of spheres that must not fade, as a share of ``solid_opacity``: a sample still prefers others."""
 
 
 def training_step(state: TrainState, frames: Frames) -> StepResult:
@@ -40,6 +43,7 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
     failed = result.failed or _non_finite_gradient(state)
     if failed is None:
         state.gaussian_optimizer.step()
+        keep_solid(state)
         if state.motion_optimizer is not None and not motion_frozen(state):
             state.motion_optimizer.step()
         if state.refines_cameras:
@@ -93,6 +97,8 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
 
     # 4. Compare.
     loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim, log_weight(state))
+    if config.loss.pooled == "always" and not pretraining:
+        loss = loss + pooled_residual(picture, truth, mask)
     total = loss if regulariser is None else loss + regulariser
 
     # 5. Backpropagate, unless the loss is non-finite.
@@ -108,6 +114,14 @@ def seeks_silhouettes(state: TrainState) -> bool:
     """Return True during the steps of stage 1 in which silhouettes draw the spheres: once the spheres move."""
     pretrain = state.config.pretrain
     return state.stage == "pretrain" and state.stage_step >= pretrain.warm_up and pretrain.silhouette > 0
+
+
+def keep_solid(state: TrainState) -> None:
+    """Raise the opacities of faded spheres to just below ``pretrain.solid_opacity``, unless they may fade."""
+    pretrain = state.config.pretrain
+    least = ALMOST * pretrain.solid_opacity
+    if state.stage == "pretrain" and pretrain.fade == "never" and least > 0:
+        state.gaussians.opacity_logits.data.clamp_(min=math.log(least / (1.0 - least)))
 
 
 def sh_degree(state: TrainState, step: int) -> int:

@@ -1,18 +1,24 @@
-"""Silhouettes of stage 1: distances, the term against float64, and spheres drawn to far parts."""
+"""Silhouettes of stage 1: distances, the term against float64, spheres drawn to far parts; and thin subjects."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.tiny import tiny_config
+from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config.presets import from_dict, preset, to_dict
+from scgs_warp.data.dataset import Dataset
+from scgs_warp.ops.pooled import pooled_residual
 from scgs_warp.training import silhouettes
+from scgs_warp.training.frames import Frames
 from scgs_warp.training.pretrain import initial_gaussians, initial_spheres
 from scgs_warp.training.silhouettes import Silhouettes, silhouette_of, silhouette_term
+from scgs_warp.training.state import TrainState, resolve_auto
+from scgs_warp.training.step import training_step
 from scgs_warp.types import Camera, Frame
 
 WIDTH, HEIGHT = 48, 32
@@ -159,21 +165,82 @@ def test_frames_without_alpha_or_subject_have_no_term():
     assert found.of(half, 2) is not first, "half-size images have silhouettes of their own"
 
 
+def strips(size: int, width: int, count: int = 1) -> Dataset:
+    """Frames of a vertical strip ``width`` pixels wide."""
+    alpha = alpha_of(slice(0, size), slice(20, 20 + width), size, size)
+    frames = [Frame(camera(size, size), 0.1 * i, torch.zeros(size, size, 3), alpha=alpha) for i in range(count)]
+    return Dataset(frames, folder=Path("strips"), split="train")
+
+
 @pytest.mark.parametrize("half_width", [1.5, 3.0, 6.0])
 def test_half_thickness_of_a_strip(half_width):
-    class Strip:
-        with_alpha = (0,)
-
-        def __getitem__(self, index):
-            alpha = alpha_of(slice(0, 64), slice(20, 20 + round(2 * half_width)), 64, 64)
-            return Frame(camera(64, 64), 0.0, torch.zeros(64, 64, 3), alpha=alpha)
+    data = strips(64, round(2 * half_width))
 
     class Same:
         def apply_camera(self, view):
             return view
 
-    found = silhouettes.half_thickness(Strip(), Same())  # type: ignore[arg-type]
+    found = silhouettes.half_thickness(data, Same())  # type: ignore[arg-type]
     assert found * 60.0 / 4.0 == pytest.approx(half_width, abs=0.6)
+
+
+def test_thin_subjects_are_told_by_their_silhouettes():
+    assert silhouettes.is_thin(strips(200, 6)) and not silhouettes.is_thin(strips(200, 12))
+    assert not silhouettes.is_thin(strips(200, 0)), "nothing is covered"
+    assert not silhouettes.is_thin(strips(64, 64)), "filled images"
+
+
+@pytest.mark.parametrize(
+    ("width", "changes", "pooled", "fade"),
+    [
+        (4, {}, "always", "always"),
+        (30, {}, "never", "never"),
+        (30, {"pretrain": {"silhouette": 0.0}}, "never", "always"),
+        (4, {"loss": {"pooled": "never"}, "pretrain": {"fade": "never"}}, "never", "never"),
+        (30, {"loss": {"pooled": "always"}, "pretrain": {"fade": "always"}}, "always", "always"),
+    ],
+)
+def test_thinness_decides_what_is_left_to_the_data(width, changes, pooled, fade):
+    resolved = resolve_auto(tiny_config(**changes), strips(200, width, 3))
+    assert (resolved.loss.pooled, resolved.pretrain.fade) == (pooled, fade)
+
+
+def test_images_without_alpha_have_neither():
+    frames = [Frame(camera(), 0.1 * i, torch.rand(HEIGHT, WIDTH, 3)) for i in range(3)]
+    resolved = resolve_auto(tiny_config(), Dataset(frames, folder=Path("filled"), split="train"))
+    assert (resolved.loss.pooled, resolved.pretrain.fade) == ("never", "always")
+
+
+@pytest.mark.parametrize(("fade", "least"), [("never", 0.09), ("always", 0.0)])
+def test_spheres_fade_only_where_they_may(fade, least, device):
+    config = tiny_config(600, pretrain={"fade": fade})
+    data = tiny_dataset(4)
+    state = TrainState.begin(config, data, device)
+    frames = Frames(data, state.normalisation, state.config, device)
+    state.gaussians.opacity_logits.data[:] = -6.0
+    training_step(state, frames)
+    opacities = state.gaussians.opacities().detach()
+    assert float(opacities.min()) == pytest.approx(least, abs=5e-3)
+    state.step = state.config.pretrain_steps
+    state.begin_main()
+    state.gaussians.opacity_logits.data[:] = -6.0
+    training_step(state, frames)
+    assert float(state.gaussians.opacities().detach().min()) < 0.01, "Gaussians may fade"
+
+
+def test_the_pooled_residual_acts_in_the_main_stage_alone():
+    data, results = tiny_dataset(4), {}
+    for pooled in ("always", "never"):
+        state = TrainState.begin(tiny_config(600, loss={"pooled": pooled}), data, "cpu")
+        frames = Frames(data, state.normalisation, state.config, "cpu")
+        first = float(training_step(state, frames).loss)
+        state.step = state.config.pretrain_steps
+        state.begin_main()
+        second = training_step(state, frames)
+        results[pooled] = first, float(second.loss), float(pooled_residual(second.render, second.truth))
+    assert results["always"][0] == results["never"][0]
+    assert results["always"][1] == pytest.approx(results["never"][1] + results["always"][2], rel=1e-5)
+    assert results["always"][2] > 1e-3
 
 
 def test_spheres_and_gaussians_are_no_larger_than_thin_subjects(device):
@@ -192,6 +259,7 @@ def test_spheres_and_gaussians_are_no_larger_than_thin_subjects(device):
 
 def test_recorded_configurations_without_the_field_have_no_silhouettes():
     recorded = to_dict(preset("cpu"))
-    del recorded["pretrain"]["silhouette"]
-    assert from_dict(recorded).pretrain.silhouette == 0.0
+    del recorded["pretrain"]["silhouette"], recorded["pretrain"]["fade"], recorded["loss"]["pooled"]
+    read = from_dict(recorded)
+    assert (read.pretrain.silhouette, read.pretrain.fade, read.loss.pooled) == (0.0, "always", "never")
     assert preset("cpu").pretrain.silhouette == 0.5
