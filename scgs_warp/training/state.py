@@ -267,6 +267,9 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     and much of it is static beside moving surfaces (hyper-coordinates gain 0.55 dB; a motion mask gains 0.2 dB alone,
     and nothing in addition to them). If the data has points, control points start as a sample of them and Gaussians
     start at them (2 dB better than finding both with spheres).
+
+    Thin subjects get the pooled residual, and their spheres may fade; those of others may not where silhouettes lead
+    them back.
     """
     filled = not data.with_alpha
     motion, growth = config.motion, config.densify
@@ -275,12 +278,12 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
         config = replace(config, motion=replace(motion, hyper_dim=hyper_dim))
     if growth.prune_large == "auto":
         config = replace(config, densify=replace(growth, prune_large="never" if filled else "always"))
-    if "auto" in (config.loss.pooled, config.pretrain.fade):
-        thin, drawn = is_thin(data), config.pretrain.silhouette > 0 and not filled
-        pooled = config.loss.pooled if config.loss.pooled != "auto" else "always" if thin else "never"
-        fade = config.pretrain.fade if config.pretrain.fade != "auto" else "always" if thin or not drawn else "never"
-        loss, pretrain = replace(config.loss, pooled=pooled), replace(config.pretrain, fade=fade)
-        config = replace(config, loss=loss, pretrain=pretrain)
+    thin = "auto" in (config.loss.pooled, config.pretrain.fade) and is_thin(data)
+    if config.loss.pooled == "auto":
+        config = replace(config, loss=replace(config.loss, pooled="always" if thin else "never"))
+    if config.pretrain.fade == "auto":
+        led = config.pretrain.silhouette > 0 and not filled and not thin
+        config = replace(config, pretrain=replace(config.pretrain, fade="never" if led else "always"))
     if has_initial_points(data, config) and not config.pretrain.with_points:
         config = replace(config, init_from="points", pretrain=replace(config.pretrain, steps=0))
     return config
