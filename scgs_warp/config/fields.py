@@ -162,7 +162,7 @@ class PretrainConfig:
     transparent. If above 0, spheres are not larger than thin subjects are thick."""
     fade: Literal["auto", "always", "never"] = newer("auto", before="always")
     """Let spheres turn more transparent than ``solid_opacity``. A part whose spheres have faded is lost, but strays
-    should fade. auto: only in thin subjects, which leave most of their hull empty, and without ``silhouette``."""
+    should fade. auto: yes, unless ``silhouette`` leads spheres to a subject in separate parts, which is not thin."""
     progressive: bool = False
     """Begin with the first 20 % of the frames and add 20 % every ``progressive_every`` steps."""
     progressive_every: int = milestone(1_000, 1)

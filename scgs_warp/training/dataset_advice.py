@@ -16,7 +16,7 @@ from ..config.presets import TrainConfig
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Frame
-from .silhouettes import is_thin
+from .silhouettes import is_in_parts, is_thin
 
 MOST_PAIRS = 12
 FEWEST_PAIRS = 6
@@ -62,6 +62,8 @@ class Survey:
     """True where alpha separates objects from the background."""
     thin: bool
     """True if the subject is thin (:func:`silhouettes.is_thin`)."""
+    in_parts: bool
+    """True if the subject consists of separate parts (:func:`silhouettes.is_in_parts`)."""
     flicker: float
     """Relative change of brightness between successive frames (the ninth decile), measured where the camera hardly
     moves."""
@@ -93,6 +95,7 @@ def survey(data: Dataset) -> Survey:
         typical_gap=float(np.median(steps)) if len(steps) else 0.0,
         cut_out=bool(data.with_alpha),
         thin=is_thin(data),
+        in_parts=is_in_parts(data),
         flicker=_flicker(data, [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(following < SAME_PLACE)]),
         points=0 if data.points is None else len(data.points),
     )
@@ -148,7 +151,9 @@ def _content(facts: Survey) -> str:
     """Say what the images show: it decides how parts that do not fit are treated (``state.resolve_auto``)."""
     if not facts.cut_out:
         return "filled images"
-    return "cut out by alpha, a thin subject" if facts.thin else "cut out by alpha"
+    if facts.thin:
+        return "cut out by alpha, a thin subject"
+    return "cut out by alpha, a subject in parts" if facts.in_parts else "cut out by alpha"
 
 
 def _expectation(facts: Survey) -> str:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, label
 from torch import Tensor
 
 from ..data.dataset import Dataset
@@ -35,8 +35,10 @@ MEASURED_VIEWS = 50
 """Largest number of images in which the subject's thickness is measured."""
 THIN = 0.02
 """Half width of the silhouette, as a share of the image's width, below which a subject is thin."""
-THIN_VIEWS = 10
-"""Largest number of images from which thin subjects are told."""
+PART = 0.005
+"""Share of the silhouette's pixels from which a connected region counts as a part."""
+JUDGED_VIEWS = 20
+"""Largest number of images from which thin subjects and separate parts are told."""
 
 
 class Silhouette(NamedTuple):
@@ -156,8 +158,18 @@ class Silhouettes:
 
 def is_thin(data: Dataset) -> bool:
     """Decide whether the subject is thin: the median over images of the silhouette's half width is below ``THIN``."""
-    shares = [width / data.entries[index].camera.width for index, width in _half_widths(data, THIN_VIEWS)]
+    shares = [width / data.entries[index].camera.width for index, width in _half_widths(data, JUDGED_VIEWS)]
     return bool(shares) and float(np.median(shares)) < THIN
+
+
+def is_in_parts(data: Dataset) -> bool:
+    """Decide whether the subject consists of separate parts: at least half of the silhouettes do."""
+    counts = []
+    for _, covered in _covered(data, JUDGED_VIEWS):
+        regions: Any = label(covered, structure=np.ones((3, 3)))
+        sizes = np.bincount(regions[0].ravel())[1:]
+        counts.append(int((sizes >= PART * sizes.sum()).sum()))
+    return bool(counts) and float(np.median(counts)) >= 2.0
 
 
 def half_thickness(data: Dataset, normalisation: Normalisation) -> float:
@@ -181,9 +193,15 @@ def _half_widths(data: Dataset, most: int) -> Iterator[tuple[int, float]]:
 
     In a strip of half width w, pixels are w / 2 from the border on average.
     """
+    for index, covered in _covered(data, most):
+        yield index, 2.0 * (float(_distances(covered)[covered].mean()) - 0.5)
+
+
+def _covered(data: Dataset, most: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the silhouettes [H, W] of at most about ``most`` images, with their indices."""
     for index in data.with_alpha[:: max(1, len(data.with_alpha) // most)]:
         alpha = data[index].alpha
         assert alpha is not None
         covered = (alpha.cpu() >= COVERED).numpy()
         if 0.0 < covered.mean() <= FILLED:
-            yield index, 2.0 * (float(_distances(covered)[covered].mean()) - 0.5)
+            yield index, covered

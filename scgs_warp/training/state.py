@@ -39,7 +39,7 @@ from .pretrain import (
     thin_spheres,
 )
 from .process_group import ProcessGroup
-from .silhouettes import half_thickness, is_thin
+from .silhouettes import half_thickness, is_in_parts, is_thin
 
 Stage = Literal["pretrain", "main"]
 THICKEST = 2.0
@@ -268,8 +268,8 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     and nothing in addition to them). If the data has points, control points start as a sample of them and Gaussians
     start at them (2 dB better than finding both with spheres).
 
-    Thin subjects get the pooled residual, and their spheres may fade; those of others may not where silhouettes lead
-    them back.
+    Thin subjects get the pooled residual. Where the subject is in separate parts and silhouettes lead spheres back to
+    them, spheres may not fade.
     """
     filled = not data.with_alpha
     motion, growth = config.motion, config.densify
@@ -282,7 +282,7 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     if config.loss.pooled == "auto":
         config = replace(config, loss=replace(config.loss, pooled="always" if thin else "never"))
     if config.pretrain.fade == "auto":
-        led = config.pretrain.silhouette > 0 and not filled and not thin
+        led = config.pretrain.silhouette > 0 and not thin and is_in_parts(data)
         config = replace(config, pretrain=replace(config.pretrain, fade="never" if led else "always"))
     if has_initial_points(data, config) and not config.pretrain.with_points:
         config = replace(config, init_from="points", pretrain=replace(config.pretrain, steps=0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -194,15 +195,32 @@ def test_thin_subjects_are_told_by_their_silhouettes():
     ("width", "changes", "pooled", "fade"),
     [
         (4, {}, "always", "always"),
-        (30, {}, "never", "never"),
-        (30, {"pretrain": {"silhouette": 0.0}}, "never", "always"),
+        (30, {}, "never", "always"),
         (4, {"loss": {"pooled": "never"}, "pretrain": {"fade": "never"}}, "never", "never"),
-        (30, {"loss": {"pooled": "always"}, "pretrain": {"fade": "always"}}, "always", "always"),
+        (30, {"loss": {"pooled": "always"}, "pretrain": {"fade": "never"}}, "always", "never"),
     ],
 )
 def test_thinness_decides_what_is_left_to_the_data(width, changes, pooled, fade):
     resolved = resolve_auto(tiny_config(**changes), strips(200, width, 3))
     assert (resolved.loss.pooled, resolved.pretrain.fade) == (pooled, fade)
+
+
+@pytest.mark.parametrize(("changes", "fade"), [({}, "never"), ({"pretrain": {"silhouette": 0.0}}, "always")])
+def test_spheres_of_separate_parts_are_led_back(changes, fade):
+    """One of two parts is hidden in one frame of three; specks do not count."""
+    whole, both = strips(200, 30).entries[0], []
+    for index, columns in enumerate((slice(100, 140), slice(100, 140), slice(30, 70))):
+        alpha = whole.alpha.clone()
+        alpha[50:90, columns] = 1.0
+        both.append(dataclasses.replace(whole, time=0.3 * index, alpha=alpha))
+    data = Dataset(both, folder=Path("parts"), split="train")
+    assert silhouettes.is_in_parts(data) and not silhouettes.is_thin(data)
+    resolved = resolve_auto(tiny_config(**changes), data)
+    assert (resolved.loss.pooled, resolved.pretrain.fade) == ("never", fade)
+    speck = whole.alpha.clone()
+    speck[50:55, 100:105] = 1.0
+    alone = dataclasses.replace(whole, alpha=speck)
+    assert not silhouettes.is_in_parts(Dataset([alone], folder=Path("speck"), split="train"))
 
 
 def test_images_without_alpha_have_neither():
