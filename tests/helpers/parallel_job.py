@@ -37,7 +37,8 @@ SHORT = timedelta(seconds=6)
 ENDING = ("hung", "killed")
 """Scenarios after which the processes are no longer joined."""
 
-PLAIN = tiny_config(40, batch=2)
+PLAIN = tiny_config(40, batch=2, loss={"arap_until": 40})
+"""With ARAP to the end: a row of the log has its last value since a row or a resume, so both see it."""
 RICH = tiny_config(
     40,
     batch=4,

@@ -57,7 +57,7 @@ def test_the_log_shows_the_regulariser(batch, tmp_path, monkeypatch):
         return result
 
     monkeypatch.setattr(loop, "training_step", recorded)
-    config = tiny_config(100, batch=batch, pretrain={"silhouette": 0.0})
+    config = tiny_config(100, batch=batch, pretrain={"silhouette": 0.0}, loss={"arap_until": 100})
     fit(config, tiny_dataset(4), output=tmp_path / "run")
     log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
     rows = {entry["step"]: entry["regulariser"] for entry in log if "loss" in entry}
