@@ -322,7 +322,7 @@ def overview(source: Source) -> str:
     return table(["", "PSNR", "SSIM", "motion error", "training"], lines)
 
 
-ZOO = ("robot", "rods", "rods-dark", "balls", "cloth", "fan", "touch", "opening", "still", *DNERF)
+ZOO = ("robot", "rods", "rods-dark", "balls", "cloth", "fan", "touch", "opening", "still", *DNERF, "handheld")
 
 
 def change_of_defaults(source: Source) -> str:
