@@ -279,7 +279,7 @@ class LossConfig:
     pooled: Literal["auto", "always", "never"] = newer("auto", before="never")
     """Add the residual averaged over squares of 2, 4 and 8 % of the width in the main stage (not in the paper): a part
     beside its true place then costs less than a missing one, so it is moved instead of turned transparent. auto: only
-    for thin subjects; others end 0.3 dB lower with it."""
+    for thin subjects; it lowers the scores of others."""
     arap: float = bounded(1e-4, 0)
     arap_end: float = bounded(1e-7, 0)
     arap_until: int = milestone(10_000)
