@@ -209,9 +209,10 @@ class TrainState:
         tensors, metadata = checkpoint.read(folder)
         source = str(folder / checkpoint.FILE)
         check_metadata(metadata, source)
-        _check_same_configuration(with_newer_fields(metadata["config"]), to_dict(config), source)
+        # Settings that the data chooses differ with the frames, so the frames come first.
         if metadata.get("frames") != data.fingerprint:
             raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
+        _check_same_configuration(with_newer_fields(metadata["config"]), to_dict(config), source)
         check_tensors(tensors, source)
         check_resumed(tensors, metadata, source)
         if metadata["step"] > config.steps:
