@@ -3,6 +3,9 @@
 To first order the light that a diffuse surface reflects is linear in its normal (an environment's irradiance up to
 degree 1). If a surface turns by R, its brightness therefore changes by the relative amount ``x = <G, R - I>``, where G
 combines light and normal. A term quadratic in x approximates the cut-off of a lamp's light at grazing angles.
+
+A tint changes a Gaussian's colour without any rotation, as a shadow does that falls on it: it is the change of the
+colour's logarithm.
 """
 
 import warp as wp
@@ -15,6 +18,8 @@ GAIN_MAX = wp.constant(4.0)
 """Upper limit of a Gaussian's brightness, relative to its brightness at rest."""
 BEND = wp.constant(5.0)
 """Scale of the quadratic term's coefficient, chosen so that the coefficient learns about as fast as G."""
+TINT_MIN, TINT_MAX = wp.constant(-3.0), wp.constant(1.0)
+"""Limits of a tint: factors 0.05 and 2.7 on a Gaussian's colour."""
 GREY = wp.constant(1.7724538509055159)
 """Constant 0.5 / C0: the coefficient of degree 0 is (colour - 0.5) / C0."""
 
@@ -102,3 +107,53 @@ def shade_adjoint(
         for c in range(3):
             v_shading_out[i, 3 * r + c] = v_x * turn[r, c]
     v_shading_out[i, 9] = v_bend
+
+
+@wp.func
+def tint_factor(tint: float) -> float:
+    """Return the factor on a colour, within its limits; 1 where the tint is non-finite."""
+    if not wp.isfinite(tint):
+        return 1.0
+    return wp.exp(wp.clamp(tint, TINT_MIN, TINT_MAX))
+
+
+@wp.kernel
+def tint(
+    first: int,
+    # In:
+    sh_dc_in: wp.array[wp.vec3],  # [N]
+    tints_in: wp.array[wp.vec3],  # [N]
+    # Out:
+    sh_dc_out: wp.array[wp.vec3],  # [N]
+):
+    """Scale the colour of degree 0, each channel by its factor. Grid: N."""
+    i = first + wp.tid()
+    tinted = sh_dc_in[i]
+    for c in range(3):
+        tinted[c] = tint_factor(tints_in[i][c]) * (tinted[c] + GREY) - GREY
+    sh_dc_out[i] = tinted
+
+
+@wp.kernel
+def tint_adjoint(
+    first: int,
+    # In:
+    sh_dc_in: wp.array[wp.vec3],  # [N]
+    tints_in: wp.array[wp.vec3],  # [N]
+    v_sh_dc_t_in: wp.array[wp.vec3],  # [N]
+    # Out:
+    v_sh_dc_out: wp.array[wp.vec3],  # [N]
+    v_tints_out: wp.array[wp.vec3],  # [N]
+):
+    """Compute the gradients of colour and tint; a limited or non-finite tint gets none. Grid: N."""
+    i = first + wp.tid()
+    v_sh_dc = v_sh_dc_t_in[i]
+    v_tints = wp.vec3(0.0)
+    for c in range(3):
+        t = tints_in[i][c]
+        v_sh_dc[c] = tint_factor(t) * v_sh_dc[c]
+        v = v_sh_dc[c] * (sh_dc_in[i][c] + GREY)
+        if t > TINT_MIN and t < TINT_MAX and wp.isfinite(v):
+            v_tints[c] = v
+    v_sh_dc_out[i] = v_sh_dc
+    v_tints_out[i] = v_tints

@@ -7,6 +7,8 @@ The adjoint runs in three steps: ``skin_adjoint`` computes each Gaussian's own g
 node's Gaussians (by chunks of Gaussians on a CPU, by segments of all pairs in ``cuda/node_sums.py``), and
 ``skin_finish`` computes each node's gradients from its sums. The rotation's gradient is summed as the matrix
 ``G = sum w v (x - p)^T`` and converted to the quaternion's gradient once per node.
+
+Extras are three more values per node, blended linearly: changes of log scales, or tints.
 """
 
 import warp as wp
@@ -24,7 +26,7 @@ from .quaternion import (
 wp.set_module_options({"enable_backward": False})
 
 SUMS = 16
-"""Number of columns of the node sums: G (9), w v (3), w s v_blend (4); with log scales 3 more, w v_log_scales. w is the
+"""Number of columns of the node sums: G (9), w v (3), w s v_blend (4); with extras 3 more, w v_extras. w is the
 weight, v the gradient of the moved mean, and s = +-1 the sign that aligns the quaternion."""
 
 
@@ -56,20 +58,20 @@ def skin(
     translations_in: wp.array[wp.vec3],  # [M]
     rotations_in: wp.array[wp.vec4],  # [M] wxyz
     shape_rotations_in: wp.array[wp.vec4],  # [M] wxyz, the same array as rotations_in where there are none
-    log_scales_in: wp.array[wp.vec3],  # [M], touched only with has_log_scales
-    has_log_scales: int,
+    extras_in: wp.array[wp.vec3],  # [M], touched only with has_extras
+    has_extras: int,
     indices_in: wp.array2d[wp.int32],  # [N, K]
     weights_in: wp.array2d[float],  # [N, K]
     # Out:
     means_out: wp.array[wp.vec3],  # [N]
     quats_out: wp.array[wp.vec4],  # [N] unit
-    log_scales_out: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+    extras_out: wp.array[wp.vec3],  # [N], touched only with has_extras
 ):
     i = first + wp.tid()
     x = means_in[i]
     mean = wp.vec3(0.0)
     blend = wp.vec4(0.0)
-    log_scales = wp.vec3(0.0)
+    extras = wp.vec3(0.0)
     reference = wp.vec4(0.0)
     for k in range(indices_in.shape[1]):
         m = indices_in[i, k]
@@ -81,12 +83,12 @@ def skin(
         if k == 0:
             reference = shape
         blend += w * aligned(shape, reference)
-        if has_log_scales != 0:
-            log_scales += w * log_scales_in[m]
+        if has_extras != 0:
+            extras += w * extras_in[m]
     means_out[i] = mean
     quats_out[i] = quat_multiply(quat_normalise(blend), quat_normalise(quats_in[i]))
-    if has_log_scales != 0:
-        log_scales_out[i] = log_scales
+    if has_extras != 0:
+        extras_out[i] = extras
 
 
 @wp.kernel
@@ -99,13 +101,13 @@ def skin_adjoint(
     translations_in: wp.array[wp.vec3],  # [M]
     rotations_in: wp.array[wp.vec4],  # [M]
     shape_rotations_in: wp.array[wp.vec4],  # [M]
-    log_scales_in: wp.array[wp.vec3],  # [M], touched only with has_log_scales
-    has_log_scales: int,
+    extras_in: wp.array[wp.vec3],  # [M], touched only with has_extras
+    has_extras: int,
     indices_in: wp.array2d[wp.int32],  # [N, K]
     weights_in: wp.array2d[float],  # [N, K]
     v_means_in: wp.array[wp.vec3],  # [N]
     v_quats_in: wp.array[wp.vec4],  # [N]
-    v_log_scales_in: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+    v_extras_in: wp.array[wp.vec3],  # [N], touched only with has_extras
     # Out:
     v_means_out: wp.array[wp.vec3],  # [N]
     v_quats_out: wp.array[wp.vec4],  # [N]
@@ -146,8 +148,8 @@ def skin_adjoint(
         shape = quat_normalise(shape_rotations_in[m])
         moved = quat_rotate(r, x - p) + p + translations_in[m]
         v_w = wp.dot(v, moved) + wp.dot(v_blend, aligned(shape, reference))
-        if has_log_scales != 0:
-            v_w += wp.dot(v_log_scales_in[i], log_scales_in[m])
+        if has_extras != 0:
+            v_w += wp.dot(v_extras_in[i], extras_in[m])
         v_weights_out[i, k] = v_w
         v_mean += weights_in[i, k] * quat_rotate(quat_conjugate(r), v)
         if not near(moved):
@@ -178,8 +180,8 @@ def _add(
     weights: wp.array2d[float],
     v_means: wp.array[wp.vec3],
     v_blends: wp.array[wp.vec4],
-    v_log_scales: wp.array[wp.vec3],
-    has_log_scales: int,
+    v_extras: wp.array[wp.vec3],
+    has_extras: int,
     sums: wp.array2d[float],
 ):
     """Add the pair of Gaussian i and its k-th neighbour to that node's sums."""
@@ -199,10 +201,10 @@ def _add(
     v_blend = v_blends[i]
     for a in range(4):
         sums[row, 12 + a] = sums[row, 12 + a] + w * v_blend[a]
-    if has_log_scales != 0:
-        v_scale = weights[i, k] * v_log_scales[i]
+    if has_extras != 0:
+        v_extra = weights[i, k] * v_extras[i]
         for a in range(3):
-            sums[row, 16 + a] = sums[row, 16 + a] + v_scale[a]
+            sums[row, 16 + a] = sums[row, 16 + a] + v_extra[a]
 
 
 @wp.kernel
@@ -218,8 +220,8 @@ def skin_reduce_chunks(
     weights_in: wp.array2d[float],  # [N, K]
     v_means_in: wp.array[wp.vec3],  # [N]
     v_blends_in: wp.array[wp.vec4],  # [N]
-    v_log_scales_in: wp.array[wp.vec3],  # [N], touched only with has_log_scales
-    has_log_scales: int,
+    v_extras_in: wp.array[wp.vec3],  # [N], touched only with has_extras
+    has_extras: int,
     # Out:
     sums_out: wp.array2d[float],  # [chunks * M, SUMS (+ 3)] zero on entry
 ):
@@ -231,7 +233,7 @@ def skin_reduce_chunks(
             row = chunk * M + indices_in[i, k]
             _add(
                 i, k, row, means_in, quats_in, nodes_in, shape_rotations_in, indices_in, weights_in,
-                v_means_in, v_blends_in, v_log_scales_in, has_log_scales, sums_out,
+                v_means_in, v_blends_in, v_extras_in, has_extras, sums_out,
             )  # fmt: skip
 
 
@@ -243,14 +245,14 @@ def skin_finish(
     rotations_in: wp.array[wp.vec4],  # [M]
     shape_rotations_in: wp.array[wp.vec4],  # [M]
     has_shape_rotations: int,
-    has_log_scales: int,
+    has_extras: int,
     sums_in: wp.array2d[float],  # [chunks * M, SUMS (+ 3)]
     # Out:
     v_nodes_out: wp.array[wp.vec3],  # [M]
     v_translations_out: wp.array[wp.vec3],  # [M]
     v_rotations_out: wp.array[wp.vec4],  # [M]
     v_shape_rotations_out: wp.array[wp.vec4],  # [M], touched only with has_shape_rotations
-    v_log_scales_out: wp.array[wp.vec3],  # [M], touched only with has_log_scales
+    v_extras_out: wp.array[wp.vec3],  # [M], touched only with has_extras
 ):
     """Compute the gradients of one node from its sums."""
     m = first + wp.tid()
@@ -258,7 +260,7 @@ def skin_finish(
     G = wp.mat33(0.0)
     v = wp.vec3(0.0)
     v_blend = wp.vec4(0.0)
-    v_log_scales = wp.vec3(0.0)
+    v_extras = wp.vec3(0.0)
     for chunk in range(chunks):
         row = chunk * M + m
         for a in range(3):
@@ -267,9 +269,9 @@ def skin_finish(
             v[a] = v[a] + sums_in[row, 9 + a]
         for a in range(4):
             v_blend[a] = v_blend[a] + sums_in[row, 12 + a]
-        if has_log_scales != 0:
+        if has_extras != 0:
             for a in range(3):
-                v_log_scales[a] = v_log_scales[a] + sums_in[row, 16 + a]
+                v_extras[a] = v_extras[a] + sums_in[row, 16 + a]
     r = quat_normalise(rotations_in[m])
     v_translations_out[m] = passed(v)
     v_nodes_out[m] = passed(v - quat_rotate(quat_conjugate(r), v))
@@ -279,5 +281,5 @@ def skin_finish(
     else:
         v_r += v_blend
     v_rotations_out[m] = passed(quat_normalise_adjoint(rotations_in[m], v_r))
-    if has_log_scales != 0:
-        v_log_scales_out[m] = passed(v_log_scales)
+    if has_extras != 0:
+        v_extras_out[m] = passed(v_extras)

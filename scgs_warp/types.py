@@ -68,6 +68,9 @@ class Pose:
     """[M, 4] wxyz, unit; separate rotations for the Gaussians' shapes. None: ``rotations`` turn shapes, too."""
     log_scales: Tensor | None = None
     """[M, 3] change of the Gaussians' log scales. None: no change."""
+    tints: Tensor | None = None
+    """[M, 3] change of the logarithms of the Gaussians' colours. None: no change. A pose has ``log_scales`` or
+    ``tints``, not both, because skinning blends three values beside the motion."""
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,18 @@ wp.set_module_options({"enable_backward": False})
 @native_function("skinning.h")
 def _skin(
     begin: int, means: wp.array[wp.vec3], quats: wp.array[wp.vec4], motion: wp.array2d[float],
-    reach: wp.array2d[float], aligned: int, has_log_scales: int, indices: wp.array2d[wp.int32],
+    reach: wp.array2d[float], aligned: int, has_extras: int, indices: wp.array2d[wp.int32],
     weights: wp.array2d[float], means_t: wp.array[wp.vec3], quats_t: wp.array[wp.vec4],
-    log_scales: wp.array[wp.vec3],
+    extras: wp.array[wp.vec3],
 ): ...  # fmt: skip
 
 
 @native_function("skinning.h")
 def _skin_rbf(
     begin: int, means: wp.array[wp.vec3], quats: wp.array[wp.vec4], hyper: wp.array2d[float], has_hyper: int,
-    motion: wp.array2d[float], reach: wp.array2d[float], aligned: int, has_strengths: int, has_log_scales: int,
+    motion: wp.array2d[float], reach: wp.array2d[float], aligned: int, has_strengths: int, has_extras: int,
     indices: wp.array2d[wp.int32], weights: wp.array2d[float], means_t: wp.array[wp.vec3],
-    quats_t: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
+    quats_t: wp.array[wp.vec4], extras: wp.array[wp.vec3],
 ): ...  # fmt: skip
 
 
@@ -42,19 +42,19 @@ def skin(
     motion_in: wp.array2d[float],  # [M, 16]
     reach_in: wp.array2d[float],  # [M, 16]
     aligned: int,  # all shape rotations lie on the same side
-    has_log_scales: int,
+    has_extras: int,
     indices_in: wp.array2d[wp.int32],  # [N, K]
     weights_in: wp.array2d[float],  # [N, K]
     # Out:
     means_out: wp.array[wp.vec3],  # [N]
     quats_out: wp.array[wp.vec4],  # [N]
-    log_scales_out: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+    extras_out: wp.array[wp.vec3],  # [N], touched only with has_extras
 ):
     """Move Gaussians ``16 i .. 16 i + 15`` with known weights."""
     begin = (first + wp.tid()) * LANES
     _skin(
-        begin, means_in, quats_in, motion_in, reach_in, aligned, has_log_scales, indices_in, weights_in,
-        means_out, quats_out, log_scales_out,
+        begin, means_in, quats_in, motion_in, reach_in, aligned, has_extras, indices_in, weights_in,
+        means_out, quats_out, extras_out,
     )  # fmt: skip
 
 
@@ -70,17 +70,17 @@ def skin_rbf(
     reach_in: wp.array2d[float],  # [M, 16]
     aligned: int,  # all shape rotations lie on the same side
     has_strengths: int,
-    has_log_scales: int,
+    has_extras: int,
     indices_in: wp.array2d[wp.int32],  # [N, K]
     # Out:
     weights_out: wp.array2d[float],  # [N, K]
     means_out: wp.array[wp.vec3],  # [N]
     quats_out: wp.array[wp.vec4],  # [N]
-    log_scales_out: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+    extras_out: wp.array[wp.vec3],  # [N], touched only with has_extras
 ):
     """Compute the weights of Gaussians ``16 i .. 16 i + 15`` and move them."""
     begin = (first + wp.tid()) * LANES
     _skin_rbf(
         begin, means_in, quats_in, hyper_in, has_hyper, motion_in, reach_in, aligned, has_strengths,
-        has_log_scales, indices_in, weights_out, means_out, quats_out, log_scales_out,
+        has_extras, indices_in, weights_out, means_out, quats_out, extras_out,
     )  # fmt: skip

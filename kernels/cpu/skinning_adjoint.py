@@ -15,8 +15,8 @@ wp.set_module_options({"enable_backward": False})
 def _skin_rbf_adjoint(
     chunk: int, size: int, means: wp.array[wp.vec3], quats: wp.array[wp.vec4], hyper: wp.array2d[float],
     has_hyper: int, motion: wp.array2d[float], reach: wp.array2d[float], aligned: int, has_strengths: int,
-    has_log_scales: int, indices: wp.array2d[wp.int32], weights: wp.array2d[float], v_means_t: wp.array[wp.vec3],
-    v_quats_t: wp.array[wp.vec4], v_log_scales_t: wp.array[wp.vec3], v_means: wp.array[wp.vec3],
+    has_extras: int, indices: wp.array2d[wp.int32], weights: wp.array2d[float], v_means_t: wp.array[wp.vec3],
+    v_quats_t: wp.array[wp.vec4], v_extras_t: wp.array[wp.vec3], v_means: wp.array[wp.vec3],
     v_quats: wp.array[wp.vec4], v_hyper: wp.array2d[float], v_motion: wp.array2d[float], v_reach: wp.array2d[float],
 ): ...  # fmt: skip
 
@@ -34,23 +34,23 @@ def skin_rbf_adjoint(
     reach_in: wp.array2d[float],  # [M, 16]
     aligned: int,  # all shape rotations lie on the same side
     has_strengths: int,
-    has_log_scales: int,
+    has_extras: int,
     indices_in: wp.array2d[wp.int32],  # [N, K]
     weights_in: wp.array2d[float],  # [N, K]
     v_means_in: wp.array[wp.vec3],  # [N]
     v_quats_in: wp.array[wp.vec4],  # [N]
-    v_log_scales_in: wp.array[wp.vec3],  # [N], touched only with has_log_scales
+    v_extras_in: wp.array[wp.vec3],  # [N], touched only with has_extras
     # Out:
     v_means_out: wp.array[wp.vec3],  # [N]
     v_quats_out: wp.array[wp.vec4],  # [N]
     v_hyper_out: wp.array2d[float],  # [N, H], touched only with has_hyper
     v_motion_out: wp.array2d[float],  # [chunks * M, 16]
-    v_reach_out: wp.array2d[float],  # [chunks * M, 16]: as reach; v e, v d^2, v, w v_log_scales of the exponents' v
+    v_reach_out: wp.array2d[float],  # [chunks * M, 16]: as reach; v e, v d^2, v, w v_extras of the exponents' v
 ):
     """Compute the gradients of one chunk of Gaussians, and this chunk's sums for every node."""
     chunk = first + wp.tid()
     _skin_rbf_adjoint(
         chunk, size, means_in, quats_in, hyper_in, has_hyper, motion_in, reach_in, aligned, has_strengths,
-        has_log_scales, indices_in, weights_in, v_means_in, v_quats_in, v_log_scales_in, v_means_out, v_quats_out,
+        has_extras, indices_in, weights_in, v_means_in, v_quats_in, v_extras_in, v_means_out, v_quats_out,
         v_hyper_out, v_motion_out, v_reach_out,
     )  # fmt: skip

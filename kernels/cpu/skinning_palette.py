@@ -1,7 +1,7 @@
 """Palette for ``cpu/skinning.py``: two rows of sixteen floats per control point (node), each row one register.
 
 - ``motion``: the affine map ``[R | p + T - R p]`` (12, row by row), then the unit shape rotation (4);
-- ``reach``: position (3), ``-1 / (2 radius^2)``, ``log strength``, log scales (3), hyper-coordinates (MAX_HYPER,
+- ``reach``: position (3), ``-1 / (2 radius^2)``, ``log strength``, extras (3), hyper-coordinates (MAX_HYPER,
   zero-padded).
 
 p is the node's rest position, T its translation and R its rotation; radius and strength give the RBF weight.
@@ -34,8 +34,8 @@ def palette(
     translations_in: wp.array[wp.vec3],  # [M]
     rotations_in: wp.array[wp.vec4],  # [M]
     shape_rotations_in: wp.array[wp.vec4],  # [M]
-    log_scales_in: wp.array[wp.vec3],  # [M], touched only with has_log_scales
-    has_log_scales: int,
+    extras_in: wp.array[wp.vec3],  # [M], touched only with has_extras
+    has_extras: int,
     # Out:
     motion_out: wp.array2d[float],  # [M, 16]
     reach_out: wp.array2d[float],  # [M, 16]
@@ -56,8 +56,8 @@ def palette(
         reach_out[m, d] = 0.0
     for d in range(3):
         reach_out[m, d] = p[d]
-        if has_log_scales != 0:
-            reach_out[m, 5 + d] = log_scales_in[m][d]
+        if has_extras != 0:
+            reach_out[m, 5 + d] = extras_in[m][d]
     if has_radii != 0:
         reach_out[m, 3] = -0.5 / (radii_in[m] * radii_in[m])
     if has_strengths != 0:
@@ -88,7 +88,7 @@ def palette_adjoint(
     rotations_in: wp.array[wp.vec4],  # [M]
     shape_rotations_in: wp.array[wp.vec4],  # [M]
     has_shape_rotations: int,
-    has_log_scales: int,
+    has_extras: int,
     v_motion_in: wp.array2d[row],  # [chunks, M] rows
     v_reach_in: wp.array2d[row],  # [chunks, M] rows
     # Out:
@@ -99,7 +99,7 @@ def palette_adjoint(
     v_translations_out: wp.array[wp.vec3],  # [M]
     v_rotations_out: wp.array[wp.vec4],  # [M]
     v_shape_rotations_out: wp.array[wp.vec4],  # [M], touched only with has_shape_rotations
-    v_log_scales_out: wp.array[wp.vec3],  # [M], touched only with has_log_scales
+    v_extras_out: wp.array[wp.vec3],  # [M], touched only with has_extras
 ):
     """Compute the gradients of one node from the gradients of its two rows."""
     m = first + wp.tid()
@@ -140,5 +140,5 @@ def palette_adjoint(
         if strengths_in[m] > MIN_STRENGTH:
             v_strength = reach[4] / strengths_in[m]
         v_strengths_out[m] = passed(v_strength)
-    if has_log_scales != 0:
-        v_log_scales_out[m] = passed(wp.vec3(reach[5], reach[6], reach[7]))
+    if has_extras != 0:
+        v_extras_out[m] = passed(wp.vec3(reach[5], reach[6], reach[7]))

@@ -25,7 +25,7 @@ Lane = wp.types.vector(length=LANES, dtype=wp.float32)
 
 @wp.func
 def put_skin_row(
-    row: int, G: wp.mat33, v: wp.vec3, blend: wp.vec4, scale: wp.vec3, scaled: int, rows: wp.array2d[float]
+    row: int, G: wp.mat33, v: wp.vec3, blend: wp.vec4, extra: wp.vec3, has_extras: int, rows: wp.array2d[float]
 ):
     for a in range(3):
         for c in range(3):
@@ -33,9 +33,9 @@ def put_skin_row(
         rows[row, 9 + a] = v[a]
     for a in range(4):
         rows[row, 12 + a] = blend[a]
-    if scaled != 0:
+    if has_extras != 0:
         for a in range(3):
-            rows[row, 16 + a] = scale[a]
+            rows[row, 16 + a] = extra[a]
 
 
 @wp.kernel
@@ -51,8 +51,8 @@ def skin_segments(
     weights_in: wp.array2d[float],  # [N, K]
     v_means_in: wp.array[wp.vec3],  # [N]
     v_blends_in: wp.array[wp.vec4],  # [N]
-    v_log_scales_in: wp.array[wp.vec3],  # [N], touched only with has_log_scales
-    has_log_scales: int,
+    v_extras_in: wp.array[wp.vec3],  # [N], touched only with has_extras
+    has_extras: int,
     # Out:
     rows_out: wp.array2d[float],  # [segments + M, SUMS (+ 3)] columns as in skinning.skin_finish
 ):
@@ -62,7 +62,7 @@ def skin_segments(
     G = wp.mat33(0.0)
     v_sum = wp.vec3(0.0)
     blend = wp.vec4(0.0)
-    scale = wp.vec3(0.0)
+    extra = wp.vec3(0.0)
     for at in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, order_in.shape[0])):
         pair = order_in[at]
         i = pair // K
@@ -70,26 +70,26 @@ def skin_segments(
         m = indices_in[i, k]
         if m != node:
             if node >= 0:
-                put_skin_row(segment + node, G, v_sum, blend, scale, has_log_scales, rows_out)
+                put_skin_row(segment + node, G, v_sum, blend, extra, has_extras, rows_out)
             node = m
             G = wp.mat33(0.0)
             v_sum = wp.vec3(0.0)
             blend = wp.vec4(0.0)
-            scale = wp.vec3(0.0)
+            extra = wp.vec3(0.0)
         x = means_in[i]
         if finite(v_blends_in[i]):
             w = weights_in[i, k]
             v = w * v_means_in[i]
             G += wp.outer(v, x - nodes_in[m])
             v_sum += v
-            if has_log_scales != 0:
-                scale += w * v_log_scales_in[i]
+            if has_extras != 0:
+                extra += w * v_extras_in[i]
             own = quat_normalise(shape_rotations_in[m])
             if wp.dot(own, quat_normalise(shape_rotations_in[indices_in[i, 0]])) < 0.0:
                 w = -w
             blend += w * v_blends_in[i]
     if node >= 0:
-        put_skin_row(segment + node, G, v_sum, blend, scale, has_log_scales, rows_out)
+        put_skin_row(segment + node, G, v_sum, blend, extra, has_extras, rows_out)
 
 
 @wp.func

@@ -18,8 +18,8 @@ ALWAYS_INLINE vf exponential(vf x) {
 // Move the Gaussians at x and q by their blended motion, and write them.
 ALWAYS_INLINE void move(
     int begin, int rows, const vf* x, const vf* q, const wp::array_t<float>& motion, const wp::array_t<float>& reach,
-    const int* pick, int K, const float* weight, const vf* weights_of, int aligned, int has_log_scales,
-    wp::array_t<wp::vec3>& means_t, wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& log_scales
+    const int* pick, int K, const float* weight, const vf* weights_of, int aligned, int has_extras,
+    wp::array_t<wp::vec3>& means_t, wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& extras
 ) {
     FUSE_WITHIN_EXPRESSIONS
     vf B[16], side[MAX_NEIGHBORS];
@@ -35,7 +35,7 @@ ALWAYS_INLINE void move(
     };
     write_vectors(means_t.data, begin, rows, 3, moved);
     write_vectors(quats_t.data, begin, rows, 4, turned);
-    if (has_log_scales) {
+    if (has_extras) {
         float sums[16][4];
         for (int l = 0; l < 16; ++l) {
             v4 row = {};
@@ -44,16 +44,16 @@ ALWAYS_INLINE void move(
             *(v4*)sums[l] = row;
         }
         for (int l = 0; l < rows; ++l)
-            for (int c = 0; c < 3; ++c) log_scales.data[begin + l].c[c] = sums[l][1 + c];
+            for (int c = 0; c < 3; ++c) extras.data[begin + l].c[c] = sums[l][1 + c];
     }
 }
 
 // Skin with known weights.
 static inline void skin(
     int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<wp::vec4>& quats, const wp::array_t<float>& motion,
-    const wp::array_t<float>& reach, int aligned, int has_log_scales, const wp::array_t<int>& indices,
+    const wp::array_t<float>& reach, int aligned, int has_extras, const wp::array_t<int>& indices,
     const wp::array_t<float>& weights, wp::array_t<wp::vec3>& means_t, wp::array_t<wp::vec4>& quats_t,
-    wp::array_t<wp::vec3>& log_scales
+    wp::array_t<wp::vec3>& extras
 ) {
     FUSE_WITHIN_EXPRESSIONS
     struct Any {
@@ -74,10 +74,7 @@ static inline void skin(
         const float* weight = (const float*)read_rows(weights.data + (long long)begin * K, rows, 4 * K, spare_weights);
         vf columns[16];
         if (!aligned) weight_columns(weight, K, columns);
-        move(
-            begin, rows, x, q, motion, reach, pick, K, weight, columns, aligned, has_log_scales, means_t, quats_t,
-            log_scales
-        );
+        move(begin, rows, x, q, motion, reach, pick, K, weight, columns, aligned, has_extras, means_t, quats_t, extras);
     };
     if (indices.shape[1] == 4)
         run(Four{});
@@ -89,8 +86,8 @@ static inline void skin(
 static inline void skin_rbf(
     int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<wp::vec4>& quats, const wp::array_t<float>& hyper,
     int has_hyper, const wp::array_t<float>& motion, const wp::array_t<float>& reach, int aligned, int has_strengths,
-    int has_log_scales, const wp::array_t<int>& indices, wp::array_t<float>& weights, wp::array_t<wp::vec3>& means_t,
-    wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& log_scales
+    int has_extras, const wp::array_t<int>& indices, wp::array_t<float>& weights, wp::array_t<wp::vec3>& means_t,
+    wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& extras
 ) {
     FUSE_WITHIN_EXPRESSIONS
     struct Any {
@@ -137,8 +134,7 @@ static inline void skin_rbf(
         weight_rows(w, K, spare_weights);
         __builtin_memcpy(weights.data + (long long)begin * K, spare_weights, 4 * K * rows);
         move(
-            begin, rows, x, q, motion, reach, pick, K, spare_weights, w, aligned, has_log_scales, means_t, quats_t,
-            log_scales
+            begin, rows, x, q, motion, reach, pick, K, spare_weights, w, aligned, has_extras, means_t, quats_t, extras
         );
     };
     if (indices.shape[1] == 4)

@@ -22,9 +22,9 @@ ALWAYS_INLINE void add4(float* table, const int* pick, int K, int k, const vf* c
 static inline void skin_rbf_adjoint(
     int chunk, int size, const wp::array_t<wp::vec3>& means, const wp::array_t<wp::vec4>& quats,
     const wp::array_t<float>& hyper, int has_hyper, const wp::array_t<float>& motion, const wp::array_t<float>& reach,
-    int aligned, int has_strengths, int has_log_scales, const wp::array_t<int>& indices,
-    const wp::array_t<float>& weights, const wp::array_t<wp::vec3>& v_means_t, const wp::array_t<wp::vec4>& v_quats_t,
-    const wp::array_t<wp::vec3>& v_log_scales_t, wp::array_t<wp::vec3>& v_means, wp::array_t<wp::vec4>& v_quats,
+    int aligned, int has_strengths, int has_extras, const wp::array_t<int>& indices, const wp::array_t<float>& weights,
+    const wp::array_t<wp::vec3>& v_means_t, const wp::array_t<wp::vec4>& v_quats_t,
+    const wp::array_t<wp::vec3>& v_extras_t, wp::array_t<wp::vec3>& v_means, wp::array_t<wp::vec4>& v_quats,
     wp::array_t<float>& v_hyper, wp::array_t<float>& v_motion, wp::array_t<float>& v_reach
 ) {
     FUSE_WITHIN_EXPRESSIONS
@@ -53,11 +53,11 @@ static inline void skin_rbf_adjoint(
         vf hyper_point[MAX_HYPER];
         read_hyper(hyper, H, begin, rows, hyper_point);
         const float* weight = (const float*)read_rows(weights.data + (long long)begin * K, rows, 4 * K, spare_weights);
-        vf w[MAX_NEIGHBORS], v[3], t[4], v_scales[3];
+        vf w[MAX_NEIGHBORS], v[3], t[4], v_extras_of[3];
         weight_columns(weight, K, w);
         read_vectors(v_means_t.data, begin, rows, 3, v);
         read_vectors(v_quats_t.data, begin, rows, 4, t);
-        if (has_log_scales) read_vectors(v_log_scales_t.data, begin, rows, 3, v_scales);
+        if (has_extras) read_vectors(v_extras_t.data, begin, rows, 3, v_extras_of);
         vf B[16], side[MAX_NEIGHBORS], b[4], u[4], v_x[3], rows_of[16];
         blend(motion.data, pick, weight, w, K, aligned, side, B);
         // Non-finite Gaussians, Gaussians moved by a non-finite control point, and lanes past the end pass no gradient:
@@ -78,7 +78,7 @@ static inline void skin_rbf_adjoint(
                 q[c] = alive ? q[c] : vf{};
                 t[c] = alive ? t[c] : vf{};
             }
-            for (int c = 0; c < 3 && has_log_scales; ++c) v_scales[c] = alive ? v_scales[c] : vf{};
+            for (int c = 0; c < 3 && has_extras; ++c) v_extras_of[c] = alive ? v_extras_of[c] : vf{};
             for (int d = 0; d < H; ++d) hyper_point[d] = alive ? hyper_point[d] : vf{};
             weight_rows(w, K, spare_weights);
             weight = spare_weights;
@@ -127,10 +127,10 @@ static inline void skin_rbf_adjoint(
                 store(sum, load16(sum) + weight[l * K + k] * g, 16);
             }
             v_weight[k] = lane_sums(products);
-            if (has_log_scales) {
+            if (has_extras) {
                 vf node[4];
                 gather4(reach.data + 4, pick, K, k, node);
-                for (int c = 0; c < 3; ++c) v_weight[k] = v_weight[k] + v_scales[c] * node[1 + c];
+                for (int c = 0; c < 3; ++c) v_weight[k] = v_weight[k] + v_extras_of[c] * node[1 + c];
             }
             v_weight[k] = (alive & usable(v_weight[k])) ? v_weight[k] : vf{};
             mean = mean + w[k] * v_weight[k];
@@ -149,9 +149,9 @@ static inline void skin_rbf_adjoint(
             }
             part[3] = moves ? v_logit * d2 : vf{};
             add4(reach_sum, pick, K, k, part);
-            if (has_strengths || has_log_scales) {
+            if (has_strengths || has_extras) {
                 part[0] = v_logit;
-                for (int c = 0; c < 3; ++c) part[1 + c] = has_log_scales ? w[k] * v_scales[c] : vf{};
+                for (int c = 0; c < 3; ++c) part[1 + c] = has_extras ? w[k] * v_extras_of[c] : vf{};
                 add4(reach_sum + 4, pick, K, k, part);
             }
             for (int h = 0; h < H; h += 4) {

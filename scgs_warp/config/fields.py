@@ -90,6 +90,9 @@ class MotionConfig:
     correctives: bool = newer(False, before=False)
     """Let a Gaussian's position follow the rotation of its surface (not in the paper): what pose blend shapes are to a
     body model."""
+    tints: bool = newer(True, before=False)
+    """Let the control points change the Gaussians' colours over time (not in the paper), as shadows and the light from
+    neighbouring surfaces do. Off with ``scale_residual``, because skinning blends three values beside the motion."""
     mask: bool = False
     """Learn a share of the motion per Gaussian (an option of the official code); hyper-coordinates work better."""
     time_noise: float = bounded(0.0, 0, 1e6)
@@ -110,6 +113,11 @@ class MotionConfig:
     def has_shading(self) -> bool:
         """True if shading is on and the model is control-points: the rival models have no shading."""
         return self.shading and self.model == "control-points"
+
+    @property
+    def has_tints(self) -> bool:
+        """True if tints are on, the model is control-points, and it does not change scales."""
+        return self.tints and self.model == "control-points" and not self.scale_residual
 
     @property
     def has_correctives(self) -> bool:

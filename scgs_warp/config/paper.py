@@ -42,6 +42,7 @@ PAPER = TrainConfig(
         scale_residual=False,
         shading=False,
         correctives=False,
+        tints=False,
         mask=False,
         time_noise=0.0,
         bfloat16=False,

@@ -94,7 +94,7 @@ def compose(motion: MotionPose, bent: NodePose) -> Pose:
         return torch.where(turned, torch.from_numpy(further).float().to(device), rotations)
 
     shape = None if own.shape_rotations is None else turn(own.shape_rotations)
-    return Pose(moved.contiguous(), turn(own.rotations).contiguous(), shape, own.log_scales)
+    return Pose(moved.contiguous(), turn(own.rotations).contiguous(), shape, own.log_scales, own.tints)
 
 
 def own_pose(motion: MotionPose, bent: NodePose) -> Pose | None:

@@ -66,6 +66,8 @@ def write_npz(
         arrays["node_own_rotations"] = skeleton.own_rotations
     if skeleton.log_scales is not None:
         arrays["node_log_scales"] = skeleton.log_scales
+    if skeleton.tints is not None:
+        arrays["node_tints"] = skeleton.tints
     arrays = {name: np.asarray(value, "<f4") for name, value in arrays.items()}
     arrays["indices"] = skeleton.indices.astype("<i4")
     content = io.BytesIO()

@@ -23,7 +23,7 @@ COARSE_ERROR = 8e-4
 """Acceptable error of interpolation halfway between two times (root mean square, normalised units and radians). The
 number of times is doubled until the error is below this, and then once more, which leaves about a quarter of the
 error."""
-POSE_PARTS = ("translation", "rotation", "shape", "log_scale")
+POSE_PARTS = ("translation", "rotation", "shape", "log_scale", "tint")
 QUATERNIONS = ("rotation", "shape")
 TIMES_AT_ONCE = 16
 """Number of times per evaluation of the network; it limits the memory for many control points."""
@@ -135,6 +135,7 @@ def _facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
         "masked": False,
         "shapes": False,
         "scaled": False,
+        "tinted": False,
     }
 
 
@@ -185,7 +186,8 @@ def _binding_columns(
 def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
     """Store rest positions, and poses at evenly spaced times, node by node."""
     poses = sample_poses(motion)
-    facts.update(samples=len(poses["translation"]), shapes="shape" in poses, scaled="log_scale" in poses)
+    facts.update(samples=len(poses["translation"]), shapes="shape" in poses)
+    facts.update(scaled="log_scale" in poses, tinted="tint" in poses)
     rest = _array(motion.positions)
     columns = [quantise(f"rest{a}", rest[:, a], STEPS["rest"]) for a in range(3)]
     for name, values in poses.items():
@@ -196,7 +198,7 @@ def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
 
 def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
     """Sample ``translation`` [T, M, 3], ``rotation`` [T, M, 4], and if the model has them ``shape`` [T, M, 4] and
-    ``log_scale`` [T, M, 3], at T evenly spaced times, with quaternion signs continuous over time.
+    ``log_scale`` or ``tint`` [T, M, 3], at T evenly spaced times, with quaternion signs continuous over time.
 
     Raises:
         UserError: a pose is not finite.
@@ -241,7 +243,7 @@ def _poses_at(motion: ControlPoints, times: Tensor) -> dict[str, np.ndarray]:
     samples: dict[str, list[np.ndarray]] = {}
     for part in times.split(TIMES_AT_ONCE):
         for pose in motion.poses(part):
-            fields = pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales
+            fields = pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales, pose.tints
             for name, value in zip(POSE_PARTS, fields, strict=True):
                 if value is not None:
                     samples.setdefault(name, []).append(_array(value))

@@ -211,9 +211,9 @@ def _usable(scene: Scene) -> np.ndarray:
 
 def mean_colors(session: EditSession, moments: list[AnimationMoment]) -> np.ndarray:
     """Return harmonics of degree 0 averaged over all moments, [N, 3], for formats that hold one colour: shading changes
-    the colour as the surface turns."""
+    the colour as the surface turns, and tints change it over time."""
     scene = session.scene
-    if not scene.gaussians.shading.shape[1]:
+    if not scene.gaussians.shading.shape[1] and not scene.config.motion.has_tints:
         return scene.gaussians.sh_dc.detach().cpu().numpy()
     total = np.zeros((scene.gaussian_count, 3))
     for moment in moments:

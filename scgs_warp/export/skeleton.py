@@ -51,6 +51,8 @@ class Skeleton:
     """[T, M, 4] rotations of the Gaussians' shapes, if they differ from ``rotations``."""
     log_scales: np.ndarray | None
     """[T, M, 3] changes of the logarithms of scales, if there are any."""
+    tints: np.ndarray | None
+    """[T, M, 3] changes of the logarithms of colours, if there are any."""
     indices: np.ndarray
     """[N, K] int32"""
     weights: np.ndarray
@@ -151,6 +153,7 @@ def build_skeleton(
         _unit([pose.rotations for pose in poses]),
         None if poses[0].shape_rotations is None else _unit([_require(pose.shape_rotations) for pose in poses]),
         None if poses[0].log_scales is None else _stack([_require(pose.log_scales) for pose in poses]),
+        None if poses[0].tints is None else _stack([_require(pose.tints) for pose in poses]),
         indices,
         weights,
         None if all(a is b for a, b in zip(own, poses)) else _unit([_turns(pose) for pose in own]),
@@ -162,7 +165,7 @@ def build_skeleton(
 def _check_finite(skeleton: Skeleton) -> None:
     tracks = (
         *(skeleton.positions, skeleton.rotations, skeleton.shape_rotations, skeleton.log_scales),
-        skeleton.own_rotations,
+        *(skeleton.tints, skeleton.own_rotations),
     )
     for track in tracks:
         good = track is None or np.isfinite(track).all(axis=(1, 2))
@@ -186,8 +189,7 @@ def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> tuple[
     """Return the pose at a moment, and the result of ``own_pose``."""
     engine, edit = session.engine, session.edit
     motion = engine.motion_at(moment.time)
-    fields = motion.pose.translations, motion.pose.rotations, motion.pose.shape_rotations, motion.pose.log_scales
-    if not all(value is None or value.isfinite().all() for value in fields):
+    if not all(value is None or value.isfinite().all() for value in vars(motion.pose).values()):
         raise _not_finite(moment.time)
     bent = engine.bend(edit, moment.time, moment.at, frame=edit.reach)
     if bent is None:
@@ -221,7 +223,11 @@ def _with_rest(skeleton: Skeleton, gaussians: GaussianParameters) -> Skeleton:
     frames, joints = skeleton.positions.shape[:2]
     still = np.zeros((frames, 1, 4))
     still[..., 0] = 1.0
-    shapes, sizes = skeleton.shape_rotations, skeleton.log_scales
+    shapes = skeleton.shape_rotations
+    sizes, tints = (
+        None if track is None else np.concatenate([track, np.zeros((frames, 1, 3))], axis=1)
+        for track in (skeleton.log_scales, skeleton.tints)
+    )
     middle = skeleton.rest.mean(axis=0, keepdims=True)
     return Skeleton(
         skeleton.seconds,
@@ -230,7 +236,8 @@ def _with_rest(skeleton: Skeleton, gaussians: GaussianParameters) -> Skeleton:
         np.concatenate([skeleton.positions, np.broadcast_to(middle, (frames, 1, 3))], axis=1),
         np.concatenate([skeleton.rotations, still], axis=1),
         None if shapes is None else np.concatenate([shapes, still], axis=1),
-        None if sizes is None else np.concatenate([sizes, np.zeros((frames, 1, 3))], axis=1),
+        sizes,
+        tints,
         np.column_stack([skeleton.indices, np.full(len(share), joints, np.int32)]),
         np.column_stack([share * skeleton.weights, 1.0 - share]),
     )

@@ -10,7 +10,7 @@ from ..config.presets import LossConfig, MotionConfig, TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.correctives import correct
 from ..ops.neighbors import NeighborSearch, rbf_weights
-from ..ops.shading import shade
+from ..ops.shading import shade, tint
 from ..ops.skinning import skin, skin_rbf
 from ..runtime.environment import one_piece
 from ..seeding import generator
@@ -30,6 +30,8 @@ def heads_of(config: MotionConfig) -> dict[str, int]:
         heads["shape_rotations"] = 4
     if config.scale_residual:
         heads["log_scales"] = 3
+    if config.has_tints:
+        heads["tints"] = 3
     return heads
 
 
@@ -54,17 +56,20 @@ def unit_rotations(raw: Tensor) -> Tensor:
 def _posed(
     gaussians: GaussianParameters,
     moved: tuple[Tensor, Tensor, Tensor | None],
+    pose: Pose,
     masked: bool,
     own: Tensor | None = None,
 ) -> Gaussians:
     """Activate the moved Gaussians.
 
     Args:
+        moved: means, quats, and log scales or tints, from skinning.
+        pose: of the control points that moved them.
         masked: the last hyper-coordinate is the logit of the share of the motion that a Gaussian takes.
         own: [N, 4] rotations that shading and correctives follow in place of the moved ones: those of the trained
             motion, under an edit.
     """
-    means, quats, log_scales = moved
+    means, quats, extras = moved
     if gaussians.correctives.shape[1]:
         means = correct(means, gaussians.correctives, gaussians.quats, quats, own)
     if masked:
@@ -76,9 +81,10 @@ def _posed(
         quats = rest + share * (quats - rest)
         if own is not None:
             own = rest + share * (torch.where((rest * own).sum(1, keepdim=True) < 0, -own, own) - rest)
-        log_scales = None if log_scales is None else share * log_scales
+        extras = None if extras is None else share * extras
+    log_scales, tints = (extras, None) if pose.tints is None else (None, extras)
     scales = gaussians.scales() if log_scales is None else fixed_exp(gaussians.log_scales + log_scales)
-    sh_dc = gaussians.sh_dc
+    sh_dc = gaussians.sh_dc if tints is None else tint(gaussians.sh_dc, tints)
     if gaussians.shading.shape[1]:
         sh_dc = shade(sh_dc, gaussians.shading, gaussians.quats, quats if own is None else own)
     return Gaussians(means, quats, scales, gaussians.opacities(), sh_dc, gaussians.sh_rest)
@@ -113,13 +119,12 @@ class ControlPoints(Motion):
         out = self.network(self.positions.detach(), times.to(self.positions.device))
         rotations = unit_rotations(out["rotations"])
         shape = unit_rotations(out["shape_rotations"]) if "shape_rotations" in out else None
-        log_scales = out.get("log_scales")
+        optional = shape, out.get("log_scales"), out.get("tints")
         return [
             Pose(
                 out["translations"][i].contiguous(),
                 rotations[i].contiguous(),
-                None if shape is None else shape[i].contiguous(),
-                None if log_scales is None else log_scales[i].contiguous(),
+                *(None if value is None else value[i].contiguous() for value in optional),
             )
             for i in range(times.shape[0])
         ]
@@ -159,7 +164,7 @@ class ControlPoints(Motion):
         correctives follow the rotations of ``own`` if given, those of the trained motion."""
         moved = skin(gaussians.means, gaussians.quats, self.positions, pose, *binding)
         rotations = None if own is None else skin(gaussians.means, gaussians.quats, self.positions, own, *binding)[1]
-        return _posed(gaussians, moved, self.config.mask, rotations)
+        return _posed(gaussians, moved, pose, self.config.mask, rotations)
 
     def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:
         """Bind and pose all Gaussians in one pass; ``frozen`` control points receive no gradient."""
@@ -179,7 +184,7 @@ class ControlPoints(Motion):
         moved = skin_rbf(
             gaussians.means, gaussians.quats, nodes, radii, pose, indices, strengths, hyper_points, hyper_nodes
         )
-        return _posed(gaussians, moved, self.config.mask)
+        return _posed(gaussians, moved, pose, self.config.mask)
 
     def cache_binding(self, gaussians: GaussianParameters | None) -> None:
         """Keep the Gaussians' neighbours and weights for rendering, as they do not depend on time; with None, discard

@@ -1,4 +1,4 @@
-"""Diffuse shading: colours that change as their surface turns, with gradients."""
+"""Brightness that follows a Gaussian's own rotation, and tints, which change its colour; with gradients."""
 
 from __future__ import annotations
 
@@ -60,3 +60,39 @@ def shade(sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor) -> Ten
             raise ValueError(f"{name} must be [{count}, {width}], got {tuple(value.shape)}")
     quats, quats_t = quats.detach().contiguous(), quats_t.detach().contiguous()
     return _Shade.apply(sh_dc.contiguous(), shading.contiguous(), quats, quats_t)
+
+
+class _Tint(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sh_dc: Tensor, tints: Tensor):
+        tinted = torch.empty_like(sh_dc)
+        launch(kernels.tint, sh_dc.shape[0], sh_dc, tints, tinted)
+        ctx.save_for_backward(sh_dc, tints)
+        return tinted
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_tinted: Tensor):  # type: ignore[override]
+        sh_dc, tints = ctx.saved_tensors
+        v_sh_dc, v_tints = torch.empty_like(sh_dc), torch.empty_like(tints)
+        launch(kernels.tint_adjoint, sh_dc.shape[0], sh_dc, tints, v_tinted.contiguous(), v_sh_dc, v_tints)
+        return v_sh_dc, v_tints
+
+
+def tint(sh_dc: Tensor, tints: Tensor) -> Tensor:
+    """Multiply base colours by the exponentials of their tints, each within [-3, 1].
+
+    Args:
+        sh_dc: [N, 3] spherical harmonics coefficients of degree 0 (colour less one half, over C0).
+        tints: [N, 3] changes of the logarithms of the colours.
+
+    Returns:
+        [N, 3] coefficients of degree 0. Gradients reach both; a tint at or beyond a limit gets none.
+
+    Raises:
+        ValueError: a shape is wrong.
+    """
+    for name, value in {"sh_dc": sh_dc, "tints": tints}.items():
+        if tuple(value.shape) != (sh_dc.shape[0], 3):
+            raise ValueError(f"{name} must be [{sh_dc.shape[0]}, 3], got {tuple(value.shape)}")
+    return _Tint.apply(sh_dc.contiguous(), tints.contiguous())

@@ -17,68 +17,70 @@ from .node_sums import skin_node_sums
 
 class _Skin(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means, quats, nodes, translations, rotations, shapes, log_scales, weights, indices, lists):
-        scaled = int(log_scales is not None)
-        outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(means) if scaled else None
+    def forward(ctx: Any, means, quats, nodes, translations, rotations, shapes, extras, weights, indices, lists):
+        extended = int(extras is not None)
+        outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(means) if extended else None
         both = rotations if shapes is None else shapes
-        inputs = means, quats, nodes, translations, rotations, both, log_scales, scaled, indices, weights
+        inputs = means, quats, nodes, translations, rotations, both, extras, extended, indices, weights
         launch(kernels.skin, means.shape[0], *inputs, *outputs)
-        ctx.save_for_backward(means, quats, nodes, translations, rotations, shapes, log_scales, indices, weights)
+        ctx.save_for_backward(means, quats, nodes, translations, rotations, shapes, extras, indices, weights)
         ctx.lists = lists
         return outputs
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients):  # type: ignore[override]
-        means, quats, nodes, translations, rotations, shapes, log_scales, indices, weights = ctx.saved_tensors
-        scaled = int(log_scales is not None)
+        means, quats, nodes, translations, rotations, shapes, extras, indices, weights = ctx.saved_tensors
+        extended = int(extras is not None)
         v_outputs = tuple(None if v is None else v.contiguous() for v in gradients)
         both = rotations if shapes is None else shapes
         v_means, v_quats = torch.empty_like(means), torch.empty_like(quats)
         v_weights, v_blends = torch.empty_like(weights), torch.empty_like(quats)
-        inputs = means, quats, nodes, translations, rotations, both, log_scales, scaled, indices, weights
+        inputs = means, quats, nodes, translations, rotations, both, extras, extended, indices, weights
         own = v_means, v_quats, v_weights, v_blends
         launch(kernels.skin_adjoint, means.shape[0], *inputs, *v_outputs, *own)
-        pairs = means, quats, nodes, both, indices, weights, v_outputs[0], v_blends, v_outputs[2], scaled
-        chunks, sums = _node_sums(pairs, scaled, ctx.lists)
+        pairs = means, quats, nodes, both, indices, weights, v_outputs[0], v_blends, v_outputs[2], extended
+        chunks, sums = _node_sums(pairs, extended, ctx.lists)
         v_nodes, v_translations, v_rotations = (torch.empty_like(x) for x in (nodes, translations, rotations))
         v_shapes = None if shapes is None else torch.empty_like(shapes)
-        v_log_scales = torch.empty_like(log_scales) if scaled else None
+        v_extras = torch.empty_like(extras) if extended else None
         launch(
             kernels.skin_finish,
             nodes.shape[0],
-            *(chunks, rotations, both, int(shapes is not None), scaled, sums),
-            *(v_nodes, v_translations, v_rotations, v_shapes, v_log_scales),
+            *(chunks, rotations, both, int(shapes is not None), extended, sums),
+            *(v_nodes, v_translations, v_rotations, v_shapes, v_extras),
             grain=128,
         )
-        of_pose = v_translations, v_rotations, v_shapes, v_log_scales
+        of_pose = v_translations, v_rotations, v_shapes, v_extras
         return v_means, v_quats, v_nodes, *of_pose, v_weights, None, None
 
 
-def _skin_lanes(means, quats, nodes, translations, rotations, shapes, log_scales, weights, indices) -> tuple:
+def _skin_lanes(means, quats, nodes, translations, rotations, shapes, extras, weights, indices) -> tuple:
     """Run ``skin`` on a CPU, without gradients."""
-    scaled = int(log_scales is not None)
-    outputs = _like(means, quats, means if scaled else None)
-    palette = pack_palette(nodes, (translations, rotations, shapes, log_scales))
-    launch(skinning.skin, _lanes(means), means, quats, *palette, scaled, indices, weights, *outputs, grain=32)
+    extended = int(extras is not None)
+    outputs = _like(means, quats, means if extended else None)
+    palette = pack_palette(nodes, (translations, rotations, shapes, extras))
+    launch(skinning.skin, _lanes(means), means, quats, *palette, extended, indices, weights, *outputs, grain=32)
     return tuple(outputs)
 
 
-def _node_sums(pairs: tuple, scaled: int, lists: NodeLists | None) -> tuple[int, Tensor]:
+def _node_sums(pairs: tuple, extended: int, lists: NodeLists | None) -> tuple[int, Tensor]:
     """Sum the nodes' gradients in parts, and return the number of parts and their buffer [parts * M, columns]."""
     means, nodes, indices = pairs[0], pairs[2], pairs[4]
-    count, width = nodes.shape[0], kernels.SUMS + 3 * scaled
+    count, width = nodes.shape[0], kernels.SUMS + 3 * extended
     if lists is None and means.device.type == "cpu":
         size = chunk_size(count)
         chunks = -(-means.shape[0] // size)
         sums = torch.zeros(chunks * count, width)
         launch(kernels.skin_reduce_chunks, chunks, size, *pairs, sums, grain=1)
         return chunks, sums
-    return 1, skin_node_sums(*(lists or node_lists(indices, count)), pairs, scaled)
+    return 1, skin_node_sums(*(lists or node_lists(indices, count)), pairs, extended)
 
 
 def _pose_tensors(pose: Pose) -> tuple[Tensor | None, ...]:
-    return pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales
+    """Return translations, rotations, shape rotations, and the extras: log scales or tints."""
+    extras = pose.tints if pose.log_scales is None else pose.log_scales
+    return pose.translations, pose.rotations, pose.shape_rotations, extras
 
 
 def _check_shapes(expected: dict[str, tuple[Tensor | None, tuple[int, ...]]]) -> None:
@@ -103,8 +105,11 @@ def _validate(means: Tensor, quats: Tensor, nodes: Tensor, pose: Pose, indices: 
         "pose.rotations": (pose.rotations, (count, 4)),
         "pose.shape_rotations": (pose.shape_rotations, (count, 4)),
         "pose.log_scales": (pose.log_scales, (count, 3)),
+        "pose.tints": (pose.tints, (count, 3)),
     }
     _check_shapes(expected)
+    if pose.log_scales is not None and pose.tints is not None:
+        raise ValueError("a pose has log_scales or tints, not both")
 
 
 def skin(
@@ -134,7 +139,8 @@ def skin(
         lists: ``node_lists(indices, M)``, if computed before; used on CUDA.
 
     Returns:
-        Means [N, 3], quaternions [N, 4] (wxyz, unit), and the change of log scales [N, 3] (None if the pose has none).
+        Means [N, 3], quaternions [N, 4] (wxyz, unit), and the blend of the pose's log scales or tints [N, 3] (None if
+        the pose has neither).
         Gradients flow to all tensors except the indices; a Gaussian with a non-finite mean or quaternion passes none.
 
     Raises:
@@ -167,9 +173,9 @@ def pack_palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=N
     """Pack tensors of control points, which must be contiguous, into a palette.
 
     Args:
-        pose: translations, rotations, shape rotations, log scales.
+        pose: results of :func:`_pose_tensors`.
     """
-    translations, rotations, shapes, log_scales = pose
+    translations, rotations, shapes, extras = pose
     count = nodes.shape[0]
     motion, reach = (torch.empty(count, skinning_palette.ROW) for _ in range(2))
     launch(
@@ -177,7 +183,7 @@ def pack_palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=N
         count,
         *(nodes, hyper, int(hyper is not None), radii, int(radii is not None), strengths, int(strengths is not None)),
         *(translations, rotations, rotations if shapes is None else shapes),
-        *(log_scales, int(log_scales is not None), motion, reach),
+        *(extras, int(extras is not None), motion, reach),
         grain=128,
     )
     return Palette(motion, reach, int(bool((motion[:, 12] > SAME_SIDE).all())))
@@ -187,19 +193,19 @@ class _SkinRbf(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose_and_indices):
         *pose, indices = pose_and_indices
-        has_hyper, has_strengths, has_log_scales = (int(value is not None) for value in (hyper, strengths, pose[3]))
+        has_hyper, has_strengths, has_extras = (int(value is not None) for value in (hyper, strengths, pose[3]))
         palette = pack_palette(nodes, tuple(pose), radii, strengths, hyper_nodes)
         weights = torch.empty(indices.shape)
-        outputs = _like(means, quats, means if has_log_scales else None)
+        outputs = _like(means, quats, means if has_extras else None)
         launch(
             skinning.skin_rbf,
             _lanes(means),
-            *(means, quats, hyper, has_hyper, *palette, has_strengths, has_log_scales, indices, weights, *outputs),
+            *(means, quats, hyper, has_hyper, *palette, has_strengths, has_extras, indices, weights, *outputs),
             grain=32,
         )
         saved = means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose
         ctx.save_for_backward(*saved, indices, weights, palette.motion, palette.reach)
-        ctx.flags = has_hyper, has_strengths, has_log_scales, palette.aligned
+        ctx.flags = has_hyper, has_strengths, has_extras, palette.aligned
         return tuple(outputs)
 
     @staticmethod
@@ -208,8 +214,8 @@ class _SkinRbf(torch.autograd.Function):
         means, quats, hyper, nodes, hyper_nodes, radii, strengths, *pose, indices, weights, motion, reach = (
             ctx.saved_tensors
         )
-        translations, rotations, shapes, log_scales = pose
-        (has_hyper, has_strengths, has_log_scales, aligned), count = ctx.flags, nodes.shape[0]
+        translations, rotations, shapes, extras = pose
+        (has_hyper, has_strengths, has_extras, aligned), count = ctx.flags, nodes.shape[0]
         v_outputs = (None if v is None else v.contiguous() for v in gradients)
         size = chunk_size(count)
         chunks = -(-means.shape[0] // size)
@@ -218,19 +224,19 @@ class _SkinRbf(torch.autograd.Function):
         launch(
             skinning_adjoint.skin_rbf_adjoint,
             chunks,
-            *(size, means, quats, hyper, has_hyper, motion, reach, aligned, has_strengths, has_log_scales),
+            *(size, means, quats, hyper, has_hyper, motion, reach, aligned, has_strengths, has_extras),
             *(indices, weights, *v_outputs),
             *(v_means, v_quats, v_hyper, v_motion.view(-1, 16), v_reach.view(-1, 16)),
             grain=1,
         )
         of_nodes = _like(nodes, hyper_nodes, radii, strengths)
-        of_pose = _like(translations, rotations, shapes, log_scales)
+        of_pose = _like(translations, rotations, shapes, extras)
         both = rotations if shapes is None else shapes
         launch(
             skinning_palette.palette_adjoint,
             count,
             *(nodes, has_hyper, radii, strengths, has_strengths),
-            *(rotations, both, int(shapes is not None), has_log_scales, v_motion, v_reach, *of_nodes, *of_pose),
+            *(rotations, both, int(shapes is not None), has_extras, v_motion, v_reach, *of_nodes, *of_pose),
             grain=64,
         )
         return v_means, v_quats, v_hyper, *of_nodes, *of_pose, None

@@ -52,7 +52,7 @@ def test_best_is_the_former_paper():
     }
     assert {name: best[name] for name, value in values.items() if best[name] != value} == changed
     newer = {name: default["before"] for name, default in recorded._fields(TrainConfig()) if "before" in default}
-    added = {"pretrain.silhouette": 0.5, "pretrain.fade": "auto", "loss.pooled": "auto"}
+    added = {"pretrain.silhouette": 0.5, "pretrain.fade": "auto", "loss.pooled": "auto", "motion.tints": True}
     assert {name: best[name] for name in best.keys() - values.keys()} == {**newer, **added}
 
 

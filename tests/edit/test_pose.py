@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.edit_scenes import bar_scene
+from helpers.edit_scenes import bar_scene, tinted_scene
 from helpers.edit_sessions import TURN, part, same
 from scgs_warp.edit import Edit, EditSession, Hold
 from scgs_warp.edit.pose import NodePose, pose_gaussians
@@ -105,3 +105,14 @@ def test_a_bend_beyond_the_motion_moves_no_corrective_further():
         lengths.append((own, (bent[0] - bent[1]).norm(dim=1)))
     for own, under_edit in lengths:
         torch.testing.assert_close(under_edit, own, rtol=0, atol=2e-5)
+
+
+def test_an_edit_keeps_the_tints_of_the_motion():
+    scene = tinted_scene(shaded=True)
+    session = EditSession(scene)
+    session.add_handle(part(session, 0.8, 1.0), 1.0, "right")
+    session.move("right", [0.0, 0.1, 0.0], TURN)
+    before, after = scene.gaussians_at(1.0), session.gaussians_at(1.0)
+    assert not torch.allclose(before.means, after.means, atol=1e-2)
+    assert not torch.allclose(before.sh_dc, scene.gaussians_at(0.0).sh_dc, atol=0.1), "tints change the colours"
+    torch.testing.assert_close(after.sh_dc, before.sh_dc, rtol=1e-5, atol=1e-5)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from helpers.edit_scenes import bar_scene, rich_scene
+from helpers.edit_scenes import bar_scene, rich_scene, tinted_scene
 from helpers.page_reader import PagePlayer, read_page
 from scgs_warp.errors import UserError
 from scgs_warp.export import page
@@ -21,7 +21,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(-10 * torch.log10(((a.clamp(0, 1) - b.clamp(0, 1)) ** 2).mean()))
 
 
-@pytest.mark.parametrize("make", [bar_scene, rich_scene])
+@pytest.mark.parametrize("make", [bar_scene, rich_scene, tinted_scene])
 def test_what_a_page_holds_renders_as_the_scene(make, tmp_path):
     scene = make()
     page.write_page(scene, tmp_path / "page.html")

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from helpers.chromium import chromium
-from helpers.edit_scenes import bar_scene, rich_scene
+from helpers.edit_scenes import bar_scene, rich_scene, tinted_scene
 from scgs_warp.export.page import write_page
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.motion import build_motion
@@ -114,6 +114,7 @@ SCENES = {
     "shaded": lambda: bar_scene(shaded=True),
     "corrected": lambda: bar_scene(shaded=True, corrected=True),
     "rich": rich_scene,
+    "tinted": lambda: tinted_scene(shaded=True),
     "one neighbour": lambda: with_neighbors(bar_scene(), 1),
     "static": lambda: plain(bar_scene()),
     "static with control points": lambda: with_control_points(plain(bar_scene()), 20),

@@ -89,7 +89,7 @@ def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
     path = tmp_path / "a.npz"
     export("--run", run, "--output", path, "--frames", 5, "--fps", 4)
     scene, data = Scene.load(run), dict(np.load(path))
-    assert str(data["format"]) == "scgs-warp motion" and {"shading", "correctives"} <= data.keys()
+    assert str(data["format"]) == "scgs-warp motion" and {"shading", "node_tints", "correctives"} <= data.keys()
     means, quats, scales, sh_dc = (None,) * 4
     for seconds, time in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
         means, quats, scales, sh_dc = player()["play"](data, seconds)
@@ -99,7 +99,7 @@ def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
         np.testing.assert_allclose(sh_dc, truth.sh_dc, atol=2e-5)
         parts = means, quats, scales, data["opacities"], sh_dc, data["sh_rest"]
         again = Gaussians(*(torch.from_numpy(np.asarray(part)).float() for part in parts))
-        assert float((picture(again) - picture(truth)).abs().max()) < 1e-5
+        assert float((picture(again) - picture(truth)).abs().max()) < 2e-5
     assert np.abs(means - data["means"]).max() > 1e-2
     between = player()["play"](data, 0.6)[0]
     assert np.isfinite(between).all() and not np.array_equal(between, means)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -181,5 +182,20 @@ def rich_scene() -> Scene:
 
     motion.poses = poses  # type: ignore[method-assign]
     scene.config = dataclasses.replace(scene.config, antialiased=True)
+    scene.freeze_binding()
+    return scene
+
+
+def tinted_scene(**options: Any) -> Scene:
+    """Return a scene whose control points also change the colours: darker at the end, by position."""
+    scene = bar_scene(**options)
+    plain = scene.motion.poses
+
+    def poses(times: torch.Tensor) -> list[Pose]:
+        found = zip(times.tolist(), plain(times), strict=True)
+        slope = torch.tensor([[1.0, -0.5, 0.2]]) * scene.motion.positions.detach()[:, :1]
+        return [Pose(pose.translations, pose.rotations, tints=time * slope) for time, pose in found]
+
+    scene.motion.poses = poses  # type: ignore[method-assign]
     scene.freeze_binding()
     return scene

@@ -85,6 +85,7 @@ def pose_of(facts: dict[str, Any], columns: dict[str, np.ndarray], time: float) 
         unit(blend("rotation", 4), dim=-1),
         unit(blend("shape", 4), dim=-1) if facts["shapes"] else None,
         blend("log_scale", 3) if facts["scaled"] else None,
+        blend("tint", 3) if facts["tinted"] else None,
     )
 
 

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reference.shading import shade as shade_reference
-from scgs_warp.ops.shading import shade
+from reference.shading import tint as tint_reference
+from scgs_warp.ops.shading import shade, tint
 
 
 def draw(seed, n, device="cpu", spread=0.8):
@@ -116,3 +117,37 @@ def test_wrong_shapes_are_named(which):
     inputs[which] = inputs[which][:, :-1]
     with pytest.raises(ValueError, match=("sh_dc", "shading", "quats", "quats_t")[which]):
         shade(*inputs)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 257])
+def test_tints_and_their_gradients(n, device):
+    g = torch.Generator().manual_seed(n)
+    inputs = [torch.randn(n, 3, generator=g).to(device), (2.0 * torch.randn(n, 3, generator=g)).to(device)]
+    weights = torch.randn(n, 3, generator=g)
+    ours, ours_grad = gradients(tint, inputs, weights)
+    twin, twin_grad = gradients(tint_reference, [x.double() for x in inputs], weights)
+    assert ours.shape == (n, 3) and ours.device.type == device
+    torch.testing.assert_close(ours.double(), twin, rtol=1e-5, atol=1e-5)
+    for a, b in zip(ours_grad, twin_grad, strict=True):
+        torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=1e-5)
+    if n == 257:  # both limits are reached, where a tint learns nothing
+        outside = (inputs[1] < -3) | (inputs[1] > 1)
+        assert (inputs[1] < -3).any() and (inputs[1] > 1).any()
+        assert not ours_grad[1][outside].any() and ours_grad[1][~outside].all()
+
+
+def test_a_tint_of_zero_and_a_non_finite_one_change_nothing(device):
+    sh_dc = torch.randn(4, 3, generator=torch.Generator().manual_seed(1)).to(device)
+    tints = torch.tensor([0.0, math.nan, math.inf, -math.inf])[:, None].repeat(1, 3).to(device).requires_grad_()
+    out = tint(sh_dc, tints)
+    torch.testing.assert_close(out, sh_dc, rtol=1e-6, atol=1e-6)
+    out.sum().backward()
+    assert torch.isfinite(tints.grad).all() and not tints.grad[1:].any()
+
+
+@pytest.mark.parametrize("which", range(2))
+def test_wrong_shapes_of_tints_are_named(which):
+    inputs = [torch.zeros(3, 3), torch.zeros(3, 3)]
+    inputs[which] = inputs[which][:, :-1]
+    with pytest.raises(ValueError, match=("sh_dc", "tints")[which]):
+        tint(*inputs)

@@ -212,6 +212,25 @@ def test_shapes_that_do_not_fit():
         skin(means, quats, nodes, Pose(translations, rotations[:, :3]), indices, weights)
     with pytest.raises(ValueError, match="indices"):
         skin(means, quats, nodes, pose, indices.long(), weights)
+    with pytest.raises(ValueError, match=r"pose\.tints"):
+        skin(means, quats, nodes, Pose(translations, rotations, tints=rotations), indices, weights)
+    with pytest.raises(ValueError, match="log_scales or tints"):
+        both = Pose(translations, rotations, log_scales=translations, tints=translations)
+        skin(means, quats, nodes, both, indices, weights)
+
+
+def test_tints_are_blended_as_log_scales(device):
+    tensors, indices = inputs(4, 300, 12, 4, scales=True)
+    tensors = [None if x is None else x.to(device).requires_grad_() for x in tensors]
+    means, quats, nodes, weights, translations, rotations, shapes, values = tensors
+    results = []
+    for name in ("log_scales", "tints"):
+        pose = Pose(translations, rotations, shapes, **{name: values})
+        outputs = skin(means, quats, nodes, pose, indices.to(device), weights)
+        leaves = means, quats, nodes, weights, translations, rotations, values
+        results.append((*outputs, *torch.autograd.grad(sum((x * x).sum() for x in outputs), leaves)))
+    assert results[0][2] is not None and results[0][-1].any()
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
 def fused_inputs(seed, n, m, k, *, shape=False, scales=False, strong=False, hyper=0, near=False):

@@ -16,6 +16,25 @@ def scene(device):
     return scenes.synthetic_scene("control-points", 700, 40, device)
 
 
+@pytest.fixture
+def untinted(device):
+    """A moving scene whose colours change by shading alone."""
+    scene = scenes.synthetic_scene("control-points", 700, 40, device)
+    with torch.no_grad():
+        rows = head_rows(scene.motion, "tints")
+        scene.motion.network.head.weight[rows] = 0.0
+        scene.motion.network.head.bias[rows] = 0.0
+    scene.motion.network.train(False)
+    return scene
+
+
+def head_rows(motion: ControlPoints, name: str) -> slice:
+    """Return the rows of the network's last layer that a head takes."""
+    heads = motion.network.heads
+    first = sum(width for _, width in list(heads.items())[: list(heads).index(name)])
+    return slice(first, first + heads[name])
+
+
 def fresh(scene, time: float) -> Gaussians:
     """Posed without anything remembered."""
     motion = scene.motion
@@ -94,7 +113,8 @@ def test_training_sees_the_neighbours_of_the_step(scene):
                 scene.gaussians.means.data = scene.gaussians.means.data.flip(0).clone()
 
 
-def test_shading_turns_with_the_surface_and_nothing_else_changes(scene):
+def test_shading_turns_with_the_surface_and_nothing_else_changes(untinted):
+    scene = untinted
     gaussians, motion = scene.gaussians, scene.motion
     assert isinstance(motion, ControlPoints) and gaussians.shading.shape[1] == 10
     shaded = fresh(scene, 0.6)
@@ -107,18 +127,46 @@ def test_shading_turns_with_the_surface_and_nothing_else_changes(scene):
         assert torch.equal(getattr(shaded, name), getattr(plain, name)), name
 
 
-def test_shading_learns_and_the_motion_does_not_follow_brightness(scene):
-    gaussians, motion = scene.gaussians, scene.motion
+def test_shading_learns_and_rotations_do_not_follow_brightness(untinted):
+    gaussians, motion = untinted.gaussians, untinted.motion
     motion.cache_binding(None)
     posed = motion.gaussians_at(gaussians, 0.6)
     posed.sh_dc.sum().backward()
     assert gaussians.shading.grad is not None and (gaussians.shading.grad != 0).any()
-    found = [parameter.grad for parameter in motion.parameters() if parameter.grad is not None]
-    assert all(not gradient.any() for gradient in found)
+    assert motion.network.head.weight.grad[head_rows(motion, "tints")].any()
+    for name in ("translations", "rotations"):
+        assert not motion.network.head.weight.grad[head_rows(motion, name)].any(), name
     assert gaussians.quats.grad is None or not gaussians.quats.grad.any()
 
 
-def test_a_scene_from_before_shading_still_opens(scene):
+def test_tints_change_colours_and_nothing_else(scene, untinted):
+    tinted, plain = fresh(scene, 0.6), fresh(untinted, 0.6)
+    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
+        assert torch.equal(getattr(tinted, name), getattr(plain, name)), name
+    assert not torch.allclose(tinted.sh_dc, plain.sh_dc, atol=1e-2)
+    pose = scene.motion.poses(torch.tensor([0.6]))[0]
+    indices, weights = scene.motion.binding(scene.gaussians)
+    blended = (weights[..., None] * pose.tints[indices.long()]).sum(1)
+    grey = 0.5 / 0.28209479177387814
+    expected = (plain.sh_dc + grey) * blended.clamp(-3.0, 1.0).exp() - grey
+    torch.testing.assert_close(tinted.sh_dc, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_scene_from_before_tints_still_opens(scene):
+    metadata = scene.metadata()
+    del metadata["config"]["motion"]["tints"]
+    tensors = {name: value.detach().clone() for name, value in scene.tensors().items()}
+    rows = head_rows(scene.motion, "tints")
+    assert rows.stop == len(tensors["motion.network.head.bias"])
+    for name in ("weight", "bias"):
+        tensors[f"motion.network.head.{name}"] = tensors[f"motion.network.head.{name}"][: rows.start].clone()
+    opened = scene_from(tensors, metadata, str(scene.device), "old run")
+    assert opened.motion.poses(torch.tensor([0.3]))[0].tints is None
+    torch.testing.assert_close(opened.gaussians_at(0.3).means, scene.gaussians_at(0.3).means, rtol=1e-4, atol=1e-4)
+
+
+def test_a_scene_from_before_shading_still_opens(untinted):
+    scene = untinted
     tensors = {name: value.detach().clone() for name, value in scene.tensors().items() if name != "gaussians.shading"}
     metadata = scene.metadata()
     del metadata["config"]["motion"]["shading"]

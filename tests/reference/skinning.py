@@ -38,5 +38,6 @@ def skin(
     shapes = shapes[picked]
     signs = torch.where((shapes * shapes[:, :1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
     blend = normalize((weights[..., None] * signs * shapes).sum(1), dim=-1)
-    log_scales = None if pose.log_scales is None else (weights[..., None] * pose.log_scales[picked]).sum(1)
-    return (weights[..., None] * moved).sum(1), multiply(blend, normalize(quats, dim=-1)), log_scales
+    extras = pose.log_scales if pose.tints is None else pose.tints
+    extras = None if extras is None else (weights[..., None] * extras[picked]).sum(1)
+    return (weights[..., None] * moved).sum(1), multiply(blend, normalize(quats, dim=-1)), extras

@@ -100,7 +100,7 @@ function readNodes(facts, columns) {
     translation: read("translation", 3, rows),
     rotation: read("rotation", 4, rows),
     shape: facts.shapes ? read("shape", 4, rows) : null,
-    log_scale: facts.scaled ? read("log_scale", 3, rows) : null,
+    extra: facts.scaled ? read("log_scale", 3, rows) : facts.tinted ? read("tint", 3, rows) : null,
   };
 }
 
@@ -139,7 +139,7 @@ async function readModel(text) {
 }
 
 // Control points at a time in [0, 1]: 20 numbers each, the rows of x -> R (x - p) + p + t, the rotation of shapes, and
-// the change of log scales.
+// the change of log scales, or the tint.
 function poseAt(model, time, table) {
   const { nodes, facts, trajectories } = model;
   if (!nodes) return table;
@@ -155,7 +155,7 @@ function poseAt(model, time, table) {
     const norm = Math.hypot(...quat);
     for (let a = 0; a < 4; a++) quat[a] /= norm;
   };
-  const shift = [0, 0, 0], grown = [0, 0, 0];
+  const shift = [0, 0, 0], extra = [0, 0, 0];
   for (let m = 0; m < nodes; m++) {
     unit(trajectories.rotation, m);
     blend(trajectories.translation, 3, m, shift);
@@ -169,9 +169,9 @@ function poseAt(model, time, table) {
       table[20 * m + 4 * r + 3] = offset;
     }
     if (trajectories.shape) unit(trajectories.shape, m);
-    if (trajectories.log_scale) blend(trajectories.log_scale, 3, m, grown);
+    if (trajectories.extra) blend(trajectories.extra, 3, m, extra);
     table.set(quat, 20 * m + 12);
-    table.set(grown, 20 * m + 16);
+    table.set(extra, 20 * m + 16);
   }
   return table;
 }

@@ -35,7 +35,9 @@ class Renderer {
       NODES: model.nodes, BLOCKS: model.stride / 4, DEGREE: facts.sh_degree, SH_TEXELS: texels,
       COLOR_TEXELS: facts.shaded ? 4 : 1,
     };
-    for (const name of ["shaded", "corrected", "masked", "antialiased"]) if (facts[name]) defines[name.toUpperCase()] = 1;
+    for (const name of ["shaded", "tinted", "corrected", "masked", "antialiased"]) {
+      if (facts[name]) defines[name.toUpperCase()] = 1;
+    }
     this.splat = compile(gl, SHADERS["screen.vert"], SHADERS["splat.frag"], defines);
     this.draw = compile(gl, SHADERS["draw.vert"], SHADERS["draw.frag"], {});
     this.screen = compile(gl, SHADERS["screen.vert"], SHADERS["screen.frag"], {});

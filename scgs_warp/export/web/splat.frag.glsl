@@ -9,7 +9,7 @@ uniform usampler2D u_harmonics; // SH_TEXELS a Gaussian, a word a coefficient, a
 uniform vec3 u_sh_low[15], u_sh_step[15];
 uniform usampler2D u_indices;   // BLOCKS a Gaussian
 uniform sampler2D u_weights;    // BLOCKS a Gaussian
-uniform sampler2D u_nodes;      // five a control point: affine map by rows, rotation of shapes, change of log scales
+uniform sampler2D u_nodes;      // five a control point: affine map by rows, rotation of shapes, change of log scales, or tint
 uniform int u_count;
 uniform vec3 u_view[3];         // rows of the rotation, world to camera
 uniform vec3 u_shift, u_eye;
@@ -47,9 +47,9 @@ vec3 corrective(int i, vec4 quat) {
 #endif
 }
 
-void follow(int i, inout vec3 mean, inout vec4 quat, inout vec3 scale, float share) {
+void follow(int i, inout vec3 mean, inout vec4 quat, inout vec3 scale, inout vec3 tint, float share) {
 #if NODES > 0
-  vec3 moved = vec3(0.0), grown = vec3(0.0);
+  vec3 moved = vec3(0.0), extra = vec3(0.0);
   vec4 blend = vec4(0.0), reference = vec4(0.0);
   for (int block = 0; block < BLOCKS; block++) {
     uvec4 indices = texelFetch(u_indices, at(BLOCKS * i + block), 0);
@@ -65,7 +65,7 @@ void follow(int i, inout vec3 mean, inout vec4 quat, inout vec3 scale, float sha
       vec4 turn = texelFetch(u_nodes, at(m + 3), 0);
       if (block == 0 && k == 0) reference = turn;
       blend += (dot(turn, reference) < 0.0 ? -w : w) * turn;
-      grown += w * texelFetch(u_nodes, at(m + 4), 0).xyz;
+      extra += w * texelFetch(u_nodes, at(m + 4), 0).xyz;
     }
   }
   blend = normalize(blend);
@@ -74,11 +74,15 @@ void follow(int i, inout vec3 mean, inout vec4 quat, inout vec3 scale, float sha
 #ifdef MASKED
   moved = mean + share * (moved - mean);
   turned = normalize(quat + share * ((dot(quat, turned) < 0.0 ? -1.0 : 1.0) * turned - quat));
-  grown *= share;
+  extra *= share;
 #endif
   mean = moved;
   quat = turned;
-  scale += grown;
+#ifdef TINTED
+  tint = extra;
+#else
+  scale += extra;
+#endif
 #endif
 }
 
@@ -134,9 +138,9 @@ void main() {
   vec4 known = texelFetch(u_means, at(i), 0);
   vec4 rest = texelFetch(u_quats, at(i), 0);
   vec4 size = texelFetch(u_scales, at(i), 0);
-  vec3 mean = known.xyz, scale = size.xyz;
+  vec3 mean = known.xyz, scale = size.xyz, tint = vec3(0.0);
   vec4 quat = rest;
-  follow(i, mean, quat, scale, size.w);
+  follow(i, mean, quat, scale, tint, size.w);
 
   vec3 point = vec3(dot(u_view[0], mean), dot(u_view[1], mean), dot(u_view[2], mean)) + u_shift;
   if (!(point.z >= NEAR)) return;
@@ -168,7 +172,7 @@ void main() {
   float longer = min(sqrt(large * extent), 6e4), shorter = min(sqrt(determinant / large * extent), 6e4);
 
   vec4 base = texelFetch(u_colors, at(COLOR_TEXELS * i), 0);
-  vec3 color = gain(i, rest, quat, base.w) * (0.28209479177387814 * base.rgb + 0.5);
+  vec3 color = gain(i, rest, quat, base.w) * exp(clamp(tint, -3.0, 1.0)) * (0.28209479177387814 * base.rgb + 0.5);
   color = max(color + harmonics(i, normalize(mean - u_eye)), 0.0);
   vec2 center = focal * point.xy / point.z + middle;
   o_place = uvec4(floatBitsToUint(center), packHalf2x16(longer * along),
