@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from helpers.gradients import value_and_gradients
 from reference.correctives import correct as correct_reference
 from reference.quaternion import multiply, normalise, to_matrix
 from scgs_warp.ops.correctives import COLUMNS, correct
@@ -20,20 +21,13 @@ def draw(seed, n, device="cpu"):
     return [torch.randn(n, width, generator=g).to(device) for width in widths]
 
 
-def gradients(function, inputs, weights):
-    leaves = [x.detach().clone().requires_grad_() for x in inputs]
-    output = function(*leaves)
-    (output * weights.to(output)).sum().backward()
-    return output.detach(), [leaf.grad for leaf in leaves]
-
-
 @pytest.mark.parametrize("n", [0, 1, 2, 257])
 @pytest.mark.parametrize("seed", range(3))
 def test_values_and_gradients(seed, n, device):
     inputs = draw(seed, n, device)
     weights = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed))
-    ours, ours_grad = gradients(correct, inputs, weights)
-    theirs, theirs_grad = gradients(correct_reference, [x.double() for x in inputs], weights)
+    ours, ours_grad = value_and_gradients(correct, inputs, weights)
+    theirs, theirs_grad = value_and_gradients(correct_reference, [x.double() for x in inputs], weights)
     assert ours.shape == (n, 3) and ours.device.type == device
     torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=1e-5)
     for a, b in zip(ours_grad[:2], theirs_grad[:2], strict=True):
@@ -46,9 +40,9 @@ def test_values_and_gradients_under_an_edit(n, device):
     """The displacement of the motion's own rotation, carried along by the edited one."""
     inputs, own = draw(7, n, device), draw(8, n, device)[3]
     weights = torch.randn(n, 3, generator=torch.Generator().manual_seed(7))
-    ours, ours_grad = gradients(lambda *x: correct(*x, own), inputs, weights)
+    ours, ours_grad = value_and_gradients(lambda *x: correct(*x, own), inputs, weights)
     doubles = [x.double() for x in inputs]
-    theirs, theirs_grad = gradients(lambda *x: correct_reference(*x, own.double()), doubles, weights)
+    theirs, theirs_grad = value_and_gradients(lambda *x: correct_reference(*x, own.double()), doubles, weights)
     torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=1e-5)
     for a, b in zip(ours_grad[:2], theirs_grad[:2], strict=True):
         torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=1e-5)

@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.gradients import value_and_gradients
 from reference.shading import shade as shade_reference
 from reference.shading import tint as tint_reference
 from scgs_warp.ops.shading import shade, tint
@@ -21,20 +22,13 @@ def draw(seed, n, device="cpu", spread=0.8):
     return [x.to(device) for x in (*values, *turns)]
 
 
-def gradients(function, inputs, weights):
-    leaves = [x.detach().clone().requires_grad_() for x in inputs[:2]]
-    output = function(*leaves, *inputs[2:])
-    (output * weights.to(output)).sum().backward()
-    return output.detach(), [leaf.grad for leaf in leaves]
-
-
 @pytest.mark.parametrize("n", [0, 1, 2, 257])
 @pytest.mark.parametrize("seed", range(3))
 def test_values_and_gradients(seed, n, device):
     inputs = draw(seed, n, device)
     weights = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed))
-    ours, ours_grad = gradients(shade, inputs, weights)
-    twin, twin_grad = gradients(shade_reference, [x.double() for x in inputs], weights)
+    ours, ours_grad = value_and_gradients(shade, inputs, weights, learnt=2)
+    twin, twin_grad = value_and_gradients(shade_reference, [x.double() for x in inputs], weights, learnt=2)
     assert ours.shape == (n, 3) and ours.device.type == device
     torch.testing.assert_close(ours.double(), twin, rtol=1e-5, atol=2e-5)
     for a, b in zip(ours_grad, twin_grad, strict=True):
@@ -124,8 +118,8 @@ def test_tints_and_their_gradients(n, device):
     g = torch.Generator().manual_seed(n)
     inputs = [torch.randn(n, 3, generator=g).to(device), (2.0 * torch.randn(n, 3, generator=g)).to(device)]
     weights = torch.randn(n, 3, generator=g)
-    ours, ours_grad = gradients(tint, inputs, weights)
-    twin, twin_grad = gradients(tint_reference, [x.double() for x in inputs], weights)
+    ours, ours_grad = value_and_gradients(tint, inputs, weights)
+    twin, twin_grad = value_and_gradients(tint_reference, [x.double() for x in inputs], weights)
     assert ours.shape == (n, 3) and ours.device.type == device
     torch.testing.assert_close(ours.double(), twin, rtol=1e-5, atol=1e-5)
     for a, b in zip(ours_grad, twin_grad, strict=True):
