@@ -279,7 +279,7 @@ class LossConfig:
     """Settings of the losses: L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10)."""
 
     ssim: float = bounded(0.2, 0)
-    log_error: float = newer(0.0, before=0.0, least=0)
+    log_error: float = newer(0.002, before=0.0, least=0)
     """Weight of the logarithm of each view's mean squared error (not in the paper), which weighs views by their
     relative error, as PSNR does."""
     log_error_from: float = newer(0.5, before=0.5, least=0, most=1)
