@@ -326,8 +326,12 @@ ZOO = ("robot", "rods", "rods-dark", "balls", "cloth", "fan", "touch", "opening"
 
 
 def change_of_defaults(source: Source) -> str:
-    """Write mean and worst PSNR of each scene before and after a change of defaults, and the mean over the scenes."""
-    scenes = [scene for scene in ZOO if source.run("before", scene) and source.run("after", scene)]
+    """Write mean and worst PSNR of each scene before and after a change of defaults, and the mean over the scenes.
+
+    Runs with another seed are recorded as scenes of their own: ``hook-seed-1``.
+    """
+    every = [f"{scene}{seed}" for scene in ZOO for seed in ("", "-seed-1")]
+    scenes = [scene for scene in every if source.run("before", scene) and source.run("after", scene)]
     rows = []
     for scene in scenes:
         before, after = source.run("before", scene), source.run("after", scene)
@@ -337,7 +341,8 @@ def change_of_defaults(source: Source) -> str:
     marked = [source.label(row, row) for row in ("before", "after")]
     head = ["", *marked, "difference", *(f"worst image, {text}" for text in marked), "difference"]
     cells = [[signed(value) if i % 3 == 2 else number(value, 2) for i, value in enumerate(row)] for row in rows]
-    return table(head, [[name, *row] for name, row in zip((*scenes, "mean"), cells)])
+    names = [*(scene.replace("-seed-", ", seed ") for scene in scenes), "mean"]
+    return table(head, [[name, *row] for name, row in zip(names, cells)])
 
 
 WRITERS: dict[str, Callable[[Source], str]] = {
@@ -350,6 +355,8 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "motion": motion_models,
     "arap": arap,
     "defaults": change_of_defaults,
+    "tints": change_of_defaults,
+    "log-error": change_of_defaults,
     "parts": changes(TWO, "none"),
     "parts-shading": changes(TWO, "parts/shading"),
     "parts-threshold": changes(TWO, "parts-shading/threshold"),
