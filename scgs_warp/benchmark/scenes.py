@@ -64,7 +64,7 @@ RATES = 1e-6
 def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> GaussianParameters:
     """Make ``count`` Gaussians in the shape of a standing figure, 2.5 units high, determined by the arguments.
 
-    They have the hyper-coordinates and the shading that ``motion`` asks for.
+    They have the hyper-coordinates, the shading and the correctives that ``motion`` asks for.
     """
     random = generator(seed, 1)
     centres, axes, shares = (torch.tensor(column) for column in zip(*PARTS))
@@ -74,9 +74,14 @@ def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> 
     means = centres[part] + axes[part] * direction * depth
     log_scales = math.log(SIZE / math.sqrt(count)) + SIZE_SPREAD * torch.randn(count, 3, generator=random)
     colors = (0.5 + 0.4 * torch.sin(5.0 * means + torch.tensor([0.0, 2.0, 4.0]))).clamp(0.0, 1.0)
-    own = motion or MotionConfig(shading=False)
+    own = motion or MotionConfig(shading=False, correctives=False)
     made = GaussianParameters(
-        means, log_scales, (colors - 0.5) / SH_C0, hyper_dim=own.hyper_columns, shaded=own.has_shading
+        means,
+        log_scales,
+        (colors - 0.5) / SH_C0,
+        hyper_dim=own.hyper_columns,
+        shaded=own.has_shading,
+        corrected=own.has_correctives,
     )
     low, high = OPACITIES
     opacities = low + (high - low) * torch.rand(count, generator=random) ** OPACITY_POWER
@@ -86,6 +91,7 @@ def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> 
         made.sh_rest.copy_(0.05 * torch.randn(made.sh_rest.shape, generator=random))
         made.hyper.add_(HYPER_SPREAD * torch.randn(made.hyper.shape, generator=random))
         made.shading.copy_(0.1 * torch.randn(made.shading.shape, generator=random))
+        made.correctives.copy_(0.1 * torch.randn(made.correctives.shape, generator=random))
     return made
 
 

@@ -87,7 +87,7 @@ class MotionConfig:
     shading: bool = True
     """Let a Gaussian's brightness follow the rotation of its surface (not in the paper): the first-order effect of the
     angle between light and normal."""
-    correctives: bool = newer(False, before=False)
+    correctives: bool = newer(True, before=False)
     """Let a Gaussian's position follow the rotation of its surface (not in the paper): what pose blend shapes are to a
     body model."""
     tints: bool = newer(True, before=False)

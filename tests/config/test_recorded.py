@@ -44,6 +44,7 @@ def test_best_is_the_former_paper():
     added = {
         "pretrain.silhouette": 0.5,
         "pretrain.fade": "auto",
+        "motion.correctives": True,
         "motion.tints": True,
         "loss.log_error": 0.002,
         "loss.pooled": "auto",
