@@ -13,28 +13,32 @@ FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds", "data.cache_mib")
 run is resumed."""
 
 
-def with_newer_fields(values: Mapping[str, Any]) -> dict[str, Any]:
+def with_newer_fields(values: Mapping[str, Any], *, recorded: bool = False) -> dict[str, Any]:
     """Add the fields that are newer than a recorded configuration, with the values declared as ``before``.
 
     A recorded configuration holds every field of its version, so an absent newer field did not exist, and the default
     of a preset must not stand in for it. The name of the preset does not matter then: ``paper`` once had the values of
     ``best``. A configuration that lacks an older field was written by hand, and is returned as it is: presets complete
     it.
+
+    Args:
+        recorded: True if a program wrote the configuration, whatever its age, as that of a checkpoint.
     """
     newer: dict[str, Any] = {}
     for name, default in _fields(TrainConfig()):
         if _lookup(values, name) is _ABSENT:
             if "before" in default:
                 newer[name] = default["before"]
-            elif name not in FREE_TO_CHANGE:
+            elif name not in FREE_TO_CHANGE and not recorded:
                 return dict(values)
     filled = {name: dict(value) if isinstance(value, dict) else value for name, value in values.items()}
     for name, value in newer.items():
         *sections, last = name.split(".")
-        inner = filled
+        inner: Any = filled
         for section in sections:
-            inner = inner[section]
-        inner[last] = value
+            inner = inner.setdefault(section, {}) if isinstance(inner, dict) else None
+        if isinstance(inner, dict):  # a reader reports a section that is no object
+            inner[last] = value
     return filled
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..config.fields import BACKGROUND_COLORS
 from ..config.presets import TrainConfig, from_dict, lasting, to_dict
+from ..config.recorded import with_newer_fields
 from ..config.validation import check_sizes
 from ..errors import UserError
 from ..gaussians import GaussianParameters
@@ -224,7 +225,7 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
     check_tensors(tensors, source)
     check_metadata(metadata, source)
     try:
-        config = from_dict(metadata["config"], source)
+        config = from_dict(with_newer_fields(metadata["config"], recorded=True), source)
         check_sizes(config, f"{source}: ")
         rows = checkpoint.strip(tensors, "gaussians.")
         count = len(rows["means"])

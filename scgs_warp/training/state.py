@@ -209,10 +209,12 @@ class TrainState:
         tensors, metadata = checkpoint.read(folder)
         source = str(folder / checkpoint.FILE)
         check_metadata(metadata, source)
-        # Settings that the data chooses differ with the frames, so the frames come first.
+        saved, wanted = with_newer_fields(metadata["config"], recorded=True), to_dict(config)
+        _check_same_configuration({"data": saved.get("data")}, {"data": wanted["data"]}, source)
+        # Settings that the data chooses differ with the frames, so the frames come before them.
         if metadata.get("frames") != data.fingerprint:
             raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
-        _check_same_configuration(with_newer_fields(metadata["config"]), to_dict(config), source)
+        _check_same_configuration(saved, wanted, source)
         check_tensors(tensors, source)
         check_resumed(tensors, metadata, source)
         if metadata["step"] > config.steps:

@@ -36,6 +36,14 @@ def test_resume_refuses_other_frames(tmp_path):
         fit(config, tiny_dataset(4), output=tmp_path / "run", resume=True)
 
 
+def test_resume_names_settings_of_the_data_before_the_frames(tmp_path):
+    config = tiny_config(20)
+    fit(config, tiny_dataset(3), output=tmp_path / "run")
+    smaller = dataclasses.replace(config, data=dataclasses.replace(config.data, downscale=2))
+    with pytest.raises(UserError, match=r"made with data\.downscale = "):
+        fit(smaller, tiny_dataset(3, size=24), output=tmp_path / "run", resume=True)
+
+
 @pytest.mark.parametrize(("section", "field"), [("motion", "shading"), (None, "half_size")])
 def test_resume_refuses_a_run_of_another_version(section, field, tmp_path):
     """What it did without the field is no value that could be given."""
