@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..formats.gaussian_files import read_gaussians, shortage_as_user_error
 from ..formats.gaussian_ply import write_gaussian_ply
 from ..formats.gaussian_splat import write_splat
 from ..formats.gaussian_spz import read_antialiased, write_spz
+from ..motion.control_points import ControlPoints
 from ..runtime.progress import progress
 from ..scene.from_gaussians import open_gaussians
 from ..scene.scene import Scene
@@ -100,7 +102,7 @@ def _export_still(request: ExportRequest, device: str) -> str:
         elif request.time is not None:
             gaussians, when = scene.gaussians_at(request.time), f"at time {request.time:g}"
         else:
-            gaussians = at_rest(scene)
+            gaussians = _with_mean_colors(scene, None, even_moments(FRAMES, FPS))
     gaussians = keep_finite(gaussians)
     clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased)
     note = f" ({clipped:,} values clipped to what .spz can hold)" if clipped else ""
@@ -183,8 +185,7 @@ def _write_skeleton(request: ExportRequest, session: EditSession, moments: list[
         return f"{length}, {len(session.graph.edges):,} edges"
     rest, rows, skeleton = _finite(scene, skeleton)
     if request.kind == "glb":
-        colors = mean_colors(session, moments)[rows]
-        rest = Gaussians(rest.means, rest.quats, rest.scales, rest.opacities, torch.from_numpy(colors), rest.sh_rest)
+        rest = select_gaussians(_with_mean_colors(scene, session, moments), rows)
         write_glb(request.output, rest, up, skeleton)
     else:
         shading = scene.gaussians.shading.detach().cpu().numpy()[rows]
@@ -209,16 +210,17 @@ def _usable(scene: Scene) -> np.ndarray:
     return rows
 
 
-def mean_colors(session: EditSession, moments: list[AnimationMoment]) -> np.ndarray:
-    """Return harmonics of degree 0 averaged over all moments, [N, 3], for formats that hold one colour: shading changes
-    the colour as the surface turns, and tints change it over time."""
-    scene = session.scene
-    if not scene.gaussians.shading.shape[1] and not scene.config.motion.has_tints:
-        return scene.gaussians.sh_dc.detach().cpu().numpy()
-    total = np.zeros((scene.gaussian_count, 3))
+def _with_mean_colors(scene: Scene, session: EditSession | None, moments: list[AnimationMoment]) -> Gaussians:
+    """Return Gaussians at rest with their mean colours over all moments, for formats that hold one colour: shading
+    changes a colour as the surface turns, and tints change it over time."""
+    rest = at_rest(scene)
+    tinted = isinstance(scene.motion, ControlPoints) and scene.config.motion.has_tints
+    if not scene.motion.moves or not (tinted or scene.gaussians.shading.shape[1]):
+        return rest
+    total = torch.zeros_like(rest.sh_dc, dtype=torch.float64)
     for moment in moments:
-        total += posed_gaussians(scene, session, moment).sh_dc.detach().cpu().double().numpy()
-    return (total / len(moments)).astype(np.float32)
+        total += posed_gaussians(scene, session, moment).sh_dc.detach()
+    return replace(rest, sh_dc=(total / len(moments)).float())
 
 
 def _export_cameras(request: ExportRequest, device: str) -> str:

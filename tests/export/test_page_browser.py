@@ -115,6 +115,7 @@ SCENES = {
     "corrected": lambda: bar_scene(shaded=True, corrected=True),
     "rich": rich_scene,
     "tinted": lambda: tinted_scene(shaded=True),
+    "tinted, with a mask": lambda: tinted_scene(share=0.6),
     "one neighbour": lambda: with_neighbors(bar_scene(), 1),
     "static": lambda: plain(bar_scene()),
     "static with control points": lambda: with_control_points(plain(bar_scene()), 20),
