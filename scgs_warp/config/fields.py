@@ -83,7 +83,8 @@ class MotionConfig:
     """Use a second rotation head for the Gaussians' shape (official code); otherwise one rotation serves positions and
     shape (paper Eq. 7)."""
     scale_residual: bool = False
-    """Let the network also change the Gaussians' scales (official code); here it changes their logarithm."""
+    """Let the network also change the Gaussians' scales (official code); here it changes their logarithm. Turns
+    ``tints`` off."""
     shading: bool = True
     """Let a Gaussian's brightness follow the rotation of its surface (not in the paper): the first-order effect of the
     angle between light and normal."""
@@ -198,7 +199,9 @@ class OptimConfig:
     quats: float = 1e-3
     hyper: float = 2.5e-3
     shading: float = bounded(2.5e-3, 0)
-    correctives: float = newer(2.5e-3, before=2.5e-3, least=0)
+    correctives: float = newer(8e-4, before=2.5e-3, least=0)
+    """A step then moves a mean about as far as a step of the mean itself, at any rotation. At three times the rate,
+    bodies that spin were lost."""
     network: float = 8e-4
     network_end: float = 1.6e-6
     network_until: int = milestone(66_000, 1)
@@ -276,7 +279,8 @@ class DensifyConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Settings of the losses: L1 + D-SSIM, and ARAP on the control points' trajectories (paper Eq. 10)."""
+    """Settings of the losses: L1 + D-SSIM and terms beside them, and ARAP on the control points' trajectories (paper
+    Eq. 10)."""
 
     ssim: float = bounded(0.2, 0)
     log_error: float = newer(0.002, before=0.0, least=0)

@@ -45,6 +45,7 @@ def test_best_is_the_former_paper():
         "pretrain.silhouette": 0.5,
         "pretrain.fade": "auto",
         "motion.correctives": True,
+        "optim.correctives": 8e-4,
         "motion.tints": True,
         "loss.log_error": 0.002,
         "loss.pooled": "auto",
@@ -57,6 +58,7 @@ def test_a_recorded_configuration_keeps_what_it_did(name):
     values = json.loads((OLD / f"{name}.json").read_text())
     read = presets.to_dict(presets.from_dict(values))
     assert read["loss"].pop("log_error") == 0.0
+    assert not read["motion"]["tints"] and not read["motion"]["correctives"]
     for section, fields in values.items():
         own = read[section]
         assert (own if not isinstance(fields, dict) else {name: own[name] for name in fields}) == fields
