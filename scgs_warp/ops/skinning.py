@@ -18,10 +18,10 @@ from .node_sums import skin_node_sums
 class _Skin(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, nodes, translations, rotations, shapes, extras, weights, indices, lists):
-        extended = int(extras is not None)
-        outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(means) if extended else None
+        has_extras = int(extras is not None)
+        outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(means) if has_extras else None
         both = rotations if shapes is None else shapes
-        inputs = means, quats, nodes, translations, rotations, both, extras, extended, indices, weights
+        inputs = means, quats, nodes, translations, rotations, both, extras, has_extras, indices, weights
         launch(kernels.skin, means.shape[0], *inputs, *outputs)
         ctx.save_for_backward(means, quats, nodes, translations, rotations, shapes, extras, indices, weights)
         ctx.lists = lists
@@ -31,23 +31,23 @@ class _Skin(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients):  # type: ignore[override]
         means, quats, nodes, translations, rotations, shapes, extras, indices, weights = ctx.saved_tensors
-        extended = int(extras is not None)
+        has_extras = int(extras is not None)
         v_outputs = tuple(None if v is None else v.contiguous() for v in gradients)
         both = rotations if shapes is None else shapes
         v_means, v_quats = torch.empty_like(means), torch.empty_like(quats)
         v_weights, v_blends = torch.empty_like(weights), torch.empty_like(quats)
-        inputs = means, quats, nodes, translations, rotations, both, extras, extended, indices, weights
+        inputs = means, quats, nodes, translations, rotations, both, extras, has_extras, indices, weights
         own = v_means, v_quats, v_weights, v_blends
         launch(kernels.skin_adjoint, means.shape[0], *inputs, *v_outputs, *own)
-        pairs = means, quats, nodes, both, indices, weights, v_outputs[0], v_blends, v_outputs[2], extended
-        chunks, sums = _node_sums(pairs, extended, ctx.lists)
+        pairs = means, quats, nodes, both, indices, weights, v_outputs[0], v_blends, v_outputs[2], has_extras
+        chunks, sums = _node_sums(pairs, has_extras, ctx.lists)
         v_nodes, v_translations, v_rotations = (torch.empty_like(x) for x in (nodes, translations, rotations))
         v_shapes = None if shapes is None else torch.empty_like(shapes)
-        v_extras = torch.empty_like(extras) if extended else None
+        v_extras = torch.empty_like(extras) if has_extras else None
         launch(
             kernels.skin_finish,
             nodes.shape[0],
-            *(chunks, rotations, both, int(shapes is not None), extended, sums),
+            *(chunks, rotations, both, int(shapes is not None), has_extras, sums),
             *(v_nodes, v_translations, v_rotations, v_shapes, v_extras),
             grain=128,
         )
@@ -57,24 +57,24 @@ class _Skin(torch.autograd.Function):
 
 def _skin_lanes(means, quats, nodes, translations, rotations, shapes, extras, weights, indices) -> tuple:
     """Run ``skin`` on a CPU, without gradients."""
-    extended = int(extras is not None)
-    outputs = _like(means, quats, means if extended else None)
+    has_extras = int(extras is not None)
+    outputs = _like(means, quats, means if has_extras else None)
     palette = pack_palette(nodes, (translations, rotations, shapes, extras))
-    launch(skinning.skin, _lanes(means), means, quats, *palette, extended, indices, weights, *outputs, grain=32)
+    launch(skinning.skin, _lanes(means), means, quats, *palette, has_extras, indices, weights, *outputs, grain=32)
     return tuple(outputs)
 
 
-def _node_sums(pairs: tuple, extended: int, lists: NodeLists | None) -> tuple[int, Tensor]:
+def _node_sums(pairs: tuple, has_extras: int, lists: NodeLists | None) -> tuple[int, Tensor]:
     """Sum the nodes' gradients in parts, and return the number of parts and their buffer [parts * M, columns]."""
     means, nodes, indices = pairs[0], pairs[2], pairs[4]
-    count, width = nodes.shape[0], kernels.SUMS + 3 * extended
+    count, width = nodes.shape[0], kernels.SUMS + 3 * has_extras
     if lists is None and means.device.type == "cpu":
         size = chunk_size(count)
         chunks = -(-means.shape[0] // size)
         sums = torch.zeros(chunks * count, width)
         launch(kernels.skin_reduce_chunks, chunks, size, *pairs, sums, grain=1)
         return chunks, sums
-    return 1, skin_node_sums(*(lists or node_lists(indices, count)), pairs, extended)
+    return 1, skin_node_sums(*(lists or node_lists(indices, count)), pairs, has_extras)
 
 
 def _pose_tensors(pose: Pose) -> tuple[Tensor | None, ...]:

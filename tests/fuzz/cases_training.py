@@ -21,9 +21,10 @@ from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.motion import Motion, build_motion
 from scgs_warp.ops.adam import Update, adam_step, first_not_finite
+from scgs_warp.ops.correctives import correct
 from scgs_warp.ops.harmonics_rotation import SIZES, rotate_harmonics
 from scgs_warp.ops.reduction import sum_rows
-from scgs_warp.ops.shading import shade
+from scgs_warp.ops.shading import shade, tint
 from scgs_warp.ops.ssim import photometric_loss
 from scgs_warp.optim import Adam
 from scgs_warp.runtime.launch import launch
@@ -152,6 +153,37 @@ def case_shading(d: Draw, device: str) -> None:
     laws.finite("gradients of sh_dc, shading", *grads)
 
 
+def case_tint(d: Draw, device: str) -> None:
+    """Valid rows are as if alone; gradients are finite."""
+    count = d.count()
+    inputs = [d.normal(count, 3), 2.0 * d.normal(count, 3)]
+    clean, hit = tint(*on(device, *inputs)), d.rows(count)
+    for tensor in inputs:
+        if d.chance():
+            d.poison(tensor, hit)
+    leaves = [leaf(x) for x in on(device, *inputs)]
+    tinted = tint(*leaves)
+    laws.equal("coefficients of the valid", tinted[~hit.to(device)], clean[~hit.to(device)])
+    moderate = finite_rows(inputs[0]) & (inputs[0].abs().amax(1) < 1e37) if count else torch.zeros(0, dtype=torch.bool)
+    laws.finite("coefficients of finite colours", tinted[moderate.to(device)])
+    laws.finite("gradients", *torch.autograd.grad(tinted, leaves, d.normal(count, 3).to(device)))
+
+
+def case_correctives(d: Draw, device: str) -> None:
+    """Valid rows are as if alone; gradients are finite."""
+    count = d.count()
+    inputs = [d.normal(count, 3), d.normal(count, 27), d.normal(count, 4), d.normal(count, 4), d.normal(count, 4)]
+    clean, hit = correct(*on(device, *inputs)), d.rows(count)
+    for tensor in inputs[1:]:
+        if d.chance():
+            d.poison(tensor, hit)
+    leaves = [leaf(x) for x in on(device, *inputs)]
+    moved = correct(*leaves)
+    laws.equal("means of the valid", moved[~hit.to(device)], clean[~hit.to(device)])
+    laws.finite("means", moved)
+    laws.finite("gradients", *torch.autograd.grad(moved, leaves[:2], d.normal(count, 3).to(device)))
+
+
 def case_turned_harmonics(d: Draw, device: str) -> None:
     count, rest = d.count(), int(d.pick(SIZES))
     sh, quats, hit = d.normal(count, rest, 3), d.normal(count, 4), d.rows(count)
@@ -238,6 +270,8 @@ CASES = {
     "sums": (case_sums, 1),
     "quaternions": (case_quaternions, 1),
     "shading": (case_shading, 1),
+    "tints": (case_tint, 1),
+    "correctives": (case_correctives, 1),
     "turned harmonics": (case_turned_harmonics, 1),
     "densify": (case_densify, 1),
     "scene": (case_scene, 2),
