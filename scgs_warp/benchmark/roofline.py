@@ -119,7 +119,13 @@ def frame_work(scene: Scene, load: Load, width: int, height: int) -> dict[str, W
             neighbors = scene.config.motion.neighbors
             # Mean and quaternion go in and out, index and weight of each neighbour go in. For each neighbour a 3 x 4
             # matrix and a quaternion are added up; the sums are applied, multiplied and normalised.
-            work["skin"] = Work(count * (2 * (12 + 16) + 8 * neighbors), count * (32.0 * neighbors + 56))
+            # Shading, tints and correctives read their own numbers; the colour goes in and out.
+            learnt = scene.gaussians.shading.shape[1] + scene.gaussians.correctives.shape[1]
+            colors = 24 if scene.gaussians.shading.shape[1] or scene.config.motion.has_tints else 0
+            work["skin"] = Work(
+                count * (2 * (12 + 16) + 8 * neighbors + FLOAT * learnt + colors),
+                count * (32.0 * neighbors + 56 + 2.0 * learnt),
+            )
     return {**work, **draw_work(count, load, width, height, 4)}
 
 

@@ -154,7 +154,7 @@ def test_work_counts_what_the_models_say():
     weights = sum(layer.in_features * layer.out_features for layer in layers)
     assert work["network"].flops == 2 * 20 * weights
     assert work["composite"] == roofline.Work(1000 * 44 + 4 * 40 * 30 * 5, 500 * 36.0)
-    assert work["skin"] == roofline.Work(200 * (56 + 32), 200 * (128.0 + 56))
+    assert work["skin"] == roofline.Work(200 * (56 + 32 + 4 * 37 + 24), 200 * (128.0 + 56 + 2 * 37))
     assert work["project"].bytes == 200 * 80 and work["harmonics"].bytes == 200 * 216
     assert set(roofline.frame_work(scenes.synthetic_scene("static", 60, 12, "cpu"), load, 40, 30)) == {
         *("project", "harmonics", "bin", "composite")
