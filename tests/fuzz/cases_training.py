@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -137,36 +138,29 @@ def quaternion_products(a: Tensor, b: Tensor, x: Tensor, v_quat: Tensor, v_vec: 
 
 
 def case_shading(d: Draw, device: str) -> None:
-    """Valid rows are as if alone; gradients are finite."""
     count = d.count()
     inputs = [d.normal(count, 3), 0.5 * d.normal(count, 10), d.normal(count, 4), d.normal(count, 4)]
-    clean, hit = shade(*on(device, *inputs)), d.rows(count)
-    for tensor in inputs:
-        if d.chance():
-            d.poison(tensor, hit)
-    leaves = [leaf(x) for x in on(device, *inputs)]
-    shaded = shade(*leaves)
-    laws.equal("coefficients of the valid", shaded[~hit.to(device)], clean[~hit.to(device)])
-    moderate = finite_rows(inputs[0]) & (inputs[0].abs().amax(1) < 1e37) if count else torch.zeros(0, dtype=torch.bool)
-    laws.finite("coefficients of finite colours", shaded[moderate.to(device)])
-    grads = torch.autograd.grad(shaded, leaves[:2], d.normal(count, 3).to(device))
-    laws.finite("gradients of sh_dc, shading", *grads)
+    check_colors(d, device, shade, inputs)
 
 
 def case_tint(d: Draw, device: str) -> None:
-    """Valid rows are as if alone; gradients are finite."""
     count = d.count()
-    inputs = [d.normal(count, 3), 2.0 * d.normal(count, 3)]
-    clean, hit = tint(*on(device, *inputs)), d.rows(count)
+    check_colors(d, device, tint, [d.normal(count, 3), 2.0 * d.normal(count, 3)])
+
+
+def check_colors(d: Draw, device: str, op: Callable[..., Tensor], inputs: list[Tensor]) -> None:
+    """Valid rows are as if alone; gradients of the first two inputs are finite."""
+    count = len(inputs[0])
+    clean, hit = op(*on(device, *inputs)), d.rows(count)
     for tensor in inputs:
         if d.chance():
             d.poison(tensor, hit)
     leaves = [leaf(x) for x in on(device, *inputs)]
-    tinted = tint(*leaves)
-    laws.equal("coefficients of the valid", tinted[~hit.to(device)], clean[~hit.to(device)])
+    colors = op(*leaves)
+    laws.equal("coefficients of the valid", colors[~hit.to(device)], clean[~hit.to(device)])
     moderate = finite_rows(inputs[0]) & (inputs[0].abs().amax(1) < 1e37) if count else torch.zeros(0, dtype=torch.bool)
-    laws.finite("coefficients of finite colours", tinted[moderate.to(device)])
-    laws.finite("gradients", *torch.autograd.grad(tinted, leaves, d.normal(count, 3).to(device)))
+    laws.finite("coefficients of finite colours", colors[moderate.to(device)])
+    laws.finite("gradients", *torch.autograd.grad(colors, leaves[:2], d.normal(count, 3).to(device)))
 
 
 def case_correctives(d: Draw, device: str) -> None:
