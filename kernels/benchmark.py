@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from .compositing import squared_distance
+from .falloff import falloff
 from .types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
@@ -38,6 +39,7 @@ def count_contributors(
     splats_in: wp.array[int],  # [P] the sorted list
     width: int,
     columns: int,
+    sharpness: float,
     tile_size: int,
     # Out:
     counts_out: wp.array[int],  # [H * W] splats blended before the pixel ended
@@ -53,7 +55,7 @@ def count_contributors(
     for p in range(span[0], span[1]):
         i = splats_in[p]
         q = squared_distance(conics_in[i], centre - means2d_in[i])
-        alpha = wp.min(ALPHA_MAX, opacities_in[i] * wp.exp(-0.5 * q))
+        alpha = wp.min(ALPHA_MAX, opacities_in[i] * falloff(q, sharpness))
         if not (q >= 0.0 and alpha >= ALPHA_MIN):
             continue
         transmittance *= 1.0 - alpha

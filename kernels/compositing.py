@@ -3,17 +3,19 @@
 Each pixel blends its tile's sorted splats front to back (3D Gaussian Splatting, Kerbl et al. 2023, equation 3)::
 
     image = sum_i channels_i alpha_i T_i + T_end background,    T_i = prod_{j < i} (1 - alpha_j)
-    alpha_i = min(0.999, o_i exp(-q_i / 2)),    q = A dx^2 + 2 B dx dy + C dy^2,    d = pixel centre - mean
+    alpha_i = min(0.999, o_i exp(-u_i - s u_i^2)),    u = q / 2,    q = A dx^2 + 2 B dx dy + C dy^2,
+    d = pixel centre - mean
 
-A splat is skipped at a pixel where its alpha is under 1/255, or where q < 0, which rounding can cause for needle-shaped
-splats. A pixel ends before the splat that would bring its transmittance to 1e-4 or less. The faster forms in ``cpu/``
-and ``cuda/`` are tested against this one.
+The sharpness s is the same for all splats; with s = 0 they are Gaussians. A splat is skipped at a pixel where its alpha
+is under 1/255, or where q < 0, which rounding can cause for needle-shaped splats. A pixel ends before the splat that
+would bring its transmittance to 1e-4 or less. The faster forms in ``cpu/`` and ``cuda/`` are tested against this one.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
+from .falloff import falloff
 from .gradient_limits import passed
 from .types import ALPHA_MAX, ALPHA_MIN, CHANNEL_MAX, SLOT_GEOMETRY, TRANSMITTANCE_MIN
 
@@ -58,6 +60,7 @@ def composite(
     width: int,
     height: int,
     columns: int,
+    sharpness: float,
     tile_size: int,
     # Out:
     image_out: wp.array3d[float],  # [C, H, W] on the background
@@ -78,7 +81,7 @@ def composite(
     for p in range(span[0], span[1]):
         i = splats_in[p]
         q = squared_distance(conics_in[i], centre - means2d_in[i])
-        alpha = wp.min(ALPHA_MAX, opacities_in[i] * wp.exp(-0.5 * q))
+        alpha = wp.min(ALPHA_MAX, opacities_in[i] * falloff(q, sharpness))
         if not (q >= 0.0 and alpha >= ALPHA_MIN):
             continue
         remaining = transmittance * (1.0 - alpha)
@@ -102,6 +105,7 @@ def add_pixel_adjoint(
     mean: wp.vec2,
     conic: wp.vec3,
     opacity: float,
+    sharpness: float,
     v_alpha: float,
     slot: int,
     v_slots: wp.array2d[float],
@@ -109,17 +113,18 @@ def add_pixel_adjoint(
     """Add the gradients of a splat's mean, conic and opacity to its slot, from the gradient of its alpha at one
     pixel."""
     d = centre - mean
-    falloff = wp.exp(-0.5 * squared_distance(conic, d))
-    if opacity * falloff > ALPHA_MAX:
+    q = squared_distance(conic, d)
+    share = falloff(q, sharpness)
+    if opacity * share > ALPHA_MAX:
         return
-    g = v_alpha * opacity * falloff  # gradient to -q / 2
+    g = v_alpha * opacity * share * (1.0 + sharpness * q)  # gradient to -q / 2
     v_mean = g * wp.vec2(conic[0] * d[0] + conic[1] * d[1], conic[1] * d[0] + conic[2] * d[1])
     v_slots[slot, 0] = v_slots[slot, 0] + v_mean[0]
     v_slots[slot, 1] = v_slots[slot, 1] + v_mean[1]
     v_slots[slot, 2] = v_slots[slot, 2] - 0.5 * g * d[0] * d[0]
     v_slots[slot, 3] = v_slots[slot, 3] - g * d[0] * d[1]
     v_slots[slot, 4] = v_slots[slot, 4] - 0.5 * g * d[1] * d[1]
-    v_slots[slot, 5] = v_slots[slot, 5] + v_alpha * falloff
+    v_slots[slot, 5] = v_slots[slot, 5] + v_alpha * share
     v_slots[slot, 6] = v_slots[slot, 6] + wp.abs(v_mean[0])
     v_slots[slot, 7] = v_slots[slot, 7] + wp.abs(v_mean[1])
 
@@ -143,6 +148,7 @@ def composite_adjoint(
     width: int,
     height: int,
     columns: int,
+    sharpness: float,
     tile_size: int,
     absolute: int,  # whether columns 6 and 7 are wanted (they are written all the same)
     # Out:
@@ -169,7 +175,7 @@ def composite_adjoint(
                 i = splats_in[p]
                 slot = slots_in[p]
                 q = squared_distance(conics_in[i], centre - means2d_in[i])
-                alpha = wp.min(ALPHA_MAX, opacities_in[i] * wp.exp(-0.5 * q))
+                alpha = wp.min(ALPHA_MAX, opacities_in[i] * falloff(q, sharpness))
                 p -= 1
                 if not (q >= 0.0 and alpha >= ALPHA_MIN):
                     continue
@@ -182,7 +188,9 @@ def composite_adjoint(
                     )
                 v_alpha = own * transmittance - behind / (1.0 - alpha)
                 behind += own * alpha * transmittance
-                add_pixel_adjoint(centre, means2d_in[i], conics_in[i], opacities_in[i], v_alpha, slot, v_slots_out)
+                add_pixel_adjoint(
+                    centre, means2d_in[i], conics_in[i], opacities_in[i], sharpness, v_alpha, slot, v_slots_out
+                )
 
 
 @wp.kernel

@@ -8,6 +8,7 @@ less than storing and reading them.
 
 import warp as wp
 
+from .falloff import sharp_reach
 from .gradient_limits import beyond
 from .quaternion import quat_inverse_norm, quat_matrix, quat_matrix_adjoint, quat_normalise, quat_normalise_adjoint
 from .types import ALPHA_MIN
@@ -90,6 +91,7 @@ def project(
     radius_clip: float,
     eps2d: float,
     antialiased: int,
+    sharpness: float,
     # Out: (all zero where culled)
     means2d_out: wp.array[wp.vec2],  # [N]
     conics_out: wp.array[wp.vec3],  # [N]
@@ -128,7 +130,7 @@ def project(
     visible = z > 0.0 and z >= near_plane and z <= far_plane and opacity >= ALPHA_MIN and wp.isfinite(opacity)
     visible = visible and determinant > 0.0 and quat_inverse_norm(quat) > 0.0
     if visible:
-        extent = wp.sqrt(2.0 * wp.max(wp.log(opacity / ALPHA_MIN), 0.0))
+        extent = wp.sqrt(2.0 * sharp_reach(wp.max(wp.log(opacity / ALPHA_MIN), 0.0), sharpness))
         radius_x = wp.min(wp.ceil(extent * wp.sqrt(xx)), RADIUS_MAX)
         radius_y = wp.min(wp.ceil(extent * wp.sqrt(yy)), RADIUS_MAX)
         conic = wp.vec3(yy, -xy, xx) / determinant

@@ -26,7 +26,7 @@ class GaussianParameters(nn.Module):
 
     Attributes: ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``log_scales`` [N, 3], ``opacity_logits`` [N],
     ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3], ``hyper`` [N, H] (H may be 0), ``shading`` [N, 10] or [N, 0],
-    ``correctives`` [N, 27] or [N, 0].
+    ``correctives`` [N, 27] or [N, 0]; ``sharpness``, the same for all (:class:`Gaussians`).
     """
 
     NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper", "shading", "correctives")
@@ -42,8 +42,10 @@ class GaussianParameters(nn.Module):
         hyper_dim: int = 0,
         shaded: bool = False,
         corrected: bool = False,
+        sharpness: float = 0.0,
     ) -> None:
         super().__init__()
+        self.sharpness = sharpness
         count, device = means.shape[0], means.device
         quats = torch.zeros(count, 4, device=device)
         quats[:, 0] = 1.0
@@ -60,13 +62,18 @@ class GaussianParameters(nn.Module):
 
     @staticmethod
     def empty(
-        count: int, sh_count: int, hyper_dim: int, shaded: bool, corrected: bool, device: torch.device | str
+        count: int,
+        sh_count: int,
+        hyper_dim: int,
+        shaded: bool,
+        corrected: bool,
+        device: torch.device | str,
+        sharpness: float = 0.0,
     ) -> GaussianParameters:
         """Allocate ``count`` Gaussians to be filled from a checkpoint."""
         zeros = torch.zeros(count, 3, device=device)
-        made = GaussianParameters(
-            zeros, zeros, zeros, sh_degree=0, hyper_dim=hyper_dim, shaded=shaded, corrected=corrected
-        )
+        options = {"hyper_dim": hyper_dim, "shaded": shaded, "corrected": corrected, "sharpness": sharpness}
+        made = GaussianParameters(zeros, zeros, zeros, sh_degree=0, **options)
         made.sh_rest = nn.Parameter(torch.zeros(count, sh_count, 3, device=device))
         return made
 
@@ -89,7 +96,9 @@ class GaussianParameters(nn.Module):
 
     def activate(self) -> Gaussians:
         """Return the Gaussians at rest. Activation happens here and nowhere else."""
-        return Gaussians(self.means, self.quats, self.scales(), self.opacities(), self.sh_dc, self.sh_rest)
+        return Gaussians(
+            self.means, self.quats, self.scales(), self.opacities(), self.sh_dc, self.sh_rest, self.sharpness
+        )
 
 
 def neighbor_distance(points: Tensor) -> Tensor:
@@ -116,6 +125,7 @@ def gaussians_from_points(
     scale: float = 1.0,
     shaded: bool = False,
     corrected: bool = False,
+    sharpness: float = 0.0,
 ) -> GaussianParameters:
     """Make isotropic Gaussians at points.
 
@@ -125,9 +135,10 @@ def gaussians_from_points(
         scale: standard deviation in units of the distance to the neighbours (:func:`neighbor_distance`).
         shaded: whether the Gaussians have shading parameters.
         corrected: whether the Gaussians have correctives.
+        sharpness: see :class:`Gaussians`.
     """
     with one_piece():
         log_scales = (neighbor_distance(points) * scale).log()[:, None].repeat(1, 3)
     sh_dc = torch.zeros_like(points) if colors is None else (colors - 0.5) / SH_C0
     options = {"sh_degree": sh_degree, "hyper_dim": hyper_dim, "shaded": shaded, "corrected": corrected}
-    return GaussianParameters(points, log_scales, sh_dc, **options)
+    return GaussianParameters(points, log_scales, sh_dc, sharpness=sharpness, **options)

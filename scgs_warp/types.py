@@ -6,7 +6,8 @@ Image``
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -89,6 +90,27 @@ class Gaussians:
     """[N, 3] spherical harmonics of degree 0: colour is ``0.5 + 0.2821 * sh_dc`` plus the higher degrees."""
     sh_rest: Tensor
     """[N, K - 1, 3] spherical harmonics of the higher degrees; K = (degree + 1)^2."""
+    sharpness: float = 0.0
+    """Value s >= 0 by which they fall off faster than a Gaussian: the opacity is multiplied by exp(-u - s u^2), where u
+    is half the squared distance from the mean in units of the covariance."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the fields with a row per Gaussian, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
+    def plain(self) -> Gaussians:
+        """Return the most similar Gaussians of sharpness 0, for programs that draw no others: smaller by the factor
+        with which alpha falls to 1/100 of the opacity at the same distance. Tails that reach less far would leave gaps;
+        longer ones blur outlines."""
+        if self.sharpness == 0.0:
+            return self
+        return replace(self, scales=self.scales * plain_scale(self.sharpness), sharpness=0.0)
+
+
+def plain_scale(sharpness: float) -> float:
+    """Return the ratio of the scales of the most similar Gaussians to those with this sharpness."""
+    depth = math.log(100.0)
+    return math.sqrt(2.0 / (1.0 + math.sqrt(1.0 + 4.0 * sharpness * depth)))
 
 
 @dataclass(frozen=True)
@@ -107,6 +129,8 @@ class Splats:
     """[N, 2] int32 half extents in pixels along x and y; (0, 0) where culled."""
     width: int
     height: int
+    sharpness: float = 0.0
+    """That of :class:`Gaussians`."""
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ The kernels compute what ``compositing`` computes; the work is laid out as follo
 
 - Splats are packed beforehand (``pack_splats``): a pair reads one or two cache lines, and the logarithm and the
   divisions are done once per splat.
-- Exponentials are taken to base 2: ``alpha = 2^(power + log2 o)``, where the factor of ``power = -q / (2 ln 2)`` is
-  folded into the conic.
+- Exponentials are taken to base 2: ``alpha = 2^(p - s ln 2 p^2 + log2 o)``, where the factor of ``p = -q / (2 ln 2)``
+  is folded into the conic.
 - One vector operation finds which of a tile's 16 rows a splat reaches; only those are visited.
 - A pixel that has ended gets a negative transmittance, so the test of the next transmittance, > 1e-4, always fails.
 - The adjoint first contracts a splat's channels with the incoming gradient, so one running sum per pixel suffices. The
@@ -62,7 +62,7 @@ def pack_splats(
 @native_function("compositing.h")
 def composite_tile(
     tile: int, packed: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i],
-    splats: wp.array[int], width: int, height: int, columns: int,
+    splats: wp.array[int], width: int, height: int, columns: int, sharpness: float,
     image: wp.array3d[float], alpha_image: wp.array2d[float], transmittance: wp.array2d[float], last: wp.array2d[int],
 ): ...
 
@@ -71,8 +71,8 @@ def composite_tile(
 def composite_tile_adjoint(
     tile: int, packed: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i],
     splats: wp.array[int], slots: wp.array[int], transmittance: wp.array2d[float], last: wp.array2d[int],
-    v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int, absolute: int,
-    v_slots: wp.array2d[float],
+    v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int, sharpness: float,
+    absolute: int,    v_slots: wp.array2d[float],
 ): ...
 # fmt: on
 
@@ -88,6 +88,7 @@ def composite(
     width: int,
     height: int,
     columns: int,
+    sharpness: float,
     # Out:
     image_out: wp.array3d[float],  # [C, H, W]
     alpha_out: wp.array2d[float],  # [H, W]
@@ -103,6 +104,7 @@ def composite(
         width,
         height,
         columns,
+        sharpness,
         image_out,
         alpha_out,
         transmittance_out,
@@ -126,6 +128,7 @@ def composite_adjoint(
     width: int,
     height: int,
     columns: int,
+    sharpness: float,
     absolute: int,  # whether the absolute sums are wanted; else zero
     # Out:
     v_slots_out: wp.array2d[float],  # [P, S], S >= 16 and S >= 8 + C
@@ -144,6 +147,7 @@ def composite_adjoint(
         width,
         height,
         columns,
+        sharpness,
         absolute,
         v_slots_out,
     )

@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 def _project(
     begin: int, means: wp.array[wp.vec3], quats: wp.array[wp.vec4], scales: wp.array[wp.vec3],
     opacities: wp.array[float], viewmat: wp.array[wp.mat44], intrinsics: wp.array[wp.mat33], width: int, height: int,
-    near_plane: float, far_plane: float, radius_clip: float, eps2d: float, antialiased: int,
+    near_plane: float, far_plane: float, radius_clip: float, eps2d: float, antialiased: int, sharpness: float,
     means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], depths: wp.array[float], opacities_out: wp.array[float],
     radii: wp.array[wp.vec2i],
 ): ...
@@ -49,6 +49,7 @@ def project(
     radius_clip: float,
     eps2d: float,
     antialiased: int,
+    sharpness: float,
     # Out: (all zero where culled)
     means2d_out: wp.array[wp.vec2],  # [N]
     conics_out: wp.array[wp.vec3],  # [N]
@@ -59,8 +60,8 @@ def project(
     """Project Gaussians ``16 i .. 16 i + 15``."""
     _project(
         (first + wp.tid()) * LANES, means_in, quats_in, scales_in, opacities_in, viewmat_in, K_in, width, height,
-        near_plane, far_plane, radius_clip, eps2d, antialiased, means2d_out, conics_out, depths_out, opacities_out,
-        radii_out,
+        near_plane, far_plane, radius_clip, eps2d, antialiased, sharpness, means2d_out, conics_out, depths_out,
+        opacities_out, radii_out,
     )  # fmt: skip
 
 

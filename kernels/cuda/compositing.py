@@ -5,8 +5,8 @@ The kernels compute what ``compositing`` computes; the work is laid out as follo
 - A warp holds 8 x 4 pixels, one of the tile's eight parts. Splats are staged through shared memory in batches. The
   thread that stages a splat determines which parts its ellipse may reach. A ballot collects these bits, so that each
   warp visits only splats that may reach its own part.
-- Exponentials are taken to base 2: ``alpha = o 2^power``, where the factor of ``power = -q / (2 ln 2)`` is folded into
-  the staged conic.
+- Exponentials are taken to base 2: ``alpha = o 2^(p - s ln 2 p^2)``, where the factor of ``p = -q / (2 ln 2)`` is
+  folded into the staged conic.
 - The adjoint needs 16 sums over a warp for each pair (the columns of a slot). Every step halves the number of sums that
   a lane holds, so all of them take 16 shuffles together instead of 5 each. The partial sums of the eight warps are
   gathered in shared memory, 32 pairs at a time, and added in the order of the warps into the pair's own slot. Without
@@ -39,7 +39,7 @@ spills hardly any values to memory."""
 def composite_tile(
     tile: int, means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], opacities: wp.array[float],
     channels: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i], splats: wp.array[int],
-    width: int, height: int, columns: int, image: wp.array3d[float], alpha_image: wp.array2d[float],
+    width: int, height: int, columns: int, sharpness: float, image: wp.array3d[float], alpha_image: wp.array2d[float],
     transmittance_image: wp.array2d[float], last_image: wp.array2d[int],
 ): ...
 
@@ -49,7 +49,7 @@ def composite_tile_adjoint(
     tile: int, means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], opacities: wp.array[float],
     channels: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i], splats: wp.array[int],
     slots: wp.array[int], transmittance_image: wp.array2d[float], last_image: wp.array2d[int],
-    v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int,
+    v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int, sharpness: float,
     v_slots: wp.array2d[float],
 ): ...
 # fmt: on
@@ -69,6 +69,7 @@ def composite(
     width: int,
     height: int,
     columns: int,
+    sharpness: float,
     # Out:
     image_out: wp.array3d[float],  # [C, H, W] on the background
     alpha_out: wp.array2d[float],  # [H, W] 1 - final transmittance
@@ -79,7 +80,7 @@ def composite(
     block, _lane = wp.tid()
     composite_tile(
         first + block, means2d_in, conics_in, opacities_in, channels_in, background_in, ranges_in, splats_in,
-        width, height, columns, image_out, alpha_out, transmittance_out, last_out,
+        width, height, columns, sharpness, image_out, alpha_out, transmittance_out, last_out,
     )  # fmt: skip
 
 
@@ -102,6 +103,7 @@ def composite_adjoint(
     width: int,
     height: int,
     columns: int,
+    sharpness: float,
     # Out:
     v_slots_out: wp.array2d[float],  # [P, 16] row: mean 2, conic 3, opacity 1, |mean| 2, channels C, zeros
 ):
@@ -109,5 +111,5 @@ def composite_adjoint(
     block, _lane = wp.tid()
     composite_tile_adjoint(
         first + block, means2d_in, conics_in, opacities_in, channels_in, background_in, ranges_in, splats_in, slots_in,
-        transmittance_in, last_in, v_image_in, v_alpha_in, width, height, columns, v_slots_out,
+        transmittance_in, last_in, v_image_in, v_alpha_in, width, height, columns, sharpness, v_slots_out,
     )  # fmt: skip

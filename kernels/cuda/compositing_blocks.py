@@ -15,6 +15,7 @@ from __future__ import annotations
 import warp as wp
 
 from ..compositing import squared_distance
+from ..falloff import falloff
 from ..types import ALPHA_MAX, ALPHA_MIN, SLOT_GEOMETRY, TILE_SIZE, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
@@ -75,6 +76,7 @@ def composite(
     width: int,
     height: int,
     columns: int,
+    sharpness: float,
     tile_size: int,
     # Out:
     image_out: wp.array3d[float],  # [C, H, W] on the background
@@ -119,7 +121,7 @@ def composite(
             while open == 1 and j < size:
                 own = wp.tile_extract(staged, j)
                 q = squared_distance_of(own, centre - wp.vec2(own[0], own[1]))
-                alpha = wp.min(ALPHA_MAX, own[5] * wp.exp(-0.5 * q))
+                alpha = wp.min(ALPHA_MAX, own[5] * falloff(q, sharpness))
                 if q >= 0.0 and alpha >= ALPHA_MIN:
                     remaining = transmittance * (1.0 - alpha)
                     if remaining <= TRANSMITTANCE_MIN:
@@ -141,17 +143,20 @@ def composite(
 
 
 @wp.func
-def geometry_sums(own: Splat, d: wp.vec2, falloff: float, v_alpha: float) -> Sums:
-    """Return the gradients of a splat's mean, conic and opacity from that of its alpha at a pixel; 0 where clamped."""
+def geometry_sums(own: Splat, d: wp.vec2, share: float, slope: float, v_alpha: float) -> Sums:
+    """Return the gradients of a splat's mean, conic and opacity from that of its alpha at a pixel; 0 where clamped.
+
+    Alpha is the opacity times ``share``, whose logarithm changes by ``slope`` with -q / 2.
+    """
     sums = Sums()
-    if own[5] * falloff <= ALPHA_MAX:
-        g = v_alpha * own[5] * falloff  # gradient to -q / 2
+    if own[5] * share <= ALPHA_MAX:
+        g = v_alpha * own[5] * share * slope  # gradient to -q / 2
         sums[0] = g * (own[2] * d[0] + own[3] * d[1])
         sums[1] = g * (own[3] * d[0] + own[4] * d[1])
         sums[2] = -0.5 * g * d[0] * d[0]
         sums[3] = -g * d[0] * d[1]
         sums[4] = -0.5 * g * d[1] * d[1]
-        sums[5] = v_alpha * falloff
+        sums[5] = v_alpha * share
         sums[6] = wp.abs(sums[0])
         sums[7] = wp.abs(sums[1])
     return sums
@@ -176,6 +181,7 @@ def composite_adjoint(
     width: int,
     height: int,
     columns: int,
+    sharpness: float,
     tile_size: int,
     absolute: int,  # whether columns 6 and 7 are wanted (they are written all the same)
     # Out:
@@ -227,8 +233,8 @@ def composite_adjoint(
             own = wp.tile_extract(staged, p - begin)
             d = centre - wp.vec2(own[0], own[1])
             q = squared_distance_of(own, d)
-            falloff = wp.exp(-0.5 * q)
-            alpha = wp.min(ALPHA_MAX, own[5] * falloff)
+            share = falloff(q, sharpness)
+            alpha = wp.min(ALPHA_MAX, own[5] * share)
             weight = float(0.0)
             sums = Sums()
             if p < last and q >= 0.0 and alpha >= ALPHA_MIN:
@@ -239,7 +245,7 @@ def composite_adjoint(
                     seen += channels_in[splats_in[p], c] * v_image_in[c, y, x]
                 v_alpha = seen * transmittance - behind / (1.0 - alpha)
                 behind += seen * weight
-                sums = geometry_sums(own, d, falloff, v_alpha)
+                sums = geometry_sums(own, d, share, 1.0 + sharpness * q, v_alpha)
                 for c in range(4):
                     sums[SLOT_GEOMETRY + c] = weight * v_pixel[c]
             totals = wp.tile_sum(wp.tile(sums, preserve_type=True))

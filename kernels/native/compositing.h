@@ -40,13 +40,18 @@ struct Tile {
     }
 };
 
-static inline Splat read_splat(const float* s, const Tile& tile) {
+// Return the power without sharpness at which a splat's alpha is 1/255, from the power at which a Gaussian's is.
+static inline float sharp_floor(float floor, float curvature) {
+    return 2.0f * floor / (1.0f + __builtin_sqrtf(1.0f - 4.0f * curvature * floor));
+}
+
+static inline Splat read_splat(const float* s, const Tile& tile, float curvature) {
     FUSE_WITHIN_EXPRESSIONS
     Splat g;
     g.mx = s[0] - tile.x;
     g.a = s[2];
     g.log2_opacity = s[5];
-    g.floor = log2_alpha_min() - s[5];
+    g.floor = sharp_floor(log2_alpha_min() - s[5], curvature);
     g.dy = lane_numbers() - (s[1] - tile.y);
     g.bdy = s[3] * g.dy;
     g.cdy2 = s[4] * g.dy * g.dy;
@@ -63,7 +68,8 @@ static inline unsigned reached_rows(const Splat& g, float slope) {
     return bits((g.a * x + g.bdy) * x + g.cdy2 >= g.floor - 1e-3f);
 }
 
-// Return the exponent at a row's pixels. Forward pass and adjoint must round alike to agree on the contributing splats.
+// Return the exponent of a Gaussian at a row's pixels. Forward pass and adjoint must round alike to agree on the
+// contributing splats.
 static inline vf power_of(vf dx, float a, float bdy, float cdy2) {
     FUSE_WITHIN_EXPRESSIONS
     return (a * dx + bdy) * dx + cdy2;
@@ -72,7 +78,7 @@ static inline vf power_of(vf dx, float a, float bdy, float cdy2) {
 static inline void composite_tile(
     int tile, const wp::array_t<float>& packed, const wp::array_t<float>& background,
     const wp::array_t<wp::vec_t<2, int>>& ranges, const wp::array_t<int>& splats, int width, int height, int columns,
-    wp::array_t<float>& image, wp::array_t<float>& alpha_image, wp::array_t<float>& transmittance,
+    float sharpness, wp::array_t<float>& image, wp::array_t<float>& alpha_image, wp::array_t<float>& transmittance,
     wp::array_t<int>& last
 ) {
     FUSE_WITHIN_EXPRESSIONS
@@ -81,6 +87,7 @@ static inline void composite_tile(
     const long long plane = place.plane, corner = place.corner;
     const int stride = packed.shape.dims[1];
     const vf LANE = lane_numbers(), ZERO = vf{};
+    const float curvature = LN_2 * sharpness;
 
     struct Four {
         enum { value = 4 };
@@ -117,7 +124,7 @@ static inline void composite_tile(
             const int n = end - p0 < 32 ? end - p0 : 32;
             for (int k = 0; k < n; ++k) {
                 const float* s = packed.data + (long long)splats.data[p0 + k] * stride;
-                chunk[k] = read_splat(s, place);
+                chunk[k] = read_splat(s, place, curvature);
                 reached[k] = (short)reached_rows(chunk[k], s[7]);
                 for (int c = 0; c < C; ++c) channel[k][c] = s[GEOMETRY + c0 + c];
             }
@@ -135,7 +142,7 @@ static inline void composite_tile(
                     const Splat& g = chunk[k];
                     const vf power = power_of(LANE - g.mx, g.a, ((const float*)&g.bdy)[r], ((const float*)&g.cdy2)[r]);
                     const vi skip = ~((power <= 0.0f) & (power >= g.floor));  // skips NaN too: infinities may cancel
-                    vf alpha = exp2v(power + g.log2_opacity);
+                    vf alpha = exp2v(power * (1.0f - curvature * power) + g.log2_opacity);
                     alpha = alpha > ALPHA_MAX ? ZERO + ALPHA_MAX : alpha;
                     alpha = skip ? ZERO : alpha;
                     const vf next = t - t * alpha;
@@ -178,7 +185,8 @@ static inline void composite_tile_adjoint(
     int tile, const wp::array_t<float>& packed, const wp::array_t<float>& background,
     const wp::array_t<wp::vec_t<2, int>>& ranges, const wp::array_t<int>& splats, const wp::array_t<int>& slots,
     const wp::array_t<float>& transmittance, const wp::array_t<int>& last, const wp::array_t<float>& v_image,
-    const wp::array_t<float>& v_alpha, int width, int height, int columns, int absolute, wp::array_t<float>& v_slots
+    const wp::array_t<float>& v_alpha, int width, int height, int columns, float sharpness, int absolute,
+    wp::array_t<float>& v_slots
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const Tile place = Tile(tile, ranges, width, height, columns);
@@ -186,6 +194,7 @@ static inline void composite_tile_adjoint(
     const long long plane = place.plane, corner = place.corner;
     const int stride = packed.shape.dims[1];
     const vf LANE = lane_numbers(), ZERO = vf{};
+    const float curvature = LN_2 * sharpness;
 
     struct Any {
         enum { value = 0 };
@@ -228,7 +237,7 @@ static inline void composite_tile_adjoint(
         for (int p = last_pair - 1; p >= begin; --p) {
             const float* s = packed.data + (long long)splats.data[p] * stride;
             float* out = v_slots.data + (long long)slots.data[p] * row_size;
-            const Splat g = read_splat(s, place);
+            const Splat g = read_splat(s, place, curvature);
             unsigned rows = reached_rows(g, s[7]) & bits(row_ends > p);
             const unsigned visited = rows;
             if (!rows) {
@@ -239,7 +248,7 @@ static inline void composite_tile_adjoint(
             const float A = to_conic * s[2], B = 0.5f * to_conic * s[3], D = to_conic * s[4];
             const vf dx = LANE - g.mx, adx = A * dx, bdx = B * dx;
             const float *dys = (const float*)&g.dy, *bdy = (const float*)&g.bdy, *cdy2 = (const float*)&g.cdy2;
-            vf g0 = ZERO, g1 = ZERO, g2 = ZERO, abs_x = ZERO, abs_y = ZERO, v_channel[K];
+            vf g_opacity = ZERO, g0 = ZERO, g1 = ZERO, g2 = ZERO, abs_x = ZERO, abs_y = ZERO, v_channel[K];
             for (int c = 0; c < K; ++c) v_channel[c] = ZERO;
             while (rows) {
                 const int r = __builtin_ctz(rows);
@@ -247,7 +256,7 @@ static inline void composite_tile_adjoint(
                 const float dy = dys[r];
                 const vf power = power_of(dx, g.a, bdy[r], cdy2[r]);
                 const vi skip = ~((power <= 0.0f) & (power >= g.floor)) | (ends[r] <= p);
-                const vf raw = exp2v(power + g.log2_opacity);
+                const vf raw = exp2v(power * (1.0f - curvature * power) + g.log2_opacity);
                 vf alpha = raw > ALPHA_MAX ? ZERO + ALPHA_MAX : raw;
                 alpha = skip ? ZERO : alpha;
                 const vf inverse = 1.0f / (1.0f - alpha);
@@ -263,6 +272,8 @@ static inline void composite_tile_adjoint(
                 grad = raw > ALPHA_MAX ? ZERO : grad;
                 behind[r] += own * weight;
                 T[r] = t;
+                g_opacity += grad;
+                grad = grad * (1.0f - 2.0f * curvature * power);
                 const vf grad_dy = grad * dy;
                 g0 += grad;
                 g1 += grad_dy;
@@ -283,7 +294,7 @@ static inline void composite_tile_adjoint(
                            -0.5f * (g0dx * dx),
                            -(g1 * dx),
                            -0.5f * g2,
-                           g0 * s[6],
+                           g_opacity * s[6],
                            abs_x,
                            abs_y};
             for (int c = 0; c < C; ++c) sums[8 + c] = v_channel[c];

@@ -31,13 +31,14 @@ tile_thread(int tile, const wp::array_t<wp::vec2i>& ranges, int width, int heigh
 // Return the parts of the tile (a bit each, in the order of the warps) where alpha may be 1/255 or more. The bound is
 // conservative.
 static inline __device__ unsigned parts_reached(
-    const TileThread& at, float mx, float my, float a, float b, float c, float opacity
+    const TileThread& at, float mx, float my, float a, float b, float c, float opacity, float sharpness
 ) {
     if (!(opacity >= ALPHA_MIN)) return 0u;
     const float squared = b * b;  // makes a c - b b exact, which cancels for needles
     const float determinant = fmaf(a, c, -squared) + fmaf(-b, b, squared);
     if (!(determinant > 0.0f)) return 255u;
-    const float reach = fmaxf(2.0f * logf(opacity * 255.0f), 0.0f) + 1.0e-3f;
+    const float depth = fmaxf(logf(opacity * 255.0f), 0.0f);
+    const float reach = 4.0f * depth / (1.0f + sqrtf(1.0f + 4.0f * sharpness * depth)) + 1.0e-3f;
     const float half_width = 1.0001f * sqrtf(reach * c / determinant) + 0.01f;
     const float half_height = 1.0001f * sqrtf(reach * a / determinant) + 0.01f;
     unsigned parts = 0u;
@@ -54,8 +55,8 @@ static inline __device__ void composite_tile(
     int tile, const wp::array_t<wp::vec2>& means2d, const wp::array_t<wp::vec3>& conics,
     const wp::array_t<float>& opacities, const wp::array_t<float>& channels, const wp::array_t<float>& background,
     const wp::array_t<wp::vec2i>& ranges, const wp::array_t<int>& splats, int width, int height, int columns,
-    wp::array_t<float>& image, wp::array_t<float>& alpha_image, wp::array_t<float>& transmittance_image,
-    wp::array_t<int>& last_image
+    float sharpness, wp::array_t<float>& image, wp::array_t<float>& alpha_image,
+    wp::array_t<float>& transmittance_image, wp::array_t<int>& last_image
 ) {
     __shared__ float4 shape[256];  // mean, then the first two values of the scaled conic
     __shared__ float4 rest[256];   // third value of the scaled conic, opacity
@@ -85,7 +86,7 @@ static inline __device__ void composite_tile(
                 const float a = all_conics[3 * i], b = all_conics[3 * i + 1], c = all_conics[3 * i + 2];
                 const float* own = channels.data + (long long)i * stride + base;
                 const int rest_of = count - base;
-                parts = parts_reached(at, mx, my, a, b, c, opacity);
+                parts = parts_reached(at, mx, my, a, b, c, opacity, sharpness);
                 shape[thread] = make_float4(mx, my, -0.5f * LOG2_E * a, -LOG2_E * b);
                 rest[thread] = make_float4(-0.5f * LOG2_E * c, opacity, 0.0f, 0.0f);
                 color[thread] = make_float4(
@@ -103,9 +104,10 @@ static inline __device__ void composite_tile(
                     const float4 s = shape[j];
                     const float4 r = rest[j];
                     const float dx = centre_x - s.x, dy = centre_y - s.y;
-                    const float power = dx * (s.z * dx + s.w * dy) + r.x * dy * dy;
+                    const float plain = dx * (s.z * dx + s.w * dy) + r.x * dy * dy;
+                    const float power = plain * (1.0f - LN_2 * sharpness * plain);
                     const float alpha = fminf(ALPHA_MAX, r.y * exp2f(power));
-                    if (open && power <= 0.0f && alpha >= ALPHA_MIN) {
+                    if (open && plain <= 0.0f && alpha >= ALPHA_MIN) {
                         const float remaining = transmittance * (1.0f - alpha);
                         if (remaining <= TRANSMITTANCE_MIN) {
                             open = false;
@@ -143,7 +145,7 @@ static inline __device__ void composite_tile_adjoint(
     const wp::array_t<wp::vec2i>& ranges, const wp::array_t<int>& splats, const wp::array_t<int>& slots,
     const wp::array_t<float>& transmittance_image, const wp::array_t<int>& last_image,
     const wp::array_t<float>& v_image, const wp::array_t<float>& v_alpha, int width, int height, int columns,
-    wp::array_t<float>& v_slots
+    float sharpness, wp::array_t<float>& v_slots
 ) {
     struct One {
         enum { value = 1 };
@@ -204,7 +206,7 @@ static inline __device__ void composite_tile_adjoint(
                 const int i = splats.data[start + thread];
                 const float mx = means[2 * i], my = means[2 * i + 1], opacity = opacities.data[i];
                 const float a = all_conics[3 * i], b = all_conics[3 * i + 1], c = all_conics[3 * i + 2];
-                parts = parts_reached(at, mx, my, a, b, c, opacity);
+                parts = parts_reached(at, mx, my, a, b, c, opacity, sharpness);
                 shape[thread] = make_float4(mx, my, -0.5f * LOG2_E * a, -LOG2_E * b);
                 rest[thread] = make_float4(-0.5f * LOG2_E * c, opacity, 0.0f, 0.0f);
                 slot_of[thread] = slots.data[start + thread];
@@ -225,10 +227,11 @@ static inline __device__ void composite_tile_adjoint(
                 const float4 s = shape[j];
                 const float4 r = rest[j];
                 const float dx = centre_x - s.x, dy = centre_y - s.y;
-                const float power = dx * (s.z * dx + s.w * dy) + r.x * dy * dy;
+                const float plain = dx * (s.z * dx + s.w * dy) + r.x * dy * dy;
+                const float power = plain * (1.0f - LN_2 * sharpness * plain);
                 const float falloff = exp2f(power), raw = r.y * falloff;
                 const float alpha = fminf(ALPHA_MAX, raw);
-                const bool valid = start + j < last && power <= 0.0f && alpha >= ALPHA_MIN;
+                const bool valid = start + j < last && plain <= 0.0f && alpha >= ALPHA_MIN;
                 if (!__any_sync(ALL_LANES, valid)) continue;
                 hit |= 1u << bit;
                 float v[16];
@@ -256,7 +259,8 @@ static inline __device__ void composite_tile_adjoint(
                     const float v_alpha_here = seen * transmittance - behind * inverse;
                     behind += seen * weight;
                     if (raw <= ALPHA_MAX) {
-                        const float g = v_alpha_here * raw;  // gradient to -q / 2
+                        const float slope = 1.0f - 2.0f * LN_2 * sharpness * plain;
+                        const float g = v_alpha_here * raw * slope;  // gradient to -q / 2
                         v[0] = -LN_2 * g * (2.0f * s.z * dx + s.w * dy);
                         v[1] = -LN_2 * g * (s.w * dx + 2.0f * r.x * dy);
                         v[2] = -0.5f * g * dx * dx;

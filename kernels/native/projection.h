@@ -140,8 +140,9 @@ static inline void project(
     int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<wp::vec4>& quats,
     const wp::array_t<wp::vec3>& scales, const wp::array_t<float>& opacities, const wp::array_t<wp::mat44>& viewmat,
     const wp::array_t<wp::mat33>& intrinsics, int width, int height, float near_plane, float far_plane,
-    float radius_clip, float eps2d, int antialiased, wp::array_t<wp::vec2>& means2d, wp::array_t<wp::vec3>& conics,
-    wp::array_t<float>& depths, wp::array_t<float>& opacities_out, wp::array_t<wp::vec2i>& radii
+    float radius_clip, float eps2d, int antialiased, float sharpness, wp::array_t<wp::vec2>& means2d,
+    wp::array_t<wp::vec3>& conics, wp::array_t<float>& depths, wp::array_t<float>& opacities_out,
+    wp::array_t<wp::vec2i>& radii
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const vf ZERO = {}, ONE = ZERO + 1.0f;
@@ -155,7 +156,8 @@ static inline void project(
     visible = visible & (f.determinant > 0.0f) & (f.inverse_norm > 0.0f);
     const vf ratio = visible ? seen / ALPHA_MIN : ONE;
     const vf logarithms = logarithm(ratio);
-    const vf extent = root(2.0f * (logarithms > 0.0f ? logarithms : ZERO));
+    const vf reach = logarithms > 0.0f ? logarithms : ZERO;
+    const vf extent = root(4.0f * reach / (1.0f + root(1.0f + 4.0f * sharpness * reach)));
     auto radius = [&](vf variance) -> vf {
         const vf r = __builtin_elementwise_ceil(extent * root(visible ? variance : ONE));
         return r < RADIUS_MAX ? r : ZERO + RADIUS_MAX;

@@ -182,12 +182,13 @@ def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     """Count the compositing work of an image exactly, pixel by pixel; the camera is in the units of the Gaussians."""
     geometry = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     view = camera.viewmat, camera.K, camera.width, camera.height
-    splats = project(*geometry, *view, antialiased=antialiased)
+    splats = project(*geometry, *view, antialiased=antialiased, sharpness=gaussians.sharpness)
     tiles = bin_splats(splats)
     counts = torch.empty(camera.height * camera.width, dtype=torch.int32, device=splats.depths.device)
     tensors = [splats.means2d, splats.conics, splats.opacities, tiles.ranges, tiles.splats]
     lists = [tensor.contiguous() for tensor in tensors]
-    launch(kernels.count_contributors, len(counts), *lists, camera.width, tiles.columns, tiles.tile_size, counts)
+    grid = camera.width, tiles.columns, splats.sharpness, tiles.tile_size
+    launch(kernels.count_contributors, len(counts), *lists, *grid, counts)
     covered = counts > 0
     mean = float(counts[covered].double().mean()) if bool(covered.any()) else 0.0
     return Load(len(tiles.splats), mean, int(covered.sum()))
@@ -220,7 +221,9 @@ def training_state(scene: Scene, arap: bool) -> TrainState:
     without the term would show neither kind. The scene's motion stays in training mode.
     """
     own = scene.config
-    base = TrainConfig(seed=own.seed, data=own.data, motion=own.motion, antialiased=own.antialiased)
+    base = TrainConfig(
+        seed=own.seed, data=own.data, motion=own.motion, antialiased=own.antialiased, sharpness=own.sharpness
+    )
     rates = OptimConfig()
     slow = {
         item.name: RATES * getattr(rates, item.name)

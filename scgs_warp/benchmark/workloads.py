@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -93,14 +94,15 @@ def frame_rows(case: BenchCase) -> list[dict[str, Any]]:
 
 
 class Leaves:
-    """Gaussians as leaf tensors, and the gradient of an image."""
+    """Gaussians as leaf tensors, of sharpness 0 as other programs draw them, and the gradient of an image."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera) -> None:
         def leaf(value: Tensor) -> Tensor:
             return value.detach().clone().requires_grad_()
 
         self.camera = camera
-        self.gaussians = Gaussians(**{name: leaf(value) for name, value in vars(gaussians).items()})
+        gaussians = gaussians.plain()
+        self.gaussians = replace(gaussians, **{name: leaf(value) for name, value in gaussians.tensors().items()})
         self.harmonics = leaf(torch.cat([gaussians.sh_dc[:, None], gaussians.sh_rest], dim=1))
         self.degree = round(self.harmonics.shape[1] ** 0.5) - 1
         self.v_image = torch.rand(3, camera.height, camera.width, generator=generator(0, 4)).to(self.harmonics.device)
@@ -136,7 +138,7 @@ def raster_rows(case: BenchCase, forward: bool = True) -> list[dict[str, Any]]:
             leaves.draw()
 
     def both(index: int) -> None:
-        torch.autograd.grad(leaves.draw(), tuple(vars(leaves.gaussians).values()), leaves.v_image)
+        torch.autograd.grad(leaves.draw(), tuple(leaves.gaussians.tensors().values()), leaves.v_image)
 
     backward = {"backward": [(torch.autograd, "grad")]}
     rows = case.rows("raster/forward", draw, draw_stages(module)) if forward else []

@@ -338,6 +338,10 @@ class TrainConfig:
     the data has no points (official code)."""
     sh_degree: int = chosen(3, 0, 3)
     antialiased: bool = False
+    sharpness: float = newer(0.5, before=0.0, least=0, most=10)
+    """Value s by which the splats fall off faster than a Gaussian (not in the paper): the opacity is multiplied by
+    exp(-u - s u^2), where u is half the squared distance in units of the covariance. Opaque outlines become as sharp as
+    in the images. 0: exact Gaussians, as other programs draw them; exports to their formats approximate others."""
     seed: int = bounded(0, 0)
     batch: int = bounded(1, 1)
     """Number of views per step; their gradients are averaged. Several processes can share the views

@@ -19,6 +19,7 @@ PAPER = TrainConfig(
     init_random="cube",
     sh_degree=3,
     antialiased=False,
+    sharpness=0.0,
     seed=0,
     batch=1,
     half_size=0,

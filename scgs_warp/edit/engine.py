@@ -178,7 +178,7 @@ class Engine:
         undo = self.scene.normalisation
         return Gaussians(
             undo.undo(posed.means), posed.quats, undo.undo_scale(posed.scales), posed.opacities,
-            posed.sh_dc.detach(), posed.sh_rest.detach(),
+            posed.sh_dc.detach(), posed.sh_rest.detach(), posed.sharpness,
         )  # fmt: skip
 
     def normalised(self, time: float, bent: NodePose | None) -> Gaussians:

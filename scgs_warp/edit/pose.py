@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -142,7 +142,7 @@ def pose_gaussians(
         if masked:
             color_turns = _share_of(color_turns, gaussians)
         sh_rest = rotate_harmonics(sh_rest, color_turns)
-    return Gaussians(posed.means, posed.quats, posed.scales, posed.opacities, posed.sh_dc, sh_rest)
+    return replace(posed, sh_rest=sh_rest)
 
 
 def _share_of(turns: Tensor, gaussians: GaussianParameters) -> Tensor:
@@ -172,10 +172,8 @@ def _on_top(
     sh_rest = posed.sh_rest
     if sh_rest.shape[1]:
         sh_rest = rotate_harmonics(sh_rest, _blend(further, gaussians, binding))
-    return Gaussians(
-        torch.where(touched, means, posed.means), torch.where(touched, quats, posed.quats), posed.scales,
-        posed.opacities, posed.sh_dc, sh_rest,
-    )  # fmt: skip
+    means, quats = torch.where(touched, means, posed.means), torch.where(touched, quats, posed.quats)
+    return replace(posed, means=means, quats=quats, sh_rest=sh_rest)
 
 
 def _blend(turns: np.ndarray, gaussians: GaussianParameters, binding: tuple[Tensor, Tensor]) -> Tensor:

@@ -25,6 +25,7 @@ def write_glb(
     path: Path, gaussians: Gaussians, up: tuple[float, float, float], skeleton: Skeleton | None = None
 ) -> None:
     """Write activated Gaussians, world units; positions are stored unchanged, under a node that turns ``up`` to +y.
+    Sharp Gaussians are approximated (``Gaussians.plain``).
 
     Args:
         up: unit vector.
@@ -35,7 +36,7 @@ def write_glb(
     """
     document = GltfDocument()
     document.json["extensionsUsed"] = [EXTENSION]
-    attributes = _attributes(document, gaussians)
+    attributes = _attributes(document, gaussians.plain())
     # The standard ignores the node transform of a skinned mesh; this one is for programs that do not skin points.
     node: dict[str, Any] = {"name": "Gaussians", "rotation": upright(up)}
     if skeleton is not None:
@@ -53,7 +54,7 @@ def _attributes(document: GltfDocument, gaussians: Gaussians) -> dict[str, int]:
     def add(values: np.ndarray, **options: Any) -> int:
         return document.accessor(values, target=VERTICES, **options)
 
-    arrays = {name: value.detach().cpu().numpy() for name, value in vars(gaussians).items()}
+    arrays = {name: value.detach().cpu().numpy() for name, value in gaussians.tensors().items()}
     attributes = {
         "POSITION": add(arrays["means"].astype("<f4"), bounds=True),
         "COLOR_0": add(point_colors(arrays["sh_dc"], arrays["opacities"]), normalized=True),

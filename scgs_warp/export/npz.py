@@ -28,6 +28,7 @@ def write_npz(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> None:
     """Write a moving scene, world units, float32, compressed; the same scene gives the same bytes.
+    Sharp Gaussians are approximated (``Gaussians.plain``).
 
     Args:
         rest: activated Gaussians before any motion.
@@ -40,6 +41,7 @@ def write_npz(
     Raises:
         UserError: the file cannot be written.
     """
+    rest = rest.plain()
     quats = rest.quats.detach().cpu().double().numpy()
     arrays: dict[str, np.ndarray] = {
         "means": rest.means.detach().cpu().numpy(),

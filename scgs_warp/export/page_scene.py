@@ -126,6 +126,7 @@ def _facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
         "shaded": scene.gaussians.shading.shape[1] > 0,
         "corrected": scene.gaussians.correctives.shape[1] > 0,
         "antialiased": bool(scene.config.antialiased),
+        "sharpness": scene.gaussians.sharpness,
         "background": list(scene.background_color),
         "overview": scene.overview.to_dict(),
         "normalisation": {"centre": unit.centre.tolist(), "scale": unit.scale},

@@ -7,7 +7,7 @@ joint is at ``p_k + T_k``, turned by ``R_k``, and its inverse bind matrix shifts
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -88,22 +88,21 @@ def posed_gaussians(scene: Scene, session: EditSession | None, moment: Animation
 def at_rest(scene: Scene) -> Gaussians:
     """Return activated Gaussians before any motion, world units."""
     rest, undo = scene.gaussians.activate(), scene.normalisation
-    return Gaussians(
-        undo.undo(rest.means), rest.quats, undo.undo_scale(rest.scales), rest.opacities, rest.sh_dc, rest.sh_rest
-    )
+    return replace(rest, means=undo.undo(rest.means), scales=undo.undo_scale(rest.scales))
 
 
 def finite_rows(gaussians: Gaussians) -> np.ndarray:
     """Return [N] bool: Gaussians that are finite and whose quaternion is not zero."""
     count = len(gaussians.means)
-    parts = [part.detach().reshape(count, -1).isfinite().all(dim=1) for part in vars(gaussians).values()]
+    parts = [part.detach().reshape(count, -1).isfinite().all(dim=1) for part in gaussians.tensors().values()]
     return (torch.stack(parts).all(dim=0) & gaussians.quats.any(dim=1)).cpu().numpy()
 
 
 def select_gaussians(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
     """Return the Gaussians of ``rows`` [N] bool, on the CPU."""
     chosen = torch.from_numpy(rows)
-    return Gaussians(**{name: value.detach().cpu()[chosen] for name, value in vars(gaussians).items()})
+    rows_of = {name: value.detach().cpu()[chosen] for name, value in gaussians.tensors().items()}
+    return replace(gaussians, **rows_of)
 
 
 def keep_finite(gaussians: Gaussians) -> Gaussians:

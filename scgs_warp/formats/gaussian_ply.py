@@ -81,7 +81,7 @@ def _vertices(path: Path) -> np.ndarray:
 def write_gaussian_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write activated Gaussians, world units, in the layout of 3D-GS: logits of opacities, logarithms of scales, unit
     quaternions, harmonics channel by channel. The file is binary, little endian; the same Gaussians give the same
-    bytes.
+    bytes. Sharp Gaussians are approximated (``Gaussians.plain``).
 
     Raises:
         UserError: the name does not end in .ply, or the file cannot be written.
@@ -89,6 +89,7 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians) -> None:
     path = Path(path)
     if path.suffix.lower() != ".ply":
         raise UserError(f"{path}: end the name in .ply")
+    gaussians = gaussians.plain()
     count, rest = gaussians.means.shape[0], 3 * gaussians.sh_rest.shape[1]
     opacities = gaussians.opacities.detach().cpu().double().clamp(1e-6, 1.0 - 1e-6)
     quats = torch.nn.functional.normalize(gaussians.quats.detach().cpu().double(), dim=1)

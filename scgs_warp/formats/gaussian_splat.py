@@ -20,11 +20,13 @@ quaternion wxyz as 128 + 128 q."""
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:
     """Write activated Gaussians in descending order of volume times opacity, for viewers that draw while loading.
-    Colours, opacities and rotations are rounded to 8 bits; harmonics above degree 0 are lost.
+    Colours, opacities and rotations are rounded to 8 bits; harmonics above degree 0 are lost. Sharp Gaussians are
+    approximated (``Gaussians.plain``).
 
     Raises:
         UserError: the file cannot be written.
     """
+    gaussians = gaussians.plain()
     scales = gaussians.scales.detach().cpu().double().numpy()
     opacities = gaussians.opacities.detach().cpu().double().numpy()
     quats = torch.nn.functional.normalize(gaussians.quats.detach().cpu().double(), dim=1).numpy()

@@ -67,7 +67,7 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
     """Write activated Gaussians, world units, as version 3.
 
     Values are rounded: positions to ``2 ** -fraction_bits``, opacities and colours to 8 bits, scales to 6 %, rotations
-    to 10 bits a component, harmonics to 1 / 128 within [-1, 1].
+    to 10 bits a component, harmonics to 1 / 128 within [-1, 1]. Sharp Gaussians are approximated (``Gaussians.plain``).
 
     Args:
         antialiased: whether the Gaussians were trained with the antialiasing compensation.
@@ -79,6 +79,7 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
     Raises:
         UserError: the file cannot be written, or the scene is too large for the format.
     """
+    gaussians = gaussians.plain()
     means = gaussians.means.detach().cpu().double().numpy() * (1, -1, -1)
     bits = fraction_bits(means)
     fixed = np.rint(means * 2.0**bits).astype("<i4")

@@ -87,7 +87,7 @@ def _posed(
     sh_dc = gaussians.sh_dc if tints is None else tint(gaussians.sh_dc, tints)
     if gaussians.shading.shape[1]:
         sh_dc = shade(sh_dc, gaussians.shading, gaussians.quats, quats if own is None else own)
-    return Gaussians(means, quats, scales, gaussians.opacities(), sh_dc, gaussians.sh_rest)
+    return Gaussians(means, quats, scales, gaussians.opacities(), sh_dc, gaussians.sh_rest, gaussians.sharpness)
 
 
 class ControlPoints(Motion):

@@ -95,6 +95,7 @@ class HexPlane(Motion):
             gaussians.opacities(),
             gaussians.sh_dc,
             gaussians.sh_rest,
+            gaussians.sharpness,
         )
 
     def _decode(self, features: Tensor) -> Tensor:

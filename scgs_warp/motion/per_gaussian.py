@@ -33,6 +33,7 @@ class PerGaussian(Motion):
             gaussians.opacities(),
             gaussians.sh_dc,
             gaussians.sh_rest,
+            gaussians.sharpness,
         )
 
     def train_at(

@@ -34,9 +34,8 @@ class Spheres(Motion):
         # The adjoint of a product with ones sums in a fixed order; that of expand does not.
         ones = torch.ones(len(gaussians), 1, device=means.device)
         scales = (ones @ self.log_radius.exp()).expand(-1, 3)
-        return Gaussians(
-            means, gaussians.quats.detach(), scales, gaussians.opacities(), gaussians.sh_dc, gaussians.sh_rest
-        )
+        quats, colors = gaussians.quats.detach(), (gaussians.sh_dc, gaussians.sh_rest)
+        return Gaussians(means, quats, scales, gaussians.opacities(), *colors, gaussians.sharpness)
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
         moved = gaussians.means + self.translations(gaussians.means, torch.tensor([time]))[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -101,7 +103,7 @@ class StaticNodes(Motion):
         moved = pose.translations.any(dim=1) | pose.rotations[:, 1:].any(dim=1)
         touched = moved[binding[0].long()].any(dim=1, keepdim=True)
         means, quats = torch.where(touched, means, rest.means), torch.where(touched, quats, rest.quats)
-        return Gaussians(means, quats, rest.scales, rest.opacities, rest.sh_dc, rest.sh_rest)
+        return replace(rest, means=means, quats=quats)
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         return gaussians.activate()

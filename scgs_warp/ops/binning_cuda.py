@@ -12,6 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..kernels import falloff
 from ..kernels.cuda import binning as kernels
 from ..kernels.types import TILE_SIZE
 from ..runtime import debug
@@ -90,7 +91,12 @@ def bytes_within(capacity: int, count: int, tiles: int) -> int:
 def geometry_of(splats: Splats) -> list[Tensor]:
     """Return the tensors that decide which tiles a splat touches, in the kernels' order."""
     names = ("means2d", "conics", "opacities", "depths", "radii")
-    return [getattr(splats, name).detach().contiguous() for name in names]
+    geometry = [getattr(splats, name).detach().contiguous() for name in names]
+    if splats.sharpness > 0.0:
+        reaching = torch.empty_like(geometry[2])
+        launch(falloff.reaching_opacities, len(reaching), geometry[2], splats.sharpness, reaching)
+        geometry[2] = reaching
+    return geometry
 
 
 def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor]:

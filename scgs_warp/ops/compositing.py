@@ -187,7 +187,7 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
         source = torch.empty_like(opacities)  # opacities, with 0 for splats that are left out
         launch(kernels.finite_opacities, len(opacities), opacities, channels, source)
     for tiles, window in _pieces(job):
-        _draw(job.form, tiles, window, tensors, source, outputs)
+        _draw(job, tiles, window, tensors, source, outputs)
         if transmittance is not None and last is not None and checked:
             checks.check_pixels(tiles, window, alpha, transmittance, last)
         del tiles  # frees its memory before the next window
@@ -197,7 +197,7 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
 
 
 def _draw(
-    form: str,
+    job: _Job,
     tiles: Tiles,
     window: Window,
     tensors: tuple[Tensor, ...],
@@ -206,7 +206,8 @@ def _draw(
 ) -> None:
     """Composite the pixels of a window of tiles."""
     means2d, conics, _, channels, background = tensors
-    size, begin, count = (tiles.width, tiles.height, tiles.columns), window[0], window[1] - window[0]
+    size = tiles.width, tiles.height, tiles.columns, job.splats.sharpness
+    form, begin, count = job.form, window[0], window[1] - window[0]
     if form == "cpu":
         lists, load = (source, background, tiles.ranges, tiles.splats), _load(tiles, window)
         launch(cpu_kernels.composite, count, *lists, *size, *outputs, grain=1, load=load, begin=begin)
@@ -268,7 +269,8 @@ def _adjoint(
     means2d, conics, _, channels, background = tensors
     v_slots = checks.unwritten_slots(len(tiles.splats), _slot_width(channels.shape[1]), channels.device)
     lists = (background, tiles.ranges, tiles.splats, tiles.slots, *pixels)
-    size, begin, count = (tiles.width, tiles.height, tiles.columns), window[0], window[1] - window[0]
+    size = tiles.width, tiles.height, tiles.columns, job.splats.sharpness
+    begin, count = window[0], window[1] - window[0]
     if job.form == "cpu":
         rest, load = (*size, int(absolute), v_slots), _load(tiles, window)
         launch(cpu_kernels.composite_adjoint, count, source, *lists, *rest, grain=1, load=load, begin=begin)

@@ -25,7 +25,7 @@ def forward(
 
     Args:
         lists: the kernels' tensor arguments up to the sorted list.
-        size: width and height in pixels, and number of tiles in a row.
+        size: width and height in pixels, number of tiles in a row, and sharpness.
         outputs: image, alpha, final transmittance and last contributor.
         window: begin and end of the range of tiles to composite.
     """

@@ -14,6 +14,8 @@ from ..types import Splats
 from .reduction import sum_rows
 
 Form = Literal["auto", "plain", "cpu"]
+MAX_SHARPNESS = 100.0
+"""Bound that keeps the powers of the squared distance finite."""
 
 
 class _Settings(NamedTuple):
@@ -24,6 +26,7 @@ class _Settings(NamedTuple):
     radius_clip: float
     eps2d: float
     antialiased: int
+    sharpness: float
 
 
 class _Project(torch.autograd.Function):
@@ -107,11 +110,13 @@ def project(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     antialiased: bool = False,
+    sharpness: float = 0.0,
     form: Form = "auto",
 ) -> Splats:
     """Project Gaussians to a pinhole camera's image (EWA splatting, conventions of gsplat 1.5.3).
 
-    A splat ends where its alpha falls under 1/255: ``radii = ceil(sqrt(2 ln(255 opacity) covariance2d))`` per axis. A
+    A splat ends where its alpha falls under 1/255: ``radii = ceil(sqrt(2 u covariance2d))`` per axis, where
+    ``u + sharpness u^2 = ln(255 opacity)``. A
     Gaussian is culled, with all fields 0 and no gradient, if its depth is not between the planes, its splat is off the
     image, both radii are at most ``radius_clip``, the opacity is under 1/255, the quaternion is zero, or a value is
     non-finite.
@@ -131,6 +136,7 @@ def project(
         eps2d: added to both variances of the 2D covariance, px^2.
         antialiased: multiply the opacity by sqrt(det / det with eps2d) (Mip-Splatting, section 5.2) before the radii
             are computed.
+        sharpness: see :class:`Splats`; 0: Gaussians.
         form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
@@ -143,11 +149,20 @@ def project(
     _validate(means, quats, scales, opacities, viewmat, K)
     if width <= 0 or height <= 0:
         raise ValueError(f"width and height must be positive, got {width} x {height}")
+    if not 0.0 <= sharpness <= MAX_SHARPNESS:
+        raise ValueError(f"sharpness must be in 0 .. {MAX_SHARPNESS:g}, got {sharpness}")
     settings = _Settings(
-        int(width), int(height), float(near_plane), float(far_plane), float(radius_clip), float(eps2d), int(antialiased)
+        int(width),
+        int(height),
+        float(near_plane),
+        float(far_plane),
+        float(radius_clip),
+        float(eps2d),
+        int(antialiased),
+        float(sharpness),
     )
     tensors = (x.contiguous() for x in (means, quats, scales, opacities, viewmat, K))
     if form == "auto":
         form = "cpu" if means.device.type == "cpu" else "plain"
     means2d, conics, depths, seen, radii = _Project.apply(*tensors, settings, form)
-    return Splats(means2d, conics, depths, seen, radii, settings.width, settings.height)
+    return Splats(means2d, conics, depths, seen, radii, settings.width, settings.height, settings.sharpness)

@@ -75,7 +75,9 @@ def draw(
     means = gaussians.means
     shape = gaussians.quats, gaussians.scales, gaussians.opacities
     size = camera.width, camera.height
-    splats = project(means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased)
+    splats = project(
+        means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased, sharpness=gaussians.sharpness
+    )
     channels = spherical_harmonics(gaussians.sh_dc, gaussians.sh_rest, means, centre_of(camera), sh_degree)
     if depth:
         channels = torch.cat([channels, splats.depths[:, None]], dim=1)

@@ -59,7 +59,7 @@ def _static_scene(
     distance = 1.2 * max(radius, 1e-9) / math.tan(math.radians(fov) / 2)
     x, y, z = centre.tolist()
     overview = Overview((x, y, z), up or (0.0, -1.0, 0.0), distance, fov, elevation)
-    config = replace(preset("best"), antialiased=read_antialiased(path))
+    config = replace(preset("best"), antialiased=read_antialiased(path), sharpness=gaussians.sharpness)
     scene = Scene(gaussians, StaticNodes.sample(gaussians, nodes), unit, config, overview)
     scene.motion.eval()
     return scene

@@ -20,6 +20,7 @@ from ..geometry.cameras import Overview
 from ..geometry.normalisation import Normalisation
 from ..motion import build_motion
 from ..motion.base import Motion
+from ..motion.spheres import Spheres
 from ..rendering.render import render
 from ..storage import checkpoint
 from ..storage.json_files import parse_json
@@ -148,6 +149,7 @@ class Scene:
             posed.opacities,
             posed.sh_dc,
             posed.sh_rest,
+            posed.sharpness,
         )
 
     @torch.no_grad()
@@ -231,9 +233,10 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
         count = len(rows["means"])
         for name in ("shading", "correctives"):  # Absent from checkpoints of older versions.
             rows.setdefault(name, torch.zeros(count, 0))
+        sharpness = config.sharpness if metadata["motion"] != Spheres.name else 0.0  # none in stage 1
         shaded, corrected = (rows[name].shape[1] > 0 for name in ("shading", "correctives"))
         gaussians = GaussianParameters.empty(
-            count, rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, corrected, "cpu"
+            count, rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, corrected, "cpu", sharpness
         )
         gaussians.load_state_dict(rows)
         state = checkpoint.strip(tensors, "motion.")

@@ -223,6 +223,7 @@ def initial_gaussians(
         "hyper_dim": config.motion.hyper_columns,
         "shaded": config.motion.has_shading,
         "corrected": config.motion.has_correctives,
+        "sharpness": config.sharpness,
     }
     count = min(config.init_points, config.densify.max_gaussians)
     if spheres is None or config.init_from == "points":

@@ -44,7 +44,8 @@ def view_contributions(gaussians: Gaussians, camera: Camera, antialiased: bool =
     shape = gaussians.quats, gaussians.scales, gaussians.opacities
     size = camera.width, camera.height
     with torch.no_grad():
-        splats = project(gaussians.means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased)
+        options = {"antialiased": antialiased, "sharpness": gaussians.sharpness}
+        splats = project(gaussians.means, *shape, camera.viewmat, camera.K, *size, **options)
     with torch.enable_grad():
         ones = torch.ones(len(gaussians.means), 1, device=gaussians.means.device, requires_grad=True)
         image, _ = composite(splats, ones, bin_splats(splats, demand=demand(splats, ones)))

@@ -48,6 +48,7 @@ def test_best_is_the_former_paper():
         "optim.correctives": 8e-4,
         "motion.tints": True,
         "loss.log_error": 0.002,
+        "sharpness": 0.5,
         "loss.pooled": "auto",
     }
     assert {name: best[name] for name in best.keys() - values.keys()} == {**newer, **added}
@@ -57,7 +58,7 @@ def test_best_is_the_former_paper():
 def test_a_recorded_configuration_keeps_what_it_did(name):
     values = json.loads((OLD / f"{name}.json").read_text())
     read = presets.to_dict(presets.from_dict(values))
-    assert read["loss"].pop("log_error") == 0.0
+    assert read["loss"].pop("log_error") == 0.0 and read["sharpness"] == 0.0
     assert not read["motion"]["tints"] and not read["motion"]["correctives"]
     for section, fields in values.items():
         own = read[section]

@@ -56,7 +56,8 @@ def test_what_is_pinned_keeps_its_bits_and_the_handle_goes_where_it_is_put(bent)
     before, after = bent.scene.gaussians_at(0.0), bent.gaussians_at(0.0)
     held = torch.isin(bent.engine.binding[0].long(), torch.tensor(bent.edit.pins)).all(1)
     assert int(held.sum()) > 20
-    assert all(torch.equal(a[held], b[held]) for a, b in zip(dataclasses.astuple(before), dataclasses.astuple(after)))
+    for name, value in before.tensors().items():
+        assert torch.equal(value[held], getattr(after, name)[held]), name
     handle = bent.edit.handles[0]
     start = bent.engine.to_world(bent.engine.motion_at(0.0).positions)[list(handle.nodes)]
     pivot = bent.pivot("right")

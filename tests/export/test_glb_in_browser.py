@@ -162,7 +162,7 @@ def test_the_graph_plays_in_three(page):
 def test_three_reads_the_gaussians(page):
     window, folder = page
     gaussians = bar_scene().gaussians_at(0.5)
-    gaussians = Gaussians(**{name: value.detach() for name, value in vars(gaussians).items()})
+    gaussians = Gaussians(**{name: value.detach() for name, value in gaussians.tensors().items()})
     write_still(folder / "s.glb", gaussians, up=(0.0, 0.0, 1.0))
     found = window.evaluate("(url) => window.splats(url)", "/s.glb")
     matrix = np.array(found["matrix"]).reshape(4, 4).T

@@ -201,7 +201,7 @@ def case_draw(d: Draw, device: str) -> None:
     """The whole pipeline draws valid Gaussians as if alone, with finite gradients."""
     count, size, degree = d.count(), d.size(), int(d.rng.integers(4))
     g, camera = poisoned_gaussians(d, count, degree), camera_of(d, *size).to(device)
-    values = [leaf(x) for x in on(device, *vars(g).values())]
+    values = [leaf(x) for x in on(device, *g.tensors().values())]
     color = d.uniform(3)
     if d.chance(0.1):
         d.poison(color)
@@ -228,7 +228,7 @@ def case_draw(d: Draw, device: str) -> None:
 def case_render(d: Draw, device: str) -> None:
     """Colour, alpha and depth are finite; depth lies between the planes, or is 0."""
     g, camera = poisoned_gaussians(d, d.count(), int(d.rng.integers(4))), camera_of(d, *d.size())
-    values = [leaf(x) for x in on(device, *vars(g).values())]
+    values = [leaf(x) for x in on(device, *g.tensors().values())]
     image = render(Gaussians(*values), camera.to(device), antialiased=d.chance())
     laws.finite("rgb, alpha, depth", image.rgb, image.alpha, image.depth)
     assert bool((image.depth >= 0).all())

@@ -7,7 +7,7 @@ import json
 import torch
 
 # name: (width, height, splats, channels, seed, how opacities are drawn)
-CASES = {
+CASES: dict[str, tuple[int, int, int, int, int, str]] = {
     "one tile": (16, 16, 12, 3, 0, "mixed"),
     "odd size": (37, 21, 60, 4, 1, "mixed"),
     "several batches and early stop": (16, 16, 700, 3, 2, "opaque"),
@@ -16,7 +16,11 @@ CASES = {
     "one splat": (8, 8, 1, 5, 5, "opaque"),
     "clamped alpha": (16, 16, 3, 3, 7, "full"),
     "no splat": (20, 20, 0, 3, 6, "mixed"),
+    "sharp": (37, 21, 60, 4, 8, "mixed"),
+    "sharp, several batches": (16, 16, 700, 3, 9, "opaque"),
 }
+SHARPNESS = 0.5
+"""Of the cases whose name begins with it."""
 
 
 def random_splats(width: int, height: int, count: int, channels: int, seed: int, opacity: str):
@@ -52,7 +56,8 @@ def run_form(case: str, form: str, device: str) -> list[torch.Tensor]:
     means2d, conics, depths, opacities, radii, colors = tensors
     background = torch.linspace(0.1, 0.9, channels, device=device)
     leaves = [t.requires_grad_() for t in (means2d, conics, opacities, colors, background)]
-    splats = Splats(means2d, conics, depths, opacities, radii, width, height)
+    sharpness = SHARPNESS if case.startswith("sharp") else 0.0
+    splats = Splats(means2d, conics, depths, opacities, radii, width, height, sharpness)
     absgrad = torch.empty(count, 2, device=device)
     stats = Stats.zeros(count, device)
     image, alpha = composite(splats, colors, bin_splats(splats), background, stats=stats, absgrad=absgrad, form=form)

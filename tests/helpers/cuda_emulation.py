@@ -30,13 +30,13 @@ FUNCTIONS = {
 def source() -> str:
     """Return the header and, for each kernel, a C function of its name that runs blocks of threads.
 
-    Its arguments: first block, number of blocks, seed, pointers and shapes of the arrays, integers.
+    Its arguments: first block, number of blocks, seed, pointers and shapes of the arrays, numbers.
     """
     text = native.header_text(HEADER)
     macros = [f"#define {name} {value}\n" for name, value in native.constant_macros(text).items()]
     parts = [f'#include "{SHIM}"\n', *macros, text]
     for name, function in FUNCTIONS.items():
-        parameters, values, arrays, integers = ["int tile"], ["tile"], 0, 0
+        parameters, values, arrays, numbers = ["int tile"], ["tile"], 0, 0
         for label, kind in list(function.input_types.items())[1:]:
             if wp.types.is_array(kind):
                 inner = _TYPES[kind.dtype]
@@ -44,16 +44,16 @@ def source() -> str:
                 values.append(f"wp::array_t<{inner}>{{({inner}*)data[{arrays}], shapes[{arrays}]}}")
                 arrays += 1
             else:
-                parameters.append(f"int {label}")
-                values.append(f"numbers[{integers}]")
-                integers += 1
+                parameters.append(f"{_TYPES[kind]} {label}")
+                values.append(f"({_TYPES[kind]})numbers[{numbers}]")
+                numbers += 1
         parts.append(
             f"static void {name}_body({', '.join(parameters)}) {{\n"
             f"    {function.key}({', '.join(function.input_types)});\n}}\n"
         )
         parts.append(
             f'extern "C" int {name}(int begin, int blocks, unsigned seed,\n'
-            f"    void** data, wp::Shape* shapes, int* numbers) {{\n"
+            f"    void** data, wp::Shape* shapes, double* numbers) {{\n"
             f"    std::mt19937 random(seed);\n"
             f"    for (int tile = begin; tile < begin + blocks; ++tile)\n"
             f"        if (!shim::run_block([=] {{ {name}_body({', '.join(values)}); }}, random)) return 1;\n"
@@ -88,7 +88,7 @@ def launcher(library: ctypes.CDLL, seed: int = 0) -> Callable[..., None]:
                 assert tensor.is_contiguous()
                 data[at] = tensor.data_ptr()
                 shapes[at][: tensor.ndim] = list(tensor.shape)
-        integers = (ctypes.c_int * len(numbers))(*numbers)
-        assert getattr(library, kernel.key)(begin, blocks, seed, data, shapes, integers) == 0, "threads wait for ever"
+        doubles = (ctypes.c_double * len(numbers))(*numbers)
+        assert getattr(library, kernel.key)(begin, blocks, seed, data, shapes, doubles) == 0, "threads wait for ever"
 
     return launch_native

@@ -166,7 +166,7 @@ def figure_scene(nodes: int = 256, points: int = 12000) -> tuple[Scene, np.ndarr
 
 def rich_scene() -> Scene:
     """Return a scene with every feature of a page: hyper-coordinates, a share of the motion, rotations of shapes,
-    changing scales, six neighbours, antialiasing."""
+    changing scales, six neighbours, antialiasing, sharp Gaussians."""
     scene = bar_scene(nodes=30, gaussians=300, shaded=True, share=0.8)
     motion = scene.motion
     motion.config = dataclasses.replace(motion.config, neighbors=6)
@@ -181,7 +181,9 @@ def rich_scene() -> Scene:
         return found
 
     motion.poses = poses  # type: ignore[method-assign]
-    scene.config = dataclasses.replace(scene.config, antialiased=True)
+    scene.config = dataclasses.replace(scene.config, antialiased=True, sharpness=0.5)
+    scene.gaussians.sharpness = 0.5
+    scene.gaussians.log_scales.data += 0.2
     scene.freeze_binding()
     return scene
 

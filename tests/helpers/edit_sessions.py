@@ -17,7 +17,8 @@ TURN = from_axis([0, 0, 1], 40).tolist()
 
 def same(first: Gaussians | Image, second: Gaussians | Image) -> bool:
     """Whether all parts agree to the bit."""
-    return all(torch.equal(a, b) for a, b in zip(dataclasses.astuple(first), dataclasses.astuple(second)))
+    pairs = zip(dataclasses.astuple(first), dataclasses.astuple(second))
+    return all(torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b for a, b in pairs)
 
 
 def part(session: EditSession, low: float, high: float) -> np.ndarray:

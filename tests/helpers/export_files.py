@@ -59,7 +59,7 @@ def ordered(gaussians: Gaussians) -> Gaussians:
     order = gaussians.means[:, 0].argsort()
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
     quats = torch.where(quats[:, :1] < 0, -quats, quats)
-    parts = {**vars(gaussians), "quats": quats}
+    parts = {**gaussians.tensors(), "quats": quats}
     return Gaussians(**{name: value.detach()[order] for name, value in parts.items()})
 
 

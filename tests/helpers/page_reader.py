@@ -42,9 +42,8 @@ def quaternions(columns: dict[str, np.ndarray]) -> torch.Tensor:
 def gaussians_of(facts: dict[str, Any], columns: dict[str, np.ndarray]) -> GaussianParameters:
     """The page's Gaussians as parameters, normalised units."""
     rest = (facts["sh_degree"] + 1) ** 2 - 1
-    made = GaussianParameters.empty(
-        facts["gaussians"], rest, int(facts["masked"]), facts["shaded"], facts.get("corrected", False), "cpu"
-    )
+    flags = int(facts["masked"]), facts["shaded"], facts.get("corrected", False)
+    made = GaussianParameters.empty(facts["gaussians"], rest, *flags, "cpu", facts.get("sharpness", 0.0))
     with torch.no_grad():
         made.means.copy_(stack(columns, "mean0", "mean1", "mean2"))
         made.quats.copy_(quaternions(columns))

@@ -19,6 +19,7 @@ def random_splats(
     log_scale: float = 1.0,
     aspect: float = 0.8,
     opacity: tuple[float, float] = (0.0, 1.0),
+    sharpness: float = 0.0,
 ) -> Splats:
     """``n`` splats, most of them inside the image.
 
@@ -40,4 +41,4 @@ def random_splats(
     diagonal = torch.diagonal(covariance, dim1=1, dim2=2)
     radii = torch.ceil(3.33 * diagonal.sqrt()).clamp(max=2**30).int()
     tensors = (means, conics.contiguous(), depths, opacities, radii)
-    return Splats(*(t.to(device) for t in tensors), width=width, height=height)
+    return Splats(*(t.to(device) for t in tensors), width=width, height=height, sharpness=sharpness)

@@ -29,6 +29,7 @@ def check(splats: Splats, tile_size: int = 16) -> Tiles:
         *(getattr(splats, n).cpu() for n in ("means2d", "conics", "depths", "opacities", "radii")),
         width=splats.width,
         height=splats.height,
+        sharpness=splats.sharpness,
     )
     found = pairs_of(tiles)
     assert len(set(found)) == len(found) == len(tiles.splats) == len(tiles.slots)
@@ -54,6 +55,13 @@ def check(splats: Splats, tile_size: int = 16) -> Tiles:
 @pytest.mark.parametrize("seed", range(3))
 def test_every_pair_that_matters(device: str, seed: int, size: tuple[int, int]):
     check(random_splats(seed, 150, *size, device))
+
+
+@pytest.mark.parametrize("sharpness", [0.1, 0.5, 4.0])
+def test_sharp_splats_reach_less_far(device: str, sharpness: float):
+    splats = random_splats(4, 150, 64, 48, device, log_scale=2.0)
+    sharp, plain = check(replace(splats, sharpness=sharpness)), check(splats)
+    assert len(sharp.splats) < len(plain.splats)
 
 
 @pytest.mark.parametrize("tile_size", [4, 8, 32])

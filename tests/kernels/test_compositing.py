@@ -116,6 +116,21 @@ def test_extremes(device: str, kind: dict):
     check(random_splats(11, 250, 48, 40, device, **kind), random_channels(11, 250, 4, device), 11, device)
 
 
+@pytest.mark.parametrize("sharpness", [0.1, 0.5, 4.0])
+@pytest.mark.parametrize(
+    "kind",
+    [{}, {"opacity": (1.0, 1.0)}, {"opacity": (0.0, 0.02)}, {"log_scale": 4.0}, {"log_scale": 2.0, "aspect": 2.0}],
+    ids=["mixed", "opaque", "faint", "huge", "needles"],
+)
+def test_sharpness(device: str, kind: dict, sharpness: float):
+    splats = random_splats(12, 250, 48, 40, device, sharpness=sharpness, **kind)
+    channels = random_channels(12, 250, 4, device)
+    check(splats, channels, 12, device)
+    image, _ = composite(splats, channels, bin_splats(splats))
+    plain, _ = composite(replace(splats, sharpness=0.0), channels, bin_splats(splats))
+    assert (image - plain).abs().max() > 5e-3
+
+
 @pytest.mark.parametrize("n", [0, 1])
 def test_few(device: str, n: int):
     splats = random_splats(3, n, 20, 20, device, opacity=(0.5, 0.9))
@@ -131,9 +146,10 @@ def test_few(device: str, n: int):
     height=st.integers(1, 40),
     c=st.integers(1, 9),
     log_scale=st.integers(-1, 4),
+    sharpness=st.sampled_from([0.0, 0.5, 2.0]),
 )
-def test_any_scene(seed: int, n: int, width: int, height: int, c: int, log_scale: int):
-    splats = random_splats(seed, n, width, height, log_scale=log_scale)
+def test_any_scene(seed: int, n: int, width: int, height: int, c: int, log_scale: int, sharpness: float):
+    splats = random_splats(seed, n, width, height, log_scale=log_scale, sharpness=sharpness)
     channels, background = random_channels(seed, n, c), torch.rand(c)
     tiles = bin_splats(splats)
     expected, expected_alpha = composite_reference(splats, channels, tiles, background)

@@ -75,11 +75,13 @@ def compare_form(form, inputs, camera, seed, tolerance, **options):
     return ours
 
 
+@pytest.mark.parametrize("sharpness", [0.0, 0.5])
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("seed", "n", "size"), [(0, 300, (64, 48)), (1, 1000, (33, 65)), (2, 1000, (320, 200))])
-def test_values_and_gradients(seed, n, size, antialiased, device):
+def test_values_and_gradients(seed, n, size, antialiased, sharpness, device):
     g, camera = random_gaussians(seed, n, device), random_camera(seed, *size, device)
-    ours = compare(shape_of(g), camera, seed, antialiased=antialiased)
+    ours = compare(shape_of(g), camera, seed, antialiased=antialiased, sharpness=sharpness)
+    assert ours.sharpness == sharpness
     visible = (ours.radii[:, 0] > 0).float().mean()
     assert 0.2 < visible < 0.99  # both branches are met
 
@@ -95,13 +97,28 @@ def test_close_to_the_camera_where_the_jacobian_is_clamped(seed, device):
 
 
 @pytest.mark.parametrize(
-    "options", [{"radius_clip": 5.0}, {"eps2d": 0.0}, {"eps2d": 2.0}, {"near_plane": 4.0}, {"far_plane": 3.5}]
+    "options",
+    [
+        {"radius_clip": 5.0},
+        {"eps2d": 0.0},
+        {"eps2d": 2.0},
+        {"near_plane": 4.0},
+        {"far_plane": 3.5},
+        {"sharpness": 2.0},
+    ],
 )
 def test_options(options, device):
     g, camera = random_gaussians(3, 800, device), random_camera(3, 100, 80, device)
     ours = compare(shape_of(g), camera, 3, **options)
     default = project(*shape_of(g), camera.viewmat, camera.K, 100, 80)
     assert not torch.equal(ours.radii, default.radii)
+
+
+@pytest.mark.parametrize("sharpness", [-0.1, 101.0, float("nan"), float("inf")])
+def test_a_sharpness_out_of_range_is_refused(sharpness):
+    g, camera = random_gaussians(3, 5), random_camera(3, 10, 8)
+    with pytest.raises(ValueError, match=r"sharpness must be in 0 \.\. 100"):
+        project(*shape_of(g), camera.viewmat, camera.K, 10, 8, sharpness=sharpness)
 
 
 def test_against_gsplat():

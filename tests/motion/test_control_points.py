@@ -45,7 +45,7 @@ def fresh(scene, time: float) -> Gaussians:
 
 
 def assert_same(actual: Gaussians, expected: Gaussians) -> None:
-    for name, value in vars(expected).items():
+    for name, value in expected.tensors().items():
         assert torch.equal(getattr(actual, name), value), name
 
 

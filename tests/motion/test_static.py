@@ -17,7 +17,7 @@ def test_gaussians_stay():
     rest = gaussians.activate()
     for time in (0.0, 0.5, torch.tensor([1.0])):
         posed = motion.gaussians_at(gaussians, time)
-        for name, value in vars(rest).items():
+        for name, value in rest.tensors().items():
             assert torch.equal(getattr(posed, name), value), name
     pose = motion.train_at(gaussians, 0.3, 0, config, 0)
     assert pose.regulariser is None and motion.control_points_at(0.5).shape == (0, 3)

@@ -20,7 +20,7 @@ def usable(splats: Splats) -> Tensor:
 
 
 def needed_pairs(splats: Splats, tile_size: int = 16, margin: float = 0.0) -> set[tuple[int, int]]:
-    """All (tile, splat) such that the splat's q - margin <= 2 ln(255 o) at one of the tile's pixels."""
+    """All (tile, splat) such that u + s u^2 <= ln(255 o) with 2 u = q - margin at one of the tile's pixels."""
     columns = -(-splats.width // tile_size)
     x = torch.arange(splats.width, dtype=torch.float64) + 0.5
     y = torch.arange(splats.height, dtype=torch.float64) + 0.5
@@ -30,7 +30,10 @@ def needed_pairs(splats: Splats, tile_size: int = 16, margin: float = 0.0) -> se
         dx = (x - splats.means2d[i, 0].double())[None, :]
         dy = (y - splats.means2d[i, 1].double())[:, None]
         q = a * dx * dx + 2 * b * dx * dy + c * dy * dy
-        reached = torch.nonzero(q - margin <= 2 * torch.log(255 * splats.opacities[i].double()))
+        u = (q - margin) / 2
+        reached = torch.nonzero(
+            u + splats.sharpness * u.clamp(min=0) ** 2 <= (255 * splats.opacities[i].double()).log()
+        )
         for tile in torch.unique(reached[:, 0] // tile_size * columns + reached[:, 1] // tile_size).tolist():
             pairs.add((tile, i))
     return pairs

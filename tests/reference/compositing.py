@@ -51,7 +51,8 @@ def composite(
                 offsets = torch.zeros(len(index), len(pixels), 2, dtype=torch.float64, requires_grad=True)
                 saved[column, row] = (offsets, index)
                 mean = mean + offsets
-            cell = _composite_pixels(pixels, mean, conics[index], opacities[index], channels[index], background)
+            rows_of = conics[index], opacities[index], channels[index]
+            cell = _composite_pixels(pixels, mean, *rows_of, background, splats.sharpness)
             cells.append(cell.reshape(len(cell), len(ys), len(xs)))
         rows.append(torch.cat(cells, 2))
     image = torch.cat(rows, 1)
@@ -59,13 +60,19 @@ def composite(
 
 
 def _composite_pixels(
-    pixels: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor, background: Tensor
+    pixels: Tensor,
+    means: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    channels: Tensor,
+    background: Tensor,
+    sharpness: float,
 ) -> Tensor:
     """[C + 1, P]: channels and alpha of P pixels, from K splats in order."""
     d = pixels[None] - means
     a, b, c = conics[:, None].unbind(-1)
     q = a * d[..., 0] ** 2 + 2 * b * d[..., 0] * d[..., 1] + c * d[..., 1] ** 2
-    alpha = torch.clamp(opacities[:, None] * torch.exp(-q / 2), max=ALPHA_MAX)
+    alpha = torch.clamp(opacities[:, None] * torch.exp(-q / 2 - sharpness * (q / 2) ** 2), max=ALPHA_MAX)
     alpha = torch.where((q < 0) | (alpha < ALPHA_MIN), torch.zeros_like(alpha), alpha)
     after = torch.cumprod(1 - alpha, 0)
     # The transmittance only falls: once a splat would leave too little, so would every later one.

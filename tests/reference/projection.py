@@ -35,6 +35,7 @@ def project(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     antialiased: bool = False,
+    sharpness: float = 0.0,
 ) -> Projected:
     """All in the inputs' dtype. Culled rows are zero and get no gradient."""
     zero = torch.zeros((), dtype=means.dtype, device=means.device)
@@ -67,7 +68,10 @@ def project(
         factor = torch.where(solid & (ratio > 0), torch.where(ratio > 0, ratio, 1.0).sqrt(), zero)
         opacities = opacities * factor
     opaque = solid & (opacities * 255.0 >= 1.0)
-    q = 2.0 * torch.log(torch.where(opaque, opacities * 255.0, 1.0))
+    depth = torch.log(torch.where(opaque, opacities * 255.0, 1.0))
+    if sharpness > 0:  # the positive root of u + s u^2 = depth
+        depth = ((1 + 4 * sharpness * depth).sqrt() - 1) / (2 * sharpness)
+    q = 2.0 * depth
     variances = torch.where(opaque[:, None], torch.stack([blurred[:, 0, 0], blurred[:, 1, 1]], dim=1), zero)
     radii = torch.ceil((q[:, None] * variances).detach().sqrt()).clamp_max(1e9)
     centre = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)

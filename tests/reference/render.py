@@ -70,5 +70,6 @@ def rasterize(
     if background is not None:
         background = torch.cat([background, background.new_zeros(1)])
     tiles = tile_lists(splats, width, height, crop, sort_by)
-    image, alpha = composite(Splats(*splats, width, height), channels, tiles, background, crop=crop)
+    seen = Splats(*splats, width, height, options.get("sharpness", 0.0))
+    image, alpha = composite(seen, channels, tiles, background, crop=crop)
     return image, alpha, splats

@@ -210,7 +210,7 @@ def test_render_is_rasterization_with_expected_depth(device):
 
 def test_empty_scene_is_the_background(device):
     g, camera = random_gaussians(7, 0, device), random_camera(7, WIDTH, HEIGHT, device)
-    leaves = Gaussians(*(x.requires_grad_() for x in vars(g).values()))
+    leaves = Gaussians(*(x.requires_grad_() for x in g.tensors().values()))
     background = torch.tensor([0.1, 0.2, 0.3], device=device, requires_grad=True)
     image = render(leaves, camera, background)
     assert torch.equal(image.rgb, background.detach().expand(HEIGHT, WIDTH, 3))
@@ -221,16 +221,16 @@ def test_empty_scene_is_the_background(device):
 
 def test_broken_gaussians_leave_no_trace(device):
     g, camera = random_gaussians(8, 60, device), random_camera(8, WIDTH, HEIGHT, device)
-    kept = render(Gaussians(*(x[:50] for x in vars(g).values())), camera)
+    kept = render(Gaussians(*(x[:50] for x in g.tensors().values())), camera)
     for row, name in enumerate(("means", "quats", "scales", "opacities")):
         getattr(g, name)[50 + 2 * row] = float("nan")
         getattr(g, name)[51 + 2 * row] = float("inf")
     g.opacities[58:] = 0.0
-    leaves = Gaussians(*(x.requires_grad_() for x in vars(g).values()))
+    leaves = Gaussians(*(x.requires_grad_() for x in g.tensors().values()))
     image = render(leaves, camera)
     torch.testing.assert_close(image.rgb, kept.rgb)
     (image.rgb.square().sum() + image.depth.sum()).backward()
-    assert all(x.grad.isfinite().all() for x in vars(leaves).values())
+    assert all(x.grad.isfinite().all() for x in leaves.tensors().values())
 
 
 def test_stats_are_filled_by_the_backward_pass(device):
@@ -249,10 +249,10 @@ def test_same_bits_for_any_thread_count(all_threads):
     results = []
     for threads in (1, 2, 3):
         environment.configure(threads=threads)
-        leaves = Gaussians(*(x.detach().clone().requires_grad_() for x in vars(g).values()))
+        leaves = Gaussians(*(x.detach().clone().requires_grad_() for x in g.tensors().values()))
         viewmat = camera.viewmat.clone().requires_grad_()
         image = render(leaves, type(camera)(viewmat, camera.K, 128, 96))
         (image.rgb.square().mean() + image.depth.mean()).backward()
-        results.append([image.rgb, image.depth, viewmat.grad, *(x.grad for x in vars(leaves).values())])
+        results.append([image.rgb, image.depth, viewmat.grad, *(x.grad for x in leaves.tensors().values())])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))

@@ -85,7 +85,7 @@ def test_a_case_is_its_number():
 def test_a_nan_from_the_loss_is_not_hidden(device: str):
     """Overflow guards pass non-finite gradients on, so that training stops there."""
     g, camera = random_gaussians(3, 60, device), random_camera(3, 33, 31, device)
-    leaves = [x.clone().requires_grad_() for x in vars(g).values()]
+    leaves = [x.clone().requires_grad_() for x in g.tensors().values()]
     image, _ = draw(Gaussians(*leaves), camera)
     v_image = torch.zeros_like(image)
     v_image[1, 15, 16] = torch.nan

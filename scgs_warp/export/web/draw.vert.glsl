@@ -16,7 +16,7 @@ void main() {
   }
   vec2 corner = vec2(which & 1, which >> 1) * 2.0 - 1.0;
   vec2 pixel = uintBitsToFloat(place.xy) + corner.x * unpackHalf2x16(place.z) + corner.y * unpackHalf2x16(place.w);
-  v_corner = corner * sqrt(max(2.0 * log(255.0 * opacity), 0.0));
+  v_corner = corner * sqrt(extent_of(opacity));
   v_color = vec4(unpackHalf2x16(color.x), unpackHalf2x16(color.y).x, opacity);
   gl_Position = vec4(2.0 * pixel.x / u_size.x - 1.0, 1.0 - 2.0 * pixel.y / u_size.y, 0.0, 1.0);
 }

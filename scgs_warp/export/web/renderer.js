@@ -4,7 +4,12 @@ function compile(gl, vertex, fragment, defines) {
   const head = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\n"
     + "precision highp usampler2D;\n"
     + Object.entries({ WIDTH, ...defines }).map(([name, value]) => `#define ${name} ${value}\n`).join("")
-    + "ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }\n";
+    + "ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }\n"
+    // Squared distance at which alpha is 1 / 255.
+    + "float extent_of(float opacity) {\n"
+    + "  float depth = max(log(255.0 * opacity), 0.0);\n"
+    + "  return 4.0 * depth / (1.0 + sqrt(1.0 + 4.0 * SHARPNESS * depth));\n"
+    + "}\n";
   const program = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
@@ -30,17 +35,18 @@ class Renderer {
     if (model.means.length / (4 * WIDTH) * 4 > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw new Error(`${model.count} Gaussians are more than this graphics driver has room for`);
     }
+    const SHARPNESS = (model.facts.sharpness ?? 0).toFixed(6);
     const { facts } = model, texels = Math.ceil(((facts.sh_degree + 1) ** 2 - 1) / 4);
     const defines = {
       NODES: model.nodes, BLOCKS: model.stride / 4, DEGREE: facts.sh_degree, SH_TEXELS: texels,
-      COLOR_TEXELS: facts.shaded ? 4 : 1,
+      COLOR_TEXELS: facts.shaded ? 4 : 1, SHARPNESS,
     };
     for (const name of ["shaded", "tinted", "corrected", "masked", "antialiased"]) {
       if (facts[name]) defines[name.toUpperCase()] = 1;
     }
     this.splat = compile(gl, SHADERS["screen.vert"], SHADERS["splat.frag"], defines);
-    this.draw = compile(gl, SHADERS["draw.vert"], SHADERS["draw.frag"], {});
-    this.screen = compile(gl, SHADERS["screen.vert"], SHADERS["screen.frag"], {});
+    this.draw = compile(gl, SHADERS["draw.vert"], SHADERS["draw.frag"], { SHARPNESS });
+    this.screen = compile(gl, SHADERS["screen.vert"], SHADERS["screen.frag"], { SHARPNESS });
     // Halves, where they can be drawn to: sums of many faint Gaussians lose what 8 bits round away.
     const precise = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.sumFormat = precise ? gl.RGBA16F : gl.RGBA8;

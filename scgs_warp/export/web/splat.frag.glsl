@@ -167,7 +167,7 @@ void main() {
   // Half axes of the ellipse outside of which alpha is under 1 / 255
   float apart = 0.5 * (xx - yy), spread = length(vec2(apart, xy));
   float large = 0.5 * (xx + yy) + spread, angle = spread > 0.0 ? 0.5 * atan(xy, apart) : 0.0;
-  float extent = 2.0 * log(255.0 * opacity);
+  float extent = extent_of(opacity);
   vec2 along = vec2(cos(angle), sin(angle));
   float longer = min(sqrt(large * extent), 6e4), shorter = min(sqrt(determinant / large * extent), 6e4);
 
