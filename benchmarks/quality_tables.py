@@ -358,6 +358,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "tints": change_of_defaults,
     "log-error": change_of_defaults,
     "correctives": change_of_defaults,
+    "sharpness": change_of_defaults,
     "parts": changes(TWO, "none"),
     "parts-shading": changes(TWO, "parts/shading"),
     "parts-threshold": changes(TWO, "parts-shading/threshold"),

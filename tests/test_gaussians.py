@@ -40,7 +40,9 @@ def test_plain_gaussians_look_most_alike():
         assert plain.sharpness == 0.0 and plain.plain() is plain
         assert set(plain.tensors()) == {field.name for field in dataclasses.fields(plain)} - {"sharpness"}
         errors = [
-            float((render(dataclasses.replace(plain, scales=factor * plain.scales), camera).rgb - truth).square().mean())
+            float(
+                (render(dataclasses.replace(plain, scales=factor * plain.scales), camera).rgb - truth).square().mean()
+            )
             for factor in (0.8, 1.0, 1.25, 1.0 / plain_scale(0.5))
         ]
     assert errors[1] == min(errors) and errors[1] < 0.3 * errors[3]

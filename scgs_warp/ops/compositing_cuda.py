@@ -17,7 +17,7 @@ from ..runtime.launch import launch, launch_blocks
 def forward(
     form: str,
     lists: tuple[Tensor, ...],
-    size: tuple[int, ...],
+    size: tuple[float, ...],
     outputs: tuple[Tensor | None, ...],
     window: tuple[int, int],
 ) -> None:
@@ -45,7 +45,7 @@ def forward(
 def adjoint(
     form: str,
     lists: tuple[Tensor, ...],
-    size: tuple[int, ...],
+    size: tuple[float, ...],
     absolute: bool,
     v_slots: Tensor,
     window: tuple[int, int],

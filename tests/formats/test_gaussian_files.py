@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import struct
 from pathlib import Path
@@ -111,3 +112,15 @@ def test_what_does_not_fit_after_reading_is_one_line_too(tmp_path, monkeypatch, 
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "b.ply").exists()
     with pytest.raises(RuntimeError, match="another"):
         run(lambda _: (_ for _ in ()).throw(RuntimeError("another")))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".splat", ".spz", ".glb"])
+def test_sharp_gaussians_are_written_as_the_most_similar_ones(tmp_path, suffix):
+    gaussians = cloud()
+    sharp = dataclasses.replace(gaussians, sharpness=0.5)
+    written = []
+    for index, value in enumerate((sharp, sharp.plain(), gaussians)):
+        path = tmp_path / f"{index}{suffix}"
+        write_still(path, value)
+        written.append(path.read_bytes())
+    assert written[0] == written[1] != written[2]

@@ -83,6 +83,7 @@ def case_projection(d: Draw, device: str) -> None:
         "eps2d": float(d.pick((0.3, 0.3, 0.0, 1e-30, 1e30))),
         "radius_clip": float(d.pick((0.0, 0.0, 3.0))),
         "antialiased": d.chance(0.3),
+        "sharpness": sharpness_of(d),
         "form": "plain" if device != "cpu" or d.chance(0.3) else "cpu",
     }
     splats = project(*shape, viewmat, K, *size, **settings)
@@ -137,7 +138,12 @@ def splats_of(d: Draw, device: str) -> Splats:
     if d.chance(0.3):
         values = torch.tensor([0, -1, 2**31 - 1, -(2**31), 1], dtype=torch.int32)
         splats.radii[rows] = values[torch.from_numpy(d.rng.integers(0, 5, (int(rows.sum()), 2)))]
-    return Splats(*on(device, *(getattr(splats, name) for name in FIELDS)), width=width, height=height)
+    fields = on(device, *(getattr(splats, name) for name in FIELDS))
+    return Splats(*fields, width=width, height=height, sharpness=sharpness_of(d))
+
+
+def sharpness_of(d: Draw) -> float:
+    return float(d.pick((0.0, 0.0, 0.5, 1e-6, 100.0)))
 
 
 def case_binning(d: Draw, device: str) -> None:
@@ -190,7 +196,7 @@ def check_composite(d: Draw, splats: Splats, channels: Tensor, background: Tenso
     laws.finite("statistics", stats.grad_norm, stats.count, stats.max_radii, absgrad)
     whole = finite_rows(*(getattr(splats, name) for name in FIELDS[:4]), channels).to(device)
     laws.all_zero_where("gradients of the broken", ~whole, grads[:4])
-    rest = Splats(*(getattr(splats, name)[whole] for name in FIELDS), width=splats.width, height=splats.height)
+    rest = replace(splats, **{name: getattr(splats, name)[whole] for name in FIELDS})
     with torch.no_grad():
         alone = composite(rest, channels[whole], bin_splats(rest), background, form=form)
     for name, ours, other in zip(("image", "alpha"), (image, alpha), alone):
@@ -208,9 +214,9 @@ def case_draw(d: Draw, device: str) -> None:
     background = leaf(color.to(device))
     viewmat = leaf(camera.viewmat)
     own = Camera(viewmat, camera.K, *size)
-    options = {"antialiased": d.chance(0.3), "depth": d.chance()}
+    options, sharpness = {"antialiased": d.chance(0.3), "depth": d.chance()}, sharpness_of(d)
     stats = Stats.zeros(count, device)
-    image, alpha = draw_image(Gaussians(*values), own, background, stats=stats, **options)
+    image, alpha = draw_image(Gaussians(*values, sharpness), own, background, stats=stats, **options)
     laws.finite("image, alpha", image, alpha)
     incoming = d.normal(*image.shape).to(device), d.normal(*alpha.shape).to(device)
     grads = torch.autograd.grad((image, alpha), [*values, viewmat, background], incoming, allow_unused=True)
@@ -220,7 +226,7 @@ def case_draw(d: Draw, device: str) -> None:
     laws.all_zero_where("gradients of the broken", ~whole, [x for x in grads[:6] if x is not None])
     assert not bool(stats.count[~finite_rows(*values[:4]).to(device)].any()), "a broken Gaussian counts as seen"
     with torch.no_grad():
-        alone = draw_image(Gaussians(*(x[whole] for x in values)), own, background, **options)
+        alone = draw_image(Gaussians(*(x[whole] for x in values), sharpness), own, background, **options)
     for name, ours, other in zip(("image", "alpha"), (image, alpha), alone):
         laws.equal(f"{name} of the valid alone", ours, other)
 
@@ -229,7 +235,7 @@ def case_render(d: Draw, device: str) -> None:
     """Colour, alpha and depth are finite; depth lies between the planes, or is 0."""
     g, camera = poisoned_gaussians(d, d.count(), int(d.rng.integers(4))), camera_of(d, *d.size())
     values = [leaf(x) for x in on(device, *g.tensors().values())]
-    image = render(Gaussians(*values), camera.to(device), antialiased=d.chance())
+    image = render(Gaussians(*values, sharpness_of(d)), camera.to(device), antialiased=d.chance())
     laws.finite("rgb, alpha, depth", image.rgb, image.alpha, image.depth)
     assert bool((image.depth >= 0).all())
     incoming = [d.normal(*x.shape).to(device) for x in (image.rgb, image.alpha, image.depth)]

@@ -10,6 +10,7 @@ import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.errors import UserError
+from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
 from scgs_warp.training.initial_points import HALF_SIZE
 from scgs_warp.training.loop import fit
@@ -84,6 +85,22 @@ def test_the_main_stage_begins_with_control_points():
     state.begin_main()
     assert (state.stage, state.motion.name, state.stage_step) == ("main", "control-points", 0)
     assert len(state.gaussians) == len(state.stats.count) == state.config.init_points
+
+
+@pytest.mark.parametrize("model", ["control-points", "per-gaussian", "hexplane", "static"])
+def test_gaussians_are_sharp_and_spheres_are_not(model, tmp_path):
+    """Also after a checkpoint of either stage has been read."""
+    config = tiny_config(60, motion={"model": model}, sharpness=0.7)
+    state = TrainState.begin(config, tiny_dataset(3), "cpu")
+    if model == "control-points":
+        state.save(tmp_path)
+        for read in (state, TrainState.resume(tmp_path, config, tiny_dataset(3), "cpu")):
+            assert read.gaussians.sharpness == read.motion.gaussians_at(read.gaussians, 0.3).sharpness == 0.0
+        state.step = config.pretrain_steps
+        state.begin_main()
+    state.save(tmp_path)
+    for read in (state, TrainState.resume(tmp_path, config, tiny_dataset(3), "cpu"), Scene.load(tmp_path)):
+        assert read.gaussians.sharpness == read.motion.gaussians_at(read.gaussians, 0.3).sharpness == 0.7
 
 
 def test_random_points_of_the_official_code_are_grey_in_a_cube():
