@@ -292,6 +292,24 @@ def changes(scenes: tuple[str, ...], base: str) -> Callable[[Source], str]:
     return write
 
 
+def levers(source: Source) -> str:
+    """Write each change with its scores and the differences from the row ``none`` or the one in ``against``, scene by
+    scene: most were tried on few scenes."""
+    rows = dict.fromkeys(row for name, row, _ in source.runs if name == source.name)
+    lines = []
+    for row in rows:
+        cells, first = [], {}
+        for scene in TWO:
+            run = source.run(row, scene)
+            first = first or run
+            base = source.run(run.get("against", "none"), scene)
+            known = run and row != "none" and "psnr" in base
+            cells += [number(run.get("psnr"), 2), signed(run["psnr"] - base["psnr"]) if known else ""]
+            cells.append(thousands(run.get("gaussians"), 1))
+        lines.append([source.label(row, first["label"]), *cells])
+    return table(["change", *(head for scene in TWO for head in (scene, "difference", "Gaussians"))], lines)
+
+
 def overview(source: Source) -> str:
     """Write the overview from the runs of the other tables."""
     lines = []
@@ -359,6 +377,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "log-error": change_of_defaults,
     "correctives": change_of_defaults,
     "sharpness": change_of_defaults,
+    "levers": levers,
     "parts": changes(TWO, "none"),
     "parts-shading": changes(TWO, "parts/shading"),
     "parts-threshold": changes(TWO, "parts-shading/threshold"),

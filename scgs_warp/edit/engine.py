@@ -171,7 +171,8 @@ class Engine:
         return self._live is None or self._live.targets == self.targets(edit, None)
 
     def gaussians(self, time: float, bent: NodePose | None) -> Gaussians:
-        """Return activated Gaussians, world units, for the result of ``bend``."""
+        """Return activated Gaussians, world units, for the result of ``bend``; sharp ones are approximated
+        (``Gaussians.plain``)."""
         if bent is None:
             return self.scene.gaussians_at(time)
         posed = self._posed(time, bent)
@@ -179,7 +180,7 @@ class Engine:
         return Gaussians(
             undo.undo(posed.means), posed.quats, undo.undo_scale(posed.scales), posed.opacities,
             posed.sh_dc.detach(), posed.sh_rest.detach(), posed.sharpness,
-        )  # fmt: skip
+        ).plain()  # fmt: skip
 
     def normalised(self, time: float, bent: NodePose | None) -> Gaussians:
         """Return activated Gaussians in normalised units, for rendering."""

@@ -135,7 +135,8 @@ class Scene:
             time: clamped to [0, 1].
 
         Returns:
-            N Gaussians in world units on the scene's device. Row i is the same Gaussian at every time.
+            N Gaussians in world units on the scene's device. Row i is the same Gaussian at every time. Sharp ones are
+            approximated (``Gaussians.plain``).
 
         Raises:
             UserError: the time is non-finite.
@@ -150,7 +151,7 @@ class Scene:
             posed.sh_dc,
             posed.sh_rest,
             posed.sharpness,
-        )
+        ).plain()
 
     @torch.no_grad()
     def render(

@@ -93,7 +93,7 @@ def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
     means, quats, scales, sh_dc = (None,) * 4
     for seconds, time in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
         means, quats, scales, sh_dc = player()["play"](data, seconds)
-        truth = scene.gaussians_at(time).plain()
+        truth = scene.gaussians_at(time)
         np.testing.assert_allclose(means, truth.means, atol=2e-6)
         np.testing.assert_allclose(np.abs((unit(quats) * unit(truth.quats.numpy())).sum(1)), 1.0, atol=1e-6)
         np.testing.assert_allclose(sh_dc, truth.sh_dc, atol=2e-5)
