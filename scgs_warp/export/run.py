@@ -25,6 +25,7 @@ from .cameras import write_cameras
 from .control_graph import write_graph
 from .glb import write_glb
 from .npz import write_npz
+from .plain import plain_scene
 from .request import ExportRequest, check_request
 from .sequence import check_folder, write_sequence
 from .skeleton import (
@@ -94,7 +95,7 @@ def _export_still(request: ExportRequest, device: str) -> str:
             with shortage_as_user_error(request.ply):
                 gaussians, when = keep_finite(stored.activate()), f"as in {request.ply}"
     else:
-        scene = _open(request, device)
+        scene = plain_scene(_open(request, device))
         up, antialiased = scene.overview.up, scene.config.antialiased
         if request.edit is not None:
             session, at = _open_session(request, scene), request.at or 0.0
@@ -140,6 +141,8 @@ def write_still(
 
 def _export_moving(request: ExportRequest, device: str) -> str:
     scene = _open(request, device)
+    if request.kind != "graph":
+        scene = plain_scene(scene)
     session = None
     if request.edit is not None or (request.kind != "ply-sequence" and scene.motion.moves):
         session = _open_session(request, scene)

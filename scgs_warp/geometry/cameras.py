@@ -45,6 +45,8 @@ class Overview:
     """Arc of azimuths that the cameras cover; 360 for a full orbit."""
     aspect: float = 1.0
     """Aspect ratio of the images: width divided by height."""
+    longer_side: float = 0.0
+    """Median of the images' longer sides in pixels; 0 in checkpoints of older versions."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as values that JSON represents exactly."""
@@ -172,6 +174,7 @@ def overview(cameras: Sequence[Camera]) -> Overview:
         azimuth=azimuth % 360.0,
         sweep=sweep,
         aspect=float(np.median([camera.width / camera.height for camera in cameras])),
+        longer_side=float(np.median([max(camera.width, camera.height) for camera in cameras])),
     )
 
 

@@ -59,7 +59,7 @@ def run(tmp_path_factory) -> Path:
     """A run whose network moves things a little, with shading and correctives."""
     like = bar_scene(nodes=24, gaussians=120, shaded=True, corrected=True)
     fields = {"nodes": 24, "layers": 3, "width": 32, "skip": 2}
-    config = from_dict({"motion": fields})
+    config = from_dict({"motion": fields, "sharpness": 0.0})
     template = build_motion("control-points", config)
     assert isinstance(template, ControlPoints)
     rig = like.motion
