@@ -28,6 +28,7 @@ from ..motion.node_density import adapt_control_points
 from ..motion.spheres import Spheres
 from ..runtime import memory
 from ..seeding import generator
+from ..types import plain_scale
 from .densify import grow_and_prune, mean_gradient, prune, reset_opacities
 from .frames import Frames
 from .pretrain import densify_spheres, densify_spheres_by_gradient, thin_spheres
@@ -93,9 +94,11 @@ def sphere_reset_due(config: TrainConfig, done: int) -> bool:
 # Thresholds and limits
 
 
-def gradient_threshold(config: DensifyConfig, width: int, height: int) -> float:
-    """Return the gradient threshold for this image size, normalised device coordinates."""
-    return config.grad_threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent
+def gradient_threshold(config: DensifyConfig, width: int, height: int, sharpness: float = 0.0) -> float:
+    """Return the gradient threshold for this image size, normalised device coordinates. It grows as sharp splats become
+    narrower, since the gradients of their means grow likewise; otherwise there would be more of them."""
+    threshold = config.grad_threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent
+    return threshold / plain_scale(sharpness)
 
 
 def affordable_count(gaussians: GaussianParameters, wanted: int) -> int:
@@ -182,7 +185,7 @@ def _control_gaussians(state: TrainState, size: tuple[int, int], visible: Tensor
 
     # 2. Densification round.
     if round_due(config, done):
-        threshold = gradient_threshold(config, *size)
+        threshold = gradient_threshold(config, *size, state.gaussians.sharpness)
         if isinstance(state.motion, ControlPoints) and control_points_due(state.config, done):
             assert state.motion_optimizer is not None
             adapt_control_points(

@@ -25,7 +25,7 @@ from scgs_warp.training.density_control import (
 )
 from scgs_warp.training.loop import fit
 from scgs_warp.training.visibility import contributions
-from scgs_warp.types import Stats
+from scgs_warp.types import Stats, plain_scale
 
 
 def test_schedule_of_a_short_run():
@@ -77,6 +77,13 @@ def test_threshold_follows_the_resolution():
     config = DensifyConfig(grad_threshold=2e-4, resolution_exponent=0.66)
     assert gradient_threshold(config, 800, 800) == pytest.approx(2e-4)
     assert 4.8e-4 < gradient_threshold(config, 200, 200) < 5.2e-4
+
+
+def test_threshold_grows_as_sharp_splats_become_narrower():
+    config = DensifyConfig(grad_threshold=2e-4)
+    thresholds = [gradient_threshold(config, 800, 800, sharpness) for sharpness in (0.0, 0.5, 2.0)]
+    assert thresholds[0] == pytest.approx(2e-4)
+    assert thresholds[1] == pytest.approx(2e-4 / plain_scale(0.5)) and thresholds[1] < thresholds[2]
 
 
 def run_round(gaussians, optimizer, gradient, config, **options):
