@@ -85,10 +85,11 @@ def preset(name: PresetName) -> TrainConfig:
         start_ratio=16.0,
     )
     quick = with_steps(cpu, 7_000)
-    # Rigidity to the end and neighbours by place alone: the least error of motion on the built-in figure.
+    # Rigidity to the end, neighbours by place alone, less sharpness: least error of motion on the built-in figure.
     motion = dataclasses.replace(quick.motion, hyper_dim=0, node_weight=False, correctives=False)
     loss = dataclasses.replace(quick.loss, arap=1e-2, arap_end=1e-2, arap_until=quick.steps)
-    return dataclasses.replace(quick, preset="quick", half_size=1_800, pretrain=stage1, motion=motion, loss=loss)
+    changed = {"half_size": 1_800, "sharpness": 0.25, "pretrain": stage1, "motion": motion, "loss": loss}
+    return dataclasses.replace(quick, preset="quick", **changed)
 
 
 def with_steps(config: TrainConfig, steps: int) -> TrainConfig:
