@@ -183,7 +183,7 @@ def rich_scene() -> Scene:
     motion.poses = poses  # type: ignore[method-assign]
     scene.config = dataclasses.replace(scene.config, antialiased=True, sharpness=0.5)
     scene.gaussians.sharpness = 0.5
-    scene.gaussians.log_scales.data += 0.2
+    scene.gaussians.log_scales.data += 0.4
     scene.freeze_binding()
     return scene
 

@@ -59,7 +59,7 @@ def projection_arguments(count: int, width: int, eps2d: float) -> tuple[Any, ...
     K = torch.tensor([[[60.0, 0.0, 32.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]]])
     outputs = [torch.zeros(count, *tail) for tail in ((2,), (3,), (), ())]
     radii = torch.zeros(count, 2, dtype=torch.int32)
-    return means, *shape, torch.eye(4)[None], K, width, 64, 0.01, 1e10, 0.0, eps2d, 0, *outputs, radii
+    return means, *shape, torch.eye(4)[None], K, width, 64, 0.01, 1e10, 0.0, eps2d, 0, 0.5, *outputs, radii
 
 
 def test_numbers_between_arrays():
