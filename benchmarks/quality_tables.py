@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from literature_tables import Column, Literature, literature_table, read_literature
-from markdown_table import number, table
+from markdown_table import duration, number, percent, signed, table, thousands
 from provenance import OLDER, REPORTED, TRAINING, changed_since, older_note, reported_note
 
 from scgs_warp.ablation.published import PUBLISHED_PSNR, TABLE_S1
@@ -84,29 +84,6 @@ class Source:
 
     def notes(self) -> str:
         return "\n\n".join(note for note in (reported_note(self.reported), older_note(self.older)) if note)
-
-
-def duration(seconds: float | None) -> str:
-    """Write a duration as ``3 min 22 s``, from an hour on as ``1 h 30 min``."""
-    if seconds is None:
-        return ""
-    if seconds >= 3600:
-        minutes = round(seconds / 60)
-        return f"{minutes // 60} h {minutes % 60} min"
-    whole = round(seconds)
-    return f"{whole // 60} min" + (f" {whole % 60} s" if whole % 60 else "")
-
-
-def thousands(count: float | None, digits: int = 0) -> str:
-    return "" if count is None else f"{count / 1000:.{digits}f}k"
-
-
-def signed(value: float | None) -> str:
-    return "" if value is None else f"{value:+.2f}"
-
-
-def percent(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f} %"
 
 
 def training_time(run: Run) -> str:

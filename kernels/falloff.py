@@ -12,6 +12,8 @@ import warp as wp
 
 from .types import ALPHA_MIN
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def falloff(q: float, sharpness: float) -> float:

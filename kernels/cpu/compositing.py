@@ -72,7 +72,7 @@ def composite_tile_adjoint(
     tile: int, packed: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i],
     splats: wp.array[int], slots: wp.array[int], transmittance: wp.array2d[float], last: wp.array2d[int],
     v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int, sharpness: float,
-    absolute: int,    v_slots: wp.array2d[float],
+    absolute: int, v_slots: wp.array2d[float],
 ): ...
 # fmt: on
 
