@@ -29,8 +29,9 @@ one size, because the low-pass filter of rendering widens small splats by a cons
 RATES = {"log_scales": 0.02, "opacity_logits": 0.05, "sh_dc": 5e-3}
 """Learning rates of the changes; over the second half they fall to ``SETTLED`` of this."""
 SETTLED = 0.05
-GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
-"""Multiples of the golden ratio, modulo 1, fill an interval evenly."""
+GOLDEN, SILVER = (math.sqrt(5.0) - 1.0) / 2.0, math.sqrt(2.0) - 1.0
+"""Multiples of either number, modulo 1, fill an interval evenly. Azimuths follow the one and times the other, so that
+they are not tied to each other."""
 ELEVATIONS = (-15.0, 10.0, 35.0)
 """Elevations of the views in degrees, relative to the training cameras' median."""
 
@@ -90,7 +91,7 @@ def plain_scene(scene: Scene) -> Scene:
 def _view(scene: Scene, index: int) -> _View:
     overview = scene.overview
     size = min(round(overview.longer_side) or USUAL_SIZE, LARGEST_SIZE)
-    time = (0.5 + 2.0 * GOLDEN * index) % 1.0
+    time = (0.5 + SILVER * index) % 1.0
     camera = orbit_camera(overview, azimuth_of(overview, index), size, overview.elevation + ELEVATIONS[index % 3])
     view = scene.normalisation.apply_camera(camera).to(scene.device)
     background = torch.tensor(scene.background_color, device=scene.device)
