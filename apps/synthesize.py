@@ -20,8 +20,8 @@ class Options:
     mesh: Path | None = None
     """File .glb or .gltf; skins, moving nodes and morph targets are animated."""
     subject: str | None = None
-    """Built-in subject instead of a file: robot (the default), rods, rods-dark, balls, cloth, fan, touch, opening,
-    still."""
+    """Built-in subject instead of a file: robot (the default), rods, rods-dark, balls, balls-steady, cloth, fan,
+    touch, opening, still."""
     clip: str | None = None
     """Name of the animation; the first one by default. With an unknown name, the command lists all names."""
     start: float | None = None

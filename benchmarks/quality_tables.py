@@ -317,7 +317,8 @@ def overview(source: Source) -> str:
     return table(["", "PSNR", "SSIM", "motion error", "training"], lines)
 
 
-ZOO = ("robot", "rods", "rods-dark", "balls", "cloth", "fan", "touch", "opening", "still", *DNERF, "handheld")
+BALLS = ("balls", "balls-steady")
+ZOO = ("robot", "rods", "rods-dark", *BALLS, "cloth", "fan", "touch", "opening", "still", *DNERF, "handheld")
 
 
 def change_of_defaults(source: Source) -> str:

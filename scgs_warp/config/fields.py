@@ -137,8 +137,9 @@ class PretrainConfig:
     densify_until: int = milestone(7_500)
     """Step at which spheres are no longer densified and pruned; farthest-point sampling of trajectories then reduces
     them to N_p."""
-    warm_up: int = milestone(500, 0)
-    """Number of steps before the network starts to move the spheres."""
+    warm_up: int = milestone(100, 0)
+    """Number of steps before the network starts to move the spheres. After long at rest, only spheres of parts that
+    hardly move are left."""
     densify_every: int = bounded(100, 1)
     densify_by: Literal["share", "gradient"] = newer("share", before="share")
     """Choice of the spheres that are cloned. share: a fixed share of them. gradient: those whose gradient reaches
@@ -169,6 +170,9 @@ class PretrainConfig:
     """Weight of the distance between the spheres' projected centres and the silhouette (not in the paper), in units of
     the image's width; needs alpha. It brings spheres to thin and fast parts, which the photometric loss makes
     transparent. If above 0, spheres are not larger than thin subjects are thick."""
+    pooled: bool = newer(True, before=False)
+    """Add the residual averaged over squares of 2, 4 and 8 % of the width (not in the paper). A sphere is drawn to its
+    part from farther away, and moved instead of turned transparent."""
     fade: Literal["auto", "always", "never"] = newer("auto", before="always")
     """Let spheres turn more transparent than ``solid_opacity``. A part whose spheres have faded is lost, but strays
     should fade. auto: yes, unless ``silhouette`` leads spheres to a subject in separate parts, which is not thin."""

@@ -66,6 +66,7 @@ PAPER = TrainConfig(
         arap_weight=1e-2,
         random_background=True,
         silhouette=0.0,
+        pooled=False,
         fade="always",
         progressive=False,
         progressive_every=1_000,

@@ -59,7 +59,7 @@ def preset(name: PresetName) -> TrainConfig:
         coarse=1_800,
         init_points=10_000,
         evaluate_every=5_000,
-        pretrain=PretrainConfig(steps=3_000, densify_until=2_000, warm_up=300, progressive_every=300),
+        pretrain=PretrainConfig(steps=3_000, densify_until=2_000, progressive_every=300),
         motion=MotionConfig(nodes=256),
         optim=OptimConfig(means_until=21_000, network_until=21_000),
         densify=DensifyConfig(

@@ -97,7 +97,7 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
 
     # 4. Compare.
     loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim, log_weight(state))
-    if config.loss.pooled == "always" and not pretraining:
+    if config.pretrain.pooled if pretraining else config.loss.pooled == "always":
         loss = loss + pooled_residual(picture, truth, mask)
     total = loss if regulariser is None else loss + regulariser
 

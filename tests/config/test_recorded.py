@@ -38,12 +38,14 @@ def test_best_is_the_former_paper():
         "loss.arap": 1e-4,
         "loss.arap_end": 1e-7,
         "loss.arap_until": 10_000,
+        "pretrain.warm_up": 100,
     }
     assert {name: best[name] for name, value in values.items() if best[name] != value} == changed
     newer = {name: default["before"] for name, default in recorded._fields(TrainConfig()) if "before" in default}
     added = {
         "pretrain.silhouette": 0.5,
         "pretrain.fade": "auto",
+        "pretrain.pooled": True,
         "motion.correctives": True,
         "optim.correctives": 8e-4,
         "motion.tints": True,

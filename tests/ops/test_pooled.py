@@ -55,3 +55,18 @@ def test_a_part_beside_its_place_is_better_than_none():
     assert float((beside - truth).abs().mean()) > float((missing - truth).abs().mean())
     assert float(pooled_residual(beside, truth)) < 0.7 * float(pooled_residual(missing, truth))
     assert float(pooled_residual(truth, truth)) == 0.0
+
+
+def blob(x: float) -> torch.Tensor:
+    """Draw a spot with a standard deviation of 2 pixels."""
+    columns, rows = torch.arange(200.0), torch.arange(200.0)[:, None]
+    return torch.exp(-((columns - x) ** 2 + (rows - 90.0) ** 2) / 8.0).expand(3, 200, 200)
+
+
+def test_a_part_is_drawn_to_its_place_from_beyond_its_reach():
+    """Pixel by pixel, the residual does not change. The mean over positions counts, because squares have borders."""
+    places = [80.0 + 2.0 * i for i in range(16)]
+    far, near = (sum(float(pooled_residual(blob(x - d), blob(x))) for x in places) for d in (16.0, 10.0))
+    far_pixels, near_pixels = (float((blob(100.0 - d) - blob(100.0)).abs().mean()) for d in (16.0, 10.0))
+    assert far_pixels == pytest.approx(near_pixels, rel=0.02)
+    assert near < 0.9 * far, (near, far)

@@ -246,19 +246,23 @@ def test_spheres_fade_only_where_they_may(fade, least, device):
     assert float(state.gaussians.opacities().detach().min()) < 0.01, "Gaussians may fade"
 
 
-def test_the_pooled_residual_acts_in_the_main_stage_alone():
-    data, results = tiny_dataset(4), {}
-    for pooled in ("always", "never"):
-        state = TrainState.begin(tiny_config(600, loss={"pooled": pooled}), data, "cpu")
+def test_each_stage_has_its_own_pooled_residual():
+    data, losses, pooled = tiny_dataset(4), {}, {}
+    for first, main in ((False, "never"), (True, "never"), (False, "always")):
+        changes = {"pretrain": {"pooled": first}, "loss": {"pooled": main}}
+        state = TrainState.begin(tiny_config(600, **changes), data, "cpu")
         frames = Frames(data, state.normalisation, state.config, "cpu")
-        first = float(training_step(state, frames).loss)
+        results = [training_step(state, frames)]
         state.step = state.config.pretrain_steps
         state.begin_main()
-        second = training_step(state, frames)
-        results[pooled] = first, float(second.loss), float(pooled_residual(second.render, second.truth))
-    assert results["always"][0] == results["never"][0]
-    assert results["always"][1] == pytest.approx(results["never"][1] + results["always"][2], rel=1e-5)
-    assert results["always"][2] > 1e-3
+        results.append(training_step(state, frames))
+        losses[first, main] = [float(result.loss) for result in results]
+        pooled[first, main] = [float(pooled_residual(result.render, result.truth)) for result in results]
+    neither, first, main = losses.values()
+    assert first[0] == pytest.approx(neither[0] + pooled[True, "never"][0], rel=1e-5)
+    assert pooled[True, "never"][0] > 1e-3
+    assert main[1] == pytest.approx(neither[1] + pooled[False, "always"][1], rel=1e-5)
+    assert pooled[False, "always"][1] > 1e-3 and main[0] == neither[0]
 
 
 def test_spheres_and_gaussians_are_no_larger_than_thin_subjects(device):
@@ -278,6 +282,8 @@ def test_spheres_and_gaussians_are_no_larger_than_thin_subjects(device):
 def test_recorded_configurations_without_the_field_have_no_silhouettes():
     recorded = to_dict(preset("cpu"))
     del recorded["pretrain"]["silhouette"], recorded["pretrain"]["fade"], recorded["loss"]["pooled"]
+    del recorded["pretrain"]["pooled"]
     read = from_dict(recorded)
+    assert not read.pretrain.pooled
     assert (read.pretrain.silhouette, read.pretrain.fade, read.loss.pooled) == (0.0, "always", "never")
     assert preset("cpu").pretrain.silhouette == 0.5

@@ -24,6 +24,7 @@ SUBJECTS: dict[str, Maker] = {
     "rods": partial(make_rods, dark=False),
     "rods-dark": partial(make_rods, dark=True),
     "balls": make_balls,
+    "balls-steady": partial(make_balls, spins=False),
     "cloth": make_cloth,
     "fan": make_fan,
     "touch": make_touch,

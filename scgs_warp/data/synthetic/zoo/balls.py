@@ -4,6 +4,7 @@ bodies."""
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -76,21 +77,21 @@ def ball_centre(ball: Ball, time: float) -> np.ndarray:
     return np.array([x, y, TABLE_TOP + ball.radius + height])
 
 
-def ball_transforms(time: float) -> dict[str, np.ndarray]:
-    """Return body-to-world [4, 4] of the balls and of the table."""
+def ball_transforms(time: float, spins: bool = True) -> dict[str, np.ndarray]:
+    """Return body-to-world [4, 4] of the balls and of the table; balls turn if ``spins``."""
     transforms = {"table": placed(0.0, 0.0, TABLE_TOP - TABLE_HALF_HEIGHT, rotation(0.0, 0.0, 25.0))}
     for ball in BALLS:
-        x, y, z = ball.spin
+        x, y, z = ball.spin if spins else (0.0, 0.0, 0.0)
         spun = rotation(time * x, time * y, time * z)
         transforms[ball.name] = placed(*ball_centre(ball, time), turn=spun)
     return transforms
 
 
-def make_balls(device: str, shading: Shading) -> SurfaceSubject:
-    """Make the balls and their table."""
+def make_balls(device: str, shading: Shading, spins: bool = True) -> SurfaceSubject:
+    """Make the balls, which turn if ``spins``, and their table."""
     pieces = [Piece(*disc(TABLE_RADIUS, TABLE_HALF_HEIGHT, TABLE_STEP), TABLE, "table", np.eye(4))]
     for ball in BALLS:
         divisions = 6 + math.ceil(40 * ball.radius)
         solid = rounded_box((ball.radius, ball.radius, ball.radius), ball.radius, divisions)
         pieces.append(Piece(*solid, ball.material, ball.name, np.eye(4)))
-    return SurfaceSubject(RigidParts(merge(pieces), ball_transforms), device, shading, LAMP)
+    return SurfaceSubject(RigidParts(merge(pieces), partial(ball_transforms, spins=spins)), device, shading, LAMP)

@@ -24,7 +24,7 @@ from scgs_warp.errors import UserError
 from scgs_warp.evaluation.motion_metrics import load_ground_truth
 from scgs_warp.runtime import environment
 
-NAMES = ("robot", "rods", "rods-dark", "balls", "cloth", "fan", "touch", "opening", "still")
+NAMES = ("robot", "rods", "rods-dark", "balls", "balls-steady", "cloth", "fan", "touch", "opening", "still")
 TIMES = np.linspace(0.0, 1.0, 101).tolist()
 
 
@@ -130,7 +130,7 @@ def test_light_comes_from_where_it_is_set(name):
     [
         (
             {"name": "cat"},
-            "--subject cat: give one of: robot, rods, rods-dark, balls, cloth, fan, touch, opening, still",
+            f"--subject cat: give one of: {', '.join(NAMES)}",
         ),
         ({"name": "balls", "mesh": Path("x.glb")}, "--subject balls: give either --subject or --mesh"),
         ({"name": "balls", "clip": "Walk"}, "--clip: is for glTF files"),
