@@ -129,7 +129,7 @@ def beside(columns: tuple[Column, ...], rows: tuple[tuple[str, str], ...]) -> Ca
 
 
 OWN_ROWS = (
-    ("cpu", "**`cpu`** (24,000 steps, two CPU cores)"),
+    ("cpu", "**`cpu`** (24,000 steps, one CPU core)"),
     ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
     ("best", "**`best`** (80,000 steps, one CPU core)"),
     ("best-less-pruning", "`best` with `densify.min_contribution=0.02`"),
