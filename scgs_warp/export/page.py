@@ -16,7 +16,7 @@ from .page_data import pack
 from .page_scene import page_scene
 
 SCRIPTS = ("data", "camera", "renderer", "player", "controls", "main")
-SHADERS = ("splat.frag", "draw.vert", "draw.frag", "screen.vert", "screen.frag")
+SHADERS = ("shared", "splat.frag", "draw.vert", "draw.frag", "screen.vert", "screen.frag")
 MAX_DEGREE = 3
 WEB = Path(__file__).parent / "web"
 TITLE = "Moving scene"

@@ -4,12 +4,7 @@ function compile(gl, vertex, fragment, defines) {
   const head = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\n"
     + "precision highp usampler2D;\n"
     + Object.entries({ WIDTH, ...defines }).map(([name, value]) => `#define ${name} ${value}\n`).join("")
-    + "ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }\n"
-    // Squared distance at which alpha is 1 / 255.
-    + "float extent_of(float opacity) {\n"
-    + "  float depth = max(log(255.0 * opacity), 0.0);\n"
-    + "  return 4.0 * depth / (1.0 + sqrt(1.0 + 4.0 * SHARPNESS * depth));\n"
-    + "}\n";
+    + SHADERS["shared"];
   const program = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
