@@ -355,6 +355,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "log-error": change_of_defaults,
     "correctives": change_of_defaults,
     "sharpness": change_of_defaults,
+    "fast-parts": change_of_defaults,
     "levers": levers,
     "parts": changes(TWO, "none"),
     "parts-shading": changes(TWO, "parts/shading"),
