@@ -74,12 +74,14 @@ def preset(name: PresetName) -> TrainConfig:
     )
     if name == "cpu":
         return cpu
-    # The built-in figure swings an arm through 137 degrees: spheres follow it only frame by frame.
+    # The built-in figure swings an arm through 137 degrees: spheres follow it only frame by frame. So followed, they
+    # need no pooled residual.
     stage1 = dataclasses.replace(
         cpu.pretrain,
         steps=1_800,
         densify_until=1_500,
         warm_up=100,
+        pooled=False,
         progressive=True,
         progressive_every=330,
         start_ratio=16.0,
