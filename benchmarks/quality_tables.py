@@ -322,7 +322,7 @@ ZOO = ("robot", "rods", "rods-dark", *BALLS, "cloth", "fan", "touch", "opening",
 
 
 def change_of_defaults(source: Source) -> str:
-    """Write mean and worst PSNR of each scene before and after a change of defaults, and the mean over the scenes.
+    """Write mean and worst PSNR of each scene before and after a change of defaults, and the mean over several scenes.
 
     Runs with another seed are recorded as scenes of their own: ``hook-seed-1``.
     """
@@ -333,7 +333,8 @@ def change_of_defaults(source: Source) -> str:
         before, after = source.run("before", scene), source.run("after", scene)
         pairs = [(before[key], after[key]) for key in ("psnr", "psnr_worst")]
         rows.append([value for old, new in pairs for value in (old, new, new - old)])
-    rows.append([math.fsum(column) / len(scenes) for column in zip(*rows)])
+    if len(scenes) > 1:
+        rows.append([math.fsum(column) / len(scenes) for column in zip(*rows)])
     marked = [source.label(row, row) for row in ("before", "after")]
     head = ["", *marked, "difference", *(f"worst image, {text}" for text in marked), "difference"]
     cells = [[signed(value) if i % 3 == 2 else number(value, 2) for i, value in enumerate(row)] for row in rows]

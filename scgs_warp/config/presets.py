@@ -80,7 +80,6 @@ def preset(name: PresetName) -> TrainConfig:
         cpu.pretrain,
         steps=1_800,
         densify_until=1_500,
-        warm_up=100,
         pooled=False,
         progressive=True,
         progressive_every=330,

@@ -97,7 +97,8 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
 
     # 4. Compare.
     loss, l1, ssim = photometric_loss(picture, truth, mask, config.loss.ssim, log_weight(state))
-    if config.pretrain.pooled if pretraining else config.loss.pooled == "always":
+    pooled = config.pretrain.pooled if pretraining else config.loss.pooled == "always"
+    if pooled:
         loss = loss + pooled_residual(picture, truth, mask)
     total = loss if regulariser is None else loss + regulariser
 

@@ -40,6 +40,15 @@ def test_balls_are_separate_and_over_the_table():
         assert min(heights) < TABLE_TOP + ball.radius + 0.03 and max(heights) > min(heights) + 0.4 * ball.jump
 
 
+def test_steady_balls_take_the_same_way_without_turning():
+    for time in (0.0, 0.3, 1.0):
+        turning, steady = ball_transforms(time), make_balls("cpu", Shading(), spins=False).surface.bone_transforms(time)
+        for ball in BALLS:
+            np.testing.assert_array_equal(steady[ball.name][:3, 3], turning[ball.name][:3, 3])
+            np.testing.assert_allclose(steady[ball.name][:3, :3], np.eye(3), atol=1e-12)
+            assert time == 0.0 or np.abs(turning[ball.name][:3, :3] - np.eye(3)).max() > 0.1
+
+
 def test_shadows_on_the_table():
     """The table is darker where a ball hides the light than with all balls far away."""
     subject = make_balls("cpu", Shading())
