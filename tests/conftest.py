@@ -15,6 +15,8 @@ from scgs_warp.runtime import environment
 
 environment.configure()
 
+collect_ignore = [] if os.environ.get("SCGS_PRETENDED_CUDA") else ["pretended_cuda"]
+
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 

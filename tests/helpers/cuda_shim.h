@@ -3,6 +3,7 @@
 // A fibre runs until a barrier or an exchange that others have not reached yet. In which order fibres get their turn
 // is drawn from a seed: a body that misses a barrier gives other results for other seeds.
 #pragma once
+#include <setjmp.h>
 #include <ucontext.h>
 
 #include <algorithm>
@@ -31,8 +32,11 @@ struct Barrier {
     int arrived = 0;
     long generation = 0;
 };
+// A fibre is entered by setcontext and then left and resumed by _longjmp, since swapcontext costs two system calls.
 struct Fibre {
     ucontext_t context;
+    jmp_buf resume;
+    bool entered = false;
     std::unique_ptr<char[]> stack{new char[STACK]};
     long turn = 0;  // exchanges so far: two buffers take turns, nobody can be two ahead
     bool done = false;
@@ -41,7 +45,7 @@ struct Block {
     Fibre fibres[THREADS];
     Barrier all, warps[8];
     unsigned values[2][THREADS];
-    ucontext_t scheduler;
+    jmp_buf turn_over;
     int current = 0;
     long events = 0;
     void (*enter)(void*) = nullptr;
@@ -58,7 +62,7 @@ inline void wait(Barrier& barrier, int size) {
     }
     while (barrier.generation == generation) {
         Fibre& own = block->fibres[block->current];
-        swapcontext(&own.context, &block->scheduler);
+        if (!_setjmp(own.resume)) _longjmp(block->turn_over, 1);
     }
 }
 
@@ -80,6 +84,15 @@ inline void start() {
     block->enter(block->argument);
     block->fibres[block->current].done = true;
     ++block->events;
+    _longjmp(block->turn_over, 1);
+}
+
+// Runs a fibre until it waits or ends.
+inline void resume(Fibre& fibre) {
+    if (_setjmp(block->turn_over)) return;
+    if (fibre.entered) _longjmp(fibre.resume, 1);
+    fibre.entered = true;
+    setcontext(&fibre.context);
 }
 
 // Runs body() on all threads of one block; false: they wait for each other for ever.
@@ -95,7 +108,7 @@ template <typename Body> bool run_block(Body body, std::mt19937& random) {
         getcontext(&fibre.context);
         fibre.context.uc_stack.ss_sp = fibre.stack.get();
         fibre.context.uc_stack.ss_size = STACK;
-        fibre.context.uc_link = &block->scheduler;
+        fibre.context.uc_link = nullptr;
         makecontext(&fibre.context, start, 0);
     }
     for (int left = THREADS; left > 0;) {
@@ -105,7 +118,7 @@ template <typename Body> bool run_block(Body body, std::mt19937& random) {
         for (int i : order) {
             if (block->fibres[i].done) continue;
             block->current = i;
-            swapcontext(&block->scheduler, &block->fibres[i].context);
+            resume(block->fibres[i]);
             left += !block->fibres[i].done;
         }
         if (left > 0 && block->events == before) return false;

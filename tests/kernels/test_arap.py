@@ -111,7 +111,8 @@ def test_degenerate_neighborhoods(device, rest, posed, scale):
     identity = torch.eye(3, device=device)
     assert all(torch.equal(r, identity) for r in R[1:]), "no neighbours: the identity"
     energy = arap_energy(*tensors)
-    expected = twin.arap_energy(tensors[0].cpu().double(), tensors[1].cpu().double(), tensors[2], tensors[3].double())
+    rest, posed, neighbors, weights = (tensor.cpu() for tensor in tensors)
+    expected = twin.arap_energy(rest.double(), posed.double(), neighbors, weights.double())
     torch.testing.assert_close(energy.cpu().double(), expected, rtol=1e-4, atol=1e-5 * scale**2)
 
 
