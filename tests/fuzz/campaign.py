@@ -21,9 +21,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, TextIO
 
-if os.environ.get("SCGS_PRETENDED_CUDA"):
-    import pretended_cuda.plugin  # noqa: F401  (the workers of a run on the pretended device)
-
 HERE = Path(__file__).resolve().parent
 MODULES = ("fuzz.cases_render", "fuzz.cases_motion", "fuzz.cases_training", "fuzz.cases_cuda")
 SAVE_EVERY = 5.0

@@ -1,15 +1,8 @@
-"""The pytest plugin: loads the device before torch, and runs the tests that the fixture ``device`` sends to ``cuda``.
-
-Other programs of the tests load it by importing this module where ``SCGS_PRETENDED_CUDA`` is set.
-"""
+"""The pytest plugin: loads the device before torch, and runs the tests that a GPU would run."""
 
 from __future__ import annotations
 
-import atexit
-import os
 import sys
-import tempfile
-import time
 from pathlib import Path
 
 import pytest
@@ -17,20 +10,8 @@ import pytest
 TESTS = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(TESTS))  # as pytest's pythonpath does, but early enough
 
-import scgs_warp  # noqa: E402, F401  (sets the environment before torch is loaded)
-from pretended_cuda import build, ledger  # noqa: E402
-
-_library = build.load()
-ledger.attach(_library)
-
-from pretended_cuda import torch_device, warp_device  # noqa: E402
-
-torch_device.install(_library)
-_folder = tempfile.TemporaryDirectory(prefix="scgs-native-")
-warp_device.install(Path(_folder.name))
-os.environ["SCGS_PRETENDED_CUDA"] = "1"
-# Autograd's thread for the device ends while it still holds Python objects; give it the time to let go of them.
-atexit.register(time.sleep, 0.1)
+import pretended_cuda.device  # noqa: E402, F401
+from pretended_cuda import warp_device  # noqa: E402
 
 LEAST_TESTS = 960
 """Number of tests below which a run of the whole suite fails: somebody has lost them."""
