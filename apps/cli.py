@@ -14,22 +14,34 @@ from scgs_warp.runtime import environment
 from scgs_warp.runtime.torchrun import process_label
 
 Device = Literal["auto", "cpu", "cuda"]
+NO_WARP_GPU = (
+    "torch finds a GPU, but Warp does not: its wheel on PyPI needs an NVIDIA driver of version 580 or newer; update "
+    "the driver, install the wheel for CUDA 12 of the same version (+cu12) from github.com/NVIDIA/warp/releases"
+)
+"""Warp lists no device of a driver that is older than its CUDA version."""
 
 
 def choose_device(device: Device) -> str:
-    """Return the device; ``auto`` takes a GPU if there is one.
+    """Return the device; ``auto`` takes a GPU if torch and Warp find one, and says so if only torch does.
 
     Raises:
-        UserError: ``cuda`` was asked for, and there is no GPU.
+        UserError: ``cuda`` was asked for, and there is no GPU, or Warp does not find it.
     """
     import torch
 
-    present = torch.cuda.is_available()
-    if device == "cuda" and not present:
-        raise UserError(
-            "--device cuda: torch finds no CUDA GPU here; use --device cpu, or install a CUDA build of torch"
-        )
-    return "cuda" if present and device != "cpu" else "cpu"
+    if device == "cpu" or not torch.cuda.is_available():
+        if device == "cuda":
+            raise UserError(
+                "--device cuda: torch finds no CUDA GPU here; use --device cpu, or install a CUDA build of torch"
+            )
+        return "cpu"
+    environment.init_warp()
+    if not environment.warp_finds_gpu():
+        if device == "cuda":
+            raise UserError(f"--device cuda: {NO_WARP_GPU}, or use --device cpu")
+        _tell(f"using the CPU: {NO_WARP_GPU}")
+        return "cpu"
+    return "cuda"
 
 
 def _tell(text: str) -> None:

@@ -117,6 +117,10 @@ class LPIPS:
             raise ValueError(f"image must be [H, W, 3] with H, W >= {_SMALLEST}, got {list(image.shape)}")
         if truth.shape != image.shape:
             raise ValueError(f"truth must be {list(image.shape)} like image, got {list(truth.shape)}")
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            return self._distance(image, truth)
+
+    def _distance(self, image: Tensor, truth: Tensor) -> Tensor:
         pair = torch.stack([image, truth]).permute(0, 3, 1, 2).contiguous()
         activation = (2.0 * pair - 1.0 - self._shift) / self._scale
         distance = pair.new_zeros(())

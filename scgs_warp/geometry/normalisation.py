@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -68,12 +69,12 @@ class Normalisation:
 
     def apply(self, points: Tensor) -> Tensor:
         """Convert points [..., 3] from world to normalised units, in float64; the result has the points' dtype."""
-        centre = torch.as_tensor(self.centre, device=points.device)
+        centre = _on_device(tuple(self.centre), points.device)
         return ((points.double() - centre) * self.scale).to(points.dtype)
 
     def undo(self, points: Tensor) -> Tensor:
         """Convert points [..., 3] from normalised to world units."""
-        centre = torch.as_tensor(self.centre, device=points.device)
+        centre = _on_device(tuple(self.centre), points.device)
         return (points.double() / self.scale + centre).to(points.dtype)
 
     def undo_scale(self, lengths: Tensor) -> Tensor:
@@ -83,7 +84,7 @@ class Normalisation:
     def apply_camera(self, camera: Camera) -> Camera:
         """Return the camera that sees the normalised scene at the same pixels, with depths multiplied by ``scale``."""
         viewmat = camera.viewmat.double()
-        centre = torch.as_tensor(self.centre, device=viewmat.device)
+        centre = _on_device(tuple(self.centre), viewmat.device)
         moved = viewmat.clone()
         moved[:3, 3] = (viewmat[:3, 3] + viewmat[:3, :3] @ centre) * self.scale
         return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
@@ -91,10 +92,17 @@ class Normalisation:
     def undo_camera(self, camera: Camera) -> Camera:
         """Invert :meth:`apply_camera`: return the camera in world units."""
         viewmat = camera.viewmat.double()
-        centre = torch.as_tensor(self.centre, device=viewmat.device)
+        centre = _on_device(tuple(self.centre), viewmat.device)
         moved = viewmat.clone()
         moved[:3, 3] = viewmat[:3, 3] / self.scale - viewmat[:3, :3] @ centre
         return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
+
+
+@functools.lru_cache(maxsize=64)
+def _on_device(centre: tuple[float, ...], device: torch.device) -> Tensor:
+    """Return the centre, [3] float64. It is kept, because sending it makes the host wait for a GPU."""
+    with torch.inference_mode(False):
+        return torch.tensor(centre, dtype=torch.float64, device=device)
 
 
 def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from ..ops.correctives import correct
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.shading import shade, tint
 from ..ops.skinning import skin, skin_rbf
+from ..runtime.device_copies import sent
 from ..runtime.environment import one_piece
 from ..seeding import generator
 from ..types import Gaussians, Pose
@@ -116,7 +117,7 @@ class ControlPoints(Motion):
     def poses(self, times: Tensor) -> list[Pose]:
         """Return one :class:`Pose` per time, from one network evaluation. The network's input is detached, because
         gradients through the encoding's high octaves would make the control points oscillate."""
-        out = self.network(self.positions.detach(), times.to(self.positions.device))
+        out = self.network(self.positions.detach(), sent(times, self.positions.device))
         rotations = unit_rotations(out["rotations"])
         shape = unit_rotations(out["shape_rotations"]) if "shape_rotations" in out else None
         optional = shape, out.get("log_scales"), out.get("tints")

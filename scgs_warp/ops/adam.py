@@ -14,6 +14,7 @@ from torch import Tensor
 from ..kernels import adam as kernels
 from ..kernels.cpu import adam as cpu_kernels
 from ..kernels.types import ADAM_CHUNK
+from ..runtime.device_copies import sent
 from ..runtime.launch import launch
 
 Form = Literal["auto", "plain", "cpu"]
@@ -133,7 +134,7 @@ def _fits(update: Update, device: torch.device) -> bool:
 
 def _table(rows: list, dtype: type, device: torch.device) -> Tensor:
     """Make a tensor of a list through NumPy, which reads lists several times faster than torch does."""
-    return torch.from_numpy(np.array(rows, dtype)).to(device)
+    return sent(torch.from_numpy(np.array(rows, dtype)), device)
 
 
 def _refuse(update: Update, device: torch.device) -> None:

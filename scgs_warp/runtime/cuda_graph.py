@@ -3,18 +3,38 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 import warp as wp
+import warp._src.context as warp_context
 
 _streams: dict[int, dict[int, wp.Stream]] = {}
+_recording_streams: dict[int, tuple[torch.cuda.Stream, torch.cuda.Stream]] = {}
+_current_stream = threading.RLock()
+"""Held while Warp's current stream, one per device for all threads, is not its own: by sorts and captures."""
 
 
-def on_torch_stream(device: torch.device) -> contextlib.AbstractContextManager:
-    """Send Warp's launches to torch's current stream of ``device``, without synchronising."""
-    return wp.ScopedStream(warp_stream(device), sync_enter=False)
+@contextlib.contextmanager
+def on_torch_stream(device: torch.device) -> Iterator[None]:
+    """Send Warp's own operations to torch's current stream of ``device``, without synchronising.
+
+    Raises:
+        RuntimeError: an operation of Warp failed, which it reports only as a text.
+    """
+    with _current_stream, wp.ScopedStream(warp_stream(device), sync_enter=False):
+        before = warp_error()
+        yield
+        after = warp_error()
+    if after and after != before:
+        raise RuntimeError(f"Warp on {device}: {after}")
+
+
+def warp_error() -> str:
+    """Return the last error of Warp's native code, which stays until the next; empty if there was none."""
+    return warp_context.runtime.get_error_string()
 
 
 def warp_stream(device: torch.device) -> wp.Stream:
@@ -28,6 +48,16 @@ def warp_stream(device: torch.device) -> wp.Stream:
     if stream.cuda_stream not in of_device:
         of_device[stream.cuda_stream] = wp.stream_from_torch(stream)
     return of_device[stream.cuda_stream]
+
+
+def _streams_for_recording(device: torch.device) -> tuple[torch.cuda.Stream, torch.cuda.Stream]:
+    """Return the streams on which graphs are warmed up and captured, the same pair for all graphs of a device: cuBLAS
+    keeps a workspace for every stream that it ever saw."""
+    index = torch.cuda.current_device() if device.index is None else device.index
+    with _current_stream:
+        if index not in _recording_streams:
+            _recording_streams[index] = torch.cuda.Stream(device), torch.cuda.Stream(device)
+        return _recording_streams[index]
 
 
 class CudaGraph:
@@ -46,7 +76,7 @@ class CudaGraph:
         Raises:
             RuntimeError: ``body`` cannot be captured.
         """
-        warming, capturing = torch.cuda.Stream(device), torch.cuda.Stream(device)
+        warming, capturing = _streams_for_recording(device)
         warming.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(warming):
             for _ in range(2):
@@ -56,6 +86,7 @@ class CudaGraph:
             warp_stream(device)  # Warp makes an event for a new stream, which a capture does not allow
         self.graph = torch.cuda.CUDAGraph()
         with (
+            _current_stream,
             torch.cuda.device(device),
             torch.cuda.graph(self.graph, stream=capturing, capture_error_mode="thread_local"),
         ):

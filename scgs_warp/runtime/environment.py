@@ -45,6 +45,13 @@ def init_warp() -> None:
         os.close(sink)
 
 
+def warp_finds_gpu() -> bool:
+    """Return whether Warp, which has its own requirements on the driver, lists a CUDA device."""
+    import warp as wp
+
+    return wp.is_cuda_available()
+
+
 def available_threads() -> int:
     """Count the cores that this process may use, limited by its affinity and a container's share of processor time."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

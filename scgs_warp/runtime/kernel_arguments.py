@@ -42,6 +42,8 @@ _SCALAR_FORMATS = {
     ctypes.c_double: "d",
     ctypes.c_bool: "?",
 }
+LARGEST_STRIDE = 2**31 - 1
+"""Largest distance in bytes between neighbouring elements along a dimension, which Warp stores as int32."""
 MAX_LAYOUTS = 256
 """Largest number of shapes cached per parameter: most tensors keep their shape, but some change with every frame."""
 
@@ -114,6 +116,11 @@ def _descriptor(kernel: wp.Kernel, parameter: ArrayParameter, tensor: torch.Tens
     for extent in reversed(outer):
         strides.append(step)
         step *= extent
+    if strides and max(strides) > LARGEST_STRIDE:
+        raise ValueError(
+            f"kernel {kernel.key}: {parameter.label} of shape {shape} has a stride of {max(strides)} bytes; kernels "
+            f"take {LARGEST_STRIDE} at most"
+        )
     return _descriptor_type(tensor.data_ptr(), 0, len(outer), outer, strides[::-1])
 
 

@@ -24,6 +24,7 @@ from ..ops.memory_windows import require_image
 from ..rendering.render import draw, expected_depth
 from ..runtime import debug, memory
 from ..runtime.cuda_graph import CudaGraph
+from ..runtime.device_copies import sent
 from ..types import Camera, Image, Splats, Tiles
 
 CAPACITY_FACTOR = 1.25
@@ -104,9 +105,8 @@ class FrameGraph:
     def submit(self, camera: Camera, time: float, background: Tensor) -> Pending:
         """Start a frame; arguments as in :meth:`render`. Its image may lack splats until ``finish`` returns it."""
         where = camera.viewmat.device
-        instant = torch.tensor([time], device=where)
-        parts = camera.viewmat.flatten(), camera.K.flatten(), instant, background.to(where)
-        return self._start(torch.cat(parts).float(), (camera.width, camera.height))
+        parts = camera.viewmat, camera.K, sent(torch.tensor([time]), where), sent(background, where)
+        return self._start(torch.cat([part.flatten() for part in parts]).float(), (camera.width, camera.height))
 
     def finish(self, pending: Pending) -> Image:
         """Wait for the frame; draw it again with more capacity if it lacks splats."""
@@ -125,9 +125,7 @@ class FrameGraph:
     def _start(self, inputs: Tensor, size: tuple[int, int]) -> Pending:
         with self._lock:
             device = self.inputs.device
-            if device.type == "cuda" and inputs.device.type == "cpu" and not inputs.is_pinned():
-                inputs = inputs.pin_memory()
-            self.inputs.copy_(inputs, non_blocking=True)
+            self.inputs.copy_(sent(inputs, device))
             self._follow(size)
             recorded = self._recorded or Steps(self.draw_steps)
             image, total = recorded.replay()

@@ -11,6 +11,7 @@ from ..data.cache import Pixels
 from ..data.dataset import Dataset
 from ..errors import FrameError, UserError
 from ..geometry.normalisation import Normalisation
+from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Camera, Frame
 from .silhouettes import Silhouettes
@@ -51,7 +52,7 @@ class Frames:
 
     def __init__(self, data: Dataset, normalisation: Normalisation, config: TrainConfig, device: str) -> None:
         self.frames = data
-        self.config, self.device = config, device
+        self.config, self.device = config, torch.device(device)
         self.cameras = [normalisation.apply_camera(frame.camera).to(device) for frame in data.entries]
         self.background = data.background_color.to(device)
         self.random_background = data.background == "random"
@@ -120,13 +121,13 @@ class Frames:
                 frame = self.frames[index]
         except UserError as error:
             raise FrameError(str(error)) from error
-        truth = frame.image.to(self.device).permute(2, 0, 1).contiguous()
+        truth = sent(frame.image, self.device).permute(2, 0, 1).contiguous()
         background = self.background
         if frame.alpha is not None and (random_background or self.random_background):
             random = generator(self.config.seed, 42, view_number(step, self.config, view))
-            color = torch.rand(3, generator=random).to(self.device)
-            uncovered = 1.0 - frame.alpha.to(self.device)
+            color = sent(torch.rand(3, generator=random), self.device)
+            uncovered = 1.0 - sent(frame.alpha, self.device)
             truth = truth + uncovered * (color - background)[:, None, None]
             background = color
-        mask = None if frame.mask is None else frame.mask.to(self.device)
+        mask = None if frame.mask is None else sent(frame.mask, self.device)
         return frame, camera, truth, background, mask

@@ -8,10 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from helpers.app_runs import run_app
 from helpers.paths import ROOT
 from scgs_warp.apps import __main__ as console
+from scgs_warp.apps.cli import choose_device
+from scgs_warp.errors import UserError
+from scgs_warp.runtime import environment
 
 
 @pytest.mark.parametrize("app", console.APPS)
@@ -43,3 +47,18 @@ def test_the_console_script_lists_its_commands(monkeypatch, capsys):
         assert all(name in (said.err if status else said.out) for name in console.APPS)
     folder = Path(console.__file__).parent
     assert all((folder / f"{name}.py").is_file() for name in console.APPS)
+
+
+@pytest.mark.parametrize("asked", ["auto", "cuda", "cpu"])
+def test_a_gpu_whose_driver_is_too_old_for_warp(asked, monkeypatch, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(environment, "warp_finds_gpu", lambda: False)
+    if asked == "cuda":
+        with pytest.raises(UserError, match=r"580 or newer.*or use --device cpu"):
+            choose_device(asked)
+        return
+    assert choose_device(asked) == "cpu"
+    said = capsys.readouterr().err
+    assert said.count("\n") == (asked == "auto") and ("using the CPU: torch finds a GPU" in said) == (asked == "auto")
+    monkeypatch.setattr(environment, "warp_finds_gpu", lambda: True)
+    assert choose_device(asked) == ("cpu" if asked == "cpu" else "cuda")

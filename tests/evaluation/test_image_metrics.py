@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 
 from reference.ssim import ssim_map
 from scgs_warp.errors import UserError
+from scgs_warp.evaluation import image_metrics
 from scgs_warp.evaluation.image_metrics import LPIPS, psnr, ssim
 
 CONVOLUTIONS = {
@@ -101,6 +102,20 @@ def test_lpips_is_a_distance(weights_file, device):
     assert float(lpips(image, truth)) == pytest.approx(float(lpips(truth, image)), rel=1e-6)
     half = 0.5 * (image + truth)
     assert float(lpips(half, truth)) < float(lpips(image, truth))
+
+
+def test_lpips_never_computes_in_tf32(weights_file, device, monkeypatch):
+    seen = []
+
+    def convolve(*args, **kwargs):
+        seen.append(torch.backends.cudnn.allow_tf32)
+        return torch.nn.functional.conv2d(*args, **kwargs)
+
+    monkeypatch.setattr(image_metrics, "conv2d", convolve)
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    LPIPS(weights_file, device)(*(t.to(device) for t in _images(2)))
+    assert len(seen) == len(CONVOLUTIONS) + len(HEADS) and not any(seen)
+    assert torch.backends.cudnn.allow_tf32, "the process keeps its setting"
 
 
 def test_every_accepted_spelling(weights, weights_file, tmp_path):

@@ -50,6 +50,7 @@ def install(native: Path) -> None:
         return to_warp("cpu" if torch.device(device).type == "cuda" else device)
 
     wp.device_from_torch = sys.modules[wp.from_torch.__module__].device_from_torch = device_from_torch
+    wp.is_cuda_available = lambda: True
     wp.stream_from_torch = lambda stream=None: None
     wp.ScopedCapture = _Capture
 

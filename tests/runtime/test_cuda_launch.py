@@ -12,7 +12,7 @@ from scgs_warp.kernels import projection, reduction, skinning
 from scgs_warp.kernels.cuda.slots import sum_slots
 from scgs_warp.runtime import launch
 from scgs_warp.runtime.cuda_launch import RecordedKernel
-from scgs_warp.runtime.kernel_arguments import parameters_of
+from scgs_warp.runtime.kernel_arguments import ArrayParameter, _descriptor, parameters_of
 
 CPU = torch.device("cpu")
 
@@ -103,3 +103,15 @@ def test_every_kernel_can_be_settled():
     for module in (projection, reduction, skinning):
         for kernel in (value for value in vars(module).values() if isinstance(value, wp.Kernel)):
             RecordedKernel(kernel, [None if p is not None else 0 for p in parameters_of(kernel)], 1, CPU)
+
+
+@pytest.mark.parametrize(("shape", "fits"), [((2, 2**29 - 1), True), ((2, 2**29), False), ((1, 2**29), False)])
+def test_strides_beyond_int32_are_refused(shape, fits):
+    """A tensor without memory is enough: what is refused is its description."""
+    tensor = torch.empty(shape, device="meta")
+    parameter = ArrayParameter("values_in", torch.float32, (), 2, 4)
+    if fits:
+        _descriptor(reduction.sum_rows, parameter, tensor)
+    else:
+        with pytest.raises(ValueError, match=r"values_in of shape .* has a stride of 2147483648 bytes"):
+            _descriptor(reduction.sum_rows, parameter, tensor)

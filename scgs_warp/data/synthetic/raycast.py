@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from ...kernels import raycast_figure as kernels
-from ...runtime.cuda_graph import warp_stream
+from ...runtime.cuda_graph import on_torch_stream
 from ...runtime.launch import launch, warp_view
 from ...types import Camera
 from .shading import Shading
@@ -110,7 +110,7 @@ def mesh_over(vertices: Tensor, faces: Tensor) -> wp.Mesh:
     """Make a Warp mesh that shares the memory of vertices [P, 3] and faces [3 F], on torch's stream."""
     if not vertices.is_cuda:
         return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
-    with wp.ScopedStream(warp_stream(vertices.device)):
+    with on_torch_stream(vertices.device):
         return wp.Mesh(points=warp_view(vertices, wp.vec3), indices=warp_view(faces))
 
 
