@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import subprocess
 import sys
 import time
 import traceback
@@ -52,7 +51,6 @@ ROOT = Path(__file__).resolve().parent.parent
 FRAMES_A_SECOND = 1000.0
 MOTION_MS = 0.15
 """Targets on a GPU: frames per second of the moving scene, and milliseconds for its motion."""
-TESTS_SECONDS = 500.0
 SLOWEST_FORM = 50_000
 """Largest number of Gaussians for which the slow forms of compositing are timed."""
 SHARPNESS = 0.5
@@ -317,28 +315,12 @@ def step(s: Setting) -> Report:
     return {"rows": bench("step", plan)["rows"]}
 
 
-def tests(s: Setting) -> Report:
-    """Run the tests on CUDA."""
-    selection = ["tests/kernels/test_ssim.py", "-k", "bad_arguments"] if s.quick else ["-k", "cuda and not gpu_check"]
-    command = [sys.executable, "-m", "pytest", "-x" if s.quick else "--maxfail=50", "-p", "no:cacheprovider"]
-    result = subprocess.run(
-        [*command, *selection], cwd=ROOT, capture_output=True, text=True, check=False, timeout=TESTS_SECONDS
-    )
-    lines = result.stdout.strip().splitlines()
-    failures = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
-    return {
-        "passed": result.returncode == 0,
-        "summary": lines[-1] if lines else result.stderr[-300:],
-        "failures": failures,
-    }
-
-
 PARTS: dict[str, Callable[[Setting], Report]] = {
     **{part.__name__: part for part in (agreement, frames, forms, raster, dynamic, step, gsplat)},
     "fuzz": lambda s: gpu_trust.fuzz(s.device, s.quick),
     "crowded": lambda s: gpu_trust.crowded(s.device, s.quick),
     "share": lambda s: gpu_trust.share(s.device),
-    "tests": tests,
+    "tests": lambda s: gpu_trust.tests(s.quick),
 }
 
 

@@ -1,22 +1,35 @@
-"""Parts of ``gpu_check.py`` for robustness: poisoned inputs, a crowded screen, steps shared by processes."""
+"""Parts of ``gpu_check.py`` for robustness: poisoned inputs, a crowded screen, a process group, the tests."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import re
+import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 
+from scgs_warp.apps import train
 from scgs_warp.rendering.render import draw
 from scgs_warp.runtime import memory
+from scgs_warp.runtime.torchrun import ProcessRank
 from scgs_warp.types import Camera, Gaussians
 
 ROOT = Path(__file__).resolve().parent.parent
 FUZZ_SECONDS = 240.0
+TESTS = "cuda and not gpu_check and not test_compile and not emulated and not test_layers"
+"""Selection of the tests that need the GPU."""
+TESTS_SECONDS = 500.0
+OUTCOME = re.compile(r"(tests/\S+::.*?) (PASSED|FAILED|ERROR|SKIPPED)")
+"""Line that pytest prints after a test."""
 TRAINING = "--downscale 2 --steps 60 --nodes 40 --max-gaussians 2000 --batch 2 --threads 1".split()
 """Options of a run that takes seconds, with two views per step."""
 
@@ -61,8 +74,22 @@ def crowded(device: str, quick: bool) -> dict[str, Any]:
         memory.set_limit(None)
 
 
+@contextlib.contextmanager
+def _team_of_one() -> Iterator[None]:
+    """Let the training app believe that ``torchrun`` started it as the only process of a group."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    rank = {"RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    with mock.patch.dict(os.environ, rank), mock.patch.object(train, "process_rank", lambda: ProcessRank(0, 1)):
+        yield
+
+
 def share(device: str) -> dict[str, Any]:
-    """Compare the checkpoint of ``torchrun`` with one process (NCCL on a GPU) with that of a plain run."""
+    """Compare the checkpoint of a process group of one process (NCCL on a GPU) with that of a plain run.
+
+    ``torchrun`` with one process would train without a group, so this process makes the group itself.
+    """
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "figure"
         size = ["--size", "96", "--train", "8", "--test", "2"]
@@ -70,8 +97,37 @@ def share(device: str) -> dict[str, Any]:
         alone, team = Path(folder) / "alone", Path(folder) / "team"
         options = ["--data", str(data), "--preset", "quick", "--device", device, *TRAINING]
         run([sys.executable, "apps/train.py", *options, "--output", str(alone)], 300.0)
-        torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "1"]
-        run([*torchrun, "apps/train.py", *options, "--output", str(team)], 300.0)
+        with _team_of_one():
+            train.main([*options, "--output", str(team)])
         name = "checkpoint.safetensors"
         same = (alone / name).read_bytes() == (team / name).read_bytes()
         return {"passed": same, "same_bits": same}
+
+
+def tests(quick: bool, seconds: float = TESTS_SECONDS) -> dict[str, Any]:
+    """Run the tests on CUDA, apart from those that only compile or that run in the emulation.
+
+    The outcome of each test is read as it is printed, so that those before a time-out count.
+    """
+    selection = ["tests/kernels/test_ssim.py", "-k", "bad_arguments"] if quick else ["-k", TESTS]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-o", "addopts=", "--import-mode=importlib"]
+    command += ["-m", "not slow", "-v", "--tb=short", *selection]
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as printed:
+        try:
+            ended = subprocess.run(
+                command, cwd=ROOT, stdout=printed, stderr=subprocess.STDOUT, check=False, timeout=seconds
+            )
+            status = ended.returncode
+        except subprocess.TimeoutExpired:
+            status = None
+        printed.seek(0)
+        lines = printed.read().splitlines()
+    outcomes = [match for line in lines if (match := OUTCOME.match(line))]
+    failures = [match[1] for match in outcomes if match[2] in ("FAILED", "ERROR")]
+    return {
+        "passed": status == 0,
+        "in_time": status is not None,
+        "tests_passed": sum(match[2] == "PASSED" for match in outcomes),
+        "failures": failures,
+        "end": lines[-80:] if status != 0 else lines[-1:],
+    }

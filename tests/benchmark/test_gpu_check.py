@@ -11,12 +11,15 @@ from types import ModuleType
 
 import pytest
 import torch
+import torch.distributed as dist
 
 from helpers.paths import ROOT
 from scgs_warp.scene.frame_graph import FrameGraph
 
 FOLDER = ROOT / "benchmarks"
 SCRIPT = FOLDER / "gpu_check.py"
+BODIES = {"good": "pass", "bad": "assert False", "endless": "time.sleep(60)"}
+"""Three tests, of which the last is stopped."""
 
 
 def run(*options: str | Path) -> subprocess.CompletedProcess[str]:
@@ -46,14 +49,6 @@ def test_quick_run_on_the_cpu(tmp_path: Path):
     assert report["fuzz"]["cases"] == 40 and report["crowded"]["passed"]
 
 
-@pytest.mark.slow
-def test_torchrun_on_the_cpu(tmp_path: Path):
-    output = tmp_path / "report.json"
-    result = run("--parts", "share", "--output", output)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert json.loads(output.read_text())["share"]["same_bits"]
-
-
 def test_out_of_time_is_a_failure_that_says_so(tmp_path: Path):
     output = tmp_path / "report.json"
     assert run("--parts", "agreement,tests", "--seconds", "0", "--output", output).returncode == 1
@@ -66,6 +61,29 @@ def test_out_of_time_is_a_failure_that_says_so(tmp_path: Path):
 def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(FOLDER))
     return importlib.import_module("gpu_check")
+
+
+@pytest.fixture
+def trust(script: ModuleType) -> ModuleType:
+    return importlib.import_module("gpu_trust")
+
+
+@pytest.mark.slow
+def test_a_process_group_of_one(trust: ModuleType, monkeypatch: pytest.MonkeyPatch):
+    made, init = [], dist.init_process_group
+    monkeypatch.setattr(dist, "init_process_group", lambda *args, **kwargs: (made.append(args), init(*args, **kwargs)))
+    assert trust.share("cpu")["same_bits"]
+    assert made == [("gloo",)], "one process would train without a group"
+
+
+def test_outcomes_before_a_time_out_count(trust: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    lines = ["import time"] + [f"def test_{name}(): {body}" for name, body in BODIES.items()]
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_slow_cuda.py").write_text("\n".join(lines))
+    monkeypatch.setattr(trust, "ROOT", tmp_path)
+    report = trust.tests(False, seconds=8.0)
+    assert not report["passed"] and not report["in_time"] and report["tests_passed"] == 1
+    assert report["failures"] == ["tests/test_slow_cuda.py::test_bad"]
 
 
 def test_its_checks_can_fail(script: ModuleType):
