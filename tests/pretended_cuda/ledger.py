@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[2]
+SHIPPED = ("scgs_warp", "kernels", "apps", "benchmarks")
 OPERATION, CONTACT = 0, 1
 VIEWS = frozenset(
     "_reshape_alias _unsafe_view alias as_strided detach diagonal expand permute select slice split split_with_sizes "
@@ -94,6 +95,6 @@ def calling_line() -> str:
     """Return file and line of the innermost function of the project on the stack."""
     for frame in reversed(traceback.extract_stack()):
         path = Path(frame.filename)
-        if path.is_relative_to(REPO) and "tests" not in path.relative_to(REPO).parts:
+        if path.is_relative_to(REPO) and path.relative_to(REPO).parts[0] in SHIPPED:
             return f"{path.relative_to(REPO)}:{frame.lineno}"
     return "elsewhere"
