@@ -16,7 +16,7 @@ from scgs_warp.runtime.torchrun import process_label
 Device = Literal["auto", "cpu", "cuda"]
 NO_WARP_GPU = (
     "torch finds a GPU, but Warp does not: its wheel on PyPI needs an NVIDIA driver of version 580 or newer; update "
-    "the driver, install the wheel for CUDA 12 of the same version (+cu12) from github.com/NVIDIA/warp/releases"
+    "the driver or install the wheel for CUDA 12 of the same version (+cu12) from github.com/NVIDIA/warp/releases"
 )
 """Warp lists no device of a driver that is older than its CUDA version."""
 
@@ -35,7 +35,6 @@ def choose_device(device: Device) -> str:
                 "--device cuda: torch finds no CUDA GPU here; use --device cpu, or install a CUDA build of torch"
             )
         return "cpu"
-    environment.init_warp()
     if not environment.warp_finds_gpu():
         if device == "cuda":
             raise UserError(f"--device cuda: {NO_WARP_GPU}, or use --device cpu")

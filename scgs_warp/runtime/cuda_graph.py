@@ -22,7 +22,8 @@ def on_torch_stream(device: torch.device) -> Iterator[None]:
     """Send Warp's own operations to torch's current stream of ``device``, without synchronising.
 
     Raises:
-        RuntimeError: an operation of Warp failed, which it reports only as a text.
+        RuntimeError: an operation of Warp failed. Warp reports this only as a text, which stays: a second failure with
+            the same text is not noticed.
     """
     with _current_stream, wp.ScopedStream(warp_stream(device), sync_enter=False):
         before = warp_error()

@@ -49,6 +49,7 @@ def warp_finds_gpu() -> bool:
     """Return whether Warp, which has its own requirements on the driver, lists a CUDA device."""
     import warp as wp
 
+    init_warp()
     return wp.is_cuda_available()
 
 

@@ -24,7 +24,7 @@ from ..ops.memory_windows import require_image
 from ..rendering.render import draw, expected_depth
 from ..runtime import debug, memory
 from ..runtime.cuda_graph import CudaGraph
-from ..runtime.device_copies import sent
+from ..runtime.device_copies import pinned, sent
 from ..types import Camera, Image, Splats, Tiles
 
 CAPACITY_FACTOR = 1.25
@@ -125,7 +125,7 @@ class FrameGraph:
     def _start(self, inputs: Tensor, size: tuple[int, int]) -> Pending:
         with self._lock:
             device = self.inputs.device
-            self.inputs.copy_(sent(inputs, device))
+            self.inputs.copy_(pinned(inputs, device), non_blocking=True)
             self._follow(size)
             recorded = self._recorded or Steps(self.draw_steps)
             image, total = recorded.replay()

@@ -12,7 +12,7 @@ from scgs_warp.kernels import projection, reduction, skinning
 from scgs_warp.kernels.cuda.slots import sum_slots
 from scgs_warp.runtime import launch
 from scgs_warp.runtime.cuda_launch import RecordedKernel
-from scgs_warp.runtime.kernel_arguments import ArrayParameter, _descriptor, parameters_of
+from scgs_warp.runtime.kernel_arguments import parameters_of, warp_arguments
 
 CPU = torch.device("cpu")
 
@@ -107,11 +107,10 @@ def test_every_kernel_can_be_settled():
 
 @pytest.mark.parametrize(("shape", "fits"), [((2, 2**29 - 1), True), ((2, 2**29), False), ((1, 2**29), False)])
 def test_strides_beyond_int32_are_refused(shape, fits):
-    """A tensor without memory is enough: what is refused is its description."""
-    tensor = torch.empty(shape, device="meta")
-    parameter = ArrayParameter("values_in", torch.float32, (), 2, 4)
+    """Tensors without memory are enough: what is refused is their description."""
+    args = [torch.empty(size, device="meta") for size in (shape, (1, 1))]
     if fits:
-        _descriptor(reduction.sum_rows, parameter, tensor)
+        warp_arguments(reduction.sum_rows, args)
     else:
         with pytest.raises(ValueError, match=r"values_in of shape .* has a stride of 2147483648 bytes"):
-            _descriptor(reduction.sum_rows, parameter, tensor)
+            warp_arguments(reduction.sum_rows, args)
