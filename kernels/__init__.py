@@ -31,6 +31,7 @@ skinning     skinning     skinning          node_sums           kernels/test_ski
 harmonics    harmonics    harmonics                             kernels/test_harmonics
 ssim         ssim         ssim                                  kernels/test_ssim
 adam         adam         adam                                  kernels/test_adam
+             step_outcome                                       kernels/test_step_outcome
 network      torch        network                               kernels/test_network
                           network_adjoint
 roofline                  roofline                              benchmark/test_scaling
@@ -55,7 +56,8 @@ Conventions
   indices ``(block, lane)``, and ``first`` is the first block.
 - Each argument has a line of its own, with its shape in a comment. Arguments are grouped under ``# In:`` and
   ``# Out:`` and named ``*_in`` and ``*_out``. Inputs are never written. Each output element is written by exactly one
-  grid index (no atomics), so the results do not depend on the number of threads.
+  grid index, so the results do not depend on the number of threads. The one atomic operation is a minimum of integers
+  (``step_outcome.judge_gradients``), which does not depend on the order either.
 - Adjoints are written by hand (``enable_backward`` is off); incoming gradients are named ``v_*_in``, results
   ``v_*_out``.
 """

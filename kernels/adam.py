@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .types import ADAM_CHUNK, ADAM_GRADIENT_MAX
+from .types import ADAM_CHUNK, ADAM_GRADIENT_MAX, STEP_FINE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,8 +28,13 @@ def adam_step(
     beta2: float,
     one_beta2: float,  # 1 - beta2
     eps: float,
+    outcome_in: wp.array[int],  # [1] of a recorded step: nothing is updated unless it is STEP_FINE
+    has_outcome: int,
 ):
     """Update one element and its moments in place. Grid: C x ADAM_CHUNK."""
+    if has_outcome != 0:
+        if outcome_in[0] != STEP_FINE:
+            return
     i = first + wp.tid()
     chunk = i // _CHUNK
     tensor = int(chunks_in[chunk, 0])

@@ -17,7 +17,7 @@ import warp as wp
 
 from .falloff import falloff
 from .gradient_limits import passed
-from .types import ALPHA_MAX, ALPHA_MIN, CHANNEL_MAX, SLOT_GEOMETRY, TRANSMITTANCE_MIN
+from .types import ALPHA_MAX, ALPHA_MIN, CHANNEL_MAX, SLOT_GEOMETRY, STEP_FINE, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -293,11 +293,16 @@ def add_stats(
     radii_in: wp.array[wp.vec2i],  # [N] pixels; a zero: culled
     width: int,
     height: int,
+    outcome_in: wp.array[int],  # [1] of a recorded step: nothing is added unless it is STEP_FINE
+    has_outcome: int,
     # Out (added to):
     grad_norm_out: wp.array[float],  # [N]
     count_out: wp.array[float],  # [N]
     max_radii_out: wp.array[float],  # [N]
 ):
+    if has_outcome != 0:
+        if outcome_in[0] != STEP_FINE:
+            return
     i = first + wp.tid()
     radius = wp.max(radii_in[i][0], radii_in[i][1])
     if radius <= 0:

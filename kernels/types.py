@@ -48,6 +48,16 @@ ADAM_CHUNK = 4096
 ADAM_GRADIENT_MAX = wp.constant(1.0e19)
 """Limit to which Adam clamps finite gradients: a square that overflows would freeze the value for good."""
 
+STEP_FINE = wp.constant(2**31 - 1)
+"""Outcome of a recorded training step that is committed. Any other outcome is the number of what failed; the least one
+counts."""
+
+STEP_HALTED = wp.constant(-1)
+"""Outcome of a step whose lists had too little room, and of every step after it until the host has made room."""
+
+STEP_LOSS, STEP_REGULARISER, STEP_GRADIENT = wp.constant(0), wp.constant(1), wp.constant(2)
+"""Outcomes of steps with a non-finite loss, regulariser or first gradient; the next gradient's is one more."""
+
 ROOFLINE_CHAINS = 12
 """Number of independent sums per thread: enough to hide a multiply-add's latency, few enough for the registers."""
 

@@ -35,6 +35,11 @@ class Group:
     """First moment. Both moments are None before the first step with a gradient."""
     exp_avg_sq: Tensor | None = None
 
+    def begin(self) -> None:
+        """Make the moments, unless they exist."""
+        if self.exp_avg is None or self.exp_avg_sq is None:
+            self.exp_avg, self.exp_avg_sq = (torch.zeros_like(self.parameter) for _ in range(2))
+
 
 class Adam:
     """Adam with bias correction as in ``torch.optim.Adam``, on named parameters, in one kernel launch.
@@ -60,8 +65,8 @@ class Adam:
             gradient = group.parameter.grad
             if gradient is None:
                 continue
-            if group.exp_avg is None or group.exp_avg_sq is None:
-                group.exp_avg, group.exp_avg_sq = (torch.zeros_like(group.parameter) for _ in range(2))
+            group.begin()
+            assert group.exp_avg is not None and group.exp_avg_sq is not None
             group.steps += 1
             moments = group.exp_avg, group.exp_avg_sq
             updates.append(Update(group.parameter, gradient.contiguous(), *moments, group.rate, group.steps))
@@ -103,7 +108,7 @@ class Adam:
         float32 scalar). A parameter that never had a gradient is left out."""
         tensors = {}
         for name, group in self.groups.items():
-            if group.exp_avg is not None and group.exp_avg_sq is not None:
+            if group.steps > 0 and group.exp_avg is not None and group.exp_avg_sq is not None:
                 tensors[f"{prefix}.{name}.step"] = torch.tensor(float(group.steps))
                 tensors[f"{prefix}.{name}.exp_avg"] = group.exp_avg
                 tensors[f"{prefix}.{name}.exp_avg_sq"] = group.exp_avg_sq

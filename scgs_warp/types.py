@@ -179,6 +179,13 @@ class Stats:
     """[N] largest screen radius seen, as a fraction of the longer image side."""
     absolute: bool = False
     """Flag that absolute gradients are summed over pixels, so that opposite ones do not cancel."""
+    outcome: Tensor | None = None
+    """[1] int32 outcome of a recorded step, which adds nothing unless it succeeds. None: always add."""
+
+    @property
+    def sums(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The three buffers."""
+        return self.grad_norm, self.count, self.max_radii
 
     @staticmethod
     def zeros(count: int, device: torch.device | str, absolute: bool = False) -> Stats:

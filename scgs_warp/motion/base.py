@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +11,17 @@ from ..config.presets import OptimConfig, TrainConfig
 from ..gaussians import GaussianParameters
 from ..optim import Adam, log_linear
 from ..types import Gaussians
+
+
+class MotionStep(NamedTuple):
+    """What a training step asks of the motion, decided on the host."""
+
+    times: tuple[float, ...]
+    """The view's instant, followed by those at which the regulariser compares."""
+    weight: float = 0.0
+    """Weight of the regulariser; 0: the step has none."""
+    phase: Literal["rest", "frozen", "moving"] = "moving"
+    """``rest``: the Gaussians are not moved; ``frozen``: the motion does not learn."""
 
 
 class TrainingPose(NamedTuple):
@@ -48,12 +59,36 @@ class Motion(nn.Module):
         """Activate the Gaussians and pose them at ``time``; differentiable."""
         raise NotImplementedError
 
+    def plan(
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, view: int = 0
+    ) -> MotionStep:
+        """Decide what a view at ``time`` asks for at ``step`` of the stage, and bring the regulariser up to date.
+
+        Args:
+            view: index in the step's batch; random draws differ between views.
+        """
+        return MotionStep((time,))
+
+    def refresh_due(self, step: int, config: TrainConfig) -> bool:
+        """Return True if :meth:`plan` reads the trained parameters at this step."""
+        return False
+
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
+        self,
+        gaussians: GaussianParameters,
+        plan: MotionStep,
+        times: Tensor,
+        weight: float | Tensor,
+        config: TrainConfig,
     ) -> TrainingPose:
-        """Pose the Gaussians for training at ``step``, which determines the frozen phase and the regulariser. ``view``
-        is the index in the step's batch; random draws differ between views."""
-        return TrainingPose(self.gaussians_at(gaussians, time), None)
+        """Pose the Gaussians for training.
+
+        Args:
+            plan: result of :meth:`plan`. It says the phase and whether there is a weight.
+            times: [T] the plan's times, on the model's device or on the host.
+            weight: the plan's weight, a number or a scalar on the model's device.
+        """
+        return TrainingPose(self.gaussians_at(gaussians, times[:1]), None)
 
     def control_points_at(self, time: float) -> Tensor:
         """Return the control points [M, 3] at ``time``; [0, 3] for models without control points."""

@@ -16,7 +16,7 @@ from ..runtime.device_copies import sent
 from ..runtime.environment import one_piece
 from ..seeding import generator
 from ..types import Gaussians, Pose
-from .base import Motion, TrainingPose, network_rate
+from .base import Motion, MotionStep, TrainingPose, network_rate
 from .network import DeformationNetwork
 from .rigidity import Graph, arap_times, arap_weight, build_graph, rigidity
 
@@ -216,26 +216,44 @@ class ControlPoints(Motion):
             self.cache_binding(gaussians)
         return self.apply_pose(gaussians, pose, self._cached)
 
+    def plan(
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, view: int = 0
+    ) -> MotionStep:
+        if step < config.freeze:
+            return MotionStep((time,), phase="frozen")
+        weight = arap_weight(step, config.loss)
+        if weight == 0.0:
+            return MotionStep((time,))
+        self.refresh_graph(step, config.loss)
+        others = arap_times(config.loss, generator(config.seed, 21, step * config.batch + view))
+        return MotionStep((time, *others), 0.0 if self.graph is None else weight)
+
+    def refresh_due(self, step: int, config: TrainConfig) -> bool:
+        return step >= config.freeze and arap_weight(step, config.loss) > 0.0 and self._graph_is_old(step, config.loss)
+
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
+        self,
+        gaussians: GaussianParameters,
+        plan: MotionStep,
+        times: Tensor,
+        weight: float | Tensor,
+        config: TrainConfig,
     ) -> TrainingPose:
-        frozen = step < config.freeze
-        weight = 0.0 if frozen else arap_weight(step, config.loss)
-        times = [time]
-        if weight > 0.0:
-            self.refresh_graph(step, config.loss)
-            times += arap_times(config.loss, generator(seed, 21, step * config.batch + view))
+        frozen = plan.phase == "frozen"
         with torch.set_grad_enabled(not frozen):
-            poses = self.poses(torch.tensor(times))
+            poses = self.poses(times)
         posed = self.bind_and_pose(gaussians, poses[0], frozen)
-        if weight == 0.0 or self.graph is None:
+        if plan.weight == 0.0 or self.graph is None:
             return TrainingPose(posed, None)
         instants = [self.positions.detach() + pose.translations for pose in poses]
         return TrainingPose(posed, weight * rigidity(instants, self.graph))
 
     def refresh_graph(self, step: int, loss: LossConfig) -> None:
-        if self.graph is None or step % loss.arap_refresh < loss.arap_every:
+        if self._graph_is_old(step, loss):
             self.graph = build_graph(self.trajectories, loss)
+
+    def _graph_is_old(self, step: int, loss: LossConfig) -> bool:
+        return self.graph is None or step % loss.arap_refresh < loss.arap_every
 
     def trajectories(self, times: Tensor) -> Tensor:
         """Return the control points [T, M, 3] at ``times`` [T]."""

@@ -15,7 +15,7 @@ from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_vari
 from ..optim import log_linear
 from ..seeding import generator
 from ..types import Gaussians
-from .base import Motion, TrainingPose, decay_steps
+from .base import Motion, MotionStep, TrainingPose, decay_steps
 
 SPATIAL = 64
 TEMPORAL = 25
@@ -73,14 +73,24 @@ class HexPlane(Motion):
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         return self._moved(gaussians, self.features(gaussians.means, time))
 
+    def plan(
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, view: int = 0
+    ) -> MotionStep:
+        return MotionStep((time,), phase="rest" if step < config.coarse else "moving")
+
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
+        self,
+        gaussians: GaussianParameters,
+        plan: MotionStep,
+        times: Tensor,
+        weight: float | Tensor,
+        config: TrainConfig,
     ) -> TrainingPose:
-        if step < config.coarse:  # learn a static scene first (4D-GS)
+        if plan.phase == "rest":  # learn a static scene first (4D-GS)
             return TrainingPose(gaussians.activate(), None)
         weights = Smoothness(config.loss.hexplane_tv, config.loss.hexplane_smooth, config.loss.hexplane_rest)
         variation = plane_variation(list(self.planes), weights) if any(weights) else None
-        return TrainingPose(self.gaussians_at(gaussians, time), variation)
+        return TrainingPose(self.gaussians_at(gaussians, times[:1]), variation)
 
     def train(self, mode: bool = True) -> HexPlane:
         self._packed.forget()  # the optimiser writes without raising torch's version counters

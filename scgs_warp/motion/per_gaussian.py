@@ -7,8 +7,9 @@ from torch import Tensor
 
 from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
+from ..runtime.device_copies import sent
 from ..types import Gaussians
-from .base import Motion, TrainingPose, network_rate
+from .base import Motion, MotionStep, TrainingPose, network_rate
 from .network import DeformationNetwork
 
 
@@ -24,8 +25,8 @@ class PerGaussian(Motion):
         self.network = network
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
-        times = time if isinstance(time, Tensor) else torch.tensor([time], device=gaussians.means.device)
-        out = self.network(gaussians.means.detach(), times)
+        times = time if isinstance(time, Tensor) else torch.tensor([time])
+        out = self.network(gaussians.means.detach(), sent(times, gaussians.means.device))
         return Gaussians(
             gaussians.means + out["translations"][0],
             gaussians.quats + out["rotations"][0],
@@ -36,12 +37,22 @@ class PerGaussian(Motion):
             gaussians.sharpness,
         )
 
+    def plan(
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, view: int = 0
+    ) -> MotionStep:
+        return MotionStep((time,), phase="rest" if step < config.coarse else "moving")
+
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
+        self,
+        gaussians: GaussianParameters,
+        plan: MotionStep,
+        times: Tensor,
+        weight: float | Tensor,
+        config: TrainConfig,
     ) -> TrainingPose:
-        if step < config.coarse:
+        if plan.phase == "rest":
             return TrainingPose(gaussians.activate(), None)
-        return TrainingPose(self.gaussians_at(gaussians, time), None)
+        return TrainingPose(self.gaussians_at(gaussians, times[:1]), None)
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
         rate = network_rate(step, config.coarse, config.optim)

@@ -7,9 +7,10 @@ from torch import Tensor, nn
 
 from ..config.presets import LossConfig, TrainConfig
 from ..gaussians import GaussianParameters
+from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Gaussians
-from .base import Motion, TrainingPose, network_rate
+from .base import Motion, MotionStep, TrainingPose, network_rate
 from .network import DeformationNetwork
 from .rigidity import Graph, arap_times, build_graph, rigidity
 
@@ -18,6 +19,7 @@ class Spheres(Motion):
     """The network and the radius shared by all spheres; the spheres' centres are the means of the Gaussians."""
 
     name = "spheres"
+    takes_time_tensor = True
 
     def __init__(self, network: DeformationNetwork, radius: float) -> None:
         super().__init__()
@@ -28,7 +30,7 @@ class Spheres(Motion):
     def translations(self, positions: Tensor, times: Tensor) -> Tensor:
         """Return displacements [T, n, 3] of ``positions`` [n, 3]. The positions are detached, because gradients through
         the encoding's high octaves would make the spheres oscillate."""
-        return self.network(positions.detach(), times.to(positions.device))["translations"]
+        return self.network(positions.detach(), sent(times, positions.device))["translations"]
 
     def _spheres_at(self, gaussians: GaussianParameters, means: Tensor) -> Gaussians:
         # The adjoint of a product with ones sums in a fixed order; that of expand does not.
@@ -37,30 +39,51 @@ class Spheres(Motion):
         quats, colors = gaussians.quats.detach(), (gaussians.sh_dc, gaussians.sh_rest)
         return Gaussians(means, quats, scales, gaussians.opacities(), *colors, gaussians.sharpness)
 
-    def gaussians_at(self, gaussians: GaussianParameters, time: float) -> Gaussians:
-        moved = gaussians.means + self.translations(gaussians.means, torch.tensor([time]))[0]
-        return self._spheres_at(gaussians, moved)
+    def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
+        times = time if isinstance(time, Tensor) else torch.tensor([time])
+        return self._spheres_at(gaussians, gaussians.means + self.translations(gaussians.means, times)[0])
+
+    def plan(
+        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, view: int = 0
+    ) -> MotionStep:
+        if step < config.pretrain.warm_up:
+            return MotionStep((time,), phase="rest")
+        if not self._compares(step, config):
+            return MotionStep((time,))
+        if self._graph_is_old(step, config.loss):
+            self.graph = build_graph(
+                lambda times: gaussians.means + self.translations(gaussians.means, times), config.loss
+            )
+        others = arap_times(config.loss, generator(config.seed, 22, step * config.batch + view))
+        weight = config.pretrain.arap_weight * config.loss.arap_every
+        return MotionStep((time, *others), 0.0 if self.graph is None else weight)
+
+    def refresh_due(self, step: int, config: TrainConfig) -> bool:
+        moving = step >= config.pretrain.warm_up
+        return moving and self._compares(step, config) and self._graph_is_old(step, config.loss)
 
     def train_at(
-        self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, seed: int, view: int = 0
+        self,
+        gaussians: GaussianParameters,
+        plan: MotionStep,
+        times: Tensor,
+        weight: float | Tensor,
+        config: TrainConfig,
     ) -> TrainingPose:
-        if step < config.pretrain.warm_up:
+        if plan.phase == "rest":
             return TrainingPose(self._spheres_at(gaussians, gaussians.means), None)
-        rigid = config.pretrain.arap_weight > 0 and step % config.loss.arap_every == 0
-        times = [time]
-        if rigid:
-            self.refresh_graph(gaussians, step, config.loss)
-            times += arap_times(config.loss, generator(seed, 22, step * config.batch + view))
-        moves = self.translations(gaussians.means, torch.tensor(times))
+        moves = self.translations(gaussians.means, times)
         posed = self._spheres_at(gaussians, gaussians.means + moves[0])
-        if not rigid or self.graph is None:
+        if plan.weight == 0.0 or self.graph is None:
             return TrainingPose(posed, None)
-        weight = config.pretrain.arap_weight * config.loss.arap_every
         return TrainingPose(posed, weight * rigidity([gaussians.means.detach() + move for move in moves], self.graph))
 
-    def refresh_graph(self, gaussians: GaussianParameters, step: int, loss: LossConfig) -> None:
-        if self.graph is None or step % loss.arap_refresh < loss.arap_every:
-            self.graph = build_graph(lambda times: gaussians.means + self.translations(gaussians.means, times), loss)
+    def _compares(self, step: int, config: TrainConfig) -> bool:
+        """Return True if the step has the regulariser."""
+        return config.pretrain.arap_weight > 0 and step % config.loss.arap_every == 0
+
+    def _graph_is_old(self, step: int, loss: LossConfig) -> bool:
+        return self.graph is None or step % loss.arap_refresh < loss.arap_every
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
         rate = network_rate(step, config.pretrain.warm_up, config.optim)

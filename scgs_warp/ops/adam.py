@@ -62,13 +62,13 @@ def adam_step(
         value, gradient, exp_avg, exp_avg_sq, rate, steps = update
         addresses.append((value.data_ptr(), gradient.data_ptr(), exp_avg.data_ptr(), exp_avg_sq.data_ptr()))
         factors.append((rate / (1.0 - betas[0] ** steps), (1.0 - betas[1] ** steps) ** -0.5))
-    sizes, chunks = _layout(tuple([update.value.numel() for update in updates]), device)
-    tables = _table(addresses, np.int64, device), _table(factors, np.float32, device), sizes, chunks
+    sizes, chunks = element_chunks(tuple([update.value.numel() for update in updates]), device)
+    tables = table(addresses, np.int64, device), table(factors, np.float32, device), sizes, chunks
     numbers = 1.0 - betas[0], betas[1], 1.0 - betas[1], eps
     if simd:
         launch(cpu_kernels.adam_step, len(chunks), *tables, *numbers, grain=4)
     else:
-        launch(kernels.adam_step, len(chunks) * ADAM_CHUNK, *tables, *numbers)
+        launch(kernels.adam_step, len(chunks) * ADAM_CHUNK, *tables, *numbers, None, 0)
     # As after torch's own in-place operations, a backward pass that needs the old values raises.
     torch.autograd.graph.increment_version([tensor for update in updates for tensor in (update.value, *update[2:4])])
 
@@ -87,9 +87,9 @@ def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
         if tensor.dtype != torch.float32:
             raise ValueError(f"tensors must be float32, got {tensor.dtype}")
     tensors = [tensor if tensor.is_contiguous() else tensor.contiguous() for tensor in tensors]
-    sizes, chunks = _layout(tuple([tensor.numel() for tensor in tensors]), tensors[0].device)
+    sizes, chunks = element_chunks(tuple([tensor.numel() for tensor in tensors]), tensors[0].device)
     bad = torch.empty(len(chunks), dtype=torch.int32)
-    addresses = _table([tensor.data_ptr() for tensor in tensors], np.int64, tensors[0].device)
+    addresses = table([tensor.data_ptr() for tensor in tensors], np.int64, tensors[0].device)
     launch(cpu_kernels.find_non_finite, len(chunks), addresses, sizes, chunks, bad, grain=4)
     bad_chunks = bad.numpy().nonzero()[0]
     return int(chunks[bad_chunks[0], 0]) if len(bad_chunks) else None
@@ -132,7 +132,7 @@ def _fits(update: Update, device: torch.device) -> bool:
     )
 
 
-def _table(rows: list, dtype: type, device: torch.device) -> Tensor:
+def table(rows: list, dtype: type | str, device: torch.device) -> Tensor:
     """Make a tensor of a list through NumPy, which reads lists several times faster than torch does."""
     return sent(torch.from_numpy(np.array(rows, dtype)), device)
 
@@ -150,8 +150,8 @@ def _refuse(update: Update, device: torch.device) -> None:
 
 
 @lru_cache(maxsize=16)
-def _layout(sizes: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+def element_chunks(sizes: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
     """Return sizes [T] and chunks [C, 2] (tensor, first element) of tensors with ``sizes`` elements."""
     chunks = [(i, begin) for i, size in enumerate(sizes) for begin in range(0, size, ADAM_CHUNK)]
-    table = torch.tensor(chunks, dtype=torch.int64).view(-1, 2)
-    return torch.tensor(sizes, dtype=torch.int64).to(device), table.to(device)
+    where = torch.tensor(chunks, dtype=torch.int64).view(-1, 2)
+    return torch.tensor(sizes, dtype=torch.int64).to(device), where.to(device)

@@ -139,7 +139,8 @@ class _Composite(torch.autograd.Function):
             norm_of = absgrad if job.stats.absolute else v_means2d
             stats, size = job.stats, (job.tiles.width, job.tiles.height)
             radii = job.splats.radii.contiguous()
-            launch(kernels.add_stats, count, norm_of, radii, *size, stats.grad_norm, stats.count, stats.max_radii)
+            gate = stats.outcome, int(stats.outcome is not None)
+            launch(kernels.add_stats, count, norm_of, radii, *size, *gate, *stats.sums)
         v_background = _background_gradient(v_image, transmittance) if ctx.needs_input_grad[4] else None
         return v_means2d, v_conics, v_opacities, v_channels, v_background, None
 

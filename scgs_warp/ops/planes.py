@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..runtime.device_copies import sent
+
 PAIRS = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
 """Axes of the six planes of a level; 3 is time."""
 
@@ -52,12 +54,9 @@ def plane_features(positions: Tensor, time: float | Tensor, planes: list[Tensor]
     if positions.dtype != torch.float32 or positions.device != planes[0].device:
         raise ValueError("positions and planes must be float32 on one device")
     inside = positions.nan_to_num(nan=-1.0)
-    if isinstance(time, Tensor):
-        t = 2.0 * time.detach().nan_to_num(nan=0.0).clamp(0.0, 1.0) - 1.0
-        axes = [*inside.unbind(1), t.expand(len(inside))]
-    else:
-        t = 2.0 * (time if 0.0 <= time <= 1.0 else float(time > 1.0)) - 1.0
-        axes = [*inside.unbind(1), inside.new_full((len(inside),), t)]
+    instant = time if isinstance(time, Tensor) else sent(torch.tensor([time]), positions.device)
+    t = 2.0 * instant.detach().nan_to_num(nan=0.0).clamp(0.0, 1.0) - 1.0
+    axes = [*inside.unbind(1), t.expand(len(inside))]
     levels = []
     for level in range(0, len(planes), len(PAIRS)):
         product = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -17,6 +18,22 @@ _current_stream = threading.RLock()
 """Held while Warp's current stream, one per device for all threads, is not its own: by sorts and captures."""
 
 
+class GraphMemory:
+    """Memory that recordings share which never run side by side and need nothing of each other.
+
+    The memory of a dropped recording serves the next one, instead of staying reserved.
+    """
+
+    def __init__(self) -> None:
+        self._first: CudaGraph | None = None
+        """A recording of one operation: torch forgets a memory pool that no recording uses."""
+
+    def pool(self, device: torch.device) -> Any:
+        if self._first is None:
+            self._first = CudaGraph(lambda: torch.zeros(1, device=device), device, warm_ups=1)
+        return self._first.graph.pool()
+
+
 @contextlib.contextmanager
 def on_torch_stream(device: torch.device) -> Iterator[None]:
     """Send Warp's own operations to torch's current stream of ``device``, without synchronising.
@@ -25,7 +42,10 @@ def on_torch_stream(device: torch.device) -> Iterator[None]:
         RuntimeError: an operation of Warp failed. Warp reports this only as a text, which stays: a second failure with
             the same text is not noticed.
     """
-    with _current_stream, wp.ScopedStream(warp_stream(device), sync_enter=False):
+    # A capture holds the lock already, on another thread if this is a backward pass.
+    capturing = torch.cuda.is_current_stream_capturing()
+    lock = contextlib.nullcontext() if capturing else _current_stream
+    with lock, wp.ScopedStream(warp_stream(device), sync_enter=False):
         before = warp_error()
         yield
         after = warp_error()
@@ -61,6 +81,25 @@ def _streams_for_recording(device: torch.device) -> tuple[torch.cuda.Stream, tor
         return _recording_streams[index]
 
 
+@contextlib.contextmanager
+def _captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) -> Iterator[None]:
+    """Capture the block. Unlike ``torch.cuda.graph``, which collects garbage and empties the cache, this takes
+    milliseconds; garbage is not collected within the block, because a graph that is deleted there would spoil it."""
+    torch.cuda.synchronize(stream.device)
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        with torch.cuda.stream(stream):
+            graph.capture_begin(**({} if pool is None else {"pool": pool}), capture_error_mode="thread_local")
+            try:
+                yield
+            finally:
+                graph.capture_end()
+    finally:
+        if collects:
+            gc.enable()
+
+
 class CudaGraph:
     """A CUDA graph of everything that ``body`` launches through torch and Warp.
 
@@ -71,8 +110,14 @@ class CudaGraph:
     overwrites = True
     """Flag that a replay overwrites the previous result, always True here."""
 
-    def __init__(self, body: Callable[[], Any], device: torch.device) -> None:
-        """Run ``body`` twice to load and compile its kernels, then capture it.
+    def __init__(
+        self, body: Callable[[], Any], device: torch.device, *, warm_ups: int = 2, memory: GraphMemory | None = None
+    ) -> None:
+        """Run ``body`` to load and compile its kernels, then capture it.
+
+        Args:
+            warm_ups: number of runs before the capture.
+            memory: shared with other recordings. None: the recording's own.
 
         Raises:
             RuntimeError: ``body`` cannot be captured.
@@ -80,17 +125,14 @@ class CudaGraph:
         warming, capturing = _streams_for_recording(device)
         warming.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(warming):
-            for _ in range(2):
+            for _ in range(warm_ups):
                 body()
         torch.cuda.current_stream(device).wait_stream(warming)
         with torch.cuda.stream(capturing):
             warp_stream(device)  # Warp makes an event for a new stream, which a capture does not allow
         self.graph = torch.cuda.CUDAGraph()
-        with (
-            _current_stream,
-            torch.cuda.device(device),
-            torch.cuda.graph(self.graph, stream=capturing, capture_error_mode="thread_local"),
-        ):
+        pool = None if memory is None else memory.pool(device)
+        with _current_stream, torch.cuda.device(device), _captured(self.graph, capturing, pool):
             # Warp must know of the capture, so that its radix sort takes its memory from the graph.
             capture = wp.ScopedCapture(stream=warp_stream(device), external=True)
             with capture:
@@ -102,3 +144,12 @@ class CudaGraph:
         """Launch the graph on torch's current stream and return its result, the same tensors every time."""
         self.graph.replay()
         return self.result
+
+
+class Steps:
+    """Stand-in for a ``CudaGraph`` on a CPU: it runs ``body`` at every replay."""
+
+    overwrites = False
+
+    def __init__(self, body: Callable[[], Any]) -> None:
+        self.replay = body

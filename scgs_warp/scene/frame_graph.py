@@ -23,7 +23,7 @@ from ..ops.compositing import image_demand
 from ..ops.memory_windows import require_image
 from ..rendering.render import draw, expected_depth
 from ..runtime import debug, memory
-from ..runtime.cuda_graph import CudaGraph
+from ..runtime.cuda_graph import CudaGraph, Steps
 from ..runtime.device_copies import pinned, sent
 from ..types import Camera, Image, Splats, Tiles
 
@@ -204,12 +204,3 @@ class FrameGraph:
         image, alpha = draw(posed, camera, background, antialiased=self._antialiased, depth=True, binned=binned)
         depth = self._depth_of(expected_depth(image[3], alpha))
         return Image(image[:3].permute(1, 2, 0), alpha, depth)
-
-
-class Steps:
-    """Stand-in for a ``CudaGraph`` that runs ``body`` at every replay."""
-
-    overwrites = False
-
-    def __init__(self, body: Callable[[], Any]) -> None:
-        self.replay = body

@@ -113,6 +113,18 @@ def affordable_count(gaussians: GaussianParameters, wanted: int) -> int:
     return min(wanted, count + memory.room(device) // each)
 
 
+def density_due(state: TrainState) -> bool:
+    """Decide whether anything is added, removed or reset after the present step."""
+    config, done = state.config, state.stage_step + 1
+    if state.stage == "pretrain":
+        thinned = done == config.pretrain.densify_until
+        return thinned or spheres_due(config.pretrain, done) or sphere_reset_due(config, done)
+    if done > config.densify.until:
+        return False
+    growth = config.densify
+    return round_due(growth, done) or opacity_reset_due(growth, done) or visibility_pruning_due(growth, done)
+
+
 # Before a step
 
 

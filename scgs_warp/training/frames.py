@@ -14,6 +14,7 @@ from ..geometry.normalisation import Normalisation
 from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Camera, Frame
+from .device_images import DeviceImages
 from .silhouettes import Silhouettes
 
 PROGRESSIVE_SHARE = 0.2
@@ -53,8 +54,10 @@ class Frames:
     def __init__(self, data: Dataset, normalisation: Normalisation, config: TrainConfig, device: str) -> None:
         self.frames = data
         self.config, self.device = config, torch.device(device)
-        self.cameras = [normalisation.apply_camera(frame.camera).to(device) for frame in data.entries]
-        self.background = data.background_color.to(device)
+        self.views = [normalisation.apply_camera(frame.camera) for frame in data.entries]
+        """Normalised cameras, on the host."""
+        self.background = data.background_color
+        self.images = DeviceImages(self.device)
         self.random_background = data.background == "random"
         self.silhouettes = Silhouettes(device)
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
@@ -89,7 +92,7 @@ class Frames:
 
     def halved(self, index: int) -> tuple[Frame, Camera]:
         """Return the frame and its normalised camera at half the size; each pixel is the mean of four."""
-        entry, camera = self.frames.entries[index], self.cameras[index]
+        entry, camera = self.frames.entries[index], self.views[index]
         half = self.frames.cache.get((self, index), lambda: _half(self.frames[index]))
         intrinsics = camera.K * camera.K.new_tensor([0.5, 0.5, 1.0])[:, None]
         small = Camera(camera.viewmat, intrinsics, half.image.shape[1], half.image.shape[0])
@@ -107,13 +110,13 @@ class Frames:
         """Load the frame of this step's ``view``.
 
         Returns:
-            Frame, normalised camera, truth [3, H, W] composited on the view's background, background [3], and mask [H,
-            W] bool or None.
+            Frame, normalised camera and background [3], both on the host; and on the device: truth [3, H, W] composited
+            on that background, and mask [H, W] bool or None.
 
         Raises:
             FrameError: the frame's file is no longer readable.
         """
-        camera = self.cameras[index]
+        camera = self.views[index]
         try:
             if step < self.config.half_size and min(camera.width, camera.height) >= LEAST_HALVED_SIDE:
                 frame, camera = self.halved(index)
@@ -121,13 +124,14 @@ class Frames:
                 frame = self.frames[index]
         except UserError as error:
             raise FrameError(str(error)) from error
-        truth = sent(frame.image, self.device).permute(2, 0, 1).contiguous()
+        key = index, camera.height
+        truth = self.images.planar(key, frame.image)
         background = self.background
         if frame.alpha is not None and (random_background or self.random_background):
             random = generator(self.config.seed, 42, view_number(step, self.config, view))
-            color = sent(torch.rand(3, generator=random), self.device)
-            uncovered = 1.0 - sent(frame.alpha, self.device)
-            truth = truth + uncovered * (color - background)[:, None, None]
+            color = torch.rand(3, generator=random)
+            uncovered = 1.0 - self.images.plane(("alpha", *key), frame.alpha)
+            truth = truth + uncovered * sent(color - background, self.device)[:, None, None]
             background = color
-        mask = None if frame.mask is None else sent(frame.mask, self.device)
-        return frame, camera, truth, background, mask
+        mask = None if frame.mask is None else self.images.plane(("mask", *key), frame.mask)
+        return frame, camera, background, truth, mask

@@ -1,4 +1,4 @@
-"""The training loop: :func:`fit` prepares a run and repeats ``step.training_step`` until the last step."""
+"""The training loop: :func:`fit` prepares a run and repeats training steps until the last one."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import time
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from torch import Tensor
 
 from ..config.presets import TrainConfig
 from ..config.validation import check
@@ -18,12 +20,13 @@ from ..runtime.progress import Progress, progress
 from ..runtime.stop_signals import stop_signals
 from ..scene.scene import Scene
 from ..storage import checkpoint
-from .density_control import control_density, visible_gaussians
+from .density_control import control_density, density_due, visible_gaussians
 from .frames import Frames
 from .multi_view import check_replicas, check_share
 from .process_group import ProcessGroup, ProcessLost
+from .recorded_step import RecordedSteps
 from .run_folder import ReadOnlyRunFolder, RunFolder
-from .state import TrainState
+from .state import StepResult, TrainState
 from .step import training_step
 
 MOST_FAILURES = 20
@@ -116,45 +119,57 @@ def _start_or_resume(folder: RunFolder, config: TrainConfig, data: Dataset, devi
     return TrainState.begin(config, data, device)
 
 
+class PlainSteps:
+    """Steps whose results are known at once."""
+
+    def __init__(self, state: TrainState, frames: Frames) -> None:
+        self._state, self._frames = state, frames
+
+    def take(self) -> list[StepResult]:
+        """Take the state's next step and return its result."""
+        return [training_step(self._state, self._frames)]
+
+    def settle(self) -> list[StepResult]:
+        """Return nothing: no step is in flight."""
+        return []
+
+
+def steps_of(state: TrainState, frames: Frames) -> PlainSteps | RecordedSteps:
+    """Return what takes the steps of a run: on a GPU without waiting for them, if a step has a single view."""
+    recorded = state.device.type == "cuda" and state.config.batch == 1 and state.group is None
+    return RecordedSteps(state, frames) if recorded else PlainSteps(state, frames)
+
+
 def _train(
     state: TrainState, frames: Frames, folder: RunFolder, test: Dataset | None, bar: Progress, stop: threading.Event
 ) -> None:
-    config, noted = state.config, False
+    config, noted, steps = state.config, False, steps_of(state, frames)
     saved_at = time.monotonic()
     while state.step < config.steps:
         # 1. Enter the main stage when stage 1 is over.
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
+            _finish(state, steps, folder, bar)
             state.begin_main()
 
-        # 2. Measure visibility where pruning is due, then render, compare and update the parameters.
-        try:
-            visible = visible_gaussians(state, frames)
-            result = training_step(state, frames)
-        except NotEnoughMemory:  # nothing has changed yet: a machine with more memory can continue
-            state.save(folder.path)
-            raise
-        except FrameError as error:
-            state.save(folder.path)
-            saved = f"step {state.step} is saved: " if state.group is None or state.group.first else ""
-            raise UserError(f"{error}; {saved}continue with --resume") from error
-        if result.failed is None:
-            state.failures = 0
-        else:
-            _count_failure(state, result.failed, folder, bar)
+        # 2. Render, compare and update the parameters.
+        done = state.step + 1
+        tested = test is not None and (done % config.evaluate_every == 0 or done == config.steps)
+        results, visible = _take(state, frames, folder, bar, steps, tested or folder.shows(done))
+        for result in results:
+            _count_failure(state, result, folder, bar)
 
         # 3. Score held-out frames, before an opacity reset could put a dip into the curve.
-        done = state.step + 1
-        if test is not None and (done % config.evaluate_every == 0 or done == config.steps):
+        if test is not None and tested:
             folder.log_test_psnr(state.scene(), test, done)
 
         # 4. Adaptive density control.
         state.consistent = False
-        note = control_density(state, result.size, visible)
+        note = control_density(state, results[-1].size, visible) if density_due(state) else None
         if note is not None and not noted:
             noted = True
             bar.print(f"step {state.step}: {note}")
             folder.log({"step": state.step, "stage": state.stage, "note": note})
-        state.step += 1
+        state.step = done
         state.consistent = True
 
         # 5. Agree with the other processes on stopping, and on the scene.
@@ -164,9 +179,10 @@ def _train(
             check_replicas(state)
 
         # 6. Log, save, stop.
-        folder.record(state, result, bar)
-        now = time.monotonic()
-        if now - saved_at >= config.checkpoint_seconds or last or stopping:
+        for result in results:
+            folder.record(state, result, bar)
+        if time.monotonic() - saved_at >= config.checkpoint_seconds or last or stopping:
+            _finish(state, steps, folder, bar)
             state.save(folder.path)
             saved_at = time.monotonic()
         if stopping:
@@ -174,6 +190,46 @@ def _train(
                 state.group.barrier()  # torchrun ends all processes when one has ended: the first must have saved
             bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
             raise KeyboardInterrupt
+
+
+def _take(
+    state: TrainState,
+    frames: Frames,
+    folder: RunFolder,
+    bar: Progress,
+    steps: PlainSteps | RecordedSteps,
+    looked_at: bool,
+) -> tuple[list[StepResult], Tensor | None]:
+    """Measure visibility where pruning is due, then take a step.
+
+    Args:
+        looked_at: the step's result is needed at once, as it is where density is controlled.
+
+    Returns:
+        The results of all steps that have become known, and the visible Gaussians (``visible_gaussians``).
+    """
+    due = density_due(state)
+    try:
+        results = steps.settle() if due else []
+        visible = visible_gaussians(state, frames)
+        results += steps.take()
+        return (results + steps.settle() if due or looked_at else results), visible
+    except NotEnoughMemory:  # nothing has changed yet: a machine with more memory can continue
+        _finish(state, steps, folder, bar)
+        state.save(folder.path)
+        raise
+    except FrameError as error:
+        _finish(state, steps, folder, bar)
+        state.save(folder.path)
+        saved = f"step {state.step} is saved: " if state.group is None or state.group.first else ""
+        raise UserError(f"{error}; {saved}continue with --resume") from error
+
+
+def _finish(state: TrainState, steps: PlainSteps | RecordedSteps, folder: RunFolder, bar: Progress) -> None:
+    """Wait for the steps in flight, and report them."""
+    for result in steps.settle():
+        _count_failure(state, result, folder, bar)
+        folder.record(state, result, bar)
 
 
 def _process_lost(state: TrainState, folder: RunFolder, lost: ProcessLost) -> UserError:
@@ -191,15 +247,19 @@ def _process_lost(state: TrainState, folder: RunFolder, lost: ProcessLost) -> Us
     )
 
 
-def _count_failure(state: TrainState, term: str, folder: RunFolder, bar: Progress) -> None:
-    """Report a dropped step.
+def _count_failure(state: TrainState, result: StepResult, folder: RunFolder, bar: Progress) -> None:
+    """Count the dropped steps in a row, and report a dropped step.
 
     Raises:
         UserError: too many steps in a row were dropped.
     """
+    term = result.failed
+    if term is None:
+        state.failures = 0
+        return
     state.failures += 1
-    bar.print(f"step {state.step}: {term} is not finite; the step was dropped")
-    folder.log({"step": state.step, "stage": state.stage, "dropped": term})
+    bar.print(f"step {result.step}: {term} is not finite; the step was dropped")
+    folder.log({"step": result.step, "stage": state.stage, "dropped": term})
     if state.failures >= MOST_FAILURES:
         state.save(folder.path)  # no dropped step has touched the parameters
         raise UserError(

@@ -85,7 +85,8 @@ class RunFolder:
             check_installed()
         self.tensorboard = tensorboard
         self._board: TensorBoard | None = None
-        self.path = Path(path)
+        self.path, self._steps = Path(path), config.steps
+        self._between = max(1, config.steps // BOARD_IMAGES)
         self.settings = settings if settings is not None else to_dict(config)
         self.resume = resume
         self.seconds = 0.0
@@ -208,10 +209,19 @@ class RunFolder:
     def _show(self, name: str, truth: torch.Tensor, render: torch.Tensor, step: int) -> None:
         self._on_board(lambda board: board.show(name, truth, render, step))
 
+    def shows(self, done: int) -> bool:
+        """Return True if the record of the last of ``done`` steps holds its losses or its picture."""
+        pictured = self._board is not None and done % self._between == 0
+        return done % LOG_EVERY == 0 or done == self._steps or pictured
+
     def record(self, state: TrainState, result: StepResult, bar: Progress) -> None:
-        """Advance the progress bar, add a log line every 50 steps, and write a preview every 15 seconds. ``state.step``
-        already counts this step."""
-        due = state.step % LOG_EVERY == 0 or state.step == state.config.steps
+        """Advance the progress bar, add a log line every 50 steps, and write a preview every 15 seconds.
+
+        Args:
+            result: of any step. Its picture is read only if :meth:`shows` or if no step has followed.
+        """
+        done = result.step + 1
+        due = done % LOG_EVERY == 0 or done == self._steps
         # A run that resumes after the last such step before a row logs 0.0 in that row.
         if result.failed is None and result.regulariser:
             self._regulariser = result.regulariser
@@ -222,7 +232,7 @@ class RunFolder:
                 self._psnr = now if self._psnr is None else 0.9 * self._psnr + 0.1 * now
             self.log(
                 {
-                    "step": state.step,
+                    "step": done,
                     "stage": state.stage,
                     "loss": float(result.loss),
                     "l1": float(result.l1),
@@ -238,10 +248,9 @@ class RunFolder:
             bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
         else:
             bar.advance(1)
-        between = max(1, state.config.steps // BOARD_IMAGES)
-        if state.step % between == 0 and result.failed is None:
-            self._show("train", result.truth, result.render, state.step)
-        if time.monotonic() - self._shown_at >= PREVIEW_SECONDS:
+        if done % self._between == 0 and result.failed is None:
+            self._show("train", result.truth, result.render, done)
+        if done == state.step and time.monotonic() - self._shown_at >= PREVIEW_SECONDS:
             self._shown_at = time.monotonic()
             with self._optional("previews"):
                 self.show(result)

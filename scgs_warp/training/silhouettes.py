@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..geometry.normalisation import Normalisation
+from ..runtime.device_copies import sent
 from ..runtime.environment import one_piece
 from ..types import Camera, Frame
 
@@ -47,9 +48,25 @@ class Silhouette(NamedTuple):
     distances: Tensor
     """[h, w] distance of each pixel to the silhouette, 0 inside."""
     pixels: Tensor
-    """[P, 2] centres (x, y) of the pixels inside, row by row."""
-    pixel: float
-    """Side of a pixel of ``distances``. Pixels of a reduced silhouette cover several of the image's."""
+    """[P, 2] centres (x, y) of the pixels inside, row by row, on the host."""
+    size: Tensor
+    """[2] width and height of ``distances``. Pixels of a reduced silhouette cover several of the image's."""
+
+    def sample(self, random: torch.Generator) -> SilhouetteSample:
+        """Choose ``PIXELS`` of the pixels at random, with replacement."""
+        chosen = self.pixels[torch.randint(len(self.pixels), (PIXELS,), generator=random)]
+        return SilhouetteSample(self.distances, sent(chosen, self.distances.device), self.size)
+
+
+class SilhouetteSample(NamedTuple):
+    """What a step compares with the spheres, on one device."""
+
+    distances: Tensor
+    """[h, w] as in :class:`Silhouette`."""
+    pixels: Tensor
+    """[PIXELS, 2] some of the silhouette's pixels."""
+    size: Tensor
+    """[2] as in :class:`Silhouette`."""
 
 
 def silhouette_of(alpha: Tensor, device: str = "cpu") -> Silhouette | None:
@@ -65,7 +82,8 @@ def silhouette_of(alpha: Tensor, device: str = "cpu") -> Silhouette | None:
     pixel = reduction / covered.shape[1]
     distances = torch.from_numpy(_distances((~inside).numpy()) * pixel).float()
     centres = (inside.nonzero().flip(1).float() + 0.5) * pixel
-    return Silhouette(distances.to(device), centres.to(device), pixel)
+    size = centres.new_tensor(distances.shape).flip(0) * pixel
+    return Silhouette(distances.to(device), centres, size.to(device))
 
 
 def _distances(mask: np.ndarray) -> np.ndarray:
@@ -74,30 +92,29 @@ def _distances(mask: np.ndarray) -> np.ndarray:
     return np.asarray(distance_transform_edt(mask))
 
 
-def silhouette_term(means: Tensor, camera: Camera, silhouette: Silhouette, random: torch.Generator) -> Tensor:
+def silhouette_term(means: Tensor, camera: Camera, sample: SilhouetteSample) -> Tensor:
     """Return the mean distance of projected centres to the silhouette, plus the mean distance of its pixels to the
     nearest centre.
 
     Args:
         means: [N, 3] centres at the time of the image, normalised.
         camera: camera of the image, normalised.
-        silhouette: of the image, on the device of the centres.
-        random: generator that chooses ``PIXELS`` of the silhouette.
+        sample: of the image's silhouette, on the device of the centres.
 
     Returns:
         Scalar, in units of the image's width. Gradients flow to ``means``.
     """
-    return _Term.apply(means, camera, silhouette, random)  # type: ignore[return-value]
+    return _Term.apply(means, camera, sample)  # type: ignore[return-value]
 
 
 class _Term(torch.autograd.Function):
     """The term with its gradient, both computed in one thread: in several, torch rounds differently."""
 
     @staticmethod
-    def forward(ctx: Any, means: Tensor, camera: Camera, silhouette: Silhouette, random: torch.Generator) -> Tensor:
+    def forward(ctx: Any, means: Tensor, camera: Camera, sample: SilhouetteSample) -> Tensor:
         with one_piece(), torch.enable_grad():
             leaf = means.detach().requires_grad_()
-            term = _term(leaf, camera, silhouette, random)
+            term = _term(leaf, camera, sample)
             (gradient,) = torch.autograd.grad(term, leaf)
         ctx.save_for_backward(gradient)
         return term.detach()
@@ -106,20 +123,17 @@ class _Term(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_term: Tensor):  # type: ignore[override]
         (gradient,) = ctx.saved_tensors
-        return v_term * gradient, None, None, None
+        return v_term * gradient, None, None
 
 
-def _term(means: Tensor, camera: Camera, silhouette: Silhouette, random: torch.Generator) -> Tensor:
+def _term(means: Tensor, camera: Camera, sample: SilhouetteSample) -> Tensor:
     points = _project(means, camera)
     # Distance of the centres to the silhouette.
-    height, width = silhouette.distances.shape
-    size = points.new_tensor([width, height]) * silhouette.pixel
-    grid = 2.0 * points / size - 1.0
-    table = silhouette.distances[None, None]
+    grid = 2.0 * points / sample.size - 1.0
+    table = sample.distances[None, None]
     strayed = F.grid_sample(table, grid[None, None], align_corners=False, padding_mode="border")
     # Distance of the silhouette's pixels to the centres.
-    chosen = torch.randint(len(silhouette.pixels), (PIXELS,), generator=random)
-    pixels = silhouette.pixels[chosen.to(points.device)]
+    pixels = sample.pixels
     with torch.no_grad():
         nearest = torch.cdist(pixels, points, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)
     uncovered = (pixels - points[nearest]).norm(dim=1)

@@ -49,6 +49,8 @@ THICKEST = 2.0
 class StepResult(NamedTuple):
     """Report of a step: detached scalars averaged over its views, and a picture for previews."""
 
+    step: int
+    """Number of steps before this one, of both stages."""
     loss: Tensor
     l1: Tensor
     ssim: Tensor

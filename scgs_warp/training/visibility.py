@@ -23,7 +23,7 @@ def contributions(state: TrainState, frames: Frames, indices: list[int]) -> Tens
     most = torch.zeros(len(state.gaussians), device=state.device)
     ever = torch.zeros_like(most, dtype=torch.bool)
     for index in indices:
-        camera = frames.cameras[index]
+        camera = frames.views[index].to(state.device)
         with torch.no_grad():
             camera = state.cameras.apply(camera, index) if state.refines_cameras else camera
             posed = state.motion.gaussians_at(state.gaussians, frames.frames.entries[index].time)

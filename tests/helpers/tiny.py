@@ -13,6 +13,8 @@ from PIL import Image as Picture
 from helpers.scenes import look_at
 from scgs_warp.config.presets import TrainConfig, from_dict, preset, with_steps
 from scgs_warp.data.dataset import Dataset
+from scgs_warp.gaussians import GaussianParameters
+from scgs_warp.motion.base import Motion, TrainingPose
 from scgs_warp.rendering.render import render
 from scgs_warp.types import Camera, Frame, Gaussians
 
@@ -69,6 +71,14 @@ def tiny_config(steps: int = 60, **changes) -> TrainConfig:
         "pretrain": {"densify_every": 3},
     }
     return from_dict(changes, "test", from_dict(small, "test", base))
+
+
+def trained_pose(
+    motion: Motion, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig
+) -> TrainingPose:
+    """Pose the Gaussians as a training step does."""
+    plan = motion.plan(gaussians, time, step, config)
+    return motion.train_at(gaussians, plan, torch.tensor(plan.times), plan.weight, config)
 
 
 def write_dnerf(folder: Path, size: int = 48) -> Path:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from helpers.splats import random_splats
 from reference.compositing import composite as composite_reference
+from scgs_warp.kernels.types import STEP_FINE, STEP_HALTED, STEP_LOSS, STEP_REGULARISER
 from scgs_warp.ops.binning import bin_splats
 from scgs_warp.ops.compositing import composite
 from scgs_warp.runtime import environment
@@ -259,6 +260,19 @@ def test_stats_and_absgrad(device: str, absolute: bool, c: int):
         assert torch.allclose(stats.grad_norm.cpu().double(), 1.0 + torch.where(radii > 0, norm, 0.0), rtol=2e-3)
         assert torch.equal(stats.count.cpu(), (radii > 0).float())
         assert torch.allclose(stats.max_radii.cpu(), torch.clamp(radii / 40.0, min=0.05))
+
+
+@pytest.mark.parametrize("outcome", [STEP_FINE, STEP_HALTED, STEP_LOSS, STEP_REGULARISER])
+def test_a_step_that_is_not_committed_adds_no_statistics(outcome: int, device: str):
+    splats, channels = random_splats(9, 90, 40, 24, device), random_channels(9, 90, 3, device)
+    always, gated = (Stats.zeros(90, device) for _ in range(2))
+    gated.outcome = torch.tensor([outcome], dtype=torch.int32, device=device)
+    for stats in (always, gated):
+        own, found = leaves(splats, channels, torch.zeros(3, device=device), torch.float32)
+        composite(own, found[3], bin_splats(splats), found[4], stats=stats)[0].sum().backward()
+    for values, expected in zip(gated.sums, always.sums):
+        assert torch.equal(values, expected if outcome == STEP_FINE else torch.zeros_like(expected))
+        assert expected.any()
 
 
 def test_threads_change_nothing(all_threads: None):

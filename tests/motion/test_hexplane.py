@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from helpers.tiny import trained_pose
 from scgs_warp.config.presets import LossConfig, MotionConfig, TrainConfig
 from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.motion import build_motion
@@ -64,7 +65,7 @@ def test_agrees_with_its_layers_in_torch(seed, time):
 def test_a_training_step_adds_the_smoothness():
     model, gaussians = model_and_gaussians(3)
     config = TrainConfig()
-    pose = model.train_at(gaussians, 0.3, config.coarse, config, seed=0)
+    pose = trained_pose(model, gaussians, 0.3, config.coarse, config)
     assert pose.regulariser is not None
     loss = config.loss
     smoothness = plane_variation(
@@ -77,9 +78,9 @@ def test_a_training_step_adds_the_smoothness():
     smooth = torch.autograd.grad(smoothness, list(model.planes))
     for whole, *parts in zip(both, moved, smooth):
         torch.testing.assert_close(whole, parts[0] + parts[1], rtol=1e-5, atol=1e-6)
-    assert model.train_at(gaussians, 0.3, config.coarse - 1, config, seed=0).regulariser is None
+    assert trained_pose(model, gaussians, 0.3, config.coarse - 1, config).regulariser is None
     none = dataclasses.replace(config, loss=LossConfig(hexplane_tv=0.0, hexplane_smooth=0.0, hexplane_rest=0.0))
-    assert model.train_at(gaussians, 0.3, config.coarse, none, seed=0).regulariser is None
+    assert trained_pose(model, gaussians, 0.3, config.coarse, none).regulariser is None
 
 
 @pytest.mark.parametrize("times, expected", [(0, 7), (30, 30)])
@@ -120,7 +121,7 @@ def test_same_bits_on_any_number_of_threads(all_threads):
     results = []
     for threads in (1, 2, 3):
         environment.configure(threads)
-        pose = model.train_at(gaussians, 0.4, config.coarse, config, seed=0)
+        pose = trained_pose(model, gaussians, 0.4, config.coarse, config)
         posed = [pose.gaussians.means, pose.gaussians.quats, pose.gaussians.scales, pose.regulariser]
         v = [torch.linspace(-1.0, 1.0, p.numel()).view_as(p) for p in posed if p is not None]
         parameters = [gaussians.means, gaussians.quats, gaussians.log_scales, *model.parameters()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from helpers.tiny import tiny_config
+from helpers.tiny import tiny_config, trained_pose
 from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.motion import PerGaussian, build_motion
 
@@ -19,8 +19,8 @@ def test_residuals_begin_after_the_static_phase(device):
     with torch.no_grad():
         motion.network.head.bias.copy_(torch.arange(1.0, 11.0))
     rest = gaussians.activate()
-    assert torch.equal(motion.train_at(gaussians, 0.4, 5, config, 0).gaussians.means, rest.means)
-    posed = motion.train_at(gaussians, 0.4, 6, config, 0).gaussians
+    assert torch.equal(trained_pose(motion, gaussians, 0.4, 5, config).gaussians.means, rest.means)
+    posed = trained_pose(motion, gaussians, 0.4, 6, config).gaussians
     moves = torch.tensor([5.0, 6.0, 7.0], device=device).expand(12, 3)
     torch.testing.assert_close(posed.means - rest.means, moves, rtol=1e-3, atol=1e-2)
     turns = torch.tensor([1.0, 2.0, 3.0, 4.0], device=device).expand(12, 4)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from helpers.tiny import tiny_config
+from helpers.tiny import tiny_config, trained_pose
 from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.motion import Spheres
 from scgs_warp.motion.control_points import heads_of, make_network
@@ -37,7 +37,7 @@ def test_all_have_one_radius_that_learns(device):
 def test_warm_up_then_motion_then_rigidity_every_few_steps(device):
     gaussians, spheres = model(device)
     assert CONFIG.loss.arap_every == 5
-    poses = {step: spheres.train_at(gaussians, 0.5, step, CONFIG, 0) for step in (5, 6, 10, 11)}
+    poses = {step: trained_pose(spheres, gaussians, 0.5, step, CONFIG) for step in (5, 6, 10, 11)}
     assert torch.equal(poses[5].gaussians.means, gaussians.means)
     assert not torch.equal(poses[6].gaussians.means, gaussians.means)
     carried = [step for step, pose in poses.items() if pose.regulariser is not None]
@@ -49,7 +49,7 @@ def test_warm_up_then_motion_then_rigidity_every_few_steps(device):
 def test_the_graph_is_saved_and_restored(device):
     gaussians, spheres = model(device)
     assert spheres.extra_state() == {}
-    spheres.train_at(gaussians, 0.5, 10, CONFIG, 0)
+    trained_pose(spheres, gaussians, 0.5, 10, CONFIG)
     saved = {name: value.clone() for name, value in spheres.extra_state().items()}
     _, other = model(device)
     other.load_extra_state(saved)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from helpers.tiny import tiny_config
+from helpers.tiny import tiny_config, trained_pose
 from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.motion import Static, build_motion
 
@@ -19,5 +19,5 @@ def test_gaussians_stay():
         posed = motion.gaussians_at(gaussians, time)
         for name, value in rest.tensors().items():
             assert torch.equal(getattr(posed, name), value), name
-    pose = motion.train_at(gaussians, 0.3, 0, config, 0)
+    pose = trained_pose(motion, gaussians, 0.3, 0, config)
     assert pose.regulariser is None and motion.control_points_at(0.5).shape == (0, 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import threading
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -67,13 +68,15 @@ class Graph:
         self._handle = self.library.pretended_graph_begin()
         if not self._handle:
             raise RuntimeError("CUDA error: operation not permitted when stream is capturing (a second capture)")
-        Graph.capturing = self
+        Graph.capturing, Graph.thread = self, threading.get_ident()
 
     def capture_end(self) -> None:
         Graph.capturing = None
         self.library.pretended_graph_end()
 
     capturing: Graph | None = None
+    thread = 0
+    """The thread that captures."""
 
     def record(self, call: Callable[[], None]) -> None:
         """Add a launch, which holds all that it needs."""
@@ -84,6 +87,9 @@ class Graph:
         ledger.count_launch("graph")
         if self.library.pretended_graph_replay(self._handle, self._repeat):
             raise RuntimeError(self.library.pretended_error().decode())
+
+    def pool(self) -> tuple[int, int]:
+        return 0, 1
 
     def __len__(self) -> int:
         return self.library.pretended_graph_size(self._handle) if self._handle else 0
@@ -128,6 +134,11 @@ def install(library: ctypes.CDLL) -> None:
         finally:
             streams.pop()
 
+    def capturing_here() -> bool:
+        # Autograd's threads, which Python has not started, work on the stream of the thread that waits for them.
+        started = not isinstance(threading.current_thread(), threading._DummyThread)
+        return bool(library.pretended_capturing()) and (not started or threading.get_ident() == Graph.thread)
+
     def free_and_total(device: Any = None) -> tuple[int, int]:
         return TOTAL_MEMORY - library.pretended_allocated(), TOTAL_MEMORY
 
@@ -150,7 +161,7 @@ def install(library: ctypes.CDLL) -> None:
         "CUDAGraph": Graph,
         "graph": graph,
         "synchronize": lambda device=None: ledger.contact("synchronize"),
-        "is_current_stream_capturing": lambda: bool(library.pretended_capturing()),
+        "is_current_stream_capturing": capturing_here,
         "mem_get_info": free_and_total,
         "memory_allocated": lambda device=None: library.pretended_allocated(),
         "memory_reserved": lambda device=None: library.pretended_allocated(),

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from helpers.steps import before_each_step
 from helpers.tiny import blobs, tiny_camera, tiny_config, tiny_dataset, write_dnerf
 from scgs_warp.apps import evaluate as app
 from scgs_warp.config.presets import OptimConfig
@@ -169,23 +170,18 @@ def test_a_run_that_refined_none_has_none(tmp_path):
 
 
 def test_resumed_to_the_same_bits(tmp_path, device, monkeypatch):
-    import scgs_warp.training.loop as train
-
     data = tiny_dataset(6)
     config = tiny_config(40, optim={"cameras": 1e-3}, motion={"mask": True, "time_noise": 0.1})
     fit(config, data, output=tmp_path / "whole", device=device)
-    step = train.training_step
 
-    def interrupted(state, frames):
-        if state.step == 25 and not state.failures:
+    def interrupt(state):
+        if state.step == 25:
             state.save(tmp_path / "parts")
             raise KeyboardInterrupt
-        return step(state, frames)
 
-    monkeypatch.setattr(train, "training_step", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        before_each_step(patch, interrupt)
         fit(config, data, output=tmp_path / "parts", device=device)
-    monkeypatch.undo()
     fit(config, data, output=tmp_path / "parts", device=device, resume=True)
     whole, parts = (read(tmp_path / name)[0] for name in ("whole", "parts"))
     assert whole["cameras.twists"].any() and "adam.cameras.twists.exp_avg" in whole

@@ -46,19 +46,19 @@ def test_progressive_by_fifths_adds_them_at_once():
 
 def test_random_background_is_under_the_image_alone():
     made = frames()
-    frame, _, truth, background, mask = made.view(3, 7, True)
-    plain = made.view(3, 7, False)[2]
+    frame, _, background, truth, mask = made.view(3, 7, True)
+    plain = made.view(3, 7, False)[3]
     assert mask is None
     assert torch.allclose(truth, plain + (1 - frame.alpha) * background[:, None, None])
-    assert torch.equal(truth, made.view(3, 7, True)[2]), "the same step gives the same background"
-    assert not torch.equal(truth, made.view(3, 8, True)[2])
+    assert torch.equal(truth, made.view(3, 7, True)[3]), "the same step gives the same background"
+    assert not torch.equal(truth, made.view(3, 8, True)[3])
 
 
 @pytest.mark.parametrize("size", [64, 65])
 def test_half_size_sees_the_same_scene(size):
     made = frames(size, half_size=10)
-    _, camera, truth, _, _ = made.view(2, 9, False)
-    _, whole_camera, whole, _, _ = made.view(2, 10, False)
+    _, camera, _, truth, _ = made.view(2, 9, False)
+    _, whole_camera, _, whole, _ = made.view(2, 10, False)
     assert truth.shape == (3, size // 2, size // 2) and whole.shape == (3, size, size)
     assert (camera.width, camera.height) == (size // 2, size // 2)
     even = whole[:, : size // 2 * 2, : size // 2 * 2]

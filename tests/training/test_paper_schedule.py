@@ -21,7 +21,8 @@ from scgs_warp.training.density_control import (
 )
 from scgs_warp.training.loop import fit
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.step import motion_frozen, set_rates, sh_degree
+from scgs_warp.training.step import motion_frozen, set_rates
+from scgs_warp.training.view import sh_degree
 
 PAPER = preset("paper")
 SMALL = {"init_points": 300, "motion": {"nodes": 16, "layers": 3, "width": 32, "skip": 2}}

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from helpers.steps import before_each_step
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config.presets import TrainConfig
 from scgs_warp.runtime import environment
-from scgs_warp.training import loop
 from scgs_warp.training.loop import fit
 from scgs_warp.training.state import TrainState
 
@@ -52,18 +52,17 @@ def test_the_same_bits(model, tmp_path, device, all_threads, monkeypatch):
         assert trained(config, tmp_path / f"{threads}", threads, device) == whole, f"{threads} threads differ from 2"
     assert trained(tiny_config(STOPS[-1], seed=1), tmp_path / "other", 2, device) != whole
 
-    config, inner = replace(config, checkpoint_seconds=0.0), loop.training_step
+    config = replace(config, checkpoint_seconds=0.0)
     for index, (begin, end) in enumerate(pairwise(STOPS)):
 
-        def step(state, frames, end=end):
+        def crash(state, end=end):
             if state.step == end:
                 raise Crash
-            return inner(state, frames)
 
-        monkeypatch.setattr(loop, "training_step", step)
         threads = 1 + index % 3
         if end < STOPS[-1]:
-            with pytest.raises(Crash):
+            with monkeypatch.context() as patch, pytest.raises(Crash):
+                before_each_step(patch, crash)
                 trained(config, tmp_path / "pieces", threads, device, resume=begin > 0)
         else:
             assert trained(config, tmp_path / "pieces", threads, device, resume=True) == whole, "resumed runs differ"

@@ -69,7 +69,7 @@ def test_distances_are_zero_in_the_silhouette_and_grow_with_the_distance_in_imag
     assert bool((distances[10:20, 8:16] == 0).all())
     assert float(distances[12, 40]) == pytest.approx(25 / WIDTH, abs=1e-6)
     assert float(distances[25, 20]) == pytest.approx(math.hypot(5, 6) / WIDTH, abs=1e-3)
-    assert len(found.pixels) == 80 and found.pixel == 1 / WIDTH
+    assert len(found.pixels) == 80 and found.size.tolist() == pytest.approx([1.0, HEIGHT / WIDTH])
     torch.testing.assert_close(found.pixels[0] * WIDTH, torch.tensor([8.5, 10.5]))
     assert silhouette_of(torch.zeros(4, 4)) is None
     assert silhouette_of(torch.ones(4, 4)) is None, "a filled image with an alpha channel has no silhouette"
@@ -90,7 +90,7 @@ def test_a_reduced_silhouette_lies_where_the_image_s_does():
     """1030 x 730 is no multiple of the reduction by 5; the last reduced pixels reach beyond the image."""
     alpha = alpha_of(slice(700, 730), slice(1000, 1030), 730, 1030)
     found = silhouette_of(alpha)
-    assert found is not None and found.pixel == pytest.approx(5 / 1030)
+    assert found is not None and found.size.tolist() == pytest.approx([206 * 5 / 1030, 146 * 5 / 1030])
     assert found.distances.shape == (146, 206)
     centre = found.pixels.mean(0) * 1030
     assert centre.tolist() == pytest.approx([1015.0, 715.0], abs=0.01)
@@ -98,7 +98,7 @@ def test_a_reduced_silhouette_lies_where_the_image_s_does():
 
     def strayed(x: float, y: float) -> float:
         mean = torch.tensor([[(x - 515.0) * 4 / 60, (y - 365.0) * 4 / 60, 0.0]])
-        term = float(silhouette_term(mean, view, found, torch.Generator().manual_seed(1)))
+        term = float(silhouette_term(mean, view, found.sample(torch.Generator().manual_seed(1))))
         pixels = found.pixels[torch.randint(len(found.pixels), (512,), generator=torch.Generator().manual_seed(1))]
         return 1030 * (term - float((pixels - mean[:, :2].new_tensor([x, y]) / 1030).norm(dim=1).mean()))
 
@@ -114,7 +114,7 @@ def test_term_and_gradients_agree_with_float64(device):
     assert silhouette is not None
     chosen = torch.randint(11 * 11, (silhouettes.PIXELS,), generator=torch.Generator().manual_seed(9)).numpy()
     fast = means.clone().to(device).requires_grad_()
-    term = silhouette_term(fast, camera().to(device), silhouette, torch.Generator().manual_seed(9))
+    term = silhouette_term(fast, camera().to(device), silhouette.sample(torch.Generator().manual_seed(9)))
     term.backward()
     slow = means.double().requires_grad_()
     expected = slow_term(slow, camera(), alpha.cpu().numpy(), chosen)
@@ -130,7 +130,7 @@ def test_a_far_part_draws_the_nearest_centre(device):
     silhouette = silhouette_of(alpha, str(device))
     assert silhouette is not None
     means = torch.tensor([[-1.2, 0.0, 0.0], [-1.1, 0.0, 0.0], [0.2, 0.0, 0.0]], device=device, requires_grad=True)
-    term = silhouette_term(means, camera().to(device), silhouette, torch.Generator().manual_seed(1))
+    term = silhouette_term(means, camera().to(device), silhouette.sample(torch.Generator().manual_seed(1)))
     (gradient,) = torch.autograd.grad(term, means)
     assert float(gradient[2, 0]) < 0.0  # descent moves it to the right, where nothing is covered yet
     assert float(gradient[2, 0].abs()) > 2 * float(gradient[:2, 0].abs().max())
@@ -146,7 +146,7 @@ def test_descent_covers_two_parts_and_leaves_no_stray(device):
     random, view = torch.Generator().manual_seed(3), camera().to(device)
     for _ in range(300):
         optimizer.zero_grad()
-        silhouette_term(means, view, silhouette, random).backward()
+        silhouette_term(means, view, silhouette.sample(random)).backward()
         optimizer.step()
     local = means.detach().cpu() + torch.tensor([0.0, 0.0, 4.0])
     x = 60.0 * local[:, 0] / local[:, 2] + WIDTH / 2

@@ -14,14 +14,12 @@ from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import (
     SETTLED,
-    log_weight,
     motion_frozen,
-    noisy_time,
     set_rates,
     settling,
-    sh_degree,
     training_step,
 )
+from scgs_warp.training.view import log_weight, noisy_time, sh_degree
 
 
 def test_constant_rates_settle_in_the_last_share_of_the_run():

@@ -61,7 +61,7 @@ def test_the_most_over_the_views():
     with torch.no_grad():
         state.gaussians.means[0] += 1e4
     posed = state.motion.gaussians_at(state.gaussians, 0.0)
-    views = [view_contributions(posed, camera)[0] for camera in frames.cameras]
+    views = [view_contributions(posed, camera)[0] for camera in frames.views]
     views = [torch.where(torch.arange(len(view)) == 0, torch.inf, view) for view in views]
     whole = contributions(state, frames, list(range(6)))
     assert torch.equal(whole, torch.stack(views).amax(0)) and whole[-1] == 0.0
@@ -76,7 +76,7 @@ def test_views_from_where_the_cameras_were_found_to_stand():
     before = contributions(state, frames, [1])
     with torch.no_grad():
         state.cameras.twists[1, 3:] = 0.2
-    corrected = state.cameras.apply(frames.cameras[1], 1)
+    corrected = state.cameras.apply(frames.views[1], 1)
     posed = state.motion.gaussians_at(state.gaussians, 0.0)
     weights, in_view = view_contributions(posed, corrected)
     after = contributions(state, frames, [1])

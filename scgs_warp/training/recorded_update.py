@@ -1,0 +1,221 @@
+"""The device's part of a recorded step: compare the view, judge the outcome, update the parameters."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Hashable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..kernels.types import STEP_FINE
+from ..ops.binning_cuda import bin_within
+from ..ops.step_outcome import Moments, StepOutcome, UpdateTable
+from ..optim import ADAM_BETAS, ADAM_EPS, Group
+from ..runtime.cuda_graph import CudaGraph, GraphMemory, Steps
+from ..runtime.device_copies import pinned
+from ..types import Camera, Splats, Tiles
+from .silhouettes import SilhouetteSample
+from .state import TrainState
+from .step import least_logit, motion_frozen
+from .view import Numbers, View, compare, form_of
+
+RECORD_AFTER = 2
+"""Number of steps of one kind that are taken operation by operation before one is recorded; they load its kernels."""
+MOST_RECORDINGS = 8
+"""Largest number of recordings at a time. Images of many sizes have as many kinds of steps."""
+MOST_TIMES = 3
+"""Largest number of instants of a step: the view's and two of the regulariser."""
+CAMERA, BACKGROUND, WEIGHT, TIMES = 25, 28, 29, 29 + MOST_TIMES
+"""Ends of the numbers of the camera, the background, the weight and the times; the learning rates follow."""
+
+
+class Kind(NamedTuple):
+    """What all steps of one kind update."""
+
+    table: UpdateTable
+    received: list[int]
+    """Indices of the parameters that receive a gradient."""
+    gradients: list[Tensor]
+    """Their gradients, at fixed addresses."""
+    names: list[str]
+    """Their names."""
+    updated: list[Group]
+
+
+class RecordedUpdate:
+    """Steps on the present tensors of a state, valid until one of these is replaced.
+
+    Attributes: ``outcome``; ``memory`` (of the recordings); ``recordings`` (number of graphs recorded); ``failure``
+    (error of a failed recording, else None).
+    """
+
+    def __init__(self, state: TrainState, memory: GraphMemory | None = None) -> None:
+        """
+        Args:
+            state: its optimisers' counts of steps must be those on which the steps follow.
+            memory: of earlier recordings, to be used again.
+        """
+        self._state, self._device = state, state.device
+        self.memory = memory or GraphMemory()
+        self.recordings, self.failure = 0, None
+        self.outcome = StepOutcome(self._device)
+        named = [pair for optimizer in state.optimizers() for pair in optimizer.groups.items()]
+        self._names, self._groups = [name for name, _ in named], [group for _, group in named]
+        for group in self._groups:
+            group.begin()
+        self._tensors = self._present()
+        counts = torch.tensor([group.steps for group in self._groups], dtype=torch.int32)
+        self._counts = counts.to(self._device)
+        self._inputs = torch.zeros(TIMES + len(self._groups), dtype=torch.float64, device=self._device)
+        self._kinds: dict[Hashable, Kind] = {}
+        self._seen: Counter[Hashable] = Counter()
+        self._recorded: dict[Hashable, CudaGraph | Steps] = {}
+        self._buffers: dict[Hashable, View] = {}
+
+    def holds(self) -> bool:
+        """Return True as long as none of the state's tensors has been replaced."""
+        now = self._present()
+        return len(now) == len(self._tensors) and all(
+            old is new and address == new.data_ptr() for (old, address), (new, _) in zip(self._tensors, now)
+        )
+
+    def _present(self) -> list[tuple[Tensor, int]]:
+        """Return all tensors that a step reads and writes, with their addresses."""
+        state = self._state
+        groups = [group for optimizer in state.optimizers() for group in optimizer.groups.values()]
+        found = [tensor for group in groups for tensor in (group.parameter, group.exp_avg, group.exp_avg_sq)]
+        found += [*state.motion.extra_state().values(), *state.stats.sums]
+        return [(tensor, tensor.data_ptr()) for tensor in found if tensor is not None]
+
+    def key(self, view: View) -> Hashable:
+        """Return a key for the kind of the state's present step."""
+        return form_of(view, motion_frozen(self._state))
+
+    def numbers(self, view: View) -> Tensor:
+        """Gather the numbers that change from step to step, float64 on the host."""
+        camera, times = view.camera, view.plan.times
+        cells = [*camera.viewmat.flatten().tolist(), *camera.K.flatten().tolist(), *view.background.tolist()]
+        cells += [view.plan.weight, *times, *[0.0] * (MOST_TIMES - len(times))]
+        return torch.tensor([*cells, *(group.rate for group in self._groups)], dtype=torch.float64)
+
+    def take(self, view: View, numbers: Tensor, key: Hashable, room: int, record: bool) -> tuple[Tensor, Tensor, Kind]:
+        """Take a step; the host does not wait.
+
+        Args:
+            numbers, key: results of :meth:`numbers` and :meth:`key` for the view.
+            room: number of pairs that the lists hold; the same until :meth:`forget_recordings`.
+            record: record the step if it has been repeated often enough.
+
+        Returns:
+            The report of ``StepOutcome``, the picture [3, H, W], and the step's kind. The next step of the same kind
+            may overwrite report and picture.
+        """
+        self._inputs.copy_(pinned(numbers, self._device), non_blocking=True)
+        body = partial(self._step, self._in_buffers(view), key, room)
+        recorded = self._recorded.get(key)
+        if recorded is None and record and self._seen[key] >= RECORD_AFTER:
+            recorded = self._record(key, body)
+        self._seen[key] += 1
+        report, picture = body() if recorded is None else recorded.replay()
+        torch.autograd.graph.increment_version([tensor for tensor, _ in self._tensors if tensor.is_floating_point()])
+        return report, picture, self._kinds[key]
+
+    def forget_recordings(self) -> None:
+        """Drop what was recorded with another room."""
+        self._recorded.clear()
+        self._seen.clear()
+
+    def _in_buffers(self, view: View) -> View:
+        """Copy the view's images to fixed addresses, and return the view with these."""
+        shapes = view.truth.shape, view.mask is None, None if view.sample is None else view.sample.distances.shape
+        kept = self._buffers.get(shapes)
+        if kept is None:
+            mask = None if view.mask is None else view.mask.clone()
+            sample = None if view.sample is None else SilhouetteSample(*(part.clone() for part in view.sample))
+            kept = self._buffers[shapes] = view._replace(truth=view.truth.clone(), mask=mask, sample=sample)
+        else:
+            for to, values in zip(_images(kept), _images(view)):
+                to.copy_(values)
+        return view._replace(truth=kept.truth, mask=kept.mask, sample=kept.sample)
+
+    def _record(self, key: Hashable, body: Callable[[], Any]) -> CudaGraph | Steps | None:
+        if len(self._recorded) >= MOST_RECORDINGS or self.failure is not None:
+            return None
+        if self._device.type != "cuda":
+            recorded: CudaGraph | Steps = Steps(body)
+        else:
+            # Steps that warm up must not be committed.
+            halted = self.outcome.halted.clone()
+            self.outcome.halted.fill_(1)
+            try:
+                recorded = CudaGraph(body, self._device, warm_ups=1, memory=self.memory)
+            except RuntimeError as error:  # steps are then taken operation by operation
+                self.failure = str(error)
+                return None
+            finally:
+                self.outcome.halted.copy_(halted)
+        self._recorded[key] = recorded
+        self.recordings += 1
+        return recorded
+
+    def _step(self, view: View, key: Hashable, room: int) -> tuple[Tensor, Tensor]:
+        """Compare the view, judge the loss and the gradients, update, and report."""
+        state, totals = self._state, []
+
+        def binned(splats: Splats) -> Tiles:
+            tiles, total = bin_within(splats, room)
+            totals.append(total)
+            return tiles
+
+        # 1. Compare. Statistics obey the outcome, which is known before the backward pass.
+        stats = replace(state.stats, outcome=self.outcome.value)
+        compared = compare(state, view, self._on_device(view), stats, binned)
+        self.outcome.judge_loss(totals[0], room, compared.loss, compared.regulariser)
+        parameters = [group.parameter for group in self._groups]
+        gradients = torch.autograd.grad(compared.total, parameters, allow_unused=True)
+
+        # 2. Update, unless a gradient is not finite.
+        kind = self._kinds.get(key)
+        if kind is None:
+            kind = self._kinds[key] = self._kind(gradients)
+        torch._foreach_copy_(kind.gradients, [gradients[index] for index in kind.received])  # pyright: ignore[reportPrivateImportUsage]
+        kind.table.judge_gradients(self.outcome)
+        kind.table.adam_step(self.outcome, self._inputs[TIMES:], self._counts, ADAM_BETAS, ADAM_EPS)
+        least = least_logit(state)
+        if least is not None:
+            logits = state.gaussians.opacity_logits.data
+            logits.copy_(torch.where(self.outcome.value == STEP_FINE, logits.clamp(min=least), logits))
+        terms = compared.loss, compared.l1, compared.ssim, compared.regulariser
+        return self.outcome.report(totals[0], *terms), compared.picture.detach()
+
+    def _on_device(self, view: View) -> Numbers:
+        cells = self._inputs[:TIMES].float()
+        viewmat, K = cells[:16].view(4, 4), cells[16:CAMERA].view(3, 3)
+        camera = Camera(viewmat, K, view.camera.width, view.camera.height)
+        times = cells[WEIGHT : WEIGHT + len(view.plan.times)]
+        return Numbers(camera, cells[CAMERA:BACKGROUND], times, cells[BACKGROUND])
+
+    def _kind(self, gradients: tuple[Tensor | None, ...]) -> Kind:
+        state = self._state
+        learns = [state.gaussian_optimizer] if motion_frozen(state) else state.optimizers()
+        learning = {id(group) for optimizer in learns for group in optimizer.groups.values()}
+        received = [index for index, gradient in enumerate(gradients) if gradient is not None]
+        buffers = [torch.zeros_like(self._groups[index].parameter) for index in received]
+        updates, updated = [], []
+        for index, buffer in zip(received, buffers):
+            group = self._groups[index]
+            if id(group) in learning:
+                assert group.exp_avg is not None and group.exp_avg_sq is not None
+                updates.append((index, Moments(group.parameter, buffer, group.exp_avg, group.exp_avg_sq)))
+                updated.append(group)
+        table = UpdateTable(buffers, updates, self._device)
+        return Kind(table, received, buffers, [self._names[index] for index in received], updated)
+
+
+def _images(view: View) -> list[Tensor]:
+    images = [view.truth, view.mask, *(() if view.sample is None else view.sample)]
+    return [image for image in images if image is not None]

@@ -1,0 +1,182 @@
+"""One training view: prepared on the host, then posed, rendered and compared on the device.
+
+:func:`prepare` draws all random numbers and reads the images; :func:`compare` neither waits for the device nor copies
+from the host, so that a step can be recorded (``recorded_step``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..config.presets import TrainConfig
+from ..motion.base import MotionStep
+from ..ops.pooled import pooled_residual
+from ..ops.ssim import photometric_loss
+from ..rendering.render import draw
+from ..seeding import generator
+from ..types import Camera, Splats, Stats, Tiles
+from .frames import Frames, view_number
+from .silhouettes import SilhouetteSample, silhouette_term
+from .state import TrainState
+
+
+class View(NamedTuple):
+    """What a step needs of one view. ``form`` and the shapes decide which operations the step consists of."""
+
+    index: int
+    """Index of the frame."""
+    camera: Camera
+    """Normalised, on the host."""
+    background: Tensor
+    """[3] on the host."""
+    plan: MotionStep
+    form: Form
+    truth: Tensor
+    """[3, H, W] on the device, on the background."""
+    mask: Tensor | None
+    """[H, W] bool on the device, True where the pixel is valid."""
+    sample: SilhouetteSample | None
+    """Part of the image's silhouette, on the device."""
+
+
+class Form(NamedTuple):
+    """Numbers of a view that choose operations. They change a few times in a run."""
+
+    sh_degree: int
+    collects: bool
+    """True while statistics for densification are collected."""
+    log_weight: float
+    pooled: bool
+
+
+class Numbers(NamedTuple):
+    """Numbers of a view that change from step to step, on the device."""
+
+    camera: Camera
+    background: Tensor
+    """[3]"""
+    times: Tensor
+    """[T] those of the plan."""
+    weight: float | Tensor
+    """Weight of the motion's regulariser."""
+
+
+class Compared(NamedTuple):
+    """Loss of one view and its parts, scalars, and the picture [3, H, W]."""
+
+    total: Tensor
+    """What is minimised: the loss, and the regulariser if there is one."""
+    loss: Tensor
+    l1: Tensor
+    ssim: Tensor
+    regulariser: Tensor | None
+    """Weighted; None in steps without the term."""
+    picture: Tensor
+
+
+def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
+    """Choose and load the frame of this step's ``view``, and draw the step's random numbers.
+
+    The frame after this process's next view is read in the background.
+
+    Raises:
+        FrameError: the frame's file is no longer readable.
+    """
+    config, step = state.config, state.stage_step
+    pretraining = state.stage == "pretrain"
+    progressive = config.pretrain.progressive and pretraining
+    index = frames.index_at(step, progressive, view)
+    random_background = pretraining and config.pretrain.random_background
+    frame, camera, background, truth, mask = frames.view(index, state.step, random_background, view)
+    later, next_view = divmod(view + (1 if state.group is None else state.group.size), config.batch)
+    frames.expect(step + later, progressive, next_view)
+    time = noisy_time(frame.time, state, len(frames), view)
+    plan = state.motion.plan(state.gaussians, time, step, config, view)
+    silhouette = frames.silhouettes.of(frame, index) if seeks_silhouettes(state) else None
+    random = generator(config.seed, 45, view_number(state.step, config, view))
+    sample = None if silhouette is None else silhouette.sample(random)
+    pooled = config.pretrain.pooled if pretraining else config.loss.pooled == "always"
+    collects = pretraining or step < config.densify.until
+    form = Form(sh_degree(state, step), collects, log_weight(state), pooled)
+    return View(index, camera, background, plan, form, truth, mask, sample)
+
+
+def compare(
+    state: TrainState,
+    view: View,
+    numbers: Numbers,
+    stats: Stats,
+    binned: Callable[[Splats], Tiles] | None = None,
+) -> Compared:
+    """Pose and render the Gaussians as the view sees them, and compare the picture with the truth.
+
+    Args:
+        stats: what the backward pass adds to, if the step collects statistics.
+        binned: as in ``render.draw``.
+    """
+    config, camera, form = state.config, numbers.camera, view.form
+    # 1. Pose: the Gaussians at the frame's time, and the regulariser of the motion.
+    posed, regulariser = state.motion.train_at(state.gaussians, view.plan, numbers.times, numbers.weight, config)
+    if view.sample is not None:
+        sought = config.pretrain.silhouette * silhouette_term(posed.means, camera, view.sample)
+        regulariser = sought if regulariser is None else regulariser + sought
+
+    # 2. Render.
+    picture, _ = draw(
+        posed,
+        camera,
+        numbers.background,
+        sh_degree=form.sh_degree,
+        stats=stats if form.collects else None,
+        antialiased=config.antialiased,
+        binned=binned,
+    )
+
+    # 3. Compare.
+    loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
+    if form.pooled:
+        loss = loss + pooled_residual(picture, view.truth, view.mask)
+    total = loss if regulariser is None else loss + regulariser
+    return Compared(total, loss, l1, ssim, regulariser, picture)
+
+
+def form_of(view: View, *others: Hashable) -> Hashable:
+    """Return a key that is equal for views whose steps consist of the same operations on tensors of the same shapes."""
+    distances = None if view.sample is None else view.sample.distances.shape
+    plan = view.plan.phase, len(view.plan.times), view.plan.weight != 0.0
+    return view.form, plan, view.truth.shape, view.mask is None, distances, *others
+
+
+def seeks_silhouettes(state: TrainState) -> bool:
+    """Return True during the steps of stage 1 in which silhouettes draw the spheres: once the spheres move."""
+    pretrain = state.config.pretrain
+    return state.stage == "pretrain" and state.stage_step >= pretrain.warm_up and pretrain.silhouette > 0
+
+
+def sh_degree(state: TrainState, step: int) -> int:
+    """Return the degree of spherical harmonics at this step of the stage; it grows by one every ``densify.sh_every``
+    steps."""
+    return min(state.gaussians.sh_degree, step // state.config.densify.sh_every)
+
+
+def log_weight(state: TrainState) -> float:
+    """Return the weight of the logarithm of the squared error: 0 until ``loss.log_error_from`` of the main stage."""
+    config = state.config
+    begins = round(config.loss.log_error_from * config.main_steps)
+    return config.loss.log_error if state.stage == "main" and state.stage_step >= begins else 0.0
+
+
+def noisy_time(time: float, state: TrainState, frames: int, view: int = 0) -> float:
+    """Add noise to a view's time, for data in which the cameras move between instants. The noise keeps the motion from
+    jumping from frame to frame; it fades until ``optim.network_until``."""
+    config: TrainConfig = state.config
+    fade = max(0.0, 1.0 - state.stage_step / config.optim.network_until)
+    spread = config.motion.time_noise * fade / max(frames - 1, 1)
+    if spread == 0.0:
+        return time
+    noise = torch.randn(1, generator=generator(config.seed, 43, view_number(state.step, config, view)))
+    return min(max(time + spread * float(noise), 0.0), 1.0)
