@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -20,8 +21,10 @@ from ..ops.projection import project
 from ..rendering import render
 from ..scene.scene import Scene
 from ..seeding import generator
-from ..training import step as training
+from ..training import view as training_view
 from ..training.frames import Frames
+from ..training.loop import PlainSteps, steps_of
+from ..training.state import StepResult, TrainState
 from ..types import Camera, Gaussians
 from .plan import MIDDLE, BenchCase, posed
 from .scenes import Size, scene_camera, training_data, training_state
@@ -150,7 +153,10 @@ def _this_module() -> Any:
 
 
 def step_rows(case: BenchCase) -> list[dict[str, Any]]:
-    """Measure training steps of stage 2 on images of the scene, without and (if any) with the ARAP term."""
+    """Measure training steps of stage 2 on images of the scene, without and (if any) with the ARAP term.
+
+    On CUDA the whole is a recorded graph, so its stages are those of a step taken operation by operation.
+    """
     scene = case.scene
     data = training_data(scene, case.plan.size)
     rows = []
@@ -165,19 +171,22 @@ def step_rows(case: BenchCase) -> list[dict[str, Any]]:
         targets = {
             **motion_stages(scene.motion, training=True),
             **draw_stages(render),
-            "loss": [(training, "photometric_loss")],
+            "loss": [(training_view, "photometric_loss")],
             "backward": [(torch.Tensor, "backward")],
             "adam": [(one, "step") for one in (state.gaussian_optimizer, state.motion_optimizer) if one is not None],
         }
 
-        def step(index: int, state: Any = state, frames: Frames = frames) -> None:
-            if training.training_step(state, frames).failed is not None:
+        taken = steps_of(state, frames)
+
+        def step(index: int, state: TrainState = state, take: Callable[[], list[StepResult]] = taken.take) -> None:
+            if any(result.failed is not None for result in take()):
                 raise UserError(
                     f"step: the loss of {scene.motion_name} is not finite; measure another scene with --run"
                 )
             state.step += 1
 
-        rows += case.rows(name, step, targets)
+        plain = partial(step, take=PlainSteps(state, frames).take) if case.plan.device == "cuda" else None
+        rows += case.rows(name, step, targets, staged=plain)
     scene.motion.eval()
     scene.freeze_binding()
     return rows

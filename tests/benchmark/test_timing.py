@@ -12,7 +12,7 @@ from scgs_warp.benchmark import run as bench
 from scgs_warp.benchmark import timing as bench_clock
 from scgs_warp.benchmark import workloads
 from scgs_warp.rendering import render as render_module
-from scgs_warp.training import step as training
+from scgs_warp.training import view as training_view
 
 pytestmark = pytest.mark.usefixtures("all_threads")
 
@@ -36,7 +36,7 @@ def test_stages_unwrap_what_they_wrap_and_count_nested_ones_once():
 def test_nothing_stays_wrapped(tmp_path):
     names = [
         (render_module, "project"),
-        (training, "photometric_loss"),
+        (training_view, "photometric_loss"),
         (torch.Tensor, "backward"),
         (workloads, "project"),
     ]
