@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -51,7 +53,13 @@ def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> Defo
 
 def unit_rotations(raw: Tensor) -> Tensor:
     """Convert network output [..., 4] to unit quaternions near the identity."""
-    return F.normalize(raw + torch.eye(1, 4, device=raw.device, dtype=raw.dtype), dim=-1)
+    return F.normalize(raw + _identity(raw.device, raw.dtype), dim=-1)
+
+
+@lru_cache(maxsize=16)
+def _identity(device: torch.device, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.eye(1, 4, device=device, dtype=dtype)
 
 
 def _posed(

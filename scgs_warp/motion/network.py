@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import cast
 
 import torch
@@ -13,10 +14,16 @@ from ..runtime.environment import one_piece
 
 def encode(values: Tensor, frequencies: int) -> Tensor:
     """Encode [..., D] as [..., D (1 + 2 F)]: the values, then sin and cos of 2^k times the values, k = 0 .. F - 1."""
-    octaves = 2.0 ** torch.arange(frequencies, device=values.device, dtype=values.dtype)
-    angles = (values[..., None, :] * octaves[:, None]).flatten(-2)
+    angles = (values[..., None, :] * _octaves(frequencies, values.device, values.dtype)).flatten(-2)
     with one_piece():
         return torch.cat([values, angles.sin(), angles.cos()], dim=-1)
+
+
+@lru_cache(maxsize=16)
+def _octaves(count: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Return the powers of two from 1 on, [count, 1]; made once, because a step on a GPU is many small operations."""
+    with torch.inference_mode(False):
+        return 2.0 ** torch.arange(count, device=device, dtype=dtype)[:, None]
 
 
 class _Bfloat16Linear(torch.autograd.Function):
@@ -112,8 +119,17 @@ class DeformationNetwork(nn.Module):
         for i, layer in enumerate(self.layers):
             if i == self.skip:
                 hidden = torch.cat([inputs, hidden], dim=-1)
-            hidden = (_bfloat16_linear(hidden, layer) if hidden.dtype is torch.bfloat16 else layer(hidden)).relu()
+            hidden = self._hidden(hidden, cast(nn.Linear, layer))
         return self.head(hidden.float())
+
+    def _hidden(self, inputs: Tensor, layer: nn.Linear) -> Tensor:
+        """Apply one hidden layer to [N, in], with its ReLU; on a GPU without gradients as one operation."""
+        if inputs.dtype is torch.bfloat16:
+            return _bfloat16_linear(inputs, layer).relu()
+        if inputs.is_cuda and not torch.is_grad_enabled():
+            fused = torch._addmm_activation  # pyright: ignore[reportPrivateImportUsage]
+            return fused(layer.bias, inputs, layer.weight.T)
+        return layer(inputs).relu()
 
     def _fused(self, where: Tensor, when: Tensor) -> Tensor | None:
         """Evaluate all layers in one kernel; return None if no kernel fits them."""

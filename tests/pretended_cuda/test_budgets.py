@@ -13,13 +13,13 @@ from scgs_warp.training.recorded_update import RecordedUpdate
 from scgs_warp.training.state import TrainState
 
 SIZE = (64, 48)
-FRAME_OPERATIONS, FRAME_LAUNCHES = 58, 15
+FRAME_OPERATIONS, FRAME_LAUNCHES = 45, 15
 """In the recorded frame, all motion included."""
-STEP_CONTACTS, STEP_OPERATIONS = 1, 5
+STEP_CONTACTS, STEP_OPERATIONS = 1, 3
 """Of a recorded step, beside the replay."""
-RECORDED_OPERATIONS, RECORDED_LAUNCHES = 181, 44
+RECORDED_OPERATIONS, RECORDED_LAUNCHES = 176, 44
 """In the recorded step. The copies of gradients, one for each parameter here, are few launches on a GPU."""
-ARAP_OPERATIONS, ARAP_LAUNCHES = 195, 48
+ARAP_OPERATIONS, ARAP_LAUNCHES = 190, 47
 """In the recorded step that carries ARAP."""
 
 
