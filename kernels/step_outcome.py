@@ -1,7 +1,8 @@
 """Outcome of a recorded training step, decided on the device: the host reads it one step later.
 
-A step that cannot be committed changes neither parameters nor statistics. Its outcome is a number: ``STEP_FINE``, or
-the least of the numbers of everything that failed. There is one form, for any device.
+A step that is not committed changes no parameter; unless only a gradient is non-finite, it changes no statistics
+either. Its outcome is a number: ``STEP_FINE``, or the least of the numbers of everything that failed. There is one
+form, for any device.
 """
 
 from __future__ import annotations

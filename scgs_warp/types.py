@@ -180,7 +180,7 @@ class Stats:
     absolute: bool = False
     """Flag that absolute gradients are summed over pixels, so that opposite ones do not cancel."""
     outcome: Tensor | None = None
-    """[1] int32 outcome of a recorded step, which adds nothing unless it succeeds. None: always add."""
+    """[1] int32 outcome of a recorded step so far: nothing is added unless it is fine. None: always add."""
 
     @property
     def sums(self) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -56,7 +56,7 @@ def unit_rotations(raw: Tensor) -> Tensor:
     return F.normalize(raw + _identity(raw.device, raw.dtype), dim=-1)
 
 
-@lru_cache(maxsize=16)
+@cache
 def _identity(device: torch.device, dtype: torch.dtype) -> Tensor:
     with torch.inference_mode(False):
         return torch.eye(1, 4, device=device, dtype=dtype)

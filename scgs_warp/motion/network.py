@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from typing import cast
 
 import torch
@@ -19,7 +19,7 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
         return torch.cat([values, angles.sin(), angles.cos()], dim=-1)
 
 
-@lru_cache(maxsize=16)
+@cache
 def _octaves(count: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Return the powers of two from 1 on, [count, 1]; made once, because a step on a GPU is many small operations."""
     with torch.inference_mode(False):

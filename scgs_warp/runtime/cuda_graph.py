@@ -19,7 +19,7 @@ _current_stream = threading.RLock()
 
 
 class GraphMemory:
-    """Memory that recordings share which never run side by side and need nothing of each other.
+    """Memory shared by recordings that never run at the same time and do not read each other's results.
 
     The memory of a dropped recording serves the next one, instead of staying reserved.
     """

@@ -26,7 +26,7 @@ class DeviceImages:
         self.budget = int(MEMORY_SHARE * memory.room(device)) if device.type == "cuda" else 0
         self.used = 0
         self._kept: dict[Hashable, Tensor] = {}
-        # On a GPU torch divides by a number of the host as a product with the reciprocal, which rounds otherwise.
+        # A number of the host will not do: torch multiplies by its reciprocal, which rounds differently.
         self._most = sent(torch.tensor(255.0), device)
 
     def planar(self, key: Hashable, image: Tensor) -> Tensor:
@@ -34,7 +34,8 @@ class DeviceImages:
         kept = self._kept.get(key)
         if kept is None:
             planes = image.permute(2, 0, 1).contiguous()
-            kept = self._copy(key, _smallest(planes) if self.budget else planes)
+            room = self.used + planes.numel() <= self.budget
+            kept = self._copy(key, _smallest(planes) if room else planes)
         return kept.float() / self._most if kept.dtype == torch.uint8 else kept
 
     def plane(self, key: Hashable, values: Tensor) -> Tensor:

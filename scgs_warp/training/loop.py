@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -133,22 +134,28 @@ class PlainSteps:
         """Return nothing: no step is in flight."""
         return []
 
+    def release(self) -> None:
+        """Do nothing: no tensor is held."""
 
-def steps_of(state: TrainState, frames: Frames) -> PlainSteps | RecordedSteps:
+
+def steps_of(
+    state: TrainState, frames: Frames, tell: Callable[[str], None] = lambda text: None
+) -> PlainSteps | RecordedSteps:
     """Return what takes the steps of a run: on a GPU without waiting for them, if a step has a single view."""
     recorded = state.device.type == "cuda" and state.config.batch == 1 and state.group is None
-    return RecordedSteps(state, frames) if recorded else PlainSteps(state, frames)
+    return RecordedSteps(state, frames, tell) if recorded else PlainSteps(state, frames)
 
 
 def _train(
     state: TrainState, frames: Frames, folder: RunFolder, test: Dataset | None, bar: Progress, stop: threading.Event
 ) -> None:
-    config, noted, steps = state.config, False, steps_of(state, frames)
+    config, noted, steps = state.config, False, steps_of(state, frames, bar.print)
     saved_at = time.monotonic()
     while state.step < config.steps:
         # 1. Enter the main stage when stage 1 is over.
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
             _finish(state, steps, folder, bar)
+            steps.release()
             state.begin_main()
 
         # 2. Render, compare and update the parameters.
@@ -156,7 +163,7 @@ def _train(
         tested = test is not None and (done % config.evaluate_every == 0 or done == config.steps)
         results, visible = _take(state, frames, folder, bar, steps, tested or folder.shows(done))
         for result in results:
-            _count_failure(state, result, folder, bar)
+            _count_failure(state, steps, result, folder, bar)
 
         # 3. Score held-out frames, before an opacity reset could put a dip into the curve.
         if test is not None and tested:
@@ -203,32 +210,41 @@ def _take(
     """Measure visibility where pruning is due, then take a step.
 
     Args:
-        looked_at: the step's result is needed at once, as it is where density is controlled.
+        looked_at: the step's result is needed at once; so it is wherever density is controlled.
 
     Returns:
         The results of all steps that have become known, and the visible Gaussians (``visible_gaussians``).
     """
-    due = density_due(state)
+    due, results = density_due(state), []
     try:
-        results = steps.settle() if due else []
+        results += steps.settle() if due else []
         visible = visible_gaussians(state, frames)
         results += steps.take()
-        return (results + steps.settle() if due or looked_at else results), visible
+        results += steps.settle() if due or looked_at else []
+        if due:
+            steps.release()
+        return results, visible
     except NotEnoughMemory:  # nothing has changed yet: a machine with more memory can continue
-        _finish(state, steps, folder, bar)
+        _finish(state, steps, folder, bar, results)
         state.save(folder.path)
         raise
     except FrameError as error:
-        _finish(state, steps, folder, bar)
+        _finish(state, steps, folder, bar, results)
         state.save(folder.path)
         saved = f"step {state.step} is saved: " if state.group is None or state.group.first else ""
         raise UserError(f"{error}; {saved}continue with --resume") from error
 
 
-def _finish(state: TrainState, steps: PlainSteps | RecordedSteps, folder: RunFolder, bar: Progress) -> None:
-    """Wait for the steps in flight, and report them."""
-    for result in steps.settle():
-        _count_failure(state, result, folder, bar)
+def _finish(
+    state: TrainState,
+    steps: PlainSteps | RecordedSteps,
+    folder: RunFolder,
+    bar: Progress,
+    known: Sequence[StepResult] = (),
+) -> None:
+    """Wait for the steps in flight, and report them after those ``known``."""
+    for result in [*known, *steps.settle()]:
+        _count_failure(state, steps, result, folder, bar)
         folder.record(state, result, bar)
 
 
@@ -247,7 +263,9 @@ def _process_lost(state: TrainState, folder: RunFolder, lost: ProcessLost) -> Us
     )
 
 
-def _count_failure(state: TrainState, result: StepResult, folder: RunFolder, bar: Progress) -> None:
+def _count_failure(
+    state: TrainState, steps: PlainSteps | RecordedSteps, result: StepResult, folder: RunFolder, bar: Progress
+) -> None:
     """Count the dropped steps in a row, and report a dropped step.
 
     Raises:
@@ -261,7 +279,10 @@ def _count_failure(state: TrainState, result: StepResult, folder: RunFolder, bar
     bar.print(f"step {result.step}: {term} is not finite; the step was dropped")
     folder.log({"step": result.step, "stage": state.stage, "dropped": term})
     if state.failures >= MOST_FAILURES:
-        state.save(folder.path)  # no dropped step has touched the parameters
+        # No dropped step has touched the parameters. A step in flight is part of the saved state.
+        for late in steps.settle():
+            state.step = late.step + 1
+        state.save(folder.path)
         raise UserError(
             f"{folder.path}: {term} was not finite {MOST_FAILURES} times in a row, up to step {state.step}; the "
             "checkpoint holds the last good state; lower the learning rates or check the data, then --resume"

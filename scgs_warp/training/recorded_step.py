@@ -13,7 +13,7 @@ one, which is how they are tested.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
 import torch
@@ -22,6 +22,7 @@ from torch import Tensor
 from ..kernels.types import STEP_FINE, STEP_GRADIENT, STEP_HALTED, STEP_LOSS, TILE_SIZE
 from ..ops.binning_cuda import MAX_ROOM, bytes_within
 from ..runtime import debug, memory
+from ..runtime.cuda_graph import GraphMemory
 from .frames import Frames
 from .recorded_update import Kind, RecordedUpdate
 from .state import StepResult, TrainState
@@ -65,11 +66,16 @@ class RecordedSteps:
     ``failure`` (error of a failed recording, else None).
     """
 
-    def __init__(self, state: TrainState, frames: Frames) -> None:
-        self._state, self._frames = state, frames
+    def __init__(self, state: TrainState, frames: Frames, tell: Callable[[str], None] = lambda text: None) -> None:
+        """
+        Args:
+            tell: prints a line for the user.
+        """
+        self._state, self._frames, self._tell = state, frames, tell
         self.capacity, self.recordings, self.repeats = 0, 0, 0
         self.failure: str | None = None
         self._most_pairs = 0
+        self._memory = GraphMemory()
         self._pending: deque[_Submitted] = deque()
         self._update: RecordedUpdate | None = None
 
@@ -81,7 +87,9 @@ class RecordedSteps:
         """
         state = self._state
         if not self._fits():
-            return [*self.settle(), training_step(state, self._frames)]
+            results = self.settle()
+            self.release()
+            return [*results, training_step(state, self._frames)]
         results = self.settle() if state.motion.refresh_due(state.stage_step, state.config) else []
         set_rates(state)
         view = prepare(state, self._frames)
@@ -98,21 +106,22 @@ class RecordedSteps:
             results += self._oldest()
         return results
 
+    def release(self) -> None:
+        """Let go of the state's tensors, which are to be replaced. All steps must be known."""
+        assert not self._pending, "a step is in flight"
+        self._update, self.capacity = None, 0
+
     def _fits(self) -> bool:
         """Return True if the present step can be taken without the host, as far as is known beforehand."""
         state = self._state
         ready = state.motion.takes_time_tensor and not state.refines_cameras and not debug.enabled()
         if not ready:
             return False
-        wanted = self._wanted()
-        return self.capacity >= wanted or self._make_room(wanted)
-
-    def _wanted(self) -> int:
-        """Return the number of pairs for which there should be room."""
-        if self._update is not None and self._update.holds():
-            return self.capacity
+        if self.capacity > 0 and self._update is not None and self._update.holds():
+            return True
         seen = int(CAPACITY_FACTOR * self._most_pairs)
-        return max(seen or PAIRS_PER_GAUSSIAN * len(self._state.gaussians), 1)
+        wanted = max(seen or PAIRS_PER_GAUSSIAN * len(state.gaussians), 1)
+        return self.capacity >= wanted or self._make_room(wanted)
 
     def _make_room(self, pairs: int) -> bool:
         """Set the capacity for ``pairs``; return False if it exceeds the index range or the memory."""
@@ -131,8 +140,8 @@ class RecordedSteps:
         """Return the update of the state's present tensors."""
         if self._update is None or not self._update.holds():
             assert not self._pending, "tensors may be replaced only when all steps are known"
-            earlier = None if self._update is None else self._update.memory
-            self._update, self._most_pairs = RecordedUpdate(self._state, earlier), 0
+            self._update = None  # frees the old tensors before the new buffers are made
+            self._update, self._most_pairs = RecordedUpdate(self._state, self._memory), 0
         return self._update
 
     def _submit(self, update: RecordedUpdate, step: _Step) -> None:
@@ -140,7 +149,9 @@ class RecordedSteps:
         record = self.failure is None
         report, picture, kind = update.take(step.view, step.numbers, step.key, self.capacity, record)
         self.recordings += update.recordings - before
-        self.failure = self.failure or update.failure
+        if record and update.failure is not None:
+            self.failure = update.failure
+            self._tell(f"steps are not recorded as a CUDA graph, so each takes longer: {self.failure.splitlines()[0]}")
         done, device = None, self._state.device
         if device.type == "cuda":
             host = torch.empty(report.shape, dtype=report.dtype, pin_memory=True)
@@ -182,7 +193,8 @@ class RecordedSteps:
             for submitted in again:
                 self._submit(update, submitted.step)
             return []
-        self.capacity, present, results = 0, state.step, []
+        self.release()
+        present, results = state.step, []
         for submitted in again:
             state.step = submitted.step.number
             results.append(training_step(state, self._frames))

@@ -24,13 +24,14 @@ from .step import least_logit, motion_frozen
 from .view import Numbers, View, compare, form_of
 
 RECORD_AFTER = 2
-"""Number of steps of one kind that are taken operation by operation before one is recorded; they load its kernels."""
+"""Number of steps of one kind that are taken operation by operation, which loads their kernels, before one is
+recorded."""
 MOST_RECORDINGS = 8
 """Largest number of recordings at a time. Images of many sizes have as many kinds of steps."""
 MOST_TIMES = 3
 """Largest number of instants of a step: the view's and two of the regulariser."""
 CAMERA, BACKGROUND, WEIGHT, TIMES = 25, 28, 29, 29 + MOST_TIMES
-"""Ends of the numbers of the camera, the background, the weight and the times; the learning rates follow."""
+"""Index behind the last number of the camera, the background, the weight and the times; the learning rates follow."""
 
 
 class Kind(NamedTuple):
@@ -49,18 +50,17 @@ class Kind(NamedTuple):
 class RecordedUpdate:
     """Steps on the present tensors of a state, valid until one of these is replaced.
 
-    Attributes: ``outcome``; ``memory`` (of the recordings); ``recordings`` (number of graphs recorded); ``failure``
-    (error of a failed recording, else None).
+    Attributes: ``outcome``; ``recordings`` (number of graphs recorded); ``failure`` (error of a failed recording, else
+    None).
     """
 
-    def __init__(self, state: TrainState, memory: GraphMemory | None = None) -> None:
+    def __init__(self, state: TrainState, memory: GraphMemory) -> None:
         """
         Args:
-            state: its optimisers' counts of steps must be those on which the steps follow.
-            memory: of earlier recordings, to be used again.
+            state: its optimisers' counts of steps must include every step taken so far.
+            memory: of all recordings of a run.
         """
-        self._state, self._device = state, state.device
-        self.memory = memory or GraphMemory()
+        self._state, self._device, self._memory = state, state.device, memory
         self.recordings, self.failure = 0, None
         self.outcome = StepOutcome(self._device)
         named = [pair for optimizer in state.optimizers() for pair in optimizer.groups.items()]
@@ -71,6 +71,9 @@ class RecordedUpdate:
         counts = torch.tensor([group.steps for group in self._groups], dtype=torch.int32)
         self._counts = counts.to(self._device)
         self._inputs = torch.zeros(TIMES + len(self._groups), dtype=torch.float64, device=self._device)
+        self._gradients: dict[int, Tensor] = {}
+        self._short = False
+        """True if there was too little memory for a recording."""
         self._kinds: dict[Hashable, Kind] = {}
         self._seen: Counter[Hashable] = Counter()
         self._recorded: dict[Hashable, CudaGraph | Steps] = {}
@@ -115,12 +118,14 @@ class RecordedUpdate:
             may overwrite report and picture.
         """
         self._inputs.copy_(pinned(numbers, self._device), non_blocking=True)
-        body = partial(self._step, self._in_buffers(view), key, room)
         recorded = self._recorded.get(key)
-        if recorded is None and record and self._seen[key] >= RECORD_AFTER:
-            recorded = self._record(key, body)
+        due = self._seen[key] >= RECORD_AFTER and len(self._recorded) < MOST_RECORDINGS and self.failure is None
         self._seen[key] += 1
-        report, picture = body() if recorded is None else recorded.replay()
+        if recorded is not None:
+            self._in_buffers(view)
+        elif record and due and not self._short:
+            recorded = self._record(key, partial(self._step, self._in_buffers(view), key, room))
+        report, picture = self._step(view, key, room) if recorded is None else recorded.replay()
         torch.autograd.graph.increment_version([tensor for tensor, _ in self._tensors if tensor.is_floating_point()])
         return report, picture, self._kinds[key]
 
@@ -128,6 +133,7 @@ class RecordedUpdate:
         """Drop what was recorded with another room."""
         self._recorded.clear()
         self._seen.clear()
+        self._buffers.clear()
 
     def _in_buffers(self, view: View) -> View:
         """Copy the view's images to fixed addresses, and return the view with these."""
@@ -143,21 +149,20 @@ class RecordedUpdate:
         return view._replace(truth=kept.truth, mask=kept.mask, sample=kept.sample)
 
     def _record(self, key: Hashable, body: Callable[[], Any]) -> CudaGraph | Steps | None:
-        if len(self._recorded) >= MOST_RECORDINGS or self.failure is not None:
-            return None
         if self._device.type != "cuda":
             recorded: CudaGraph | Steps = Steps(body)
         else:
-            # Steps that warm up must not be committed.
-            halted = self.outcome.halted.clone()
-            self.outcome.halted.fill_(1)
             try:
-                recorded = CudaGraph(body, self._device, warm_ups=1, memory=self.memory)
-            except RuntimeError as error:  # steps are then taken operation by operation
-                self.failure = str(error)
+                recorded = CudaGraph(body, self._device, warm_ups=0, memory=self._memory)
+            except torch.OutOfMemoryError:  # steps on these tensors are then taken operation by operation
+                self._short = True
+                self.forget_recordings()
+                torch.cuda.empty_cache()
                 return None
-            finally:
-                self.outcome.halted.copy_(halted)
+            except RuntimeError as error:  # as are all others
+                self.failure = str(error)
+                self.forget_recordings()
+                return None
         self._recorded[key] = recorded
         self.recordings += 1
         return recorded
@@ -204,7 +209,10 @@ class RecordedUpdate:
         learns = [state.gaussian_optimizer] if motion_frozen(state) else state.optimizers()
         learning = {id(group) for optimizer in learns for group in optimizer.groups.values()}
         received = [index for index, gradient in enumerate(gradients) if gradient is not None]
-        buffers = [torch.zeros_like(self._groups[index].parameter) for index in received]
+        for index in received:  # all kinds share them: one step follows the other
+            if index not in self._gradients:
+                self._gradients[index] = torch.zeros_like(self._groups[index].parameter)
+        buffers = [self._gradients[index] for index in received]
         updates, updated = [], []
         for index, buffer in zip(received, buffers):
             group = self._groups[index]

@@ -210,7 +210,7 @@ class RunFolder:
         self._on_board(lambda board: board.show(name, truth, render, step))
 
     def shows(self, done: int) -> bool:
-        """Return True if the record of the last of ``done`` steps holds its losses or its picture."""
+        """Return True if :meth:`record` writes the losses or the picture of the step that completes ``done`` steps."""
         pictured = self._board is not None and done % self._between == 0
         return done % LOG_EVERY == 0 or done == self._steps or pictured
 

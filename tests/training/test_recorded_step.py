@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -260,3 +262,41 @@ def test_images_that_are_not_copied_show(device, monkeypatch):
     monkeypatch.setattr(RecordedUpdate, "_in_buffers", first)
     with pytest.raises(AssertionError):
         compare(device, 50)
+
+
+def test_plain_steps_between_recorded_ones(device, monkeypatch):
+    """Memory comes and goes: the counts of both forms continue each other's."""
+    inner, number = RecordedSteps._fits, iter(range(10_000))
+    monkeypatch.setattr(RecordedSteps, "_fits", lambda self: next(number) % 9 < 5 and inner(self))
+    taker, _, _ = compare(device, 60)
+    assert taker.recordings > 0
+
+
+def test_a_failed_recording_is_told_once(device, monkeypatch):
+    def refuse(self, key, body):
+        self.failure = "no capture\nof this"
+
+    monkeypatch.setattr(RecordedUpdate, "_record", refuse)
+    state, frames = begin(device)
+    said: list[str] = []
+    steps = RecordedSteps(state, frames, said.append)
+    for _ in range(6):
+        steps.take()
+        state.step += 1
+    assert steps.failure is not None and len(said) == 1 and "no capture" in said[0] and "\n" not in said[0]
+
+
+def test_nothing_is_held_after_a_release(device):
+    state, frames = begin(device, pretrain={"steps": 0}, motion={"model": "static"})
+    steps = RecordedSteps(state, frames)
+    for _ in range(5):
+        steps.take()
+        state.step += 1
+    steps.settle()
+    steps.release()
+    means = weakref.ref(state.gaussians.means)
+    state.gaussian_optimizer.regather(
+        state.gaussians, ("means",), torch.arange(3, device=device), torch.zeros(3, dtype=torch.bool, device=device)
+    )
+    gc.collect()
+    assert means() is None
