@@ -20,7 +20,8 @@ from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.runtime import memory
 from scgs_warp.runtime.memory import GIB, NotEnoughMemory
 from scgs_warp.scene.scene import Scene
-from scgs_warp.training import density_control, view
+from scgs_warp.training import density_control
+from scgs_warp.training import view as training_view
 from scgs_warp.training.loop import fit
 from scgs_warp.visualization import video
 
@@ -205,7 +206,7 @@ def test_training_that_runs_out_of_memory_can_be_resumed(monkeypatch: pytest.Mon
     """To the same bits."""
     config, data = tiny_config(30, motion={"model": "static"}), tiny_dataset(6, 32)
     fit(config, data, output=tmp_path / "whole")
-    original, steps = view.draw, []
+    original, steps = training_view.draw, []
 
     def draw(*args, **options):
         steps.append(1)
@@ -213,10 +214,10 @@ def test_training_that_runs_out_of_memory_can_be_resumed(monkeypatch: pytest.Mon
             raise NotEnoughMemory("an image of 32 x 32 needs more")
         return original(*args, **options)
 
-    monkeypatch.setattr(view, "draw", draw)
+    monkeypatch.setattr(training_view, "draw", draw)
     with pytest.raises(NotEnoughMemory):
         fit(config, data, output=tmp_path / "run")
-    monkeypatch.setattr(view, "draw", original)
+    monkeypatch.setattr(training_view, "draw", original)
     assert Scene.load(tmp_path / "run").step < 30
     fit(config, data, output=tmp_path / "run", resume=True)
     files = [(tmp_path / name / "checkpoint.safetensors").read_bytes() for name in ("whole", "run")]
