@@ -152,6 +152,9 @@ class RecordedUpdate:
         if self._device.type != "cuda":
             recorded: CudaGraph | Steps = Steps(body)
         else:
+            # Nothing may be committed by a capture that runs the operations, as that of the pretended device does.
+            halted = self.outcome.halted.clone()
+            self.outcome.halted.fill_(1)
             try:
                 recorded = CudaGraph(body, self._device, warm_ups=0, memory=self._memory)
             except torch.OutOfMemoryError:  # steps on these tensors are then taken operation by operation
@@ -163,6 +166,8 @@ class RecordedUpdate:
                 self.failure = str(error)
                 self.forget_recordings()
                 return None
+            finally:
+                self.outcome.halted.copy_(halted)
         self._recorded[key] = recorded
         self.recordings += 1
         return recorded
