@@ -346,3 +346,19 @@ def sum_rows(
     for y in range(rows_in.shape[0]):
         total += rows_in[y, c]
     total_out[c] = total
+
+
+@wp.kernel
+def expected_depth(
+    first: int,
+    # In:
+    accumulated_in: wp.array[float],  # [H W] depth times alpha
+    alpha_in: wp.array[float],  # [H W]
+    unit: wp.float64,
+    # Out:
+    depth_out: wp.array[float],  # [H W]
+):
+    """Divide the accumulated depth by alpha, then by the unit in double precision. Grid: H W."""
+    p = first + wp.tid()
+    depth = accumulated_in[p] / wp.max(alpha_in[p], 1e-10)
+    depth_out[p] = float(wp.float64(depth) / unit)

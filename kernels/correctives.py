@@ -19,6 +19,23 @@ SCALE = wp.constant(0.1)
 """Scale of the displacement, chosen so that C learns about as fast as the means."""
 
 
+@wp.func
+def corrected(
+    i: int, mean: wp.vec3, correctives: wp.array2d[float], quat: wp.vec4, quat_t: wp.vec4, quat_own: wp.vec4
+) -> wp.vec3:
+    """Return the skinned mean of Gaussian i with its corrective; a non-finite one is left out."""
+    turn = rotation_between(quat, quat_own) - wp.identity(n=3, dtype=float)
+    shift = wp.vec3(0.0, 0.0, 0.0)
+    for a in range(3):
+        for r in range(3):
+            for c in range(3):
+                shift[a] = shift[a] + correctives[i, 9 * a + 3 * r + c] * turn[r, c]
+    moved = mean + SCALE * (rotation_between(quat, quat_t) * shift)
+    if not wp.isfinite(wp.dot(moved - mean, wp.vec3(1.0, 1.0, 1.0))):
+        moved = mean
+    return moved
+
+
 @wp.kernel
 def correct(
     first: int,
@@ -31,18 +48,9 @@ def correct(
     # Out:
     means_out: wp.array[wp.vec3],  # [N]
 ):
-    """Add the corrective to a mean; a non-finite one is left out. Grid: N."""
+    """Add the corrective to a mean. Grid: N."""
     i = first + wp.tid()
-    turn = rotation_between(quats_in[i], quats_own_in[i]) - wp.identity(n=3, dtype=float)
-    shift = wp.vec3(0.0, 0.0, 0.0)
-    for a in range(3):
-        for r in range(3):
-            for c in range(3):
-                shift[a] = shift[a] + correctives_in[i, 9 * a + 3 * r + c] * turn[r, c]
-    moved = means_in[i] + SCALE * (rotation_between(quats_in[i], quats_t_in[i]) * shift)
-    if not wp.isfinite(wp.dot(moved - means_in[i], wp.vec3(1.0, 1.0, 1.0))):
-        moved = means_in[i]
-    means_out[i] = moved
+    means_out[i] = corrected(i, means_in[i], correctives_in, quats_in[i], quats_t_in[i], quats_own_in[i])
 
 
 @wp.kernel

@@ -45,13 +45,52 @@ def passed(color: float, v: float) -> float:
     return wp.where(color > 0.0 and wp.isfinite(color), v, 0.0)
 
 
+@wp.func
+def color_of(
+    sh_dc: wp.vec3, sh_rest: wp.array[wp.vec3], k: int, mean: wp.vec3, camera: wp.vec3, degree: int
+) -> wp.vec3:
+    """Return the colour of a Gaussian whose higher coefficients begin at ``k``: >= 0, or non-finite where one of them
+    is."""
+    color = C0 * sh_dc + wp.vec3(0.5)
+    if degree > 0:
+        d, _inverse = view_ray(mean, camera)
+        x = d[0]
+        y = d[1]
+        z = d[2]
+        color += C1 * (z * sh_rest[k + 1] - y * sh_rest[k] - x * sh_rest[k + 2])
+        if degree > 1:
+            xx = x * x
+            yy = y * y
+            zz = z * z
+            color += (
+                (C2 * x * y) * sh_rest[k + 3]
+                - (C2 * y * z) * sh_rest[k + 4]
+                + (C20 * (3.0 * zz - 1.0)) * sh_rest[k + 5]
+                - (C2 * x * z) * sh_rest[k + 6]
+                + (C22 * (xx - yy)) * sh_rest[k + 7]
+            )
+            if degree > 2:
+                color += (
+                    (C33 * y * (yy - 3.0 * xx)) * sh_rest[k + 8]
+                    + (C32 * x * y * z) * sh_rest[k + 9]
+                    + (C31 * y * (1.0 - 5.0 * zz)) * sh_rest[k + 10]
+                    + (C30 * z * (5.0 * zz - 3.0)) * sh_rest[k + 11]
+                    + (C31 * x * (1.0 - 5.0 * zz)) * sh_rest[k + 12]
+                    + (C3Z * z * (xx - yy)) * sh_rest[k + 13]
+                    + (C33 * x * (3.0 * yy - xx)) * sh_rest[k + 14]
+                )
+    return wp.vec3(not_negative(color[0]), not_negative(color[1]), not_negative(color[2]))
+
+
 @wp.kernel
 def spherical_harmonics(
     first: int,
     # In:
-    sh_dc_in: wp.array[wp.vec3],  # [N]
-    sh_rest_in: wp.array[wp.vec3],  # [N * R]
-    rest: int,  # R
+    sh_dc_in: wp.array[wp.vec3],  # [N * dc_row]
+    dc_row: int,  # a Gaussian's part of sh_dc_in, of which the first is read
+    sh_rest_in: wp.array[wp.vec3],  # [N * rest_row]
+    rest_row: int,  # a Gaussian's part of sh_rest_in
+    rest_begin: int,  # where the higher coefficients begin in it: 1 if both arrays are the same
     means_in: wp.array[wp.vec3],  # [N]
     camera_in: wp.array[wp.vec3],  # [1] centre of projection
     degree: int,
@@ -59,44 +98,41 @@ def spherical_harmonics(
     colors_out: wp.array[wp.vec3],  # [N] >= 0, or non-finite where a coefficient is
 ):
     i = first + wp.tid()
-    k = i * rest
-    color = C0 * sh_dc_in[i] + wp.vec3(0.5)
-    if degree > 0:
-        d, _inverse = view_ray(means_in[i], camera_in[0])
-        x = d[0]
-        y = d[1]
-        z = d[2]
-        color += C1 * (z * sh_rest_in[k + 1] - y * sh_rest_in[k] - x * sh_rest_in[k + 2])
-        if degree > 1:
-            xx = x * x
-            yy = y * y
-            zz = z * z
-            color += (
-                (C2 * x * y) * sh_rest_in[k + 3]
-                - (C2 * y * z) * sh_rest_in[k + 4]
-                + (C20 * (3.0 * zz - 1.0)) * sh_rest_in[k + 5]
-                - (C2 * x * z) * sh_rest_in[k + 6]
-                + (C22 * (xx - yy)) * sh_rest_in[k + 7]
-            )
-            if degree > 2:
-                color += (
-                    (C33 * y * (yy - 3.0 * xx)) * sh_rest_in[k + 8]
-                    + (C32 * x * y * z) * sh_rest_in[k + 9]
-                    + (C31 * y * (1.0 - 5.0 * zz)) * sh_rest_in[k + 10]
-                    + (C30 * z * (5.0 * zz - 3.0)) * sh_rest_in[k + 11]
-                    + (C31 * x * (1.0 - 5.0 * zz)) * sh_rest_in[k + 12]
-                    + (C3Z * z * (xx - yy)) * sh_rest_in[k + 13]
-                    + (C33 * x * (3.0 * yy - xx)) * sh_rest_in[k + 14]
-                )
-    colors_out[i] = wp.vec3(not_negative(color[0]), not_negative(color[1]), not_negative(color[2]))
+    k = i * rest_row + rest_begin
+    colors_out[i] = color_of(sh_dc_in[i * dc_row], sh_rest_in, k, means_in[i], camera_in[0], degree)
+
+
+@wp.kernel
+def channels_with_depth(
+    first: int,
+    # In:
+    sh_dc_in: wp.array[wp.vec3],  # [N]
+    sh_rest_in: wp.array[wp.vec3],  # [N * R]
+    rest: int,  # R
+    means_in: wp.array[wp.vec3],  # [N]
+    viewmat_in: wp.array2d[float],  # [4, 4]
+    depths_in: wp.array[float],  # [N]
+    degree: int,
+    # Out:
+    channels_out: wp.array[wp.vec4],  # [N] colour, then depth
+):
+    i = first + wp.tid()
+    camera = wp.vec3(0.0, 0.0, 0.0)
+    for a in range(3):
+        for r in range(3):
+            camera[a] = camera[a] - viewmat_in[r, a] * viewmat_in[r, 3]
+    color = color_of(sh_dc_in[i], sh_rest_in, i * rest, means_in[i], camera, degree)
+    channels_out[i] = wp.vec4(color[0], color[1], color[2], depths_in[i])
 
 
 @wp.kernel
 def spherical_harmonics_adjoint(
     first: int,
     # In:
-    sh_rest_in: wp.array[wp.vec3],  # [N * R]
-    rest: int,  # R
+    sh_rest_in: wp.array[wp.vec3],  # [N * rest_row]
+    dc_row: int,  # as in the forward pass, for coefficients and gradients
+    rest_row: int,
+    rest_begin: int,
     means_in: wp.array[wp.vec3],  # [N]
     camera_in: wp.array[wp.vec3],  # [1]
     degree: int,
@@ -105,22 +141,23 @@ def spherical_harmonics_adjoint(
     has_rest: int,  # whether v_sh_rest_out is wanted
     has_means: int,  # whether v_means_out is wanted
     # Out:
-    v_sh_dc_out: wp.array[wp.vec3],  # [N]
-    v_sh_rest_out: wp.array[wp.vec3],  # [N * R]
+    v_sh_dc_out: wp.array[wp.vec3],  # [N * dc_row]
+    v_sh_rest_out: wp.array[wp.vec3],  # [N * rest_row]
     v_means_out: wp.array[wp.vec3],  # [N]; the camera's is minus their sum
 ):
     i = first + wp.tid()
-    k = i * rest
+    k = i * rest_row + rest_begin
+    end = (i + 1) * rest_row
     color = colors_in[i]
     v = v_colors_in[i]
     v = wp.vec3(passed(color[0], v[0]), passed(color[1], v[1]), passed(color[2], v[2]))
-    v_sh_dc_out[i] = C0 * v
+    v_sh_dc_out[i * dc_row] = C0 * v
     if has_means != 0:
         v_means_out[i] = wp.vec3(0.0)
     if v[0] == 0.0 and v[1] == 0.0 and v[2] == 0.0:
         # The Gaussian is culled or clamped: its coefficients need not be read, and a NaN among them must not spread.
         if has_rest != 0:
-            for j in range(k, k + rest):
+            for j in range(k, end):
                 v_sh_rest_out[j] = wp.vec3(0.0)
         return
     d, inverse = view_ray(means_in[i], camera_in[0])
@@ -153,7 +190,7 @@ def spherical_harmonics_adjoint(
             v_sh_rest_out[k + 13] = (C3Z * z * (xx - yy)) * v
             v_sh_rest_out[k + 14] = (C33 * x * (3.0 * yy - xx)) * v
             used = 15
-        for j in range(k + used, k + rest):
+        for j in range(k + used, end):
             v_sh_rest_out[j] = wp.vec3(0.0)
     if has_means == 0 or degree == 0:
         return

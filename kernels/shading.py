@@ -54,6 +54,15 @@ def limited(free: float) -> float:
     return wp.clamp(free, 0.0, GAIN_MAX)
 
 
+@wp.func
+def shaded(i: int, sh_dc: wp.vec3, shading: wp.array2d[float], quat: wp.vec4, quat_t: wp.vec4) -> wp.vec3:
+    """Return the colour of degree 0 of Gaussian i, scaled by its gain."""
+    x = response(i, shading, turned(quat, quat_t))
+    factor = limited(gain(x, shading[i, 9]))
+    grey = wp.vec3(GREY, GREY, GREY)
+    return factor * (sh_dc + grey) - grey
+
+
 @wp.kernel
 def shade(
     first: int,
@@ -67,10 +76,7 @@ def shade(
 ):
     """Scale the colour of degree 0 by the gain. Grid: N."""
     i = first + wp.tid()
-    x = response(i, shading_in, turned(quats_in[i], quats_t_in[i]))
-    factor = limited(gain(x, shading_in[i, 9]))
-    grey = wp.vec3(GREY, GREY, GREY)
-    sh_dc_out[i] = factor * (sh_dc_in[i] + grey) - grey
+    sh_dc_out[i] = shaded(i, sh_dc_in[i], shading_in, quats_in[i], quats_t_in[i])
 
 
 @wp.kernel
@@ -117,6 +123,15 @@ def tint_factor(tint: float) -> float:
     return wp.exp(wp.clamp(tint, TINT_MIN, TINT_MAX))
 
 
+@wp.func
+def tinted(sh_dc: wp.vec3, tint: wp.vec3) -> wp.vec3:
+    """Return the colour of degree 0 with each channel scaled by its factor."""
+    color = sh_dc
+    for c in range(3):
+        color[c] = tint_factor(tint[c]) * (color[c] + GREY) - GREY
+    return color
+
+
 @wp.kernel
 def tint(
     first: int,
@@ -128,10 +143,7 @@ def tint(
 ):
     """Scale the colour of degree 0, each channel by its factor. Grid: N."""
     i = first + wp.tid()
-    tinted = sh_dc_in[i]
-    for c in range(3):
-        tinted[c] = tint_factor(tints_in[i][c]) * (tinted[c] + GREY) - GREY
-    sh_dc_out[i] = tinted
+    sh_dc_out[i] = tinted(sh_dc_in[i], tints_in[i])
 
 
 @wp.kernel

@@ -48,6 +48,40 @@ def finite(q: wp.vec4):  # noqa: F811  (Warp overloads by type)
     return wp.isfinite(q[0]) and wp.isfinite(q[1]) and wp.isfinite(q[2]) and wp.isfinite(q[3])
 
 
+@wp.func
+def skinned(
+    i: int,
+    x: wp.vec3,
+    nodes: wp.array[wp.vec3],
+    translations: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    shape_rotations: wp.array[wp.vec4],
+    extras: wp.array[wp.vec3],
+    has_extras: int,
+    indices: wp.array2d[wp.int32],
+    weights: wp.array2d[float],
+):
+    """Return the moved mean of Gaussian i, which rests at x, the blended rotation of its shape, which is not unit, and
+    its extras."""
+    mean = wp.vec3(0.0)
+    blend = wp.vec4(0.0)
+    extra = wp.vec3(0.0)
+    reference = wp.vec4(0.0)
+    for k in range(indices.shape[1]):
+        m = indices[i, k]
+        w = weights[i, k]
+        r = quat_normalise(rotations[m])
+        p = nodes[m]
+        mean += w * (quat_rotate(r, x - p) + p + translations[m])
+        shape = quat_normalise(shape_rotations[m])
+        if k == 0:
+            reference = shape
+        blend += w * aligned(shape, reference)
+        if has_extras != 0:
+            extra += w * extras[m]
+    return mean, blend, extra
+
+
 @wp.kernel
 def skin(
     first: int,
@@ -68,27 +102,22 @@ def skin(
     extras_out: wp.array[wp.vec3],  # [N], touched only with has_extras
 ):
     i = first + wp.tid()
-    x = means_in[i]
-    mean = wp.vec3(0.0)
-    blend = wp.vec4(0.0)
-    extras = wp.vec3(0.0)
-    reference = wp.vec4(0.0)
-    for k in range(indices_in.shape[1]):
-        m = indices_in[i, k]
-        w = weights_in[i, k]
-        r = quat_normalise(rotations_in[m])
-        p = nodes_in[m]
-        mean += w * (quat_rotate(r, x - p) + p + translations_in[m])
-        shape = quat_normalise(shape_rotations_in[m])
-        if k == 0:
-            reference = shape
-        blend += w * aligned(shape, reference)
-        if has_extras != 0:
-            extras += w * extras_in[m]
+    mean, blend, extra = skinned(
+        i,
+        means_in[i],
+        nodes_in,
+        translations_in,
+        rotations_in,
+        shape_rotations_in,
+        extras_in,
+        has_extras,
+        indices_in,
+        weights_in,
+    )
     means_out[i] = mean
     quats_out[i] = quat_multiply(quat_normalise(blend), quat_normalise(quats_in[i]))
     if has_extras != 0:
-        extras_out[i] = extras
+        extras_out[i] = extra
 
 
 @wp.kernel

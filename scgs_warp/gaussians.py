@@ -94,6 +94,11 @@ class GaussianParameters(nn.Module):
         with one_piece():
             return self.opacity_logits.sigmoid()
 
+    def rest(self) -> tuple[Tensor, ...]:
+        """Return the raw parameters that posing reads, in the order of ``ops.posing.pose_gaussians``."""
+        shape = self.means, self.quats, self.log_scales, self.opacity_logits
+        return *shape, self.sh_dc, self.correctives, self.shading
+
     def activate(self) -> Gaussians:
         """Return the Gaussians at rest. Activation happens here and nowhere else."""
         return Gaussians(

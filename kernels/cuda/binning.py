@@ -36,7 +36,7 @@ def count_pairs(
     tile_begin: int,  # no tile before this one is wanted
     tile_end: int,  # nor this one and those behind it
     # Out:
-    counts_out: wp.array[int],  # [N] tiles touched; 0: culled
+    counts_out: wp.array[int],  # [N + 1] 0, then the tiles that each splat touches; 0: culled
     depth_keys_out: wp.array[float],  # [2 N] what to sort the splats by, in the first half
     order_out: wp.array[int],  # [2 N] 0, 1, 2, ... in the first half
 ):
@@ -52,7 +52,9 @@ def count_pairs(
     key = float(DEPTH_CULLED)
     if count > 0:
         key = depths_in[i] + 0.0  # minus zero becomes zero
-    counts_out[i] = count
+    if i == 0:
+        counts_out[0] = 0
+    counts_out[i + 1] = count
     depth_keys_out[i] = key
     order_out[i] = i
 
@@ -62,12 +64,14 @@ def counts_by_depth(
     first: int,
     # In:
     order_in: wp.array[int],  # [2 N] splats by depth in the first half
-    counts_in: wp.array[int],  # [N]
+    counts_in: wp.array[int],  # [N + 1] of ``count_pairs``
     # Out:
-    ranked_out: wp.array[int],  # [N] the count of the splat of each rank
+    ranked_out: wp.array[int],  # [N + 1] 0, then the count of the splat of each rank
 ):
     rank = first + wp.tid()
-    ranked_out[rank] = counts_in[order_in[rank]]
+    if rank == 0:
+        ranked_out[0] = 0
+    ranked_out[rank + 1] = counts_in[order_in[rank] + 1]
 
 
 @wp.kernel
@@ -80,7 +84,8 @@ def emit_by_depth(
     depths_in: wp.array[float],  # [N]
     radii_in: wp.array[wp.vec2i],  # [N]
     order_in: wp.array[int],  # [2 N] splats by depth in the first half
-    places_in: wp.array[wp.int64],  # [N + 1] where the pairs of each rank go, at most P
+    places_in: wp.array[wp.int64],  # [N + 1] where the pairs of each rank go, if there is room
+    room: int,  # P
     offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots, at most P; empty: slots are not wanted
     width: int,
     height: int,
@@ -95,8 +100,8 @@ def emit_by_depth(
     owners_out: wp.array[int],  # [P] splat of each slot; empty too
 ):
     rank = first + wp.tid()
-    at = int(places_in[rank])
-    end = int(places_in[rank + 1])
+    at = int(wp.min(places_in[rank], wp.int64(room)))
+    end = int(wp.min(places_in[rank + 1], wp.int64(room)))
     if at == end:
         return
     i = order_in[rank]

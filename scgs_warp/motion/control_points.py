@@ -12,6 +12,7 @@ from ..config.presets import LossConfig, MotionConfig, TrainConfig
 from ..gaussians import GaussianParameters, fixed_exp
 from ..ops.correctives import correct
 from ..ops.neighbors import NeighborSearch, rbf_weights
+from ..ops.posing import pose_gaussians, unit_pose
 from ..ops.shading import shade, tint
 from ..ops.skinning import skin, skin_rbf
 from ..runtime.device_copies import sent
@@ -125,7 +126,10 @@ class ControlPoints(Motion):
     def poses(self, times: Tensor) -> list[Pose]:
         """Return one :class:`Pose` per time, from one network evaluation. The network's input is detached, because
         gradients through the encoding's high octaves would make the control points oscillate."""
-        out = self.network(self.positions.detach(), sent(times, self.positions.device))
+        positions, times = self.positions.detach(), sent(times, self.positions.device)
+        if self._at_once:
+            return [unit_pose(motion, self.network.heads) for motion in self.network.motion(positions, times)]
+        out = self.network(positions, times)
         rotations = unit_rotations(out["rotations"])
         shape = unit_rotations(out["shape_rotations"]) if "shape_rotations" in out else None
         optional = shape, out.get("log_scales"), out.get("tints")
@@ -137,6 +141,11 @@ class ControlPoints(Motion):
             )
             for i in range(times.shape[0])
         ]
+
+    @property
+    def _at_once(self) -> bool:
+        """Whether poses are made in few launches, without gradients."""
+        return self.positions.is_cuda and not torch.is_grad_enabled()
 
     def _hyper(self, gaussians: GaussianParameters) -> Tensor:
         """Return the Gaussians' hyper-coordinates [N, H], without the mask's logit."""
@@ -171,6 +180,12 @@ class ControlPoints(Motion):
     ) -> Gaussians:
         """Move all Gaussians by linear blend skinning (Eq. 6-7). Editing replaces only ``pose``; shading and
         correctives follow the rotations of ``own`` if given, those of the trained motion."""
+        if self._at_once and not self.config.mask:
+            rotations = (
+                None if own is None else skin(gaussians.means, gaussians.quats, self.positions, own, *binding)[1]
+            )
+            moved = pose_gaussians(gaussians.rest(), self.positions, pose, *binding, rotations)
+            return Gaussians(*moved, gaussians.sh_rest, gaussians.sharpness)
         moved = skin(gaussians.means, gaussians.quats, self.positions, pose, *binding)
         rotations = None if own is None else skin(gaussians.means, gaussians.quats, self.positions, own, *binding)[1]
         return _posed(gaussians, moved, pose, self.config.mask, rotations)

@@ -8,6 +8,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from ..ops.encoding import encode_rows
 from ..ops.network import Layers, PackedLayers, evaluate, network, supported
 from ..runtime.environment import one_piece
 
@@ -17,6 +18,12 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
     angles = (values[..., None, :] * _octaves(frequencies, values.device, values.dtype)).flatten(-2)
     with one_piece():
         return torch.cat([values, angles.sin(), angles.cos()], dim=-1)
+
+
+def rows_of(where: Tensor, when: Tensor) -> Tensor:
+    """Combine every position [M, A] with every time [T, B], giving [T M, A + B]."""
+    both = [where[None].expand(len(when), -1, -1), when[:, None].expand(-1, len(where), -1)]
+    return torch.cat(both, dim=-1).reshape(len(when) * len(where), where.shape[1] + when.shape[1])
 
 
 @cache
@@ -100,19 +107,24 @@ class DeformationNetwork(nn.Module):
         Returns:
             One tensor [T, M, width] per head.
         """
-        where = encode(positions, self.position_frequencies)
-        when = encode(times[:, None], self.time_frequencies)
-        out = self._fused(where, when)
-        if out is None:
-            out = self._layered(where, when)
-        out = out.reshape(times.shape[0], positions.shape[0], -1)
-        return dict(zip(self.heads, out.split(list(self.heads.values()), dim=-1)))
+        return dict(zip(self.heads, self.motion(positions, times).split(list(self.heads.values()), dim=-1)))
 
-    def _layered(self, where: Tensor, when: Tensor) -> Tensor:
-        """Evaluate layer by layer in torch: used on CUDA, in bfloat16, and if positions or times need a gradient."""
-        count, instants = where.shape[0], when.shape[0]
-        both = [where[None].expand(instants, -1, -1), when[:, None].expand(-1, count, -1)]
-        inputs = torch.cat(both, dim=-1).reshape(instants * count, -1)
+    def motion(self, positions: Tensor, times: Tensor) -> Tensor:
+        """Return the heads' outputs side by side, [T, M, sum of their widths]; arguments as in :meth:`forward`."""
+        if positions.is_cuda and not (positions.requires_grad or times.requires_grad):
+            inputs = encode_rows(positions, times, self.position_frequencies, self.time_frequencies)
+            out = self._layered(inputs)
+        else:
+            where = encode(positions, self.position_frequencies)
+            when = encode(times[:, None], self.time_frequencies)
+            out = self._fused(where, when)
+            if out is None:
+                out = self._layered(rows_of(where, when))
+        return out.reshape(times.shape[0], positions.shape[0], -1)
+
+    def _layered(self, inputs: Tensor) -> Tensor:
+        """Evaluate [N, in] layer by layer in torch: used on CUDA, in bfloat16, and if positions or times need a
+        gradient."""
         if self.low_precision and self.training:
             inputs = inputs.bfloat16()
         hidden = inputs

@@ -35,7 +35,8 @@ def bin_within(splats: Splats, capacity: int, *, slots: bool = True) -> tuple[Ti
         slots: whether to make ``Tiles.slots``, which compositing needs for gradients only; otherwise it is empty.
 
     Returns:
-        Tiles whose lists have ``capacity`` entries, and the true number of pairs, int64 [1] on the device. If it is
+        Tiles whose lists have ``capacity`` entries (without slots, ``Tiles.offsets`` is empty, too), and the true
+        number of pairs, int64 [1] on the device. If it is
         larger than ``capacity``, pairs are missing from the lists (nothing is out of bounds) and an image drawn with
         them must be discarded.
 
@@ -49,13 +50,13 @@ def bin_within(splats: Splats, capacity: int, *, slots: bool = True) -> tuple[Ti
     geometry = geometry_of(splats)
     whole = (*size, 0, columns * rows)
     counts, order = _count(geometry, whole)
-    offsets = _running_sums(counts)
-    total = offsets[-1:].clone()
-    lists = _list(geometry, whole, counts, order, offsets.clamp_(max=capacity), capacity, slots)
+    ranked = _ranked(counts, order)
+    offsets = counts.cumsum(0).clamp_(max=capacity) if slots else ranked[:0]
+    lists = _list(geometry, whole, ranked, order, offsets, capacity, slots)
     tiles = Tiles(*lists, offsets, *size)
     if debug.enabled():
-        checks.check_room(tiles, capacity, len(counts))
-    return tiles, total
+        checks.check_room(tiles, capacity, len(geometry[0]))
+    return tiles, ranked[-1:]
 
 
 class RadixBinning:
@@ -66,12 +67,12 @@ class RadixBinning:
     def __init__(self, geometry: list[Tensor], size: tuple[int, ...], window: tuple[int, int]) -> None:
         self._geometry, self._size = geometry, (*size, *window)
         self._counts, self._order = _count(geometry, self._size)
-        self._offsets = _running_sums(self._counts)
+        self._offsets = self._counts.cumsum(0)
         self.pairs = self.entries = int(self._offsets[-1])
 
     @property
     def list_bytes(self) -> int:
-        return 12 * self.pairs + 8 * len(self._counts) + 8 * self._size[2] * self._size[3]
+        return 12 * self.pairs + 8 * len(self._offsets) + 8 * self._size[2] * self._size[3]
 
     @property
     def scratch_bytes(self) -> int:
@@ -79,7 +80,8 @@ class RadixBinning:
 
     def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return ranges, splats, slots and offsets."""
-        lists = _list(self._geometry, self._size, self._counts, self._order, self._offsets, self.pairs, True)
+        ranked = _ranked(self._counts, self._order)
+        lists = _list(self._geometry, self._size, ranked, self._order, self._offsets, self.pairs, True)
         return *lists, self._offsets
 
 
@@ -100,9 +102,10 @@ def geometry_of(splats: Splats) -> list[Tensor]:
 
 
 def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Return the number of tiles that each splat touches, [N], and a list [2 N] that starts with the order by depth."""
+    """Return 0 and the number of tiles that each splat touches, [N + 1], and a list [2 N] that starts with the order by
+    depth."""
     count, device = len(geometry[0]), geometry[0].device
-    counts = torch.empty(count, dtype=torch.int32, device=device)
+    counts = (torch.empty if count else torch.zeros)(count + 1, dtype=torch.int32, device=device)
     depth_keys = torch.empty(2 * count, device=device)
     order = torch.empty(2 * count, dtype=torch.int32, device=device)
     launch(kernels.count_pairs, count, *geometry, *size, counts, depth_keys, order)
@@ -110,30 +113,27 @@ def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tenso
     return counts, order
 
 
-def _running_sums(counts: Tensor) -> Tensor:
-    """Return the exclusive prefix sums of the counts and their total, [N + 1] int64."""
-    offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
-    torch.cumsum(counts, 0, dtype=torch.int64, out=offsets[1:])
-    return offsets
+def _ranked(counts: Tensor, order: Tensor) -> Tensor:
+    """Return where the pairs of each splat by depth begin, and their total: exclusive prefix sums, [N + 1] int64."""
+    ranked = (torch.empty_like if len(order) else torch.zeros_like)(counts)
+    launch(kernels.counts_by_depth, len(counts) - 1, order, counts, ranked)
+    return ranked.cumsum(0)
 
 
 def _list(
     geometry: list[Tensor],
     size: tuple[int, ...],  # width, height, columns, rows, tile size, begin and end of the window
-    counts: Tensor,
+    places: Tensor,
     order: Tensor,
     offsets: Tensor,
     room: int,
     with_slots: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return ranges [T, 2], splats [room] and slots [room] (or [0])."""
-    count, tile_count, device = len(counts), size[2] * size[3], counts.device
-    ranked = torch.empty_like(counts)
-    launch(kernels.counts_by_depth, count, order, counts, ranked)
-    places = _running_sums(ranked).clamp_(max=room)
+    count, tile_count, device = len(places) - 1, size[2] * size[3], places.device
     tiles, values = (checks.unwritten(2 * room, device) for _ in range(2))
     owners = checks.unwritten(room, device) if with_slots else None
-    lists = (order, places, offsets if with_slots else None)
+    lists = (order, places, room, offsets if with_slots else None)
     launch(kernels.fill_rest, room, places, tile_count, tiles, values, owners)
     launch(kernels.emit_by_depth, count, *geometry, *lists, *size, tiles, values, owners)
     radix_sort(tiles, values, room, tile_count.bit_length())

@@ -311,7 +311,7 @@ def _validate(
         ("conics", splats.conics, (count, 3)),
         ("opacities", splats.opacities, (count,)),
         ("absgrad", absgrad, (count, 2)),
-        ("tiles.offsets", None if tiles.windows else tiles.offsets, (count + 1,)),
+        ("tiles.offsets", None if tiles.windows or not len(tiles.offsets) else tiles.offsets, (count + 1,)),
     ]
     if channels.ndim != 2 or len(channels) != count or channels.shape[1] < 1:
         raise ValueError(f"channels must be [{count}, C] with C >= 1, got {list(channels.shape)}")

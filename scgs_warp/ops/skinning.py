@@ -77,7 +77,7 @@ def _node_sums(pairs: tuple, has_extras: int, lists: NodeLists | None) -> tuple[
     return 1, skin_node_sums(*(lists or node_lists(indices, count)), pairs, has_extras)
 
 
-def _pose_tensors(pose: Pose) -> tuple[Tensor | None, ...]:
+def pose_tensors(pose: Pose) -> tuple[Tensor | None, ...]:
     """Return translations, rotations, shape rotations, and the extras: log scales or tints."""
     extras = pose.tints if pose.log_scales is None else pose.log_scales
     return pose.translations, pose.rotations, pose.shape_rotations, extras
@@ -147,7 +147,7 @@ def skin(
         ValueError: a shape is wrong.
     """
     _validate(means, quats, nodes, pose, indices, weights)
-    floats = means, quats, nodes, *_pose_tensors(pose), weights
+    floats = means, quats, nodes, *pose_tensors(pose), weights
     values = [None if value is None else value.contiguous() for value in floats]
     indices = indices.contiguous()
     if means.device.type == "cpu" and not torch.is_grad_enabled() and indices.shape[1] <= skinning.MAX_NEIGHBORS:
@@ -173,7 +173,7 @@ def pack_palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=N
     """Pack tensors of control points, which must be contiguous, into a palette.
 
     Args:
-        pose: results of :func:`_pose_tensors`.
+        pose: results of :func:`pose_tensors`.
     """
     translations, rotations, shapes, extras = pose
     count = nodes.shape[0]
@@ -294,6 +294,6 @@ def skin_rbf(
         lists = node_lists(indices, count) if means.device.type == "cuda" and torch.is_grad_enabled() else None
         weights = rbf_weights(points, centers, radii, indices, strengths, lists=lists)
         return skin(means, quats, nodes, pose, indices, weights, lists=lists)
-    floats = means, quats, hyper_points, nodes, hyper_nodes, radii, strengths, *_pose_tensors(pose)
+    floats = means, quats, hyper_points, nodes, hyper_nodes, radii, strengths, *pose_tensors(pose)
     values = (None if value is None else value.contiguous() for value in floats)
     return _SkinRbf.apply(*values, indices.contiguous())  # type: ignore[return-value]

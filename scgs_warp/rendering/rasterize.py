@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..ops.binning import bin_splats
 from ..ops.compositing import composite, demand
-from ..ops.harmonics import MAX_DEGREE, spherical_harmonics
+from ..ops.harmonics import MAX_DEGREE, whole_harmonics
 from ..ops.projection import project
 from ..types import Camera, Splats
 from .render import centre_of, expected_depth
@@ -134,7 +134,7 @@ def rasterization(
             image = torch.cat([image[:-1], expected_depth(image[-1], alpha)[None]])
         renders.append(image.permute(1, 2, 0))
         alphas.append(alpha[..., None])
-    return torch.stack(renders), torch.stack(alphas), meta
+    return _stacked(renders), _stacked(alphas), meta
 
 
 def _channels(
@@ -151,7 +151,7 @@ def _channels(
     if not render_mode.startswith("RGB"):
         return depths, None
     if sh_degree is not None:
-        colors = spherical_harmonics(colors[:, 0], colors[:, 1:], means, centre_of(camera), sh_degree)
+        colors = whole_harmonics(colors, means, centre_of(camera), sh_degree)
     if render_mode == "RGB":
         return colors, background
     if background is not None:
@@ -159,9 +159,14 @@ def _channels(
     return torch.cat([colors, depths], dim=1), background
 
 
+def _stacked(of_cameras: list[Tensor]) -> Tensor:
+    """Stack the cameras' tensors; that of a single camera is not copied."""
+    return of_cameras[0][None] if len(of_cameras) == 1 else torch.stack(of_cameras)
+
+
 def _meta(splats: list[Splats], absgrad: bool) -> dict[str, Any]:
     meta: dict[str, Any] = {
-        name: torch.stack([getattr(splat, name) for splat in splats])
+        name: _stacked([getattr(splat, name) for splat in splats])
         for name in ("means2d", "radii", "depths", "conics", "opacities")
     }
     meta.update(width=splats[0].width, height=splats[0].height, n_cameras=len(splats))

@@ -9,10 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..kernels import compositing as kernels
 from ..ops.binning import bin_splats
 from ..ops.compositing import composite, demand
-from ..ops.harmonics import MAX_DEGREE, spherical_harmonics
+from ..ops.harmonics import MAX_DEGREE, colors_and_depths, spherical_harmonics
 from ..ops.projection import project
+from ..runtime.launch import launch
 from ..types import Camera, Gaussians, Image, Splats, Stats, Tiles
 
 
@@ -62,13 +64,14 @@ def draw(
     """Render as :func:`render` does, to planar images, with depth only on request, which saves its cost in training.
 
     Args:
+        background: [3], or with ``depth`` also [4].
         depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
         binned: function that lists the splats of each tile. None: ``bin_splats``.
 
     Returns:
         image [3 or 4, H, W] and alpha [H, W].
     """
-    if background is not None and tuple(background.shape) != (3,):
+    if background is not None and tuple(background.shape) not in ((3,), (3 + depth,)):
         raise ValueError(f"background must be [3], got {tuple(background.shape)}")
     if sh_degree is None:
         sh_degree = min(isqrt(gaussians.sh_rest.shape[1] + 1) - 1, MAX_DEGREE)
@@ -78,10 +81,14 @@ def draw(
     splats = project(
         means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased, sharpness=gaussians.sharpness
     )
-    channels = spherical_harmonics(gaussians.sh_dc, gaussians.sh_rest, means, centre_of(camera), sh_degree)
-    if depth:
-        channels = torch.cat([channels, splats.depths[:, None]], dim=1)
-        background = None if background is None else torch.cat([background, background.new_zeros(1)])
+    harmonics = gaussians.sh_dc, gaussians.sh_rest, means
+    if depth and means.is_cuda and not torch.is_grad_enabled():
+        channels = colors_and_depths(*harmonics, camera.viewmat, splats.depths, sh_degree)
+    else:
+        channels = spherical_harmonics(*harmonics, centre_of(camera), sh_degree)
+        channels = torch.cat([channels, splats.depths[:, None]], dim=1) if depth else channels
+    if depth and background is not None and len(background) == 3:
+        background = torch.cat([background, background.new_zeros(1)])
     beside = demand(splats, channels, background)
     tiles = bin_splats(splats, demand=beside) if binned is None else binned(splats)
     return composite(splats, channels, tiles, background, stats=stats)
@@ -107,6 +114,16 @@ def centre_of(camera: Camera) -> Tensor:
     return Camera(viewmat, camera.K, camera.width, camera.height).position
 
 
-def expected_depth(accumulated: Tensor, alpha: Tensor) -> Tensor:
-    """Return accumulated depth over alpha, and 0 where alpha is 0; the shapes of all three are equal."""
-    return accumulated / alpha.clamp_min(1e-10)
+def expected_depth(accumulated: Tensor, alpha: Tensor, unit: float = 1.0) -> Tensor:
+    """Return accumulated depth over alpha, and 0 where alpha is 0; the shapes of all three are equal.
+
+    Args:
+        unit: divisor of the result, the number of the Gaussians' units in a unit of the caller's.
+    """
+    if accumulated.is_cuda and not torch.is_grad_enabled():
+        depth = torch.empty_like(alpha)
+        pixels = accumulated.contiguous().flatten(), alpha.contiguous().flatten()
+        launch(kernels.expected_depth, depth.numel(), *pixels, unit, depth.view(-1))
+        return depth
+    depth = accumulated / alpha.clamp_min(1e-10)
+    return depth if unit == 1.0 else (depth.double() / unit).to(depth.dtype)

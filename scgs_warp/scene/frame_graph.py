@@ -40,7 +40,7 @@ class Pending:
     """A frame in flight."""
 
     inputs: Tensor
-    """[29] camera, time and background."""
+    """[30] camera, time, background, and the background's depth, 0."""
     size: tuple[int, int]
     image: Image
     total: Tensor
@@ -65,13 +65,13 @@ class FrameGraph:
         motion: Motion,
         *,
         antialiased: bool = False,
-        depth_of: Callable[[Tensor], Tensor] = lambda depth: depth,
+        depth_unit: float = 1.0,
     ) -> None:
         """
         Args:
             gaussians, motion: read in place at every frame. If one of their tensors is replaced or modified, the next
                 frame is recorded anew.
-            depth_of: converts depths to the caller's units.
+            depth_unit: divisor of the depths, the number of the Gaussians' units in a unit of the caller's.
 
         Raises:
             ValueError: the motion does not take its time as a tensor.
@@ -80,8 +80,8 @@ class FrameGraph:
             raise ValueError(f"motion {motion.name} needs the time on the host; it cannot be recorded")
         self.gaussians, self.motion = gaussians, motion
         self.capacity, self.recordings, self.failure = 0, 0, None
-        self._antialiased, self._depth_of = antialiased, depth_of
-        self.inputs = torch.zeros(29, device=gaussians.means.device)
+        self._antialiased, self._depth_unit = antialiased, depth_unit
+        self.inputs = torch.zeros(30, device=gaussians.means.device)
         self._size = (0, 0)
         self._state: list[Any] = []
         self._frames_of_state = 0
@@ -105,7 +105,8 @@ class FrameGraph:
     def submit(self, camera: Camera, time: float, background: Tensor) -> Pending:
         """Start a frame; arguments as in :meth:`render`. Its image may lack splats until ``finish`` returns it."""
         where = camera.viewmat.device
-        parts = camera.viewmat, camera.K, sent(torch.tensor([time]), where), sent(background, where)
+        rest = torch.tensor([time]), background, torch.zeros(1)
+        parts = camera.viewmat, camera.K, *(sent(part, where) for part in rest)
         return self._start(torch.cat([part.flatten() for part in parts]).float(), (camera.width, camera.height))
 
     def finish(self, pending: Pending) -> Image:
@@ -198,9 +199,9 @@ class FrameGraph:
     @torch.no_grad()
     def _drawn(self, inputs: Tensor, size: tuple[int, int], binned: Callable[[Splats], Tiles] | None = None) -> Image:
         """Draw the frame of ``inputs``; without ``binned``, in windows of tiles if necessary."""
-        viewmat, K, time, background = inputs.split((16, 9, 1, 3))
+        viewmat, K, time, background = inputs.split((16, 9, 1, 4))
         posed = self.motion.gaussians_at(self.gaussians, time)
         camera = Camera(viewmat.view(4, 4), K.view(3, 3), *size)
         image, alpha = draw(posed, camera, background, antialiased=self._antialiased, depth=True, binned=binned)
-        depth = self._depth_of(expected_depth(image[3], alpha))
+        depth = expected_depth(image[3], alpha, self._depth_unit)
         return Image(image[:3].permute(1, 2, 0), alpha, depth)

@@ -189,7 +189,7 @@ class Scene:
                 self.gaussians,
                 self.motion,
                 antialiased=self.config.antialiased,
-                depth_of=self.normalisation.undo_scale,
+                depth_unit=self.normalisation.scale,
             )
         return frames
 

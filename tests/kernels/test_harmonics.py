@@ -7,17 +7,24 @@ import functools
 import pytest
 import torch
 
-from helpers.scenes import random_gaussians
+from helpers.scenes import random_camera, random_gaussians
 from reference.harmonics import spherical_harmonics as harmonics_reference
 from scgs_warp.ops import harmonics
 from scgs_warp.runtime import environment
 
 
-@pytest.fixture(params=["plain", "cpu"])
+@pytest.fixture(params=["plain", "cpu", "whole"])
 def spherical_harmonics(request, device):
     if request.param == "cpu" and device != "cpu":
         pytest.skip("SIMD is for the CPU")
+    if request.param == "whole":
+        return whole
     return functools.partial(harmonics.spherical_harmonics, form=request.param)
+
+
+def whole(dc, rest, means, camera, degree):
+    """With all coefficients in one tensor."""
+    return harmonics._WholeHarmonics.apply(torch.cat([dc[:, None], rest], 1), means, camera, degree)
 
 
 CAMERA = (0.5, -3.0, 2.0)
@@ -117,3 +124,30 @@ def test_wrong_arguments_are_named():
         harmonics.spherical_harmonics(dc, rest, means, camera[None], 1)
     with pytest.raises(ValueError, match="means"):
         harmonics.spherical_harmonics(dc, rest, means[:2], camera, 1)
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("n", [0, 1, 333])
+def test_colours_beside_depths(n, degree, device):
+    dc, rest, means, _ = inputs_of(4, n, device)
+    camera = random_camera(4, 60, 40, device)
+    depths = torch.rand(n, generator=torch.Generator().manual_seed(n)).to(device)
+    channels = harmonics.colors_and_depths(dc, rest, means, camera.viewmat, depths, degree)
+    expected = harmonics_reference(dc.double(), rest.double(), means.double(), camera.position.double(), degree)
+    torch.testing.assert_close(channels[:, :3].double(), expected, rtol=1e-5, atol=5e-6)
+    assert torch.equal(channels[:, 3], depths)
+
+
+def test_arguments_of_colours_beside_depths(device):
+    dc, rest, means, camera = inputs_of(4, 5, device)
+    viewmat, depths = torch.eye(4, device=device), torch.ones(5, device=device)
+    for wrong in ((viewmat[:3], depths, 3), (viewmat, depths[:4], 3), (viewmat, depths, 4)):
+        with pytest.raises(ValueError, match=r"viewmat|depths|degree"):
+            harmonics.colors_and_depths(dc, rest, means, *wrong)
+    whole_of = torch.cat([dc[:, None], rest], 1)
+    assert torch.equal(
+        harmonics.whole_harmonics(whole_of, means, camera, 3), harmonics.spherical_harmonics(dc, rest, means, camera, 3)
+    )
+    for wrong in ((means, camera[None], 3), (means, camera, 4), (means[:2], camera, 1)):
+        with pytest.raises(ValueError, match=r"camera_position|degree|means"):
+            harmonics.whole_harmonics(whole_of, *wrong)

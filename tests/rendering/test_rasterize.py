@@ -133,14 +133,15 @@ def test_harmonics(degree, device):
     assert torch.equal(again, renders)
 
 
-def test_means2d_retains_its_gradient_and_absgrad(device):
-    shape, colors, viewmats, Ks, _ = scene_of(4, 60, device, cameras=2)
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_means2d_retains_its_gradient_and_absgrad(device, cameras):
+    shape, colors, viewmats, Ks, _ = scene_of(4, 60, device, cameras=cameras)
     inputs = leaves_of(*shape)
     renders, _, meta = scgs_warp.rasterization(*inputs, colors, viewmats, Ks, WIDTH, HEIGHT, absgrad=True)
     meta["means2d"].retain_grad()
     renders.square().sum().backward()
     grad, absgrad = meta["means2d"].grad, meta["means2d"].absgrad
-    assert grad.shape == absgrad.shape == (2, 60, 2)
+    assert grad.shape == absgrad.shape == (cameras, 60, 2)
     assert (absgrad >= grad.abs() - 1e-4 * absgrad.max()).all()
     seen = (meta["radii"] > 0).all(-1)
     assert absgrad[seen].any(-1).double().mean() > 0.8 and not absgrad[~seen].any()

@@ -1,0 +1,115 @@
+"""Posing in one launch: against float64 twins of its parts, and the network's output against its definition."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from reference.correctives import correct
+from reference.shading import shade, tint
+from reference.skinning import skin
+from scgs_warp.ops.posing import pose_gaussians, unit_pose
+from scgs_warp.types import Pose
+
+HEADS = {
+    "control points": {"rotations": 4, "translations": 3},
+    "tints": {"rotations": 4, "translations": 3, "tints": 3},
+    "official": {"rotations": 4, "translations": 3, "shape_rotations": 4, "log_scales": 3},
+    "another order": {"tints": 3, "translations": 3, "rotations": 4},
+}
+
+
+def motion_of(heads: dict[str, int], nodes: int, device: str) -> torch.Tensor:
+    return torch.randn(nodes, sum(heads.values()), generator=torch.Generator().manual_seed(3)).to(device)
+
+
+@pytest.mark.parametrize("heads", HEADS.values(), ids=HEADS)
+@pytest.mark.parametrize("nodes", [0, 1, 300])
+def test_the_networks_output_becomes_a_pose(heads, nodes, device):
+    motion = motion_of(heads, nodes, device)
+    pose = unit_pose(motion, heads)
+    parts = dict(zip(heads, motion.double().split(list(heads.values()), dim=1)))
+    for name in ("rotations", "shape_rotations"):
+        if name in parts:
+            parts[name] = normalize(parts[name] + torch.tensor([1.0, 0.0, 0.0, 0.0], device=device), dim=1)
+    for name, value in vars(pose).items():
+        assert (value is None) == (name not in heads)
+        if value is not None:
+            torch.testing.assert_close(value.double(), parts[name], rtol=1e-6, atol=1e-6)
+
+
+def test_a_rotation_that_vanishes_is_the_identity(device):
+    motion = torch.zeros(2, 7, device=device)
+    motion[0, 0] = -1.0
+    assert unit_pose(motion, HEADS["control points"]).rotations.tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2
+
+
+def rest_of(count: int, corrected: bool, shaded: bool) -> list[torch.Tensor]:
+    g = torch.Generator().manual_seed(5)
+    widths = (3, 4, 3, 1, 3, 27 * corrected, 10 * shaded)
+    values = [torch.randn(count, width, generator=g) for width in widths]
+    return [*values[:3], values[3][:, 0], *values[4:]]
+
+
+def binding_of(count: int, nodes: int, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(6)
+    indices = torch.randint(nodes, (count, k), generator=g, dtype=torch.int32)
+    return indices, torch.rand(count, k, generator=g).softmax(dim=1)
+
+
+def twin(rest, nodes: torch.Tensor, pose: Pose, indices, weights, own=None) -> tuple[torch.Tensor, ...]:
+    """Pose in float64 by the twins of the parts."""
+    means, quats, log_scales, logits, sh_dc, correctives, shading = rest
+    moved, turned, extras = skin(means, quats, nodes, pose, indices, weights)
+    own = turned if own is None else own
+    if correctives.shape[1]:
+        moved = correct(moved, correctives, quats, turned, own)
+    if pose.log_scales is not None:
+        log_scales = log_scales + extras
+    if pose.tints is not None:
+        sh_dc = tint(sh_dc, extras)
+    if shading.shape[1]:
+        sh_dc = shade(sh_dc, shading, quats, own)
+    return moved, turned, log_scales.exp(), logits.sigmoid(), sh_dc
+
+
+@pytest.mark.parametrize("edited", [False, True])
+@pytest.mark.parametrize(("corrected", "shaded"), [(False, False), (True, False), (False, True), (True, True)])
+@pytest.mark.parametrize("heads", HEADS.values(), ids=HEADS)
+@pytest.mark.parametrize(("count", "k"), [(1, 1), (257, 4)])
+def test_gaussians_are_those_of_the_parts(count, k, heads, corrected, shaded, edited, device):
+    rest, nodes = rest_of(count, corrected, shaded), torch.randn(20, 3, generator=torch.Generator().manual_seed(7))
+    pose = unit_pose(0.7 * motion_of(heads, 20, "cpu"), heads)
+    binding = binding_of(count, 20, k)
+    own = torch.randn(count, 4, generator=torch.Generator().manual_seed(8)) if edited else None
+    exact = Pose(**{name: None if value is None else value.double() for name, value in vars(pose).items()})
+    expected = twin(
+        [x.double() for x in rest],
+        nodes.double(),
+        exact,
+        binding[0],
+        binding[1].double(),
+        None if own is None else own.double(),
+    )
+    there = Pose(**{name: None if value is None else value.to(device) for name, value in vars(pose).items()})
+    found = pose_gaussians(
+        tuple(x.to(device) for x in rest),
+        nodes.to(device),
+        there,
+        *(x.to(device) for x in binding),
+        None if own is None else own.to(device),
+    )
+    for name, a, b in zip(("means", "quats", "scales", "opacities", "sh_dc"), found, expected, strict=True):
+        assert a.device.type == device
+        torch.testing.assert_close(a.cpu().double(), b, rtol=1e-4, atol=2e-5, msg=lambda m, name=name: f"{name}: {m}")
+
+
+def test_nothing_to_pose(device):
+    heads = HEADS["tints"]
+    rest = tuple(x.to(device) for x in rest_of(0, True, True))
+    binding = (x.to(device) for x in binding_of(0, 5, 3))
+    found = pose_gaussians(
+        rest, torch.zeros(5, 3, device=device), unit_pose(motion_of(heads, 5, device), heads), *binding
+    )
+    assert [len(value) for value in found] == [0] * 5
