@@ -18,7 +18,7 @@ from ..compositing import squared_distance
 from ..falloff import falloff
 from ..types import ALPHA_MAX, ALPHA_MIN, SLOT_GEOMETRY, TILE_SIZE, TRANSMITTANCE_MIN
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 BLOCK_DIM = TILE_SIZE * TILE_SIZE
 _LANES = wp.constant(BLOCK_DIM)

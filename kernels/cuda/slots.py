@@ -8,7 +8,7 @@ from ..compositing import SLOT_WIDTH as SLOT_WIDTH
 from ..gradient_limits import passed
 from ..types import SLOT_GEOMETRY
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.kernel
