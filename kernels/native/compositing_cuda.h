@@ -142,8 +142,9 @@ static inline __device__ void composite_tile(
         for (int first = begin; first < end; first += 256) {
             // This is also the barrier after which no thread reads the previous batch.
             if (__syncthreads_count(least < 1.0f) == 0) break;
+            const int size = end - first < 256 ? end - first : 256;
             unsigned parts = 0u;
-            if (first + thread < end) {
+            if (thread < size) {
                 const int i = splats.data[first + thread];
                 const float mx = means[2 * i], my = means[2 * i + 1], opacity = opacities.data[i];
                 const float a = all_conics[3 * i], b = all_conics[3 * i + 1], c = all_conics[3 * i + 2];
@@ -154,7 +155,7 @@ static inline __device__ void composite_tile(
             }
             shared.reached[thread] = parts;
             __syncthreads();
-            for (int word = 0; word < 256; word += 32) {
+            for (int word = 0; word < size; word += 32) {
                 unsigned left = __ballot_sync(ALL_LANES, (shared.reached[word + lane] >> warp) & 1u);
                 if (!__any_sync(ALL_LANES, least < 1.0f)) break;
                 while (left) {
