@@ -17,6 +17,8 @@ import re
 import sys
 from pathlib import Path
 
+from kernel_tables import WRITERS as KERNELS
+from kernel_tables import kernel_table
 from provenance import ROOT, without_older_marks
 from quality_tables import WRITERS, quality_table, reported_table
 from repeatable_tables import REPEATABLE, repeatable_table
@@ -32,6 +34,7 @@ def table_names(results: Path) -> list[str]:
     return [
         *BENCHMARKS,
         "speed-overview",
+        *KERNELS,
         *(f"quality-{name}" for name in WRITERS),
         *sorted(reported | set(REPEATABLE)),
     ]
@@ -47,6 +50,8 @@ def section(name: str, results: Path) -> str:
         return timing_table(name, results)
     if name == "speed-overview":
         return speed_overview(results)
+    if name in KERNELS:
+        return kernel_table(name, results)
     if name.startswith("quality-") and name[len("quality-") :] in WRITERS:
         return quality_table(name[len("quality-") :], results)
     measured = repeatable_table(name, results) if name in REPEATABLE else None
