@@ -23,13 +23,15 @@ binning      binning      binning           binning             kernels/test_bin
 compositing  compositing  compositing       compositing         kernels/test_compositing
                                             compositing_blocks  kernels/cuda/test_compositing
                                             slots               kernels/cuda/test_compositing_emulated
-neighbors    neighbors    neighbors         node_sums           kernels/test_neighbors
-                          neighbor_lists                        kernels/cuda/test_node_sums
+neighbors    neighbors    neighbors         neighbors           kernels/test_neighbors
+                          neighbor_lists    node_sums           kernels/cuda/test_neighbors
+                                                                kernels/cuda/test_node_sums
 skinning     skinning     skinning          node_sums           kernels/test_skinning
                           skinning_adjoint                      kernels/cuda/test_node_sums
                           skinning_palette
 harmonics    harmonics    harmonics                             kernels/test_harmonics
-ssim         ssim         ssim                                  kernels/test_ssim
+ssim         ssim         ssim              ssim                kernels/test_ssim
+                                                                kernels/cuda/test_ssim
 adam         adam         adam                                  kernels/test_adam
              step_outcome                                       kernels/test_step_outcome
 network      torch        network                               kernels/test_network

@@ -15,6 +15,41 @@ MAX_NEIGHBORS = 16
 
 
 @wp.kernel
+def number_pairs(
+    first: int,
+    # In:
+    nodes_in: wp.array[wp.int32],  # [P] node of each pair, in [-1, M)
+    # Out:
+    keys_out: wp.array[wp.int32],  # [2 P] the node + 1, in the first half
+    order_out: wp.array[wp.int32],  # [2 P] the pair's index, in the first half
+):
+    """Write the key of a pair, which is not negative, so that a sort need not look at the sign."""
+    i = first + wp.tid()
+    keys_out[i] = nodes_in[i] + 1
+    order_out[i] = i
+
+
+@wp.kernel
+def node_begins(
+    first: int,
+    # In:
+    keys_in: wp.array[wp.int32],  # [2 P] of number_pairs, sorted in the first half
+    # Out:
+    begin_out: wp.array[wp.int32],  # [M + 1] index of the first pair whose node is m or more
+):
+    """Write the beginnings that lie between pair ``i - 1`` and pair ``i``. Grid: P + 1."""
+    i = first + wp.tid()
+    low = int(0)
+    high = begin_out.shape[0]
+    if i > 0:
+        low = keys_in[i - 1]
+    if i < keys_in.shape[0] // 2:
+        high = keys_in[i]
+    for m in range(low, high):
+        begin_out[m] = i
+
+
+@wp.kernel
 def nearest(
     first: int,
     # In:

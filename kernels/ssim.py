@@ -7,8 +7,9 @@ as their sum. The forward pass stores the three partial derivatives of each SSIM
 
     d/dx = G * d_mean + 2 x (G * d_squares) + y (G * d_product)
 
-This form computes one pixel or one row per grid index and runs on any device; ``cpu/ssim.py`` is the SIMD form. Where
-``mask`` is false, the image counts as equal to the truth, and the pixel's own terms are left out.
+This form computes one pixel or one row per grid index and runs on any device; ``cpu/ssim.py`` is the SIMD form, and
+``cuda/ssim.py`` the form for blocks of threads. Where ``mask`` is false, the image counts as equal to the truth, and
+the pixel's own terms are left out.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ RADIUS = 5
 SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
+LEAST_ERROR = 1e-7
+"""Mean squared error below which its logarithm is constant: 70 dB."""
 
 _taps = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(RADIUS + 1)]
 TAPS = [tap / (_taps[0] + 2.0 * sum(_taps[1:])) for tap in _taps]

@@ -77,6 +77,10 @@ beyond."""
 SSIM_BLOCK = 128
 """Number of columns of a band processed at once: 4 maps x 11 rows x 128 columns take 22 KiB."""
 
+SSIM_TILE_COLUMNS, SSIM_TILE_ROWS = 32, 16
+"""Size of a tile of the photometric loss on CUDA: a warp reads whole rows, two pixels per thread share their reads, and
+four blocks fit into 100 KiB of shared memory."""
+
 MAX_DIMENSIONS = 64
 """Largest number of dimensions in the SIMD search for neighbours, which keeps a block's coordinates on the stack."""
 

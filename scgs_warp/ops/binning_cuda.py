@@ -6,20 +6,16 @@ of pairs and leaves the true number on the device. Both also run on a CPU, where
 
 from __future__ import annotations
 
-import contextlib
-
 import torch
-import warp as wp
 from torch import Tensor
 
 from ..kernels import falloff
 from ..kernels.cuda import binning as kernels
 from ..kernels.types import TILE_SIZE
 from ..runtime import debug
-from ..runtime.cuda_graph import on_torch_stream
-from ..runtime.launch import launch, warp_view
+from ..runtime.launch import launch
 from ..types import Splats, Tiles
-from . import checks
+from . import checks, radix
 
 MAX_PAIRS = 2**31 - 1
 MAX_ROOM = MAX_PAIRS // 2
@@ -109,7 +105,7 @@ def _count(geometry: list[Tensor], size: tuple[int, ...]) -> tuple[Tensor, Tenso
     depth_keys = torch.empty(2 * count, device=device)
     order = torch.empty(2 * count, dtype=torch.int32, device=device)
     launch(kernels.count_pairs, count, *geometry, *size, counts, depth_keys, order)
-    radix_sort(depth_keys, order, count, 32)
+    radix.radix_sort(depth_keys, order, count, 32)
     return counts, order
 
 
@@ -136,7 +132,7 @@ def _list(
     lists = (order, places, room, offsets if with_slots else None)
     launch(kernels.fill_rest, room, places, tile_count, tiles, values, owners)
     launch(kernels.emit_by_depth, count, *geometry, *lists, *size, tiles, values, owners)
-    radix_sort(tiles, values, room, tile_count.bit_length())
+    radix.radix_sort(tiles, values, room, tile_count.bit_length())
     ranges = torch.empty(tile_count, 2, dtype=torch.int32, device=device)
     launch(kernels.tile_ranges, tile_count, tiles, room, ranges)
     if owners is None:
@@ -144,11 +140,3 @@ def _list(
     splats = torch.empty(room, dtype=torch.int32, device=device)
     launch(kernels.gather_owners, room, values, owners, splats)
     return ranges, splats, values[:room]
-
-
-def radix_sort(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
-    """Sort the first halves of the tensors by key, stably; the second halves are scratch memory."""
-    if count == 0:
-        return
-    with on_torch_stream(keys.device) if keys.is_cuda else contextlib.nullcontext():
-        wp.utils.radix_sort_pairs(warp_view(keys), warp_view(values), count, 0, bits)

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from ..kernels import neighbors as kernels
 from ..kernels.cpu import neighbor_lists, neighbors
+from ..kernels.cuda import neighbors as cuda_kernels
 from ..runtime.launch import launch
+from . import compositing_cuda, radix
 from .node_sums import rbf_node_sums
 
 
@@ -23,10 +25,18 @@ class NodeLists(NamedTuple):
 
 
 def node_lists(indices: Tensor, count: int) -> NodeLists:
-    """List the pairs of each of ``count`` nodes; ``indices`` [N, K] int32 has entries in [0, count)."""
-    nodes, order = torch.sort(indices.reshape(-1), stable=True)
-    bounds = torch.arange(count + 1, device=indices.device, dtype=nodes.dtype)
-    return NodeLists(order.int(), torch.searchsorted(nodes, bounds, out_int32=True))
+    """List the pairs of each of ``count`` nodes, without host contact.
+
+    Args:
+        indices: [N, K] int32 in [-1, count). Pairs of node -1 belong to no node; they come first in ``order``.
+    """
+    pairs, device = indices.numel(), indices.device
+    keys, order = (torch.empty(2 * pairs, dtype=torch.int32, device=device) for _ in range(2))
+    begin = torch.empty(count + 1, dtype=torch.int32, device=device)
+    launch(kernels.number_pairs, pairs, indices.reshape(-1), keys, order)
+    radix.radix_sort(keys, order, pairs, count.bit_length())
+    launch(kernels.node_begins, pairs + 1, keys, begin)
+    return NodeLists(order[:pairs], begin)
 
 
 def chunk_size(nodes: int) -> int:
@@ -73,6 +83,9 @@ def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
     arguments = points, nodes, k, indices, distances
     if _in_lanes(points):
         launch(neighbors.nearest, _blocks(points), *arguments, grain=16)
+    elif points.is_cuda and k <= cuda_kernels.MAX_NEIGHBORS and points.shape[1] <= cuda_kernels.MAX_DIMENSIONS:
+        blocks = -(-points.shape[0] // cuda_kernels.BLOCK_DIM)
+        compositing_cuda.launch_native(cuda_kernels.nearest, blocks, *arguments)
     else:
         launch(kernels.nearest, points.shape[0], *arguments)
     return indices, distances

@@ -11,12 +11,12 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels import ssim as kernels
 from ..kernels.cpu import ssim as cpu_kernels
+from ..kernels.ssim import LEAST_ERROR
 from ..kernels.types import SSIM_BAND
 from ..runtime import launch
+from .ssim_cuda import PhotometricTiles
 
-Form = Literal["auto", "pixel", "cpu"]
-LEAST_ERROR = 1e-7
-"""Mean squared error below which its logarithm is constant: 70 dB."""
+Form = Literal["auto", "pixel", "cpu", "cuda"]
 
 
 def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form = "auto") -> Tensor:
@@ -27,7 +27,8 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form
         truth: [C, H, W] float32, a constant: no gradient reaches it.
         mask: [H, W] bool, True for valid pixels. None: all are valid. Invalid pixels of ``image`` are replaced by those
             of ``truth`` so that they do not affect neighbouring windows, and they are left out of the mean.
-        form: kernels to run: ``pixel`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
+        form: kernels to run: ``pixel`` on any device, ``cpu`` in SIMD, ``cuda`` on a GPU; ``auto`` takes the fastest
+            for the device.
 
     Returns:
         The mean over valid pixels and channels, a scalar; 1 if no pixel is valid. Differentiable in ``image``.
@@ -76,14 +77,23 @@ def photometric_loss(
             f"mask must be {list(image.shape[1:])} bool on {image.device}, "
             f"got {list(mask.shape)} {mask.dtype} on {mask.device}"
         )
-    if form == "cpu" and image.device.type != "cpu":
-        raise ValueError(f"form 'cpu' needs tensors on the CPU, image is on {image.device}")
-    if form not in ("auto", "pixel", "cpu"):
-        raise ValueError(f"form must be auto, pixel or cpu, got {form!r}")
-    simd = form == "cpu" or (form == "auto" and image.device.type == "cpu")
+    resolved = _resolve_form(form, image.device)
     needs_gradient = torch.is_grad_enabled() and image.requires_grad
-    weights = ssim_weight, log_weight
-    return _Photometric.apply(image, truth.detach(), mask, weights, simd, needs_gradient)
+    arguments = image, truth.detach(), mask, (ssim_weight, log_weight)
+    if resolved == "cuda":
+        return PhotometricTiles.apply(*arguments, needs_gradient)
+    return _Photometric.apply(*arguments, resolved == "cpu", needs_gradient)
+
+
+def _resolve_form(form: str, device: torch.device) -> str:
+    """Return the form to run on a device."""
+    if form not in ("auto", "pixel", "cpu", "cuda"):
+        raise ValueError(f"form must be auto, pixel, cpu or cuda, got {form!r}")
+    if form == "auto":
+        return "cuda" if device.type == "cuda" else "cpu"
+    if form == "cpu" and device.type != "cpu":
+        raise ValueError(f"form 'cpu' needs tensors on the CPU, image is on {device}")
+    return form
 
 
 def _forward_bands(image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor | None) -> Tensor:

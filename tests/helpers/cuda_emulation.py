@@ -1,4 +1,4 @@
-"""The native functions of ``kernels.cuda.compositing``, compiled for the CPU with ``cuda_shim.h``."""
+"""The native functions of ``kernels.cuda``, compiled for the CPU with ``cuda_shim.h``."""
 
 from __future__ import annotations
 
@@ -14,29 +14,44 @@ import torch
 import warp as wp
 
 from scgs_warp.kernels import native
-from scgs_warp.kernels.cuda import compositing
+from scgs_warp.kernels.cuda import compositing, neighbors, ssim
 
 SHIM = Path(__file__).resolve().parent / "cuda_shim.h"
 COMPILER = shutil.which("g++") if sys.platform == "linux" else None
 _TYPES = {wp.vec2: "wp::vec2", wp.vec3: "wp::vec3", wp.vec2i: "wp::vec2i", float: "float", int: "int"}
-_TYPES.update({wp.float32: "float", wp.int32: "int"})
-HEADER = "compositing_cuda.h"
+_TYPES.update({wp.float32: "float", wp.float64: "double", wp.int32: "int", bool: "bool", wp.bool: "bool"})
 FUNCTIONS = {
-    "composite": compositing.composite_tile,
-    "composite_adjoint": compositing.composite_tile_adjoint,
+    "compositing_cuda.h": {
+        "composite": compositing.composite_tile,
+        "composite_adjoint": compositing.composite_tile_adjoint,
+    },
+    "neighbors_cuda.h": {"nearest": neighbors.nearest_of_block},
+    "ssim_cuda.h": {
+        "photometric": ssim.photometric_tile,
+        "photometric_total": ssim.sum_photometric,
+        "photometric_adjoint": ssim.photometric_tile_adjoint,
+    },
 }
+"""Native functions by header and by the kernel that calls them."""
 
 
 def source() -> str:
-    """Return the header and, for each kernel, a C function of its name that runs blocks of threads.
+    """Return the headers and, for each kernel, a C function of its name that runs blocks of threads."""
+    return f'#include "{SHIM}"\n' + "".join(_unit(header, functions) for header, functions in FUNCTIONS.items())
 
-    Its arguments: first block, number of blocks, seed, pointers and shapes of the arrays, numbers.
+
+def _unit(header: str, functions: dict[str, wp.Function]) -> str:
+    """Return a header in a namespace of its own and the C functions of its kernels.
+
+    Their arguments: first block, number of blocks, seed, pointers and shapes of the arrays, numbers.
     """
-    text = native.header_text(HEADER)
-    macros = [f"#define {name} {value}\n" for name, value in native.constant_macros(text).items()]
-    parts = [f'#include "{SHIM}"\n', *macros, text]
-    for name, function in FUNCTIONS.items():
-        parameters, values, arrays, numbers = ["int tile"], ["tile"], 0, 0
+    text = native.header_text(header)
+    space = header.removesuffix(".h")
+    macros = native.constant_macros(text)
+    parts = [f"#define {name} {value}\n" for name, value in macros.items()]
+    parts += [f"namespace {space} {{\n{text}}}\n", *(f"#undef {name}\n" for name in macros)]
+    for name, function in functions.items():
+        parameters, values, arrays, numbers = ["int block"], ["block"], 0, 0
         for label, kind in list(function.input_types.items())[1:]:
             if wp.types.is_array(kind):
                 inner = _TYPES[kind.dtype]
@@ -49,13 +64,13 @@ def source() -> str:
                 numbers += 1
         parts.append(
             f"static void {name}_body({', '.join(parameters)}) {{\n"
-            f"    {function.key}({', '.join(function.input_types)});\n}}\n"
+            f"    {space}::{function.key}({', '.join(['block', *list(function.input_types)[1:]])});\n}}\n"
         )
         parts.append(
             f'extern "C" int {name}(int begin, int blocks, unsigned seed,\n'
             f"    void** data, wp::Shape* shapes, double* numbers) {{\n"
             f"    std::mt19937 random(seed);\n"
-            f"    for (int tile = begin; tile < begin + blocks; ++tile)\n"
+            f"    for (int block = begin; block < begin + blocks; ++block)\n"
             f"        if (!shim::run_block([=] {{ {name}_body({', '.join(values)}); }}, random)) return 1;\n"
             f"    return 0;\n}}\n"
         )

@@ -37,7 +37,6 @@ struct Fibre {
     ucontext_t context;
     jmp_buf resume;
     bool entered = false;
-    std::unique_ptr<char[]> stack{new char[STACK]};
     long turn = 0;  // exchanges so far: two buffers take turns, nobody can be two ahead
     bool done = false;
 };
@@ -52,6 +51,12 @@ struct Block {
     void* argument = nullptr;
 };
 inline Block* block = nullptr;
+
+// The stacks of all fibres, kept from block to block: new memory costs more than most blocks take to run.
+inline char* stacks() {
+    static const std::unique_ptr<char[]> all(new char[THREADS * STACK]);
+    return all.get();
+}
 
 inline void wait(Barrier& barrier, int size) {
     const long generation = barrier.generation;
@@ -106,7 +111,7 @@ template <typename Body> bool run_block(Body body, std::mt19937& random) {
         Fibre& fibre = block->fibres[i];
         order[i] = i;
         getcontext(&fibre.context);
-        fibre.context.uc_stack.ss_sp = fibre.stack.get();
+        fibre.context.uc_stack.ss_sp = stacks() + i * STACK;
         fibre.context.uc_stack.ss_size = STACK;
         fibre.context.uc_link = nullptr;
         makecontext(&fibre.context, start, 0);

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reference.ssim import photometric_loss as reference_loss
-from scgs_warp.kernels.types import SSIM_BAND, SSIM_BLOCK
+from scgs_warp.kernels.types import SSIM_BAND, SSIM_BLOCK, SSIM_TILE_COLUMNS, SSIM_TILE_ROWS
 from scgs_warp.ops.ssim import LEAST_ERROR, photometric_loss, ssim
 from scgs_warp.runtime import environment
 
@@ -20,6 +20,8 @@ SHAPES = [
     (1, SSIM_BAND + 1, 7),
     (3, SSIM_BAND, 2 * SSIM_BLOCK + 3),
     (4, 90, 31),
+    (2, SSIM_TILE_ROWS, SSIM_TILE_COLUMNS),
+    (1, 2 * SSIM_TILE_ROWS + 1, 2 * SSIM_TILE_COLUMNS + 1),
 ]
 
 
@@ -33,7 +35,7 @@ def _pair(shape: tuple[int, ...], seed: int) -> tuple[torch.Tensor, torch.Tensor
 
 
 def _forms(device: str) -> list[str]:
-    return ["pixel", "cpu"] if device == "cpu" else ["pixel"]
+    return ["pixel", "cpu" if device == "cpu" else "cuda"]
 
 
 def _compare(image, truth, mask, weight, device, form, log_weight=0.0):
@@ -125,10 +127,11 @@ def test_no_valid_pixel_is_no_loss(device):
 
 @pytest.mark.parametrize("shape", [(3, 0, 5), (3, 5, 0), (0, 5, 5)], ids=str)
 def test_empty_images(shape, device):
-    leaf = torch.zeros(shape, device=device, requires_grad=True)
-    loss, _, similarity = photometric_loss(leaf, torch.zeros(shape, device=device))
-    loss.backward()
-    assert (loss.item(), similarity.item()) == (0.0, 1.0)
+    for form in _forms(device):
+        leaf = torch.zeros(shape, device=device, requires_grad=True)
+        loss, _, similarity = photometric_loss(leaf, torch.zeros(shape, device=device), form=form)
+        loss.backward()
+        assert (loss.item(), similarity.item()) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])

@@ -7,7 +7,7 @@ import threading
 import pytest
 import torch
 
-from scgs_warp.ops import binning_cuda
+from scgs_warp.ops import radix
 from scgs_warp.runtime import cuda_graph
 from scgs_warp.runtime.cuda_graph import CudaGraph, on_torch_stream
 
@@ -19,9 +19,9 @@ def test_a_sort_that_fails_raises(monkeypatch):
     texts = iter(["an old error", "an old error", "an old error", "Warp CUDA error 2: out of memory"])
     monkeypatch.setattr(cuda_graph, "warp_error", lambda: next(texts))
     keys, values = (torch.zeros(8, dtype=torch.int32, device=CUDA) for _ in range(2))
-    binning_cuda.radix_sort(keys, values, 4, 32)
+    radix.radix_sort(keys, values, 4, 32)
     with pytest.raises(RuntimeError, match=r"cuda:0: Warp CUDA error 2: out of memory"):
-        binning_cuda.radix_sort(keys, values, 4, 32)
+        radix.radix_sort(keys, values, 4, 32)
 
 
 def test_no_sort_enters_the_capture_of_another_thread():

@@ -41,7 +41,7 @@ def install(native: Path) -> None:
     Args:
         native: folder for the compiled native bodies.
     """
-    from scgs_warp.ops import binning_cuda, compositing, compositing_cuda
+    from scgs_warp.ops import compositing, compositing_cuda, radix, ssim
     from scgs_warp.runtime import cuda_launch
 
     to_warp = wp.device_from_torch
@@ -71,7 +71,7 @@ def install(native: Path) -> None:
 
     kernel.__init__, kernel.launch = prepared, launched
 
-    sort = binning_cuda.radix_sort
+    sort = radix.radix_sort
 
     def sorted_on_device(keys, values, count, bits) -> None:
         if keys.is_cuda and count:
@@ -79,15 +79,18 @@ def install(native: Path) -> None:
         else:
             sort(keys, values, count, bits)
 
-    binning_cuda.radix_sort = sorted_on_device
-    resolve = compositing._resolve_form
+    radix.radix_sort = sorted_on_device
+    for op in (compositing, ssim):
+        op._resolve_form = _portable_on_demand(op._resolve_form)
+    compositing_cuda.launch_native = _native(compositing_cuda.launch_native, native)
 
-    def resolve_form(form: str, device: torch.device, tile_size: int) -> str:
-        found = resolve(form, device, tile_size)
+
+def _portable_on_demand(resolve: Callable[..., str]) -> Callable[..., str]:
+    def resolve_form(form: str, *args: Any) -> str:
+        found = resolve(form, *args)
         return "pixel" if found == "cuda" and form == "auto" and not native_bodies else found
 
-    compositing._resolve_form = resolve_form
-    compositing_cuda.launch_native = _native(compositing_cuda.launch_native, native)
+    return resolve_form
 
 
 def _native(launch: Callable[..., None], folder: Path) -> Callable[..., None]:
