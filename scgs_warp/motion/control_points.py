@@ -273,7 +273,7 @@ class ControlPoints(Motion):
 
     def refresh_graph(self, step: int, loss: LossConfig) -> None:
         if self._graph_is_old(step, loss):
-            self.graph = build_graph(self.trajectories, loss)
+            self.graph = build_graph(self.trajectories, loss, self.graph)
 
     def _graph_is_old(self, step: int, loss: LossConfig) -> bool:
         return self.graph is None or step % loss.arap_refresh < loss.arap_every

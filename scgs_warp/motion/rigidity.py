@@ -29,6 +29,15 @@ class Graph(NamedTuple):
     def of(neighbors: Tensor, weights: Tensor) -> Graph:
         return Graph(neighbors, weights, reverse_edges(neighbors))
 
+    def replaced_by(self, other: Graph) -> Graph:
+        """Return the other graph, in this one's tensors if they have the same shapes: recorded steps read these."""
+        pairs = [*zip(self[:2], other[:2]), *zip(self.reverse, other.reverse)]
+        if any(old.shape != new.shape for old, new in pairs):
+            return other
+        for old, new in pairs:
+            old.copy_(new)
+        return self
+
 
 def arap_weight(step: int, loss: LossConfig) -> float:
     """Return the weight at this main step: exponential decay over ``arap_until`` steps, then 0. Only every
@@ -43,13 +52,24 @@ def arap_times(loss: LossConfig, random: torch.Generator) -> list[float]:
     return torch.rand(1 if loss.arap_pair == "frame" else 2, generator=random).tolist()
 
 
-def build_graph(positions_at: Callable[[Tensor], Tensor], loss: LossConfig) -> Graph | None:
-    """Find neighbours by trajectory from ``positions_at(times [T]) -> [T, M, 3]`` at N_t times; return None if M <
-    2."""
+def build_graph(
+    positions_at: Callable[[Tensor], Tensor], loss: LossConfig, before: Graph | None = None
+) -> Graph | None:
+    """Find neighbours by trajectory from ``positions_at(times [T]) -> [T, M, 3]`` at N_t times.
+
+    Args:
+        before: the graph to replace.
+
+    Returns:
+        None if M < 2.
+    """
     with torch.no_grad():
         trajectories = positions_at(torch.linspace(0.0, 1.0, loss.arap_times))
         count = min(loss.arap_neighbors, trajectories.shape[1] - 1)
-        return Graph.of(*trajectory_graph(trajectories.contiguous(), count)) if count >= 1 else None
+        if count < 1:
+            return None
+        graph = Graph.of(*trajectory_graph(trajectories.contiguous(), count))
+        return graph if before is None else before.replaced_by(graph)
 
 
 def rigidity(instants: list[Tensor], graph: Graph) -> Tensor:

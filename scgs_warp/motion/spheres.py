@@ -52,7 +52,7 @@ class Spheres(Motion):
             return MotionStep((time,))
         if self._graph_is_old(step, config.loss):
             self.graph = build_graph(
-                lambda times: gaussians.means + self.translations(gaussians.means, times), config.loss
+                lambda times: gaussians.means + self.translations(gaussians.means, times), config.loss, self.graph
             )
         others = arap_times(config.loss, generator(config.seed, 22, step * config.batch + view))
         weight = config.pretrain.arap_weight * config.loss.arap_every

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -15,7 +18,7 @@ from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Camera, Frame
 from .device_images import DeviceImages
-from .silhouettes import Silhouettes
+from .silhouettes import Silhouette, Silhouettes
 
 PROGRESSIVE_SHARE = 0.2
 """Share of the frames with which progressive pre-training begins and by which it grows."""
@@ -47,6 +50,28 @@ def _half(frame: Frame) -> Pixels:
     return Pixels(image.permute(1, 2, 0), alpha, mask)
 
 
+class Parts(NamedTuple):
+    """What a frame has beside its colours."""
+
+    alpha: bool
+    mask: bool
+
+
+class Loaded(NamedTuple):
+    """A view of a training frame."""
+
+    camera: Camera
+    """Normalised, on the host."""
+    background: Tensor
+    """[3] on the host."""
+    truth: Tensor
+    """[3, H, W] on the device, composited on that background."""
+    mask: Tensor | None
+    """[H, W] bool on the device. None: all pixels are valid."""
+    silhouette: Silhouette | None
+    """None: not asked for, or the frame has no alpha."""
+
+
 class Frames:
     """Training frames in random order without replacement: the order is the same for the same seed and differs between
     epochs."""
@@ -60,6 +85,7 @@ class Frames:
         self.images = DeviceImages(self.device)
         self.random_background = data.background == "random"
         self.silhouettes = Silhouettes(device)
+        self._parts: dict[tuple[int, bool], Parts] = {}
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
         self.by_time = sorted(range(len(self.frames)), key=lambda i: data.entries[i].time)
 
@@ -90,48 +116,71 @@ class Frames:
             self._order = ((epoch, count), order.tolist())
         return self.by_time[first + self._order[1][position]]
 
-    def halved(self, index: int) -> tuple[Frame, Camera]:
-        """Return the frame and its normalised camera at half the size; each pixel is the mean of four."""
-        entry, camera = self.frames.entries[index], self.views[index]
-        half = self.frames.cache.get((self, index), lambda: _half(self.frames[index]))
+    def halves(self, index: int, step: int) -> bool:
+        """Return whether this step uses the frame at half its size."""
+        camera = self.views[index]
+        return step < self.config.half_size and min(camera.width, camera.height) >= LEAST_HALVED_SIDE
+
+    def camera(self, index: int, halved: bool) -> Camera:
+        """Return the frame's normalised camera, on the host."""
+        camera = self.views[index]
+        if not halved:
+            return camera
         intrinsics = camera.K * camera.K.new_tensor([0.5, 0.5, 1.0])[:, None]
-        small = Camera(camera.viewmat, intrinsics, half.image.shape[1], half.image.shape[0])
-        return Frame(entry.camera, entry.time, *half, name=entry.name), small
+        return Camera(camera.viewmat, intrinsics, camera.width // 2, camera.height // 2)
 
-    def expect(self, step: int, progressive: bool, view: int = 0) -> None:
-        """Start to read the frame of this step's ``view`` in the background, unless it is in memory."""
-        index = self.index_at(step, progressive, view)
-        if (self, index) not in self.frames.cache:
-            self.frames.expect(index)
-
-    def view(
-        self, index: int, step: int, random_background: bool, view: int = 0
-    ) -> tuple[Frame, Camera, Tensor, Tensor, Tensor | None]:
-        """Load the frame of this step's ``view``.
-
-        Returns:
-            Frame, normalised camera and background [3], both on the host; and on the device: truth [3, H, W] composited
-            on that background, and mask [H, W] bool or None.
+    def pixels(self, index: int, halved: bool) -> Pixels:
+        """Read the frame's image, at half the size if asked: each pixel is then the mean of four.
 
         Raises:
             FrameError: the frame's file is no longer readable.
         """
-        camera = self.views[index]
         try:
-            if step < self.config.half_size and min(camera.width, camera.height) >= LEAST_HALVED_SIDE:
-                frame, camera = self.halved(index)
+            if halved:
+                found = self.frames.cache.get((self, index), lambda: _half(self.frames[index]))
             else:
                 frame = self.frames[index]
+                found = Pixels(frame.image, frame.alpha, frame.mask)
         except UserError as error:
             raise FrameError(str(error)) from error
-        key = index, camera.height
-        truth = self.images.planar(key, frame.image)
+        self._parts[index, halved] = Parts(found.alpha is not None, found.mask is not None)
+        return found
+
+    def expect(self, step: int, progressive: bool, view: int = 0) -> None:
+        """Start to read the frame of this step's ``view`` in the background, unless it is in memory."""
+        index = self.index_at(step, progressive, view)
+        if (self, index) not in self.frames.cache and not any(
+            self.images.hold((index, half)) for half in (False, True)
+        ):
+            self.frames.expect(index)
+
+    def view(self, index: int, step: int, random_background: bool, sought: bool, view: int = 0) -> Loaded:
+        """Load the images of this step's ``view``. A file whose images are on the device is not read.
+
+        Args:
+            sought: whether the silhouette is needed.
+
+        Raises:
+            FrameError: the frame's file is no longer readable.
+        """
+        halved = self.halves(index, step)
+        key = index, halved
+        pixels = cache(lambda: self.pixels(index, halved))
+        truth = self.images.planar(key, lambda: pixels().image)
+        has_alpha, has_mask = self._parts[key]
         background = self.background
-        if frame.alpha is not None and (random_background or self.random_background):
+        if has_alpha and (random_background or self.random_background):
             random = generator(self.config.seed, 42, view_number(step, self.config, view))
             color = torch.rand(3, generator=random)
-            uncovered = 1.0 - self.images.plane(("alpha", *key), frame.alpha)
+            uncovered = 1.0 - self.images.plane(("alpha", *key), lambda: present(pixels().alpha))
             truth = truth + uncovered * sent(color - background, self.device)[:, None, None]
             background = color
-        mask = None if frame.mask is None else self.images.plane(("mask", *key), frame.mask)
-        return frame, camera, background, truth, mask
+        mask = self.images.plane(("mask", *key), lambda: present(pixels().mask)) if has_mask else None
+        silhouette = self.silhouettes.of(key, lambda: present(pixels().alpha)) if sought and has_alpha else None
+        return Loaded(self.camera(index, halved), background, truth, mask, silhouette)
+
+
+def present(plane: Tensor | None) -> Tensor:
+    """Return a plane that is known to be there."""
+    assert plane is not None
+    return plane

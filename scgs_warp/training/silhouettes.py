@@ -7,7 +7,7 @@ and the silhouette has a gradient at any range.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from ..data.dataset import Dataset
 from ..geometry.normalisation import Normalisation
 from ..runtime.device_copies import sent
 from ..runtime.environment import one_piece
-from ..types import Camera, Frame
+from ..types import Camera
 
 COVERED = 0.3
 """Alpha from which a pixel belongs to the silhouette. Below one half, because rods thinner than a pixel count, too."""
@@ -158,15 +158,16 @@ class Silhouettes:
 
     def __init__(self, device: str) -> None:
         self.device = device
-        self._found: dict[tuple[int, int], Silhouette | None] = {}
+        self._found: dict[Hashable, Silhouette | None] = {}
 
-    def of(self, frame: Frame, index: int) -> Silhouette | None:
-        """Return the silhouette of the frame with this index; None if it has none."""
-        if frame.alpha is None:
-            return None
-        key = index, frame.alpha.shape[1]
+    def of(self, key: Hashable, alpha: Callable[[], Tensor]) -> Silhouette | None:
+        """Return the silhouette of an image, None if it has none; the same key must stand for the same image.
+
+        Args:
+            alpha: returns the image's coverage [H, W]; called at the first use only.
+        """
         if key not in self._found:
-            self._found[key] = silhouette_of(frame.alpha, self.device)
+            self._found[key] = silhouette_of(alpha(), self.device)
         return self._found[key]
 
 

@@ -91,18 +91,17 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     progressive = config.pretrain.progressive and pretraining
     index = frames.index_at(step, progressive, view)
     random_background = pretraining and config.pretrain.random_background
-    frame, camera, background, truth, mask = frames.view(index, state.step, random_background, view)
+    loaded = frames.view(index, state.step, random_background, seeks_silhouettes(state), view)
     later, next_view = divmod(view + (1 if state.group is None else state.group.size), config.batch)
     frames.expect(step + later, progressive, next_view)
-    time = noisy_time(frame.time, state, len(frames), view)
+    time = noisy_time(frames.frames.entries[index].time, state, len(frames), view)
     plan = state.motion.plan(state.gaussians, time, step, config, view)
-    silhouette = frames.silhouettes.of(frame, index) if seeks_silhouettes(state) else None
     random = generator(config.seed, 45, view_number(state.step, config, view))
-    sample = None if silhouette is None else silhouette.sample(random)
+    sample = None if loaded.silhouette is None else loaded.silhouette.sample(random)
     pooled = config.pretrain.pooled if pretraining else config.loss.pooled == "always"
     collects = pretraining or step < config.densify.until
     form = Form(sh_degree(state, step), collects, log_weight(state), pooled)
-    return View(index, camera, background, plan, form, truth, mask, sample)
+    return View(index, loaded.camera, loaded.background, plan, form, loaded.truth, loaded.mask, sample)
 
 
 def compare(

@@ -25,7 +25,7 @@ def test_no_bit_is_lost(name, device, monkeypatch):
     monkeypatch.setattr(device_images, "MEMORY_SHARE", 1.0)
     images, image = DeviceImages(torch.device(device)), pictures()[name]
     for _ in range(2):
-        found = images.planar((0, 1), image)
+        found = images.planar((0, 1), lambda: image)
         assert found.device.type == device and found.is_contiguous()
         assert torch.equal(found.cpu(), image.permute(2, 0, 1))
     assert images.used == (0 if device == "cpu" else image.numel() * (1 if name == "file" else 4))
@@ -33,7 +33,7 @@ def test_no_bit_is_lost(name, device, monkeypatch):
 
 def test_values_beyond_bytes_are_kept():
     image = torch.tensor([[[1.5, -0.25, float("nan")]]])
-    found = DeviceImages(torch.device("cpu")).planar(0, image)
+    found = DeviceImages(torch.device("cpu")).planar(0, lambda: image)
     assert torch.equal(found.nan_to_num(7.0), image.permute(2, 0, 1).nan_to_num(7.0))
     for value in (1.5, -0.25, float("nan"), float("inf"), 0.1):
         image = torch.full((2, 2, 3), value)
@@ -45,6 +45,6 @@ def test_memory_is_respected(device):
     images.budget = image.numel() + 10
     mask = torch.rand(256, 9) > 0.5
     for key in (0, 1, 0):
-        assert torch.equal(images.planar(key, image).cpu(), image.permute(2, 0, 1))
-        assert torch.equal(images.plane(("mask", key), mask).cpu(), mask)
+        assert torch.equal(images.planar(key, lambda: image).cpu(), image.permute(2, 0, 1))
+        assert torch.equal(images.plane(("mask", key), lambda: mask).cpu(), mask)
     assert images.used == image.numel(), "one image fits; neither the second nor a mask does"

@@ -46,19 +46,19 @@ def test_progressive_by_fifths_adds_them_at_once():
 
 def test_random_background_is_under_the_image_alone():
     made = frames()
-    frame, _, background, truth, mask = made.view(3, 7, True)
-    plain = made.view(3, 7, False)[3]
+    _, background, truth, mask, _ = made.view(3, 7, True, False)
+    alpha, plain = made.frames[3].alpha, made.view(3, 7, False, False).truth
     assert mask is None
-    assert torch.allclose(truth, plain + (1 - frame.alpha) * background[:, None, None])
-    assert torch.equal(truth, made.view(3, 7, True)[3]), "the same step gives the same background"
-    assert not torch.equal(truth, made.view(3, 8, True)[3])
+    assert torch.allclose(truth, plain + (1 - alpha) * background[:, None, None])
+    assert torch.equal(truth, made.view(3, 7, True, False).truth), "the same step gives the same background"
+    assert not torch.equal(truth, made.view(3, 8, True, False).truth)
 
 
 @pytest.mark.parametrize("size", [64, 65])
 def test_half_size_sees_the_same_scene(size):
     made = frames(size, half_size=10)
-    _, camera, _, truth, _ = made.view(2, 9, False)
-    _, whole_camera, _, whole, _ = made.view(2, 10, False)
+    camera, _, truth, _, _ = made.view(2, 9, False, False)
+    whole_camera, _, whole, _, _ = made.view(2, 10, False, False)
     assert truth.shape == (3, size // 2, size // 2) and whole.shape == (3, size, size)
     assert (camera.width, camera.height) == (size // 2, size // 2)
     even = whole[:, : size // 2 * 2, : size // 2 * 2]
@@ -72,11 +72,11 @@ def test_half_size_sees_the_same_scene(size):
 
 def test_small_images_and_masks_at_half_size():
     made = frames(48, half_size=10)
-    assert made.view(0, 0, False)[1].width == 48, "too small to be halved"
+    assert made.view(0, 0, False, False).camera.width == 48, "too small to be halved"
     made = frames(64, half_size=10)
     mask = torch.ones(64, 64, dtype=torch.bool)
     mask[10, 11] = False
     masked = [dataclasses.replace(frame, mask=mask if index == 1 else None) for index, frame in enumerate(made.frames)]
     made.frames = Dataset(masked, folder=made.frames.folder, split="train")
-    half = made.view(1, 0, False)[4]
+    half = made.view(1, 0, False, False).mask
     assert half is not None and not half[5, 5] and int((~half).sum()) == 1

@@ -13,6 +13,7 @@ import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp import optim
+from scgs_warp.motion import rigidity
 from scgs_warp.ops.adam import adam_step
 from scgs_warp.ops.step_outcome import UpdateTable
 from scgs_warp.training import recorded_step, recorded_update
@@ -270,6 +271,36 @@ def test_plain_steps_between_recorded_ones(device, monkeypatch):
     monkeypatch.setattr(RecordedSteps, "_fits", lambda self: next(number) % 9 < 5 and inner(self))
     taker, _, _ = compare(device, 60)
     assert taker.recordings > 0
+
+
+def test_a_new_graph_of_neighbours_keeps_the_recordings(device, monkeypatch):
+    """A graph of the same size is written into the old one's tensors, which the recorded step reads."""
+    loss = {"arap": 0.01, "arap_end": 0.01, "arap_until": 1000, "arap_every": 1, "arap_refresh": 4}
+    state, frames = begin(device, 80, loss=loss, freeze=0, densify={"start": 1000})
+    state.step = state.config.pretrain_steps
+    state.begin_main()
+    steps, built = RecordedSteps(state, frames), []
+    build = rigidity.trajectory_graph
+    monkeypatch.setattr(rigidity, "trajectory_graph", lambda *inputs: built.append(1) or build(*inputs))
+    for _ in range(14):
+        steps.take()
+        state.step += 1
+    steps.settle()
+    assert len(built) >= 3 and steps.recordings == 1 and steps.failure is None
+
+
+def test_images_on_the_device_are_not_read_again(device, monkeypatch):
+    state, frames = begin(device, 40)
+    reads = []
+    read = frames.pixels
+    monkeypatch.setattr(frames, "pixels", lambda *key: reads.append(key) or read(*key))
+    steps = RecordedSteps(state, frames)
+    for _ in range(30):
+        steps.take()
+        state.step += 1
+    steps.settle()
+    once = len(set(reads))
+    assert once >= 6 and (len(reads) == 30 if device == "cpu" else len(reads) <= 2 * once), reads
 
 
 def test_a_failed_recording_is_told_once(device, monkeypatch):
