@@ -1,21 +1,19 @@
-"""Parts of ``gpu_check.py`` for robustness: poisoned inputs, a crowded screen, a process group, the tests."""
+"""Parts of ``gpu_check`` for robustness: poisoned inputs, a crowded screen, a process group."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import os
-import re
+import shutil
 import socket
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import torch
+from gpu_session import ROOT, Call, NotRun, Report
 
 from scgs_warp.apps import train
 from scgs_warp.rendering.render import draw
@@ -23,13 +21,7 @@ from scgs_warp.runtime import memory
 from scgs_warp.runtime.torchrun import ProcessRank
 from scgs_warp.types import Camera, Gaussians
 
-ROOT = Path(__file__).resolve().parent.parent
 FUZZ_SECONDS = 240.0
-TESTS = "cuda and not gpu_check and not test_compile and not emulated and not test_layers"
-"""Selection of the tests that need the GPU."""
-TESTS_SECONDS = 500.0
-OUTCOME = re.compile(r"(tests/\S+::.*?) (PASSED|FAILED|ERROR|SKIPPED)")
-"""Line that pytest prints after a test."""
 TRAINING = "--downscale 2 --steps 60 --nodes 40 --max-gaussians 2000 --batch 2 --threads 1".split()
 """Options of a run that takes seconds, with two views per step."""
 
@@ -41,26 +33,29 @@ def run(command: list[str], seconds: float) -> None:
         raise RuntimeError(f"status {done.returncode}: {(done.stderr or done.stdout)[-800:]}")
 
 
-def fuzz(device: str, quick: bool) -> dict[str, Any]:
+def fuzz(call: Call) -> Report:
     """Run the fuzzing campaign: poisoned inputs of every op."""
-    cases = 40 if quick else 2000
-    with tempfile.TemporaryDirectory() as folder:
-        summary = Path(folder) / "summary.json"
-        command = [sys.executable, "tests/fuzz/campaign.py", "--cases", str(cases), "--device", device]
-        run([*command, "--seed", "50000", "--summary", str(summary)], FUZZ_SECONDS)
-        return {"passed": True, "cases": cases, "summary": json.loads(summary.read_text())}
+    cases, summary = 40 if call.setting.quick else 2000, call.work / "fuzz.json"
+    command = [sys.executable, "tests/fuzz/campaign.py", "--cases", str(cases), "--device", call.setting.device]
+    run([*command, "--seed", "50000", "--summary", str(summary)], FUZZ_SECONDS)
+    return {"passed": True, "cases": cases, "summary": json.loads(summary.read_text(encoding="utf-8"))}
 
 
-def crowded(device: str, quick: bool) -> dict[str, Any]:
+def crowded(call: Call) -> Report:
     """Draw, in bands that need little memory, Gaussians that all fill the screen."""
-    count, width, height, gib = (1000, 320, 240, 4.0) if quick else (1_000_000, 1920, 1080, 4.0)
+    device = call.setting.device
+    count, width, height, gib = (1000, 320, 240, 4.0) if call.setting.quick else (1_000_000, 1920, 1080, 4.0)
     g = torch.Generator().manual_seed(0)
     means = torch.randn(count, 3, generator=g) * 0.05 + torch.tensor([0.0, 0.0, 4.0])
     quats, scales = torch.randn(count, 4, generator=g), 6.0 + torch.rand(count, 3, generator=g)
     opacities, colors = 0.02 + 0.05 * torch.rand(count, generator=g), torch.randn(count, 3, generator=g)
-    fields = (means, quats, scales, opacities, colors, torch.zeros(count, 0, 3))
+    rest = torch.zeros(count, 0, 3)
     K = torch.tensor([[width * 0.8, 0.0, width / 2], [0.0, width * 0.8, height / 2], [0.0, 0.0, 1.0]])
-    gaussians, camera = Gaussians(*(x.to(device) for x in fields)), Camera(torch.eye(4), K, width, height).to(device)
+    means, quats, scales, opacities, colors, rest = (
+        x.to(device) for x in (means, quats, scales, opacities, colors, rest)
+    )
+    gaussians = Gaussians(means, quats, scales, opacities, colors, rest)
+    camera = Camera(torch.eye(4), K, width, height).to(device)
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
     memory.set_limit(gib)
@@ -85,49 +80,25 @@ def _team_of_one() -> Iterator[None]:
         yield
 
 
-def share(device: str) -> dict[str, Any]:
+def share(call: Call) -> Report:
     """Compare the checkpoint of a process group of one process (NCCL on a GPU) with that of a plain run.
 
     ``torchrun`` with one process would train without a group, so this process makes the group itself.
+
+    Raises:
+        NotRun: this torch has no NCCL.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        data = Path(folder) / "figure"
-        size = ["--size", "96", "--train", "8", "--test", "2"]
-        run([sys.executable, "apps/synthesize.py", "--output", str(data), *size], 240.0)
-        alone, team = Path(folder) / "alone", Path(folder) / "team"
-        options = ["--data", str(data), "--preset", "quick", "--device", device, *TRAINING]
-        run([sys.executable, "apps/train.py", *options, "--output", str(alone)], 300.0)
-        with _team_of_one():
-            train.main([*options, "--output", str(team)])
-        name = "checkpoint.safetensors"
-        same = (alone / name).read_bytes() == (team / name).read_bytes()
-        return {"passed": same, "same_bits": same}
-
-
-def tests(quick: bool, seconds: float = TESTS_SECONDS) -> dict[str, Any]:
-    """Run the tests on CUDA, apart from those that only compile or that run in the emulation.
-
-    The outcome of each test is read as it is printed, so that those before a time-out count.
-    """
-    selection = ["tests/kernels/test_ssim.py", "-k", "bad_arguments"] if quick else ["-k", TESTS]
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-o", "addopts=", "--import-mode=importlib"]
-    command += ["-m", "not slow", "-v", "--tb=short", *selection]
-    with tempfile.TemporaryFile("w+", encoding="utf-8") as printed:
-        try:
-            ended = subprocess.run(
-                command, cwd=ROOT, stdout=printed, stderr=subprocess.STDOUT, check=False, timeout=seconds
-            )
-            status = ended.returncode
-        except subprocess.TimeoutExpired:
-            status = None
-        printed.seek(0)
-        lines = printed.read().splitlines()
-    outcomes = [match for line in lines if (match := OUTCOME.match(line))]
-    failures = [match[1] for match in outcomes if match[2] in ("FAILED", "ERROR")]
-    return {
-        "passed": status == 0,
-        "in_time": status is not None,
-        "tests_passed": sum(match[2] == "PASSED" for match in outcomes),
-        "failures": failures,
-        "end": lines[-80:] if status != 0 else lines[-1:],
-    }
+    if call.setting.device == "cuda" and not torch.distributed.is_nccl_available():
+        raise NotRun("this torch has no NCCL")
+    data, alone, team = (call.work / f"share-{name}" for name in ("scene", "alone", "team"))
+    for folder in (data, alone, team):
+        shutil.rmtree(folder, ignore_errors=True)
+    size = ["--size", "96", "--train", "8", "--test", "2"]
+    run([sys.executable, "apps/synthesize.py", "--output", str(data), *size], 240.0)
+    options = ["--data", str(data), "--preset", "quick", "--device", call.setting.device, *TRAINING]
+    run([sys.executable, "apps/train.py", *options, "--output", str(alone)], 300.0)
+    with _team_of_one():
+        train.main([*options, "--output", str(team)])
+    name = "checkpoint.safetensors"
+    same = (alone / name).read_bytes() == (team / name).read_bytes()
+    return {"passed": same, "same_bits": same}
