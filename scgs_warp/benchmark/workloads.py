@@ -30,11 +30,12 @@ from .plan import MIDDLE, BenchCase, posed
 from .scenes import Size, scene_camera, training_data, training_state
 
 RENDER_STAGES = {
-    "project": "project",
-    "harmonics": "spherical_harmonics",
-    "bin": "bin_splats",
-    "composite": "composite",
+    "project": ("project",),
+    "harmonics": ("spherical_harmonics", "colors_and_depths"),
+    "bin": ("bin_splats",),
+    "composite": ("composite",),
 }
+"""Functions of each stage of rendering; the harmonics of a frame on a GPU are computed beside its depths."""
 
 
 def motion_stages(motion: Motion, training: bool = False) -> dict[str, list[tuple[Any, str]]]:
@@ -57,7 +58,9 @@ def motion_stages(motion: Motion, training: bool = False) -> dict[str, list[tupl
 
 
 def draw_stages(module: Any) -> dict[str, list[tuple[Any, str]]]:
-    return {stage: [(module, name)] for stage, name in RENDER_STAGES.items()}
+    return {
+        stage: [(module, name) for name in names if hasattr(module, name)] for stage, names in RENDER_STAGES.items()
+    }
 
 
 def instant(index: int) -> float:
