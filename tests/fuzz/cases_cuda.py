@@ -1,4 +1,4 @@
-"""The native CUDA bodies of compositing, run on the CPU by ``cuda_emulation``, under the laws of compositing."""
+"""The native CUDA bodies, run on the CPU by ``cuda_emulation``, under the laws of the stages that they compute."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fuzz.cases_render import check_composite, splats_of
+from fuzz.cases_training import case_loss
 from fuzz.poison import Draw
 from helpers.cuda_emulation import COMPILER, build, launcher
 from scgs_warp.kernels import compositing
@@ -64,4 +65,13 @@ def case_native_compositing(d: Draw, device: str) -> None:
         check_composite(d, splats, channels, background, "cuda")
 
 
-CASES = {"cuda bodies": (case_native_compositing, 1)} if COMPILER is not None else {}
+def case_native_loss(d: Draw, device: str) -> None:
+    if device != "cpu":
+        case_loss(d, device, "cuda")
+        return
+    with emulated(d.seed % 1000):
+        case_loss(d, device, "cuda")
+
+
+NATIVE = {"cuda bodies": (case_native_compositing, 1), "cuda loss": (case_native_loss, 1)}
+CASES = NATIVE if COMPILER is not None else {}

@@ -26,7 +26,7 @@ from scgs_warp.ops.correctives import correct
 from scgs_warp.ops.harmonics_rotation import SIZES, rotate_harmonics
 from scgs_warp.ops.reduction import sum_rows
 from scgs_warp.ops.shading import shade, tint
-from scgs_warp.ops.ssim import photometric_loss
+from scgs_warp.ops.ssim import Form, photometric_loss
 from scgs_warp.optim import Adam
 from scgs_warp.runtime.launch import launch
 from scgs_warp.scene.scene import Scene
@@ -40,14 +40,14 @@ LARGEST_PIXEL = 1e9
 """Largest pixel whose fourth power fits into a float32; beyond it the loss is not finite."""
 
 
-def case_loss(d: Draw, device: str) -> None:
+def case_loss(d: Draw, device: str, form: Form | None = None) -> None:
     """Losses are finite for pixels up to 1e9, ignore masked pixels, and never hide a NaN."""
     (width, height), channels = d.size(), int(d.pick((1, 3, 4)))
     image, truth = d.uniform(channels, height, width), d.uniform(channels, height, width)
     clean, hit = image.clone(), d.rows(channels * height * width)
     d.poison(image.view(-1), hit)
     image[(image.abs() > LARGEST_PIXEL) & image.isfinite()] = 0.25
-    form = "pixel" if device != "cpu" or d.chance(0.3) else "cpu"
+    form = form or ("pixel" if d.chance(0.3) else "auto")
     weight = float(d.pick((0.0, 0.2, 1.0)))
     own = leaf(image.to(device))
     loss, l1, similarity = photometric_loss(own, truth.to(device), None, weight, form=form)

@@ -98,6 +98,14 @@ def test_logarithm_is_constant_below_its_least_error(device):
             assert torch.equal(with_log.grad, without.grad)
 
 
+def test_equal_pixels_have_no_slope(device):
+    _, truth = _pair((3, 20, 40), 11)
+    for form in _forms(device):
+        leaf = truth.to(device).clone().requires_grad_()
+        photometric_loss(leaf, truth.to(device), None, 0.0, form=form)[0].backward()
+        assert not leaf.grad.any()
+
+
 def test_what_lies_under_the_mask_does_not_matter(device):
     image, truth = _pair((3, 40, 50), 3)
     mask = torch.ones(40, 50, dtype=torch.bool)

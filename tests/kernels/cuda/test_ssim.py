@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from helpers.cuda_emulation import COMPILER, build, launcher
+from scgs_warp.kernels.cuda import ssim as kernels
 from scgs_warp.kernels.types import SSIM_TILE_COLUMNS, SSIM_TILE_ROWS
 from scgs_warp.ops import compositing_cuda
 from scgs_warp.ops.ssim import photometric_loss
@@ -76,6 +77,18 @@ def test_sums_of_more_tiles_than_threads(library: ctypes.CDLL, monkeypatch):
     image[7] = 0.0
     _, l1, _ = photometric_loss(image, truth, form="cuda")
     torch.testing.assert_close(l1, torch.tensor(299 * 1e-4 / 300), rtol=1e-6, atol=0.0)
+
+
+@emulated
+def test_the_last_sum_is_in_double_precision(library: ctypes.CDLL):
+    """Each thread adds small sums to a large one, which hides them in float32."""
+    tiles = torch.full((256 * 200, 4), 0.03)
+    tiles[:256] = 1e6
+    results, slopes = torch.empty(3), torch.empty(2)
+    launcher(library)(kernels.photometric_total, 1, tiles, 0.0, 0.0, results, slopes)
+    valid = float(tiles[:, 3].double().sum())
+    torch.testing.assert_close(results, torch.tensor([1.0, 1.0, 1.0]), rtol=1e-7, atol=0.0)
+    torch.testing.assert_close(slopes, torch.tensor([1.0 / valid, 0.0]), rtol=1e-7, atol=0.0)
 
 
 @emulated
