@@ -115,25 +115,24 @@ def open_browser(session: EditSession, options: Options) -> None:
     assert source is not None
     folder = options.folder or source / "edits"
     key = secrets.token_urlsafe(24) if options.share else None
-    editor = Editor(session, folder, 0 if options.share else options.port, key=key)
-    proxy = None
-    try:
-        if key is None:
-            print(f"open {editor.url} in a browser; Ctrl-C ends", flush=True)
-        else:
-            proxy = Proxy(editor.port, key, public=options.port)
-            print(f"open {proxy.url} in a browser; Ctrl-C ends", flush=True)
-            print("from other machines: the same with this machine's name; whoever has the token may edit", flush=True)
-            print(
-                "what is sent is not encrypted: outside a network that you trust, forward the port over SSH", flush=True
-            )
-        with stop_signals() as stop:  # Shells may make background processes ignore Ctrl-C.
+    with stop_signals() as stop:  # Shells may make background processes ignore Ctrl-C.
+        editor = Editor(session, folder, 0 if options.share else options.port, key=key)
+        proxy = None
+        try:
+            if key is None:
+                print(f"open {editor.url} in a browser; Ctrl-C ends", flush=True)
+            else:
+                proxy = Proxy(editor.port, key, public=options.port)
+                print(f"open {proxy.url} in a browser; Ctrl-C ends", flush=True)
+                print("from other machines: the same with this machine's name; whoever has the token may edit")
+                print("what is sent is not encrypted: outside a network that you trust, forward the port over SSH")
+                sys.stdout.flush()
             stop.wait()
-        print("the editor has ended", flush=True)
-    finally:
-        if proxy is not None:
-            proxy.stop()
-        editor.stop()
+            print("the editor has ended", flush=True)
+        finally:
+            if proxy is not None:
+                proxy.stop()
+            editor.stop()
 
 
 def main(args: list[str] | None) -> None:
