@@ -9,7 +9,7 @@ import warp as wp
 from .harmonics import C1, C2, C3Z, C20, C22, C30, C31, C32, C33
 from .quaternion import quat_conjugate, quat_normalise, quat_rotate
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 mat33 = wp.types.matrix(shape=(3, 3), dtype=float)

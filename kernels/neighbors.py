@@ -9,7 +9,7 @@ import warp as wp
 
 from .gradient_limits import passed
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 MAX_NEIGHBORS = 16
 

@@ -13,7 +13,11 @@ from .gradient_limits import beyond
 from .quaternion import quat_inverse_norm, quat_matrix, quat_matrix_adjoint, quat_normalise, quat_normalise_adjoint
 from .types import ALPHA_MIN
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+_BOUNDS = (256, 5)
+"""Launch bounds of ``project`` on a GPU: threads per block, and blocks per multiprocessor, which leave it 48 registers
+and spill none. The adjoint would spill with 80."""
 
 FRUSTUM_MARGIN = wp.constant(0.3)
 """Margin outside the image, in tan(fov / 2), beyond which x / z and y / z are clamped: the Jacobian would explode."""
@@ -74,7 +78,7 @@ def footprint(
     return fp
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=_BOUNDS)
 def project(
     first: int,
     # In:

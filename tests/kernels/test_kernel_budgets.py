@@ -24,9 +24,9 @@ REGISTERS = {
     "cuda.ssim": {"photometric": 48, "photometric_adjoint": 40},
     "encoding": {"encode": 30},
     "harmonics": {"spherical_harmonics": 32, "spherical_harmonics_adjoint": 32, "channels_with_depth": 32},
-    "neighbors": {"nearest": 42, "rbf_weights": 40},
+    "neighbors": {"nearest": 32, "rbf_weights": 40},
     "posing": {"unit_pose": 32, "pose_gaussians": 64},
-    "projection": {"project": 61, "project_adjoint": 96},
+    "projection": {"project": 48, "project_adjoint": 90},
     "skinning": {"skin": 64, "skin_adjoint": 80},
     "ssim": {"blur_rows": 40, "photometric": 32, "photometric_adjoint": 32},
 }
