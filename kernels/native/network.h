@@ -50,7 +50,7 @@ static inline void pack_row(
 }
 
 // Take a block of rows through all layers.
-static inline void network_block(
+WHOLE_REGISTERS static inline void network_block(
     int block, int size, int keep, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
     const wp::array_t<float>& inputs, wp::array_t<float>& hidden, wp::array_t<float>& out
 ) {

@@ -4,7 +4,7 @@
 #pragma once
 #include "network_panels.h"
 
-static inline void network_block_adjoint(
+WHOLE_REGISTERS static inline void network_block_adjoint(
     int block, int size, int first, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
     const wp::array_t<float>& hidden, const wp::array_t<float>& v_out, wp::array_t<float>& v_hidden
 ) {
@@ -51,7 +51,7 @@ static inline void network_block_adjoint(
 }
 
 // Sum the gradient of the inputs over all layers that read them, first to last.
-static inline void network_inputs_block_adjoint(
+WHOLE_REGISTERS static inline void network_inputs_block_adjoint(
     int block, int size, int first, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
     const wp::array_t<float>& v_hidden, wp::array_t<float>& v_inputs
 ) {
@@ -92,7 +92,7 @@ static inline void network_inputs_block_adjoint(
 
 // Compute the weight gradients [out, in] and the bias gradients of one panel of a layer's outputs. The sums over the
 // rows of ``v_hidden`` continue those over the rows before ``first``.
-static inline void network_panel_adjoint(
+WHOLE_REGISTERS static inline void network_panel_adjoint(
     int layer, int panel, int part, int parts, int first, int count, const wp::array_t<wp::int64>& table,
     const wp::array_t<float>& inputs, const wp::array_t<float>& hidden, const wp::array_t<float>& v_hidden
 ) {

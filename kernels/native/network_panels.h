@@ -34,6 +34,14 @@ enum { LANES = 4, ROWS = 8, VECTORS = 2 };
 #endif
 enum { STRIP = LANES * VECTORS };  // columns of a tile
 
+// Attribute of functions that compute on such registers. Without it Clang cuts registers of 512 bits into halves where
+// it tunes for an Intel CPU, unless the function takes or returns one.
+#if defined(__AVX512F__)
+#define WHOLE_REGISTERS __attribute__((min_vector_width(512)))
+#else
+#define WHOLE_REGISTERS
+#endif
+
 // One register of the CPU, and the same type without alignment.
 typedef float vn __attribute__((vector_size(LANES * 4)));
 typedef float vnu __attribute__((vector_size(LANES * 4), aligned(4)));
