@@ -38,7 +38,7 @@ def paper(call: Call) -> Report:
 
 
 def best(call: Call) -> Report:
-    """Train with the preset of the highest scores, until the goal is missed."""
+    """Train with the preset of most steps, until the goal is missed."""
     return train("best", call, TRAINING_SECONDS)
 
 

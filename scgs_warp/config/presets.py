@@ -46,8 +46,8 @@ PRESETS: tuple[str, ...] = get_args(PresetName)
 
 
 def preset(name: PresetName) -> TrainConfig:
-    """Make a configuration. ``quick`` suits the built-in scene, ``cpu`` takes minutes on two cores, ``best`` has the
-    highest scores in 80,000 steps, ``paper`` is the schedule of the SC-GS supplement in as many steps."""
+    """Make a configuration. ``quick`` suits the built-in scene, ``cpu`` takes minutes on two cores, ``best`` takes
+    80,000 steps, ``paper`` is the schedule of the SC-GS supplement in as many steps."""
     if name == "best":
         return TrainConfig()
     if name == "paper":

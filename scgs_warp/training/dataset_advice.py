@@ -209,4 +209,4 @@ def _help(facts: Survey, config: TrainConfig, device: str) -> str:
         return "COLMAP's points (ply_file_path, or its sparse model) begin some 2 dB better than random ones"
     if not facts.cut_out and facts.views == 1 and config.optim.cameras == 0.0:
         return "if the poses are off by more than a pixel, --set optim.cameras=2e-4 corrects them"
-    return "the settings fit; --preset best has the highest scores" if config.preset != "best" else "it is set up"
+    return "the settings fit"
