@@ -22,9 +22,9 @@ class Settings:
     """Settings of a training run."""
 
     preset: PresetName | None = None
-    """Schedule. quick: a few minutes on two cores; cpu: about 15 minutes, most of the quality; best: hours, the highest
-    scores; paper: hours, the schedule of the SC-GS supplement. By default quick for the built-in scene and cpu for
-    others."""
+    """Schedule. quick: a few minutes on two cores; cpu: about a quarter of an hour; best: an hour or two, better on
+    scenes of large motion; paper: hours, the schedule of the SC-GS supplement. By default quick for the built-in scene
+    and cpu for others."""
     config: Path | None = None
     """config.json of an earlier run, or a part of one; options override it."""
     downscale: int | None = None
