@@ -94,5 +94,10 @@ class Edit:
         """Largest distance from a handle's time, in scene time, at which a one-frame edit still shows."""
         return frame_reach(self.film, self.playback)
 
+    def turned(self, name: str) -> bool:
+        """Return whether any target or keyframe turns the handle of that name."""
+        places = [self.targets, *(frame.targets for frame in self.keyframes)]
+        return any(name in targets and any(targets[name].rotation[1:]) for targets in places)
+
     def handle(self, name: str) -> Handle | None:
         return next((handle for handle in self.handles if handle.name == name), None)

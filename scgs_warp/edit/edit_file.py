@@ -21,7 +21,8 @@ from .playback import Exaggerate, Hold, Playback
 from .rotations import from_axis
 
 FORMAT = "scgs-warp edit"
-VERSION = 1
+VERSION = 2
+"""In version 1, a handle of several control points without ``turns`` fixed their rotations."""
 MAX_FILM_SIZE = 8192
 """Longer side in pixels."""
 
@@ -90,12 +91,15 @@ def parse(content: Any, source: str, engine: Engine) -> Edit:
     root = FieldReader(content, source)
     if root.raw("format") != FORMAT:
         raise root.wrong("format", f"is {show_value(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
-    if root.raw("version") != VERSION:
-        raise root.wrong("version", f"is {show_value(root.raw('version'))}", f"this program reads version {VERSION}")
+    version = root.raw("version")
+    if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= VERSION:
+        raise root.wrong("version", f"is {show_value(version)}", f"this program reads versions 1 to {VERSION}")
     _check_scene(root, engine)
     handles: list[Handle] = []
     for fields in root.children("handles", 1000):
         handle = _handle(fields, engine)
+        if version == 1 and handle.turns is None:
+            handle = dataclasses.replace(handle, turns=len(handle.nodes) > 1)
         if any(handle.name == other.name for other in handles):
             raise fields.wrong("name", f"{handle.name!r} is taken", "give every handle a name of its own")
         handles.append(handle)

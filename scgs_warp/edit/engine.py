@@ -127,7 +127,8 @@ class Engine:
         """
         targets = self.targets(edit, at)
         said = tuple((name, target.translation, target.rotation) for name, target in targets.items())
-        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, said, frame
+        turned = tuple(edit.turned(handle.name) for handle in edit.handles)
+        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, said, turned, frame
 
         def solve() -> NodePose | None:
             problem = self._problem(edit, time, targets, frame)
@@ -149,7 +150,8 @@ class Engine:
         if problem is None:
             self._live = None
             return self._unbent(edit, time)
-        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, frame
+        turned = tuple(edit.turned(handle.name) for handle in edit.handles)
+        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, turned, frame
         rest = problem.base.positions
         if self._live is None or self._live.key != key:
             self._live = _Live(key, {name: STAY for name in targets}, Shape.at_rest(rest))
@@ -209,7 +211,7 @@ class Engine:
             if share == 0.0:
                 continue
             then = base if handle.time == time else self.base_at(edit, handle.time)
-            arguments = self.graph, then.positions, base.positions, self.units
+            arguments = self.graph, then.positions, base.positions, self.units, edit.turned(handle.name)
             goals.append(carried_goal(handle, targets[handle.name], share, *arguments))
         component = self.graph.component
         moved = [component[goal.nodes] for goal in goals if not goal.is_identity]

@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import UserError
 from .field_reader import MAX_NUMBER, FieldReader, plain_values
 from .graph import ControlGraph
+from .rigid_groups import RigidGroups
 from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
 from .solver import Anchors
 
@@ -80,7 +81,8 @@ class Handle:
     stiffness: float | None = None
     """None: nodes go exactly to the target. A number: nodes are pulled there with this stiffness (edges have 1)."""
     turns: bool | None = None
-    """True: the handle also fixes its nodes' rotations. None: it does so if it has more than one node."""
+    """True: the handle also fixes its nodes' rotations. False: it fixes their positions only. None: as True if a target
+    or keyframe turns the handle; until then its nodes move as a free rigid body, whose rotation the solver finds."""
     lasts: Lasting = "motion"
     """motion: the edit shows throughout, carried along by the nodes; frame: it shows in one frame; fade: it fades out
     over ``window`` on either side of the handle's time."""
@@ -96,9 +98,17 @@ class Handle:
         for name, value in handle_fields(FieldReader(plain_values(vars(self)), f"handle {self.name!r}")).items():
             object.__setattr__(self, name, value)
 
-    @property
-    def gives_rotation(self) -> bool:
-        return len(self.nodes) > 1 if self.turns is None else self.turns
+    def moves_freely(self, turned: bool) -> bool:
+        """Return whether the nodes move as a free rigid body.
+
+        Args:
+            turned: whether any target or keyframe of the edit turns the handle.
+        """
+        return self.turns is None and not turned and len(self.nodes) > 1
+
+    def gives_rotation(self, turned: bool) -> bool:
+        """Return whether the handle fixes its nodes' rotations."""
+        return turned if self.turns is None else self.turns
 
     def strength(self, time: float, frame: float = ONE_FRAME) -> float:
         """Return the share of the handle's target that applies at a scene time: 0 to 1, smooth for a fading handle."""
@@ -145,6 +155,8 @@ class Goal(NamedTuple):
     """[n, 4] rotations of the nodes beyond the rigid motion."""
     leaning: float | None = None
     """None: rotations are fixed. A number: they are pulled towards the goal, as a stiffness pulls positions."""
+    free: bool = False
+    """Whether the nodes move as a rigid body whose centre follows the goal and whose rotation is the solver's."""
 
     @property
     def is_identity(self) -> bool:
@@ -184,6 +196,7 @@ def carried_goal(
     then: np.ndarray,
     now: np.ndarray,
     to_units: tuple[np.ndarray, float],
+    turned: bool = True,
 ) -> Goal:
     """Carry a handle's target from its own time to another instant by the rigid motion of its nodes.
 
@@ -193,6 +206,7 @@ def carried_goal(
         then, now: [M, 3] control points at the handle's time and at the requested instant, normalised units; the same
             object if the two are equal.
         to_units: (centre, scale) of the normalised scene.
+        turned: whether any target or keyframe of the edit turns the handle.
     """
     centre, scale = to_units
     nodes = np.array(handle.nodes, np.int64)
@@ -214,7 +228,8 @@ def carried_goal(
     if share < 1.0:
         leaning = _clamp_stiffness(HALFWAY_STIFFNESS * share / (1.0 - share))
         stiffness = leaning if stiffness is None else _clamp_stiffness(stiffness * share)
-    return Goal(nodes, pivot, quat, translation, stiffness, handle.gives_rotation, leaning=leaning)
+    gives_rotation, free = handle.gives_rotation(turned), handle.moves_freely(turned)
+    return Goal(nodes, pivot, quat, translation, stiffness, gives_rotation, leaning=leaning, free=free)
 
 
 def _clamp_stiffness(stiffness: float) -> float:
@@ -233,11 +248,18 @@ def anchors_at(goals: Sequence[Goal], pins: np.ndarray, rest: np.ndarray, share:
     hard, turned, soft, leaning = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count), np.zeros(count)
     positions, rotations = rest.copy(), np.tile(np.eye(3), (count, 1, 1))
     hard[pins] = turned[pins] = True
+    label, arms, centers = np.full(count, -1, np.int64), np.zeros((count, 3)), []
     for goal in goals:
         at, turns = goal.pose_at(rest, share)
+        label[goal.nodes] = len(centers) if goal.free else -1
+        if goal.free:
+            arms[goal.nodes] = rest[goal.nodes] - rest[goal.nodes].mean(0)
+            centers.append(at.mean(0))
         positions[goal.nodes], rotations[goal.nodes] = at, turns
         hard[goal.nodes] = goal.stiffness is None
         soft[goal.nodes] = 0.0 if goal.stiffness is None else goal.stiffness
-        turned[goal.nodes] = goal.gives_rotation and goal.leaning is None
-        leaning[goal.nodes] = goal.leaning if goal.gives_rotation and goal.leaning is not None else 0.0
-    return Anchors(hard, soft, turned, positions, rotations, leaning)
+        told = goal.gives_rotation or goal.free
+        turned[goal.nodes] = told and goal.leaning is None
+        leaning[goal.nodes] = goal.leaning if told and goal.leaning is not None else 0.0
+    groups = RigidGroups(label, arms, np.array(centers).reshape(-1, 3))
+    return Anchors(hard, soft, turned, positions, rotations, leaning, groups)

@@ -28,6 +28,7 @@ from .graph import ControlGraph
 from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
 from .pose import NodePose
+from .rotations import IDENTITY, conjugate, mean, multiply
 
 HISTORY = 1000
 """Number of steps that can be undone, so that a session which is open for days does not grow without limit."""
@@ -184,6 +185,16 @@ class EditSession:
             return np.array(handle.pivot)
         positions = self.engine.base_at(self.edit, handle.time).positions
         return self.engine.to_world(positions[list(handle.nodes)].mean(0))
+
+    def rotation_of(self, name: str, time: float, at: float | None = None, *, live: bool = False) -> np.ndarray:
+        """Return how far a handle's control points are turned at a scene time, [4] wxyz, relative to the motion. For a
+        handle that moves as a free body this is what the solver found."""
+        nodes = list(self._handle(name).nodes)
+        bent = self._bend(time, at, live)
+        if bent is None:
+            return IDENTITY.copy()
+        base = self.engine.base_at(self.edit, min(max(float(time), 0.0), 1.0))
+        return mean(multiply(bent.turns[nodes], conjugate(base.turns[nodes]))[:, None])[0]
 
     def pin(self, nodes: Iterable[int]) -> None:
         """Pin nodes, so that they follow the motion alone."""

@@ -23,6 +23,7 @@ from scipy.sparse.linalg import splu
 from ..kernels import arap_solver as kernels
 from ..runtime.launch import launch
 from .graph import ControlGraph
+from .rigid_groups import GroupRotations, GroupState, RigidGroups
 from .rotations import exponential, from_matrix, logarithm, to_matrix
 
 SMOOTHNESS = 0.3
@@ -37,6 +38,8 @@ MAX_STEPS = 48
 """Largest number of sub-steps; a handle that is dragged very far takes longer ones."""
 STEP_ITERATIONS = 6
 FINAL_ITERATIONS = 60
+FREE_ITERATIONS = 200
+"""Replaces ``FINAL_ITERATIONS`` if a group turns freely, because a whole limb then swings into place."""
 TURN_ITERATIONS = 8
 TOLERANCE = 1e-4
 """Convergence threshold in edge lengths: iterations stop when no node moves further in one iteration."""
@@ -59,6 +62,11 @@ class Anchors(NamedTuple):
     """[M, 3, 3], read only where ``turned`` or ``leaning`` is set."""
     leaning: np.ndarray
     """[M] >= 0 weight that pulls a node to its rotation, as ``soft`` does for positions."""
+    groups: RigidGroups
+    """Nodes that move as free rigid bodies; their positions and rotations above are not read."""
+
+    def equals(self, other: Anchors) -> bool:
+        return all(np.array_equal(a, b) for a, b in zip(self[:-1], other[:-1])) and self.groups.equals(other.groups)
 
 
 @dataclass
@@ -152,17 +160,18 @@ class ArapSolver:
         system = self._system(anchors)
         start = torch.from_numpy(np.ascontiguousarray(rest))
         positions = np.where(anchors.hard[:, None], anchors.positions, shape.positions)
-        posed, rotations = torch.from_numpy(positions), torch.from_numpy(self._guess(system, anchors, shape))
-        targets = torch.from_numpy(np.ascontiguousarray(anchors.positions))
+        groups = self._groups(system, anchors, rest)
+        posed, rotations = torch.from_numpy(positions), torch.from_numpy(self._guess(system, anchors, shape, groups))
+        targets = torch.from_numpy(anchors.positions.copy())
         asked = self._asked(anchors)
         spare = rotations.clone()
+        groups.start(GroupState(positions, rotations.numpy(), targets.numpy(), asked[1].numpy()))
         edges = self._begin, self._neighbors, self._weights
         free = system.free.long().numpy()
         sums = torch.empty(len(free), 3, dtype=torch.float64)
         smooth = self.smoothness * self.graph.edge_length**2
         tolerance = TOLERANCE * self.graph.edge_length
-        old = shape.anchors
-        same = old is not None and all(np.array_equal(a, b) for a, b in zip(old, anchors))
+        same = shape.anchors is not None and anchors.equals(shape.anchors)
         for step in range(1 if same else 0, iterations + 1):
             if step:
                 inputs = system.turning, start, posed, *edges
@@ -173,25 +182,36 @@ class ArapSolver:
             stretch = self.stretch if step else 0.0  # edges of moved nodes have no valid direction yet
             inputs = system.free, system.fixed, start, posed, *edges, stretch, rotations
             launch(kernels.edge_sums, len(free), *inputs, system.pulls, targets, sums, grain=128)
-            solved = system.factor.solve(sums.numpy())
-            moved = float(np.abs(solved - positions[free]).max(initial=0.0))
-            positions[free] = solved
+            before = positions.copy()
+            positions[free] = system.factor.solve(sums.numpy())
+            state = GroupState(positions, rotations.numpy(), targets.numpy(), asked[1].numpy())
+            groups.turn(state, before, stretch)
+            spare[groups.turned] = rotations[groups.turned]
+            moved = float(np.abs(positions[free] - before[free]).max(initial=0.0))
             if step and not moved > tolerance:
                 break
         return Shape(positions, rotations.numpy(), anchors)
 
+    def _groups(self, system: _System, anchors: Anchors, rest: np.ndarray) -> GroupRotations:
+        free = system.free.long().numpy()
+        weights = self.stretch, self.smoothness * self.graph.edge_length**2
+        return GroupRotations(
+            self.graph, anchors.groups, rest, anchors.turned, free, system.factor, system.pulls.numpy(), *weights
+        )
+
     def _asked(self, anchors: Anchors) -> tuple[torch.Tensor, torch.Tensor]:
         """Return weights [M] and values [M, 3, 3] of the rotations that nodes are pulled to."""
         weights = anchors.leaning * self._degree * self.graph.edge_length**2
-        return torch.from_numpy(weights), torch.from_numpy(np.ascontiguousarray(anchors.rotations))
+        return torch.from_numpy(weights), torch.from_numpy(anchors.rotations.copy())
 
-    def _guess(self, system: _System, anchors: Anchors, shape: Shape) -> np.ndarray:
+    def _guess(self, system: _System, anchors: Anchors, shape: Shape, groups: GroupRotations) -> np.ndarray:
         """Guess rotations [M, 3, 3]. Fixed rotations are those of the anchors; the others are those of ``shape``,
         turned by the harmonic interpolation of the anchors' turns since ``shape``."""
-        turns = np.where(anchors.turned[:, None, None], anchors.rotations, shape.rotations)
+        told = anchors.turned & ~anchors.groups.members
+        turns = np.where(told[:, None, None], anchors.rotations, shape.rotations)
         further = np.zeros((len(turns), 3))
         given = np.flatnonzero(anchors.turned)
-        wanted = np.flatnonzero(anchors.turned | (anchors.leaning > 0))
+        wanted = np.flatnonzero(told | ((anchors.leaning > 0) & ~anchors.groups.members))
         change = anchors.rotations[wanted] @ shape.rotations[wanted].transpose(0, 2, 1)
         further[wanted] = logarithm(from_matrix(change))
         if system.factor is None or not further.any():
@@ -201,6 +221,10 @@ class ArapSolver:
         held = np.where(anchors.hard[:, None], further, 0.0)
         sums = (self.graph.matrix @ held) + pulls * further
         further[free] = system.factor.solve(np.ascontiguousarray(sums[free]))
+        if len(groups.rotations):
+            groups.spread_turns(self.graph, further, system.factor)
+            given = np.flatnonzero(told)
+            free = np.union1d(free, groups.turned)
         turning = np.setdiff1d(free, given)
         turns[turning] = to_matrix(exponential(further[turning])) @ turns[turning]
         return turns
@@ -217,7 +241,9 @@ class ArapSolver:
         shape = Shape.at_rest(rest)
         for step in range(1, steps + 1):
             last = step == steps
-            shape = self.relax(rest, path(step / steps), shape, FINAL_ITERATIONS if last else STEP_ITERATIONS)
+            anchors = path(step / steps)
+            final = FREE_ITERATIONS if len(anchors.groups.centers) else FINAL_ITERATIONS
+            shape = self.relax(rest, anchors, shape, final if last else STEP_ITERATIONS)
         return shape
 
     def turns(self, rest: np.ndarray, posed: np.ndarray) -> np.ndarray:
@@ -245,7 +271,7 @@ class ArapSolver:
         free_components = np.setdiff1d(graph.component, graph.component[held])
         labels, first = np.unique(graph.component, return_index=True)
         hard[first[np.isin(labels, free_components)]] = True
-        system = self._system(Anchors(hard, none, ~hard, rest, rotations, none))
+        system = self._system(Anchors(hard, none, ~hard, rest, rotations, none, RigidGroups.none(len(graph))))
         positions = rest.copy()
         free = system.free.long().numpy()
         if system.factor is not None:

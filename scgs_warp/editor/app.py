@@ -287,7 +287,7 @@ class Editor:
             self.gizmo_frame = gizmo_pose.frame_of_selection(self.session, model.selection, moment)
         else:
             target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
-            self.gizmo_frame = gizmo_pose.frame_of_handle(self.session, handle, moment.time), target
+            self.gizmo_frame = gizmo_pose.frame_of_handle(self.session, handle, moment), target
         frame, target = self.gizmo_frame
         position, wxyz = frame.pose(target)
         self.overlays.place_gizmo((self.display.show(position), wxyz))

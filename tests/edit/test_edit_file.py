@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,7 +13,7 @@ from helpers.edit_scenes import bar_scene, dress
 from helpers.edit_scripts import SCRIPT, changed
 from scgs_warp.edit import Edit, EditSession, Film
 from scgs_warp.edit.edit_file import parse, read
-from scgs_warp.edit.rotations import from_axis
+from scgs_warp.edit.rotations import angle, from_axis
 from scgs_warp.errors import UserError
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
 from scgs_warp.scene.from_gaussians import open_gaussians
@@ -36,7 +38,7 @@ def test_a_script_is_read(session):
     ("path", "value", "words"),
     [
         ("format", "gif", "format"),
-        ("version", 2, "version"),
+        ("version", 3, "version"),
         ("handles", {}, "handles"),
         ("handles.0", 3, r"handles\[0\]"),
         ("handles.0.name", "", r"handles\[0\].name"),
@@ -180,3 +182,35 @@ def ply(tmp_path) -> Path:
     generator = torch.Generator().manual_seed(0)
     write_gaussian_ply(path, dress(torch.randn(300, 3, generator=generator), degree=1).activate())
     return path
+
+
+OLD = Path(__file__).parents[1] / "fixtures" / "edits-3132a41"
+"""Edits of version 1 of the bar, and the poses that 3132a41 computed for them."""
+
+
+@pytest.mark.parametrize("name", ["several-nodes-shifted", "one-node", "soft-and-fading"])
+def test_version_1_keeps_its_meaning(session, name, tmp_path):
+    edit, poses = read(OLD / f"{name}.json", session.engine), np.load(OLD / f"{name}.npz")
+    assert all(handle.turns is not None for handle in edit.handles)
+    assert len(edit.handles) + len(edit.targets) >= 2
+    again = EditSession(session.scene, edit)
+    again.save(tmp_path / "saved.json")
+    assert json.loads((tmp_path / "saved.json").read_text())["version"] == 2
+    again.load(tmp_path / "saved.json")
+    assert again.edit == edit
+    for time, positions, turns in zip(poses["times"], poses["positions"], poses["turns"]):
+        bent = again.engine.bend(again.edit, float(time))
+        np.testing.assert_allclose(bent.positions, positions, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(bent.turns, turns, rtol=0, atol=1e-12)
+
+
+def test_version_2_leaves_the_rotation_to_the_solver(session):
+    content = json.loads((OLD / "several-nodes-shifted.json").read_text())
+    old, new = (parse({**content, "version": version}, "edit", session.engine) for version in (1, 2))
+    assert old.handles[0].turns is True and new.handles[0].turns is None
+    nodes = list(new.handles[0].nodes)
+    held, free = (session.engine.bend(edit, 0.0).turns[nodes] for edit in (old, new))
+    assert angle(held).max() == 0.0 and angle(free).min() > 0.05
+    explicit = parse({**content, "version": 2, "handles": [{**content["handles"][0], "turns": True}]}, "edit",
+                     session.engine)  # fmt: skip
+    assert explicit == old

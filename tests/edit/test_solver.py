@@ -14,6 +14,7 @@ from reference import editing as twin
 from scgs_warp.edit import ArapSolver, EditSession
 from scgs_warp.edit.graph import ControlGraph
 from scgs_warp.edit.handles import Goal, anchors_at
+from scgs_warp.edit.rigid_groups import RigidGroups
 from scgs_warp.edit.rotations import IDENTITY, angle, from_axis, from_matrix, rotate
 from scgs_warp.edit.solver import Anchors, Shape, count_steps
 from scgs_warp.runtime import environment
@@ -39,7 +40,9 @@ def test_one_iteration_is_that_of_the_twin(seed, stretch, smooth):
     posed = rest + 4.0 * random.normal(size=rest.shape)
     hard = np.arange(40) < 10
     soft = np.where(np.arange(40) % 7 == 6, 0.3, 0.0)
-    anchors = Anchors(hard, soft, np.zeros(40, bool), posed + 0.0, np.tile(np.eye(3), (40, 1, 1)), np.zeros(40))
+    anchors = Anchors(
+        hard, soft, np.zeros(40, bool), posed + 0.0, np.tile(np.eye(3), (40, 1, 1)), np.zeros(40), RigidGroups.none(40)
+    )
     found = ArapSolver(graph, smooth, stretch).relax(rest, anchors, Shape(posed, anchors.rotations), 1)
     pulls = soft * np.diff(graph.begin)
     guessed = twin.place_nodes(graph, rest, posed, anchors.rotations, hard, pulls, posed, 0.0)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 
-from helpers.editor_models import chosen, client, new_model
+from helpers.editor_models import LEFT, chosen, client, new_model
 from scgs_warp.edit import Target
 from scgs_warp.edit.handles import STAY
-from scgs_warp.edit.rotations import from_axis
+from scgs_warp.edit.rotations import angle, from_axis, multiply
 from scgs_warp.editor.frame_image import take_picture
 from scgs_warp.editor.gizmo_pose import frame_of_handle, frame_of_selection, region_at, surface_point
 from scgs_warp.editor.model import EditorModel, Region
@@ -59,10 +62,37 @@ def test_the_gizmo_says_what_the_target_says(model):
     model.release()
     session = model.session
     for time in (0.0, 0.7):
-        place = frame_of_handle(session, session.edit.handles[0], time)
+        place = frame_of_handle(session, session.edit.handles[0], dataclasses.replace(model.moment(), time=time))
         back = place.target(*place.pose(target))
         assert back.translation == pytest.approx(target.translation, abs=1e-9)
         assert back.rotation == pytest.approx(target.rotation, abs=1e-9)
         where = session.node_positions(time)[list(model.selection)].mean(0)
         assert place.pose(target)[0] == pytest.approx(where, abs=5e-3), "it stands on what it holds"
     assert place.target(place.pivot, np.array([1.0, 1e-20, 0, 0])).is_identity, "noise is no rotation"
+
+
+def test_an_arc_turns_a_free_handle_on_from_where_the_solver_put_it(model):
+    model.session.pin(chosen(model, LEFT, 2))
+    model.select(chosen(model))
+    model.grab(STAY)
+    model.drag(Target.of((0.0, 0.0, 0.25)))
+    model.release()
+    session, handle = model.session, model.session.edit.handles[0]
+    for time in (0.0, 0.6):
+        moment = dataclasses.replace(model.moment(), time=time)
+        place, shifted = frame_of_handle(session, handle, moment), session.edit.targets[handle.name]
+        position, wxyz = place.pose(shifted)
+        assert angle(place.free_turn) > math.radians(5), "the solver turned it"
+        assert wxyz == pytest.approx(session.rotation_of(handle.name, time), abs=1e-6)
+        assert place.target(position + np.array([0.1, 0.0, 0.0]), wxyz).rotation == (1.0, 0.0, 0.0, 0.0), (
+            "a shift leaves it free"
+        )
+    place = frame_of_handle(session, handle, model.moment())
+    before = session.node_positions(0.0)
+    arc = from_axis([1, 0, 0], 0.5)
+    turned = place.target(place.pose(shifted)[0], multiply(arc, place.pose(shifted)[1]))
+    model.grab(shifted)
+    model.drag(turned)
+    model.release()
+    assert np.abs(session.node_positions(0.0) - before).max() < 0.02, "half a degree does not make it jump"
+    assert frame_of_handle(session, handle, model.moment()).free_turn is None

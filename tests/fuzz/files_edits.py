@@ -23,7 +23,7 @@ from scgs_warp.scene.scene import Scene
 from scgs_warp.visualization.video import film, write_png
 
 EDIT = {
-    "format": "scgs-warp edit", "version": 1, "comment": "all there is",
+    "format": "scgs-warp edit", "version": 2, "comment": "all there is",
     "scene": {"control_points": 20},
     "handles": [
         {"name": "tip", "nodes": {"point": [1.0, -1.0, 0.25], "rings": 1}, "time": 0.0, "pivot": [0.9, -1.0, 0.25]},

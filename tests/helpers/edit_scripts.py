@@ -6,7 +6,7 @@ import copy
 
 SCRIPT = {
     "format": "scgs-warp edit",
-    "version": 1,
+    "version": 2,
     "comment": "the right end is raised and lowered",
     "handles": [
         {"name": "right", "nodes": {"point": [1.1, -1, 0.25], "rings": 1}, "time": 0.0, "pivot": [0.8, -1, 0.25]},
