@@ -29,6 +29,7 @@ from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
 from .pose import NodePose
 from .rotations import IDENTITY, conjugate, mean, multiply
+from .skeleton import Part, find_skeleton
 
 HISTORY = 1000
 """Number of steps that can be undone, so that a session which is open for days does not grow without limit."""
@@ -56,6 +57,7 @@ class EditSession:
         self._past: deque[Edit] = deque(maxlen=HISTORY)
         self._future: list[Edit] = []
         self._before_drag: Edit | None = None
+        self._parts: dict[int | None, tuple[Part, ...]] = {}
 
     def __len__(self) -> int:
         """Return the number of control points."""
@@ -135,6 +137,18 @@ class EditSession:
         K, viewmat = camera.K.double().cpu().numpy(), camera.viewmat.double().cpu().numpy()
         ray = np.array([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], 1.0])
         return viewmat[:3, :3].T @ (float(image.depth[row, column]) * ray - viewmat[:3, 3])
+
+    def parts(self, count: int | None = None) -> tuple[Part, ...]:
+        """Return the parts that moved rigidly together over the trained motion, with their joints.
+
+        Args:
+            count: number of parts; None: as many as turn against their neighbours.
+        """
+        found = self._parts.get(count)
+        if found is None:
+            indices, weights = (part.cpu().numpy() for part in self.engine.binding)
+            found = self._parts[count] = find_skeleton(self.scene, (indices, weights), count)
+        return found
 
     def _nodes(self, nodes: Iterable[int]) -> tuple[int, ...]:
         chosen = tuple(sorted({int(node) for node in nodes}))

@@ -1,0 +1,164 @@
+"""Parts of a moving body: sets of control points that moved rigidly together over the trained motion.
+
+Patches merge in three stages. First those whose union moves most rigidly (Ward's criterion), pairwise in rounds, down
+to a few dozen parts. Then patches change to a neighbouring part whose motion explains theirs better, so that early
+mistakes do not last. Last, neighbouring parts merge in the order of the angle by which they turn against each other,
+until every pair turns by more than ``LEAST_TURN``. An angle, other than a distance, neither favours large parts nor
+splits a body whose surface drifts slowly, and so the number of parts follows from the motion.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from .patches import Moments, Motions, Patches
+
+LEAST_TURN = math.radians(15.0)
+"""Largest angle by which two neighbouring parts may turn against each other and still be one part."""
+FIRST_PARTS = 90
+"""Number of parts at which merging by angle begins."""
+BOUNDARY_COST = 1.7e-3
+"""Distance, relative to the scene's size, by which a patch may be off before a boundary edge is cheaper."""
+MIN_PATCHES = 3
+"""Number of patches below which a part joins a neighbour: the skin between two parts moves half with each."""
+SWEEPS = 10
+ROBUST_FITS = 2
+
+
+def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
+    """Label patches by part, [P], numbered by decreasing size.
+
+    Args:
+        count: number of parts; None: chosen by the angles between them. A body that falls apart has at least as many
+            parts as pieces.
+    """
+    first = max(FIRST_PARTS, 3 * count if count else 0)
+    labels = _merge_by_cost(patches, first)
+    while True:
+        labels = _refined(patches, labels)
+        parts = int(labels.max()) + 1
+        if count is not None and parts <= count:
+            break
+        pairs = _neighbors(patches.edges, labels)
+        if not len(pairs):
+            break
+        turns = relative_turns(*fit_parts(patches, labels), pairs)
+        sizes = np.bincount(labels)
+        small = np.minimum(sizes[pairs[:, 0]], sizes[pairs[:, 1]]) < MIN_PATCHES
+        chosen = int(np.where(small, turns - 2.0 * math.pi, turns).argmin())
+        if count is None and turns[chosen] > LEAST_TURN and not small[chosen]:
+            break
+        labels = _renumbered(np.where(labels == pairs[chosen, 1], pairs[chosen, 0], labels))
+    sizes = np.bincount(labels, weights=patches.moments.count)
+    rank = np.empty(len(sizes), np.int64)
+    rank[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))
+    return rank[labels]
+
+
+def fit_parts(patches: Patches, labels: np.ndarray) -> tuple[Moments, Motions]:
+    """Fit the motion of each part. Patches that it explains badly count less: the skin at a joint moves half with each
+    of two parts."""
+    parts, moments = int(labels.max()) + 1, patches.moments
+    own = np.arange(len(labels)), labels
+    weights = np.ones(len(labels))
+    for _ in range(ROBUST_FITS):
+        motions = moments.scaled(weights).pooled(labels, parts).motions()
+        off = moments.errors_under(motions)[own] / moments.count
+        usual = np.array([np.median(off[labels == part]) for part in range(parts)])[labels]
+        weights = 1.0 / (1.0 + off / np.maximum(usual, 1e-30))
+    pooled = moments.scaled(weights).pooled(labels, parts)
+    return pooled, pooled.motions()
+
+
+def _largest_turn(base: np.ndarray, own: np.ndarray, spread: np.ndarray) -> float:
+    """Return the largest turn of ``own`` [T, 3, 3] against ``base`` between two instants, radians.
+
+    It is the distance by which the turn moves a body's points about their centre, relative to the largest distance for
+    that angle about any axis: a turn of a thin body about its own axis hardly counts.
+
+    Args:
+        spread: [3, 3] covariance of the body's points in the reference pose.
+    """
+    relative = np.einsum("tki,tkj->tij", base, own)
+    change = (relative[:, None] - relative[None]).reshape(-1, 3, 3)
+    most = float(np.linalg.eigvalsh(spread)[1:].sum())
+    moved = ((change @ spread) * change).sum((1, 2)).max() / max(most, 1e-300)
+    return 2.0 * math.asin(min(0.5 * math.sqrt(max(float(moved), 0.0)), 1.0))
+
+
+def relative_turns(moments: Moments, motions: Motions, pairs: np.ndarray) -> np.ndarray:
+    """Return the largest turn of one body against another between two instants, [E] radians, for pairs [E, 2]. Of the
+    two bodies' values the smaller is taken."""
+    spreads, rotations = moments.covariance(), motions.rotations
+    both = [(rotations[a], rotations[b], spreads[a], spreads[b]) for a, b in pairs.tolist()]
+    return np.array([min(_largest_turn(a, b, second), _largest_turn(b, a, first)) for a, b, first, second in both])
+
+
+def _neighbors(edges: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Return the pairs of neighbouring labels, [E, 2]."""
+    ends = np.sort(labels[edges], axis=1)
+    return np.unique(ends[ends[:, 0] != ends[:, 1]], axis=0)
+
+
+def _renumbered(labels: np.ndarray) -> np.ndarray:
+    return np.unique(labels, return_inverse=True)[1].reshape(-1)
+
+
+def _merge_by_cost(patches: Patches, count: int) -> np.ndarray:
+    """Merge neighbours whose union adds least to the error, until ``count`` parts are left. In each round, those pairs
+    merge that are each other's best choice."""
+    labels = np.arange(len(patches.nodes))
+    while labels.max(initial=0) >= count:
+        parts = int(labels.max()) + 1
+        moments, pairs = patches.moments.pooled(labels, parts), _neighbors(patches.edges, labels)
+        if not len(pairs):
+            break
+        errors = moments.errors()
+        first, second = pairs.T
+        cost = moments.take(first).plus(moments.take(second)).errors() - errors[first] - errors[second]
+        order = np.lexsort((second, first, cost))
+        labels = _merged(labels, pairs[order], parts - count)
+    return labels
+
+
+def _merged(labels: np.ndarray, pairs: np.ndarray, most: int) -> np.ndarray:
+    """Merge pairs, best first, of which neither end has a better partner; at most ``most`` of them."""
+    parts = int(labels.max()) + 1
+    into, seen, merged = np.arange(parts), np.zeros(parts, bool), 0
+    for first, second in pairs.tolist():
+        if not seen[first] and not seen[second] and merged < most:
+            into[second] = first
+            merged += 1
+        seen[first] = seen[second] = True
+    return _renumbered(into[labels])
+
+
+def _refined(patches: Patches, labels: np.ndarray) -> np.ndarray:
+    """Move patches to the neighbouring part whose motion explains theirs best, until none changes; then number the
+    connected pieces."""
+    count = len(labels)
+    ends = np.concatenate([patches.edges, patches.edges[:, ::-1]])
+    graph = csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    price = patches.moments.count.mean() * (BOUNDARY_COST * patches.size) ** 2
+    even = np.arange(count) % 2 == 0
+    for _ in range(SWEEPS):
+        parts = int(labels.max()) + 1
+        errors = patches.moments.errors_under(patches.moments.pooled(labels, parts).motions())
+        changed = labels.copy()
+        for turn in (even, ~even):
+            own = np.zeros((count, parts))
+            own[np.arange(count), changed] = 1.0
+            near = np.asarray(graph @ own)
+            cost = np.where(near + own > 0, errors - price * near, np.inf)
+            changed[turn] = cost.argmin(1)[turn]
+        changed = _renumbered(changed)
+        if np.array_equal(changed, labels):
+            break
+        labels = changed
+    same = patches.edges[labels[patches.edges[:, 0]] == labels[patches.edges[:, 1]]]
+    within = coo_matrix((np.ones(len(same)), (same[:, 0], same[:, 1])), shape=(count, count))
+    return connected_components(within, directed=False)[1].astype(np.int64)

@@ -1,0 +1,195 @@
+"""Parts and joints found in a motion, against the bones that made it."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+
+from helpers.edit_scenes import bar_scene, figure_scene
+from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
+from scgs_warp.edit import EditSession
+from scgs_warp.edit.joints import find_joints
+from scgs_warp.edit.parts import LEAST_TURN, find_parts, relative_turns
+from scgs_warp.edit.patches import Moments, Patches, make_patches
+from scgs_warp.edit.rotations import from_axis, rigid_fit, rotate, to_matrix
+from scgs_warp.runtime import environment
+
+TIMES = np.linspace(0.0, 1.0, 16)
+
+
+def chain(angles: list[float], seed: int = 0, noise: float = 0.0) -> tuple[Patches, np.ndarray, np.ndarray]:
+    """A rod along x of segments of length 1. Each segment swings about a joint at its start: the first about y, the
+    next about z, and so on, by these angles in degrees between two instants. Patches are 10 along each segment, 60
+    Gaussians each. Returns patches, the segment of each patch, and the joints at rest."""
+    random = np.random.default_rng(seed)
+    count = 600 * (len(angles) + 1)
+    rest = random.random((count, 3)) * [len(angles) + 1, 0.3, 0.3] - [0.0, 0.15, 0.15]
+    segment = rest[:, 0].astype(int)
+    tracks = []
+    for time in TIMES:
+        points, place = rest.copy(), np.eye(4)
+        for index in range(len(angles)):
+            degrees = angles[index] * 0.5 * (1.0 - math.cos(2.0 * math.pi * time))
+            turn = np.eye(4)
+            turn[:3, :3] = to_matrix(from_axis((0, 1, 0) if index % 2 == 0 else (0, 0, 1), degrees))
+            there = np.eye(4)
+            there[0, 3] = index + 1.0
+            place = place @ there @ turn @ np.linalg.inv(there)
+            own = segment == index + 1
+            points[own] = rest[own] @ place[:3, :3].T + place[:3, 3]
+        tracks.append(points + noise * random.normal(size=points.shape))
+    at = rest[:, 0] * 10.0 - 0.5
+    low = np.floor(at).clip(0, 10 * (len(angles) + 1) - 2)
+    indices = np.stack([low, low + 1], 1).astype(np.int64)
+    share = (at - low).clip(0.0, 1.0)
+    patches = make_patches(np.stack(tracks), indices, np.stack([1.0 - share, share], 1))
+    joints = np.array([[index + 1.0, 0.0, 0.0] for index in range(len(angles))])
+    return patches, np.arange(10 * (len(angles) + 1)) // 10, joints
+
+
+def same_partition(first: np.ndarray, second: np.ndarray) -> bool:
+    return len(set(zip(first.tolist(), second.tolist()))) == len(set(first.tolist())) == len(set(second.tolist()))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_moments_give_the_fits_of_the_points(seed):
+    random = np.random.default_rng(seed)
+    tracks = random.normal(size=(5, 60, 3)) + 3.0
+    label = np.sort(random.integers(0, 4, 60))
+    patches = make_patches(tracks, np.stack([label, label], 1), np.tile([1.0, 0.0], (60, 1)))
+    moments, motions = patches.moments, patches.moments.motions()
+    expected = np.zeros(4)
+    for body in range(4):
+        own = tracks[:, label == body] - patches.centre
+        for time in range(5):
+            quat, before, after = rigid_fit(own[0], own[time])
+            np.testing.assert_allclose(motions.rotations[body, time], to_matrix(quat), atol=1e-9)
+            placed = rotate(quat, own[0] - before) + after
+            np.testing.assert_allclose(
+                own[0] @ motions.rotations[body, time].T + motions.shifts[body, time], placed, atol=1e-9
+            )
+            expected[body] += ((placed - own[time]) ** 2).sum() / 5
+        np.testing.assert_allclose(moments.covariance()[body], np.cov(own[0].T, bias=True), atol=1e-9)
+    np.testing.assert_allclose(moments.errors(), expected, atol=1e-9)
+    cross = moments.errors_under(motions)
+    np.testing.assert_allclose(np.diag(cross), expected, atol=1e-9)
+    other = tracks[:, label == 2] - patches.centre
+    placed = np.einsum("tij,pj->tpi", motions.rotations[1], other[0]) + motions.shifts[1][:, None]
+    assert cross[2, 1] == pytest.approx(((placed - other) ** 2).sum() / 5)
+    union = moments.pooled(np.zeros(4, int), 1)
+    assert isinstance(union, Moments) and union.count[0] == 60
+    np.testing.assert_allclose(
+        union.cross[0, 3], (tracks[3] - patches.centre).T @ (tracks[0] - patches.centre), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_chain_falls_into_its_segments(noise):
+    patches, segment, joints = chain([40.0, 25.0, 60.0], noise=noise)
+    labels = find_parts(patches)
+    assert same_partition(labels, segment), labels
+    found = find_joints(patches, labels)
+    of = [int(labels[segment == index][0]) for index in range(4)]
+    edges = {frozenset((part, joint.parent)) for part, joint in enumerate(found) if joint.parent >= 0}
+    assert edges == {frozenset(pair) for pair in pairwise(of)}, "a chain"
+    roots = [part for part, joint in enumerate(found) if joint.parent < 0]
+    assert len(roots) == 1 and roots[0] in of[1:3], "the root is in the middle"
+    for index, (degrees, point) in enumerate(zip((40.0, 25.0, 60.0), joints)):
+        joint = next(j for p, j in enumerate(found) if {p, j.parent} == {of[index], of[index + 1]})
+        assert np.linalg.norm((joint.point - point)[[0, 2] if index % 2 == 0 else [0, 1]]) < 0.03
+        assert math.degrees(joint.turn) == pytest.approx(degrees, abs=4)
+        assert joint.axis is not None
+        assert abs(joint.axis[1 if index % 2 == 0 else 2]) > math.cos(math.radians(10)), "the axis of the hinge"
+        assert joint.confidence > 0.9 and joint.play < 0.03
+
+
+def test_what_turns_by_less_than_the_limit_is_one_part():
+    patches, _, _ = chain([12.0, 30.0])
+    assert find_parts(patches).max() == 1
+    patches, _, _ = chain([3.0, 2.0])
+    assert find_parts(patches).max() == 0
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_the_number_of_parts_can_be_given(count):
+    patches, segment, _ = chain([40.0, 25.0, 60.0])
+    labels = find_parts(patches, count)
+    assert labels.max() + 1 == count
+    if count < 4:
+        pairs = set(zip(segment.tolist(), labels.tolist()))
+        assert len(pairs) <= 5, "segments stay together"
+
+
+def test_a_joint_that_never_bent_is_in_the_middle_of_the_boundary():
+    patches, segment, _ = chain([0.0])
+    (joint,) = [joint for joint in find_joints(patches, segment) if joint.parent >= 0]
+    assert joint.confidence == 0.0 and joint.axis is None
+    np.testing.assert_allclose(joint.point, [1.0, 0.0, 0.0], atol=0.05)
+
+
+def test_pieces_are_parts_and_crumbs_belong_to_the_nearest():
+    patches, segment, _ = chain([0.0])
+    cut = patches.edges[(segment[patches.edges][:, 0]) == (segment[patches.edges][:, 1])]
+    apart = patches._replace(edges=cut)
+    labels = find_parts(apart)
+    assert same_partition(labels, segment)
+    assert [joint.parent for joint in find_joints(apart, labels)] == [-1, -1]
+    tracks = np.random.default_rng(0).random((3, 400, 3))
+    tracks[:, 390:] += 20.0
+    index = np.arange(400) // 40
+    index[390:] = 10
+    both = np.stack([index, np.minimum(index + 1, 9)], 1)
+    assert 10 in make_patches(tracks, both, np.tile([0.7, 0.3], (400, 1))).edges, "a crumb is connected"
+
+
+def test_relative_turns_measure_the_swing_and_not_the_twist():
+    random = np.random.default_rng(0)
+    rest = np.concatenate([random.normal(size=(200, 3)), random.normal(size=(200, 3)) * [0.05, 0.05, 2.0] + 5.0])
+    for axis, least, most in (((1, 0, 0), 28, 32), ((0, 0, 1), 0, 3)):
+        turned = rest.copy()
+        turned[200:] = rotate(from_axis(axis, 30), rest[200:] - 5.0) + 5.0
+        index = np.repeat([0, 1], 200)
+        patches = make_patches(np.stack([rest, turned]), np.stack([index, index], 1), np.tile([1.0, 0.0], (400, 1)))
+        found = relative_turns(patches.moments, patches.moments.motions(), np.array([[0, 1]]))
+        assert least <= math.degrees(found[0]) <= most
+    assert math.degrees(LEAST_TURN) == pytest.approx(15)
+
+
+@pytest.mark.parametrize("nodes", [256, 512])
+def test_the_figure_falls_into_its_bones(nodes):
+    scene, world, bones = figure_scene(nodes)
+    session = EditSession(scene)
+    parts = session.parts()
+    assert parts is session.parts()
+    owner = np.zeros(len(session), int)
+    for index, part in enumerate(parts):
+        owner[list(part.nodes)] = index
+    assert sorted(node for part in parts for node in part.nodes) == list(range(len(session)))
+    label = owner[session.engine.binding[0][:, 0].numpy()]
+    truth = np.where(bones == "neck", "torso", bones)
+    names, truth = np.unique(truth, return_inverse=True)
+    table = np.zeros((len(parts), len(names)), int)
+    np.add.at(table, (label, truth), 1)
+    agreed = table[linear_sum_assignment(-table)].sum()
+    assert agreed / len(world) > 0.85, (agreed / len(world), len(parts))
+    bone_of = {part.name: str(names[table[index].argmax()]) for index, part in enumerate(parts)}
+    joints = 0
+    for part in parts:
+        bone = bone_of[part.name]
+        parent = BONES[bone].parent
+        if part.parent and bone_of[part.parent] == ("torso" if parent == "neck" else parent):
+            assert np.linalg.norm(np.subtract(part.joint, bone_transforms(0.0)[bone][:3, 3])) < 0.05 * 2.35, bone
+            joints += 1
+    assert joints >= 10
+
+
+def test_parts_do_not_depend_on_threads(all_threads):
+    parts = []
+    for threads in (1, 2):
+        environment.configure(threads=threads)
+        parts.append(EditSession(bar_scene()).parts())
+    assert parts[0] == parts[1] and len(parts[0]) >= 2, "one half swings, the other rests"
