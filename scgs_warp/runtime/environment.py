@@ -19,7 +19,8 @@ def prepare_environment() -> None:
 
     OpenMP threads sleep instead of spinning between torch calls, because kernels use those cores meanwhile. cuBLAS gets
     a workspace of fixed size, which makes its sums reproducible. MKL is set to a mode whose results do not depend on
-    the number of threads; otherwise the gradient of a narrow layer would.
+    the number of threads; otherwise the gradient of a layer narrower than 64 would. On processors of other makers than
+    Intel MKL ignores that mode; there the project's own kernels, which run the networks on the CPU, keep the promise.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("KMP_BLOCKTIME", "0")

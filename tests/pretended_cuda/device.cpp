@@ -29,10 +29,28 @@ using at::Tensor;
 using c10::IValue;
 using torch::jit::Stack;
 
+// MKL, which torch_cpu contains in most builds for x86.
+extern "C" int MKL_Set_Num_Threads_Local(int) __attribute__((weak));
+
 namespace {
 
 constexpr c10::DeviceType CUDA = c10::DeviceType::CUDA;
 const c10::Device DEVICE(CUDA, 0);
+
+// On a GPU a product's rounding does not depend on the number of threads of the host. MKL's does on processors of other
+// makers than Intel, where it ignores MKL_CBWR's STRICT; so operations of this device are given one of its threads.
+class OneThreadOfMkl {
+public:
+    OneThreadOfMkl() {
+        if (MKL_Set_Num_Threads_Local) before = MKL_Set_Num_Threads_Local(1);
+    }
+    ~OneThreadOfMkl() {
+        if (MKL_Set_Num_Threads_Local) MKL_Set_Num_Threads_Local(before);
+    }
+
+private:
+    int before = 0;
+};
 
 // ---- Reports
 
@@ -272,7 +290,10 @@ void run(const c10::OperatorHandle& operation, Stack* stack) {
     if (graph) entry = {operation, on_host, {}, -1};
     const Stack before = on_host;
     stack->resize(begin);
-    operation.callBoxed(&on_host);
+    {
+        const OneThreadOfMkl one;
+        operation.callBoxed(&on_host);
+    }
     for (size_t at = 0; at < count; ++at) {
         const auto* alias = schema.arguments()[at].alias_info();
         if (alias && alias->isWrite() && given[at].isTensor() && given[at].toTensor().defined() &&
@@ -304,6 +325,7 @@ void run(const c10::OperatorHandle& operation, Stack* stack) {
 void fallback(const c10::OperatorHandle& operation, c10::DispatchKeySet, Stack* stack) { run(operation, stack); }
 
 void replay(const Graph& graph, void (*call)(int)) {
+    const OneThreadOfMkl one;
     for (const Entry& entry : graph.entries) {
         if (!entry.operation) {
             call(entry.call);

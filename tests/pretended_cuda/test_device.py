@@ -11,6 +11,7 @@ from pretended_cuda import ledger
 from pretended_cuda.torch_device import Graph
 from scgs_warp.ops.adam import first_not_finite_by_norm
 from scgs_warp.ops.neighbors import nearest
+from scgs_warp.runtime import environment
 from scgs_warp.runtime.cuda_graph import CudaGraph
 
 CUDA = torch.device("cuda:0")
@@ -43,6 +44,15 @@ def test_a_generator_belongs_to_a_device(device):
     torch.randn(3, device=device, generator=torch.Generator(device).manual_seed(0))
     with pytest.raises(RuntimeError, match="generator"):
         torch.randn(3, device=device, generator=torch.Generator().manual_seed(0))
+
+
+def test_products_round_alike_on_any_number_of_threads(device, all_threads):
+    gradients, inputs = torch.randn(600, 13, device=device), torch.randn(600, 16, device=device)
+    results = []
+    for threads in (1, 2, 3):
+        environment.configure(threads)
+        results.append(gradients.T @ inputs)
+    assert results[0].equal(results[1]) and results[0].equal(results[2])
 
 
 def test_new_memory_is_not_zero(device):
