@@ -132,6 +132,7 @@ OWN_ROWS = (
     ("cpu", "**`cpu`** (24,000 steps, one CPU core)"),
     ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
     ("best-today", "**`best`** (80,000 steps, one CPU core)"),
+    ("best-40000", "`best --steps 40000 --set loss.log_error_from=0.58` (one CPU core)"),
     ("best", "`best` (80,000 steps, one CPU core)"),
     ("best-less-pruning", "`best` with `densify.min_contribution=0.02`"),
     ("paper", "`paper` (the supplement's schedule, 80,000 steps)"),
