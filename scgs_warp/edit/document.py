@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ import numpy as np
 from .handles import ONE_FRAME, Handle, Target, Vector3
 from .keyframes import Keyframe
 from .playback import Exaggerate, Hold, Playback
+from .skeleton import Skeleton
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,8 @@ class Edit:
     holds: tuple[Hold, ...] = ()
     exaggerate: Exaggerate | None = None
     film: Film = Film()
+    skeleton: Skeleton | None = None
+    """Parts to which handles refer; None: no handle poses a part, and the run's skeleton is unchanged."""
 
     @property
     def reach(self) -> float:
@@ -98,6 +102,16 @@ class Edit:
         """Return whether any target or keyframe turns the handle of that name."""
         places = [self.targets, *(frame.targets for frame in self.keyframes)]
         return any(name in targets and any(targets[name].rotation[1:]) for targets in places)
+
+    def without(self, name: str) -> Edit:
+        """Return the edit without the handle of that name, if there is one, its target, and its part in keyframes."""
+        frames = []
+        for frame in self.keyframes:
+            rest = {n: t for n, t in frame.targets.items() if n != name}
+            frames += [dataclasses.replace(frame, targets=rest)] if rest or not frame.targets else []
+        targets = {n: t for n, t in self.targets.items() if n != name}
+        handles = tuple(h for h in self.handles if h.name != name)
+        return dataclasses.replace(self, handles=handles, targets=targets, keyframes=tuple(frames))
 
     def handle(self, name: str) -> Handle | None:
         return next((handle for handle in self.handles if handle.name == name), None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import zlib
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UserError
+from . import skeleton_file
 from .document import Edit, Film, Shot, View
 from .engine import Engine
 from .field_reader import FieldReader, one_line, read_object, show_value
@@ -19,6 +21,7 @@ from .handles import Handle, Target, handle_fields
 from .keyframes import MAX_SECONDS, Keyframe, keyframe_fields
 from .playback import Exaggerate, Hold, Playback
 from .rotations import from_axis
+from .skeleton import Skeleton
 
 FORMAT = "scgs-warp edit"
 VERSION = 2
@@ -34,13 +37,19 @@ def fingerprint(engine: Engine) -> str:
     return f"{zlib.crc32(np.ascontiguousarray(rest).tobytes()):08x}"
 
 
+def scene_of(engine: Engine) -> dict[str, Any]:
+    """Return what a file says of the scene whose control points it names."""
+    return {"control_points": len(engine.graph), "fingerprint": fingerprint(engine)}
+
+
 def to_json(edit: Edit, engine: Engine) -> str:
     """Return the JSON text of an edit, which ``read`` turns back into the same edit."""
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
-        "scene": {"control_points": len(engine.graph), "fingerprint": fingerprint(engine)},
-        "handles": [_plain(handle) for handle in edit.handles],
+        "scene": scene_of(engine),
+        "skeleton": None if edit.skeleton is None else skeleton_file.to_plain(edit.skeleton),
+        "handles": [_handle_entry(handle) for handle in edit.handles],
         "pins": list(edit.pins),
         "targets": {name: _plain(target) for name, target in edit.targets.items()},
         "keyframes": [
@@ -70,6 +79,14 @@ def _plain(value: Any) -> dict[str, Any]:
     return {name: item for name, item in dataclasses.asdict(value).items() if item is not None}
 
 
+def _handle_entry(handle: Handle) -> dict[str, Any]:
+    """Return a handle's entry; the control points of a part are in the skeleton."""
+    entry = _plain(handle)
+    if handle.part is not None:
+        del entry["nodes"]
+    return entry
+
+
 def _compact(value: Any) -> str:
     """Write lists of objects with one entry per line."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
@@ -77,16 +94,19 @@ def _compact(value: Any) -> str:
     return json.dumps(value)
 
 
-def read(path: Path, engine: Engine) -> Edit:
+def read(path: Path, engine: Engine, default: Callable[[], Skeleton] | None = None) -> Edit:
     """Read an edit for the engine's scene; regions given by place become lists of control points.
+
+    Args:
+        default: gives the skeleton of a file that names parts but holds none.
 
     Raises:
         UserError: naming the file, the field and the remedy.
     """
-    return parse(read_object(path), str(path), engine)
+    return parse(read_object(path), str(path), engine, default)
 
 
-def parse(content: Any, source: str, engine: Engine) -> Edit:
+def parse(content: Any, source: str, engine: Engine, default: Callable[[], Skeleton] | None = None) -> Edit:
     """Decode an edit from a JSON value, as ``read`` does; errors name ``source``."""
     root = FieldReader(content, source)
     if root.raw("format") != FORMAT:
@@ -96,8 +116,10 @@ def parse(content: Any, source: str, engine: Engine) -> Edit:
         raise root.wrong("version", f"is {show_value(version)}", f"this program reads versions 1 to {VERSION}")
     _check_scene(root, engine)
     handles: list[Handle] = []
+    own = root.child("skeleton")
+    skeleton = None if own is None else skeleton_file.from_fields(own, len(engine.graph))
     for fields in root.children("handles", 1000):
-        handle = _handle(fields, engine)
+        handle, skeleton = _handle(fields, engine, skeleton, default)
         if version == 1 and handle.turns is None:
             handle = dataclasses.replace(handle, turns=len(handle.nodes) > 1)
         if any(handle.name == other.name for other in handles):
@@ -118,6 +140,7 @@ def parse(content: Any, source: str, engine: Engine) -> Edit:
         holds=tuple(_hold(fields, engine) for fields in root.children("hold", 1000)),
         exaggerate=_exaggerate(root.child("exaggerate"), engine),
         film=film_of(root.child("film")),
+        skeleton=skeleton,
     )
     root.done("comment")
     return edit
@@ -178,11 +201,25 @@ def _region(region: FieldReader, engine: Engine, time: float) -> tuple[int, ...]
     return engine.graph.ring(chosen, rings)
 
 
-def _handle(fields: FieldReader, engine: Engine) -> Handle:
-    values = handle_fields(fields)
-    handle = Handle(nodes=_nodes(fields, "nodes", engine, time=values["time"]), **values)
+def _handle(
+    fields: FieldReader, engine: Engine, skeleton: Skeleton | None, default: Callable[[], Skeleton] | None
+) -> tuple[Handle, Skeleton | None]:
+    """Read a handle, and return the skeleton with it, which the first one that names a part brings in."""
+    part = fields.text_or_none("part")
+    values = handle_fields(fields, name=part)
+    if part is None:
+        handle = Handle(nodes=_nodes(fields, "nodes", engine, time=values["time"]), **values)
+        fields.done("comment")
+        return handle, skeleton
+    if fields.raw("nodes") is not None:
+        raise fields.wrong("part", "and nodes stand together", "give one of them")
+    if skeleton is None and default is not None:
+        skeleton = default()
+    known = skeleton.names if skeleton is not None else ()
+    if skeleton is None or part not in known:
+        raise fields.wrong("part", f"is {show_value(part)}", f"there is {one_line(', '.join(known)) or 'none'}")
     fields.done("comment")
-    return handle
+    return Handle(nodes=skeleton.part(part).nodes, **values), skeleton
 
 
 def _too_short(direction: tuple[float, ...]) -> bool:

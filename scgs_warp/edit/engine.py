@@ -23,9 +23,11 @@ from .document import Edit
 from .graph import ControlGraph, build_graph, sample_times
 from .handles import ONE_FRAME, STAY, Goal, Target, anchors_at, carried_goal
 from .keyframes import targets_at
+from .part_pose import PartMove, PartPoser
 from .player import Player
 from .pose import MotionPose, NodePose, Rig, motion_pose, pose_gaussians
 from .rotations import from_matrix, slerp, unit
+from .skeleton import Skeleton
 from .solver import STEP_ITERATIONS, ArapSolver, Shape, count_steps
 
 CACHED_INSTANTS = 64
@@ -33,6 +35,9 @@ CACHED_INSTANTS = 64
 LIVE_STEPS = 4
 """Largest number of sub-steps in one drag update; a longer drag catches up during the next updates."""
 LIVE_ITERATIONS = 8
+CACHED_POSERS = 4
+FREE_AROUND_HANDLES = 3
+"""Number of rings around a handle of control points within which posed parts are free to follow it."""
 MIN_OPACITY = 0.1
 """Opacity below which a Gaussian does not connect control points."""
 
@@ -47,6 +52,8 @@ class _Problem(NamedTuple):
     pins: np.ndarray
     stay: np.ndarray
     """[M] bool: strays that do not follow their leader, because they are pinned or a handle acts on their component."""
+    graph: ControlGraph
+    solver: ArapSolver
 
 
 class _Live(NamedTuple):
@@ -90,6 +97,7 @@ class Engine:
         self._motions: OrderedDict[Any, MotionPose] = OrderedDict()
         self._bases: OrderedDict[Any, NodePose] = OrderedDict()
         self._bent: OrderedDict[Any, NodePose | None] = OrderedDict()
+        self._posers: OrderedDict[Any, PartPoser] = OrderedDict()
         self._live: _Live | None = None
 
     def _shared(self) -> np.ndarray:
@@ -128,7 +136,7 @@ class Engine:
         targets = self.targets(edit, at)
         said = tuple((name, target.translation, target.rotation) for name, target in targets.items())
         turned = tuple(edit.turned(handle.name) for handle in edit.handles)
-        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, said, turned, frame
+        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, said, turned, frame, edit.skeleton
 
         def solve() -> NodePose | None:
             problem = self._problem(edit, time, targets, frame)
@@ -138,7 +146,7 @@ class Engine:
             sweeps = [goal.sweep(rest) for goal in problem.goals]
             steps = max(count_steps(turned, moved, self.graph.edge_length) for turned, moved in sweeps)
             path = lambda share: anchors_at(problem.goals, problem.pins, rest, share)  # noqa: E731
-            return self._finish(problem, self.solver.solve(rest, path, steps))
+            return self._finish(problem, problem.solver.solve(rest, path, steps))
 
         return _remember(self._bent, key, solve)
 
@@ -151,7 +159,8 @@ class Engine:
             self._live = None
             return self._unbent(edit, time)
         turned = tuple(edit.turned(handle.name) for handle in edit.handles)
-        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, turned, frame
+        posed = problem.solver is not self.solver  # a shape on one graph is no start on another
+        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, turned, frame, edit.skeleton, posed
         rest = problem.base.positions
         if self._live is None or self._live.key != key:
             self._live = _Live(key, {name: STAY for name in targets}, Shape.at_rest(rest))
@@ -163,7 +172,7 @@ class Engine:
             goals = self._problem(edit, time, between, frame)
             anchors = anchors_at(goals.goals if goals else problem.goals, problem.pins, rest, 1.0)
             iterations = LIVE_ITERATIONS if step == steps else STEP_ITERATIONS // 2
-            shape = self.solver.relax(rest, anchors, shape, iterations)
+            shape = problem.solver.relax(rest, anchors, shape, iterations)
         reached = targets if taken == steps else _between(before, targets, taken / steps)
         self._live = _Live(key, reached, shape)
         return self._finish(problem, shape)
@@ -205,15 +214,25 @@ class Engine:
         and components of the graph in which nothing moves, are left out, so that their control points stay
         bit-identical."""
         base = self.base_at(edit, time)
-        goals = []
+        goals, moves = [], []
         for handle in edit.handles:
             share = handle.strength(time, frame)
             if share == 0.0:
                 continue
             then = base if handle.time == time else self.base_at(edit, handle.time)
+            target = targets[handle.name]
+            if handle.part is not None:
+                moves.append(PartMove(handle, target, share, then.positions))
+                continue
             arguments = self.graph, then.positions, base.positions, self.units, edit.turned(handle.name)
-            goals.append(carried_goal(handle, targets[handle.name], share, *arguments))
-        component = self.graph.component
+            goals.append(carried_goal(handle, target, share, *arguments))
+        graph, solver = self.graph, self.solver
+        posed = self._part_goals(edit, moves, goals, base.positions)
+        if posed:
+            assert edit.skeleton is not None
+            poser = self.poser(edit.skeleton)
+            graph, solver, goals = poser.graph, poser.solver, [*posed, *goals]
+        component = graph.component
         moved = [component[goal.nodes] for goal in goals if not goal.is_identity]
         if not moved:
             return None
@@ -222,13 +241,32 @@ class Engine:
         pins = np.array(edit.pins, np.int64)
         stay = np.isin(component, np.concatenate([component[goal.nodes] for goal in goals]))
         stay[pins] = True
-        return _Problem(base, used, pins[alive[pins]], stay)
+        return _Problem(base, used, pins[alive[pins]], stay, graph, solver)
+
+    def poser(self, skeleton: Skeleton) -> PartPoser:
+        """Return the poser of a skeleton's parts."""
+
+        def make() -> PartPoser:
+            return PartPoser(skeleton, self.graph, self.motion_at(0.0).positions, self.units)
+
+        return _remember(self._posers, skeleton, make, CACHED_POSERS)
+
+    def _part_goals(self, edit: Edit, moves: list[PartMove], others: list[Goal], now: np.ndarray) -> list[Goal]:
+        """Return the goals of posed parts, none if no target moves a part. Control points near other handles are left
+        free."""
+        if edit.skeleton is None or not any(not move.target.is_identity for move in moves):
+            return []
+        released = np.zeros(len(self.graph), bool)
+        near = {node for goal in others if not goal.is_identity for node in goal.nodes.tolist()}
+        if near:
+            released[list(self.graph.ring(near, FREE_AROUND_HANDLES))] = True
+        return self.poser(edit.skeleton).goals(moves, now, released)
 
     def _finish(self, problem: _Problem, shape: Shape) -> NodePose:
         """Move strays (see ``graph.ControlGraph``) with their leaders, and compose the result with the base pose."""
         base = problem.base
         turns = from_matrix(shape.rotations)
-        positions, turns = self.graph.follow(base.positions, shape.positions, turns, problem.stay)
+        positions, turns = problem.graph.follow(base.positions, shape.positions, turns, problem.stay)
         return dataclasses.replace(base.then(positions, turns), base=base)
 
     def _distance(self, before: Mapping[str, Target], after: Mapping[str, Target]) -> int:
@@ -268,12 +306,14 @@ def _between(before: Mapping[str, Target], after: Mapping[str, Target], share: f
     return between
 
 
-def _remember(cache: OrderedDict[Any, Value], key: Any, make: Callable[[], Value]) -> Value:
+def _remember(
+    cache: OrderedDict[Any, Value], key: Any, make: Callable[[], Value], most: int = CACHED_INSTANTS
+) -> Value:
     """Return the cached value of ``key``; compute it if it is missing, and evict the least recently used values."""
     if key in cache:
         cache.move_to_end(key)
         return cache[key]
     value = cache[key] = make()
-    while len(cache) > CACHED_INSTANTS:
+    while len(cache) > most:
         cache.popitem(last=False)
     return value

@@ -140,6 +140,9 @@ class FieldReader:
             raise self.wrong(name, f"is {show_value(value)}", "give a name of 1 to 100 letters")
         return value
 
+    def text_or_none(self, name: str) -> str | None:
+        return None if self.raw(name) is None else self.text(name)
+
     def vector(
         self, name: str, size: int, default: Any = None, low: float = -MAX_NUMBER, high: float = MAX_NUMBER
     ) -> Any:

@@ -88,6 +88,9 @@ class Handle:
     over ``window`` on either side of the handle's time."""
     window: float = 0.1
     """Distance in scene time from the handle's own time at which a fading handle's effect ends."""
+    part: str | None = None
+    """Part of the edit's skeleton that the handle poses, with all parts that hang on it; ``nodes`` are the part's. Its
+    target turns it about its joint (or ``pivot``), relative to its parent and to the motion."""
 
     def __post_init__(self) -> None:
         """Check and convert all fields but the nodes, whose range depends on the scene.
@@ -104,7 +107,7 @@ class Handle:
         Args:
             turned: whether any target or keyframe of the edit turns the handle.
         """
-        return self.turns is None and not turned and len(self.nodes) > 1
+        return self.part is None and self.turns is None and not turned and len(self.nodes) > 1
 
     def gives_rotation(self, turned: bool) -> bool:
         """Return whether the handle fixes its nodes' rotations."""
@@ -121,20 +124,24 @@ class Handle:
         return 0.0 if share <= 0 else share * share * (3.0 - 2.0 * share)
 
 
-def handle_fields(node: FieldReader) -> dict[str, Any]:
+def handle_fields(node: FieldReader, name: str | None = None) -> dict[str, Any]:
     """Read all fields of a handle but its nodes.
+
+    Args:
+        name: name of a handle that has none; None: it must have one.
 
     Raises:
         UserError: naming the field.
     """
     return {
-        "name": node.text("name"),
+        "name": node.text_or_none("name") or name or node.text("name"),
         "time": node.number("time", 0.0, 0.0, 1.0),
         "pivot": node.vector("pivot", 3),
         "stiffness": node.number("stiffness", None, MIN_STIFFNESS, MAX_STIFFNESS),
         "turns": node.boolean("turns"),
         "lasts": node.choice("lasts", get_args(Lasting), "motion"),
         "window": node.number("window", 0.1, 1e-6, 10.0),
+        "part": node.text_or_none("part"),
     }
 
 

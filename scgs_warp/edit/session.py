@@ -28,14 +28,15 @@ from .graph import ControlGraph
 from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
 from .pose import NodePose
+from .posing import Posing
 from .rotations import IDENTITY, conjugate, mean, multiply
-from .skeleton import Part, find_skeleton
+from .skeleton import Skeleton
 
 HISTORY = 1000
 """Number of steps that can be undone, so that a session which is open for days does not grow without limit."""
 
 
-class EditSession:
+class EditSession(Posing):
     """A scene, its graph of control points, an :class:`Edit`, and the last thousand edits for undo.
 
     All points, cameras and lengths are in world units; ``time`` is scene time in [0, 1]; ``at`` is a moment of the film
@@ -57,7 +58,7 @@ class EditSession:
         self._past: deque[Edit] = deque(maxlen=HISTORY)
         self._future: list[Edit] = []
         self._before_drag: Edit | None = None
-        self._parts: dict[int | None, tuple[Part, ...]] = {}
+        self._found: dict[int | None, Skeleton] = {}
 
     def __len__(self) -> int:
         """Return the number of control points."""
@@ -138,18 +139,6 @@ class EditSession:
         ray = np.array([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], 1.0])
         return viewmat[:3, :3].T @ (float(image.depth[row, column]) * ray - viewmat[:3, 3])
 
-    def parts(self, count: int | None = None) -> tuple[Part, ...]:
-        """Return the parts that moved rigidly together over the trained motion, with their joints.
-
-        Args:
-            count: number of parts; None: as many as turn against their neighbours.
-        """
-        found = self._parts.get(count)
-        if found is None:
-            indices, weights = (part.cpu().numpy() for part in self.engine.binding)
-            found = self._parts[count] = find_skeleton(self.scene, (indices, weights), count)
-        return found
-
     def _nodes(self, nodes: Iterable[int]) -> tuple[int, ...]:
         chosen = tuple(sorted({int(node) for node in nodes}))
         if chosen and not (chosen[0] >= 0 and chosen[-1] < len(self)):
@@ -174,27 +163,20 @@ class EditSession:
         if name is None:
             name = next(f"handle {i}" for i in range(1, len(taken) + 2) if f"handle {i}" not in taken)
         handle = Handle(name=name, nodes=chosen, time=float(time), **fields)
-        edit = self._without(name)
+        edit = self.edit.without(name)
         self.apply(dataclasses.replace(edit, handles=(*edit.handles, handle)))
         return handle
 
     def remove_handle(self, name: str) -> None:
         """Remove a handle, its target, and its part in every keyframe."""
-        self.apply(self._without(self._handle(name).name))
-
-    def _without(self, name: str) -> Edit:
-        """Return the edit without the handle of that name, if there is one."""
-        frames = []
-        for frame in self.edit.keyframes:
-            rest = {n: t for n, t in frame.targets.items() if n != name}
-            frames += [dataclasses.replace(frame, targets=rest)] if rest or not frame.targets else []
-        targets = {n: t for n, t in self.edit.targets.items() if n != name}
-        handles = tuple(h for h in self.edit.handles if h.name != name)
-        return dataclasses.replace(self.edit, handles=handles, targets=targets, keyframes=tuple(frames))
+        self.apply(self.edit.without(self._handle(name).name))
 
     def pivot(self, name: str) -> np.ndarray:
-        """Return a handle's centre of rotation at its own time, [3], world units."""
+        """Return a handle's centre of rotation at its own time, [3], world units. That of a part is its joint in the
+        present pose of its parent."""
         handle = self._handle(name)
+        if handle.part is not None:
+            return self.joint_of(handle.part, handle.time)
         if handle.pivot is not None:
             return np.array(handle.pivot)
         positions = self.engine.base_at(self.edit, handle.time).positions
@@ -373,7 +355,7 @@ class EditSession:
         Raises:
             UserError: the file is missing, or a field is wrong; the edit stays unchanged.
         """
-        self.apply(edit_file.read(Path(path), self.engine))
+        self.apply(edit_file.read(Path(path), self.engine, self._run_skeleton))
 
     def export_ply(self, path: str | Path, time: float, at: float | None = None) -> None:
         """Write the edited Gaussians at one moment as a 3D-GS file, world units."""

@@ -1,25 +1,23 @@
-"""Skeleton of a scene: its parts with the joints that connect them, found in the trained motion."""
+"""Kinematic skeleton of a scene: parts of control points, joined into trees. A frozen value, so that undo covers it."""
 
 from __future__ import annotations
 
-import math
+import dataclasses
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-import torch
 
-from ..scene.scene import Scene
+from ..errors import UserError
+from .field_reader import FieldReader
 from .handles import Vector3
-from .joints import Joint, find_joints
-from .parts import find_parts
-from .patches import Patches, make_patches
 
-INSTANTS = 16
-"""Number of instants at which the motion is compared; the first one, time 0, is the reference pose."""
-MIN_OPACITY = 0.5
-"""Opacity below which a Gaussian does not show how the surface moves."""
-MAX_GAUSSIANS = 50_000
-"""Number of Gaussians that are looked at; of more, an even sample."""
+Source = Literal["motion", "geometry", "edited"]
+
+BRANCH_SHARE = 0.5
+"""Number of control points of a side branch, relative to the pulled branch, from which on a pull does not pass it. A
+hand holds still while one of its fingers is pulled, but a fragment of skin does not stop an arm."""
 
 
 @dataclass(frozen=True)
@@ -32,54 +30,184 @@ class Part:
     parent: str | None
     """None: a root; ``joint`` is then the part's centre."""
     joint: Vector3
-    axis: Vector3 | None
+    axis: Vector3 | None = None
     """Unit direction about which the motion turned the part most; None if there is no such direction."""
-    degrees: float
+    degrees: float = 0.0
     """Largest turn against the parent between two instants of the motion."""
-    confidence: float
+    confidence: float = 0.0
     """0: the motion never bent the joint, which is put in the middle of the boundary; near 1: the motion shows it."""
 
 
-def find_skeleton(scene: Scene, binding: tuple[np.ndarray, np.ndarray], count: int | None = None) -> tuple[Part, ...]:
-    """Find parts and joints; parts are in order of decreasing size and called ``part-1``, ``part-2``, ...
+@dataclass(frozen=True)
+class Skeleton:
+    """Parts that together hold every control point once."""
 
-    Args:
-        binding: indices and skinning weights of the control points of each Gaussian, [N, K] each.
-        count: number of parts; None: chosen from the motion.
+    parts: tuple[Part, ...]
+    source: Source = "motion"
+    """motion: found in it; geometry: found in the shape, since nothing moved; edited: changed by hand."""
+
+    def part(self, name: str) -> Part:
+        """Return the part of that name.
+
+        Raises:
+            UserError: there is none.
+        """
+        for part in self.parts:
+            if part.name == name:
+                return part
+        raise UserError(f"no part is called {name!r}; there is {', '.join(self.names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(part.name for part in self.parts)
+
+    def owners(self) -> np.ndarray:
+        """Return the row of the part that holds each control point, [M] int64."""
+        owner = np.full(sum(len(part.nodes) for part in self.parts), -1, np.int64)
+        for row, part in enumerate(self.parts):
+            owner[list(part.nodes)] = row
+        return owner
+
+    def children(self, name: str) -> tuple[str, ...]:
+        return tuple(part.name for part in self.parts if part.parent == name)
+
+    def branch(self, name: str) -> tuple[str, ...]:
+        """Return the part and all parts that hang on it, parents before children."""
+        found = [self.part(name).name]
+        for item in found:  # the list grows
+            found += self.children(item)
+        return tuple(found)
+
+    def chain(self, name: str) -> tuple[str, ...]:
+        """Return the parts that turn when a part is pulled, from that part towards the root. The first part from which
+        another branch of comparable size leaves, and the root, hold still; if the part has no other parent, it turns
+        alone."""
+        part = self.part(name)
+        found = [part.name]
+        while part.parent is not None:
+            above = self.part(part.parent)
+            own = self._size(part.name)
+            others = [self._size(child) for child in self.children(above.name) if child != part.name]
+            if above.parent is None or max(others, default=0) >= BRANCH_SHARE * own:
+                return tuple(found)
+            found.append(above.name)
+            part = above
+        return tuple(found)
+
+    def _size(self, name: str) -> int:
+        return sum(len(self.part(item).nodes) for item in self.branch(name))
+
+    # Changes by hand
+
+    def renamed(self, old: str, new: str) -> Skeleton:
+        """Return the skeleton with another name for a part.
+
+        Raises:
+            UserError: there is no such part, or the new name is taken or not a name.
+        """
+        FieldReader({"name": new}, "the skeleton").text("name")
+        self.part(old)
+        if new != old and new in self.names:
+            raise UserError(f"part {new!r}: the name is taken; choose another")
+        swap = lambda name: new if name == old else name  # noqa: E731
+        parts = [dataclasses.replace(p, name=swap(p.name), parent=p.parent and swap(p.parent)) for p in self.parts]
+        return Skeleton(tuple(parts), "edited")
+
+    def merged(self, first: str, second: str) -> Skeleton:
+        """Return the skeleton with two neighbouring parts united under the first one's name.
+
+        Raises:
+            UserError: a part does not exist, or the two have neither a common joint nor a common parent.
+        """
+        one, other = self.part(first), self.part(second)
+        if one.name == other.name:
+            raise UserError(f"part {first!r} cannot be merged with itself; name two parts")
+        siblings = one.parent == other.parent and one.parent is not None
+        if not (siblings or one.parent == other.name or other.parent == one.name):
+            raise UserError(f"parts {first!r} and {second!r} are not neighbours; merge the parts between them first")
+        upper = other if one.parent == other.name else one
+        whole = dataclasses.replace(upper, name=one.name, nodes=tuple(sorted({*one.nodes, *other.nodes})))
+        parts = []
+        for part in self.parts:
+            if part.name == other.name:
+                continue
+            part = whole if part.name == one.name else part
+            parts.append(dataclasses.replace(part, parent=one.name) if part.parent == other.name else part)
+        return Skeleton(tuple(parts), "edited")
+
+    def split(
+        self, name: str, nodes: Iterable[int], positions: np.ndarray, edges: np.ndarray, new: str | None = None
+    ) -> Skeleton:
+        """Return the skeleton with some control points of a part as a new part, which hangs on it. The joint is the
+        middle of their boundary; children go to the nearer of the two parts.
+
+        Args:
+            nodes: control points of the part, neither none nor all of them.
+            positions: [M, 3] control points at time 0, world units.
+            edges: [E, 2] graph of the control points.
+            new: name of the new part; None: the first free ``part-N``.
+
+        Raises:
+            UserError: a part or name is wrong, or the control points are not a proper share of the part's.
+        """
+        part, chosen = self.part(name), sorted({int(node) for node in nodes})
+        rest = sorted(set(part.nodes) - set(chosen))
+        if not chosen or not rest or len(chosen) + len(rest) != len(part.nodes):
+            raise UserError(
+                f"part {name!r} cannot be split: choose some but not all of its {len(part.nodes)} control points"
+            )
+        if new is None:
+            new = next(f"part-{i}" for i in range(1, len(self.parts) + 2) if f"part-{i}" not in self.names)
+        elif new in self.names:
+            raise UserError(f"part {new!r}: the name is taken; choose another")
+        FieldReader({"name": new}, "the skeleton").text("name")
+        joint = tuple(_middle_of_boundary(positions, edges, chosen, rest).tolist())
+        near = lambda point, group: np.linalg.norm(positions[group] - point, axis=1).min()  # noqa: E731
+        parts = []
+        for other in self.parts:
+            if other.name == name:
+                other = dataclasses.replace(other, nodes=tuple(rest))
+            elif other.parent == name and near(other.joint, chosen) < near(other.joint, rest):
+                other = dataclasses.replace(other, parent=new)
+            parts.append(other)
+        return Skeleton((*parts, Part(new, tuple(chosen), name, joint)), "edited")
+
+    def with_joint(self, name: str, joint: Sequence[float], axis: Sequence[float] | None = None) -> Skeleton:
+        """Return the skeleton with a part's joint moved.
+
+        Args:
+            joint: [3] world units, at time 0.
+            axis: [3] of any length but 0; None: as before.
+
+        Raises:
+            UserError: there is no such part, or a number is wrong.
+        """
+        fields = FieldReader({"joint": list(joint), "axis": None if axis is None else list(axis)}, f"part {name!r}")
+        part = dataclasses.replace(self.part(name), joint=fields.vector("joint", 3), confidence=1.0)
+        direction = fields.vector("axis", 3)
+        if direction is not None:
+            part = dataclasses.replace(part, axis=unit_axis(direction, fields))
+        return Skeleton(tuple(part if other.name == name else other for other in self.parts), "edited")
+
+
+def unit_axis(direction: Vector3, fields: FieldReader) -> Vector3:
+    """Return a direction with length 1.
+
+    Raises:
+        UserError: it has no direction.
     """
-    patches = observe(scene, binding)
-    labels = find_parts(patches, count)
-    joints = find_joints(patches, labels)
-    owner = _labels_of_nodes(scene, patches, labels)
-    return tuple(_part(scene, row, joint, owner) for row, joint in enumerate(joints))
+    length = float(np.linalg.norm(direction))
+    if not length > 1e-6:
+        raise fields.wrong("axis", "has no direction", "give 3 numbers, not all close to 0")
+    return direction if abs(length - 1.0) < 1e-12 else tuple((np.array(direction) / length).tolist())
 
 
-def observe(scene: Scene, binding: tuple[np.ndarray, np.ndarray]) -> Patches:
-    """Sample the motion of the opaque Gaussians, normalised units."""
-    with torch.no_grad():
-        opaque = np.flatnonzero((scene.gaussians.opacities() > MIN_OPACITY).cpu().numpy())
-        if not len(opaque):
-            opaque = np.arange(len(binding[0]))
-        chosen = opaque[:: max(1, math.ceil(len(opaque) / MAX_GAUSSIANS))]
-        times = torch.linspace(0.0, 1.0, INSTANTS).tolist()
-        tracks = [scene.motion.gaussians_at(scene.gaussians, time).means[chosen].cpu().double() for time in times]
-    return make_patches(torch.stack(tracks).numpy(), binding[0][chosen], binding[1][chosen])
-
-
-def _labels_of_nodes(scene: Scene, patches: Patches, labels: np.ndarray) -> np.ndarray:
-    """Return the part of every control point, [M]; one without Gaussians has that of the nearest one with some."""
-    with torch.no_grad():
-        points = scene.motion.control_points_at(0.0).cpu().double().numpy()
-    away = ((points[:, None] - points[patches.nodes][None]) ** 2).sum(2)
-    return labels[away.argmin(1)]
-
-
-def _part(scene: Scene, row: int, joint: Joint, owner: np.ndarray) -> Part:
-    unit = scene.normalisation
-    point = joint.point / unit.scale + np.asarray(unit.centre, np.float64)
-    axis = None if joint.axis is None else tuple(joint.axis.tolist())
-    parent = None if joint.parent < 0 else f"part-{joint.parent + 1}"
-    nodes = tuple(np.flatnonzero(owner == row).tolist())
-    return Part(
-        f"part-{row + 1}", nodes, parent, tuple(point.tolist()), axis, math.degrees(joint.turn), joint.confidence
-    )
+def _middle_of_boundary(positions: np.ndarray, edges: np.ndarray, first: list[int], second: list[int]) -> np.ndarray:
+    """Return the mean of the edges between two sets of control points, or else the middle of the nearest pair, [3]."""
+    a, b = np.isin(edges, first), np.isin(edges, second)
+    across = (a[:, 0] & b[:, 1]) | (a[:, 1] & b[:, 0])
+    if across.any():
+        return positions[edges[across]].mean((0, 1))
+    away = np.linalg.norm(positions[first][:, None] - positions[second][None], axis=2)
+    i, j = np.unravel_index(away.argmin(), away.shape)
+    return 0.5 * (positions[first[int(i)]] + positions[second[int(j)]])

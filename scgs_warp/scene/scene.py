@@ -44,7 +44,8 @@ class Scene:
     """A trained scene, as returned by training and stored in a run directory. Public methods use world units.
 
     Attributes: ``gaussians`` (:class:`GaussianParameters`, normalised units), ``motion``, ``normalisation``,
-    ``config``, ``overview`` (summary of the training cameras), ``step``, ``settings`` (``config.json`` as a dict).
+    ``config``, ``overview`` (summary of the training cameras), ``step``, ``settings`` (``config.json`` as a dict),
+    ``folder`` (the run directory; None for a scene from elsewhere).
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Scene:
         self.gaussians, self.motion, self.normalisation = gaussians, motion, normalisation
         self.config, self.overview, self.step = config, overview, step
         self.settings = settings if settings is not None else to_dict(config)
+        self.folder: Path | None = None
         self._frames: FrameGraph | None = None
 
     @staticmethod
@@ -82,6 +84,7 @@ class Scene:
             raise UserError(f"{folder}: no such run directory; apps/train.py --output makes one")
         tensors, metadata = checkpoint.read(folder, ("gaussians.", "motion."))
         scene = scene_from(tensors, metadata, device, str(folder / checkpoint.FILE))
+        scene.folder = folder
         settings_path = folder / "config.json"
         if settings_path.is_file():
             try:

@@ -1,0 +1,321 @@
+"""Posing of parts in a session: the skeleton, its changes, turns of joints, and pulls on parts."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+from . import edit_file, skeleton_file
+from .document import Edit
+from .engine import Engine
+from .handles import STAY, Handle, Target
+from .part_pose import PartMove, Rigid
+from .reach import Link, reach
+from .rotations import conjugate, from_axis, multiply, rigid_fit, rotate
+from .skeleton import Part, Skeleton
+from .skeleton_from_motion import find_skeleton
+
+
+class Posing:
+    """Base of :class:`EditSession` that poses parts. Points and lengths are in world units, angles in degrees."""
+
+    engine: Engine
+    edit: Edit
+    _found: dict[int | None, Skeleton]
+    _before_drag: Edit | None
+    apply: Callable[[Edit], None]
+    preview: Callable[[Edit], None]
+    release: Callable[[], None]
+
+    # The skeleton
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The edit's skeleton, or else that of the run, which is found in the motion once and kept in its folder."""
+        return self.edit.skeleton or self._run_skeleton()
+
+    def _run_skeleton(self) -> Skeleton:
+        found = self._found.get(None)
+        if found is None:
+            path, scene = self._skeleton_path(), edit_file.scene_of(self.engine)
+            found = skeleton_file.read(path, scene) if path is not None and path.is_file() else None
+            if found is None:
+                found = self._find(None)
+                with contextlib.suppress(UserError):  # a folder that nobody may write to is read only
+                    if path is not None:
+                        skeleton_file.write(path, found, scene)
+            self._found[None] = found
+        return found
+
+    def _find(self, count: int | None) -> Skeleton:
+        indices, weights = (part.cpu().numpy() for part in self.engine.binding)
+        return find_skeleton(self.engine.scene, (indices, weights), count)
+
+    def _skeleton_path(self) -> Path | None:
+        folder = self.engine.scene.folder
+        return None if folder is None else folder / skeleton_file.FILE
+
+    def parts(self, count: int | None = None) -> tuple[Part, ...]:
+        """Return the parts that moved rigidly together over the trained motion, with their joints.
+
+        Args:
+            count: number of parts; None: those of the edit's skeleton, by default as many as turn against their
+                neighbours.
+        """
+        if count is None:
+            return self.skeleton.parts
+        if count not in self._found:
+            self._found[count] = self._find(count)
+        return self._found[count].parts
+
+    def use_parts(self, count: int | None = None) -> None:
+        """Replace the edit's skeleton by one of ``count`` parts found in the motion; None: by that of the run. Handles
+        of parts are removed."""
+        if count is not None:
+            self.parts(count)
+        kept = tuple(handle for handle in self.edit.handles if handle.part is None)
+        names = {handle.name for handle in kept}
+        targets = {name: target for name, target in self.edit.targets.items() if name in names}
+        frames = [
+            dataclasses.replace(k, targets={n: t for n, t in k.targets.items() if n in names})
+            for k in self.edit.keyframes
+        ]
+        frames = tuple(frame for frame, old in zip(frames, self.edit.keyframes) if frame.targets or not old.targets)
+        skeleton = None if count is None else self._found[count]
+        self.apply(dataclasses.replace(self.edit, handles=kept, targets=targets, keyframes=frames, skeleton=skeleton))
+
+    def save_skeleton(self) -> Path:
+        """Write the present skeleton into the run folder, where it is the default of every later session.
+
+        Raises:
+            UserError: the scene has no folder, or the file cannot be written.
+        """
+        path = self._skeleton_path()
+        if path is None:
+            raise UserError("the scene comes from no run folder; save the edit, which holds its skeleton")
+        skeleton_file.write(path, self.skeleton, edit_file.scene_of(self.engine))
+        self._found[None] = self.skeleton
+        return path
+
+    def rename_part(self, old: str, new: str) -> None:
+        """Rename a part, also in the handles that pose it."""
+        self._restructure(self.skeleton.renamed(old, new), {old: new})
+
+    def merge_parts(self, first: str, second: str) -> None:
+        """Unite two neighbouring parts under the first one's name. A handle of the second is removed."""
+        self._restructure(self.skeleton.merged(first, second), {second: None})
+
+    def split_part(self, name: str, nodes: Iterable[int], new: str | None = None) -> str:
+        """Make some control points of a part a part of their own, which hangs on it; return its name."""
+        start = self.engine.to_world(self.engine.motion_at(0.0).positions)
+        skeleton = self.skeleton.split(name, nodes, start, self.engine.graph.edges, new)
+        self._restructure(skeleton, {})
+        return skeleton.parts[-1].name
+
+    def move_joint(self, name: str, joint: Sequence[float], axis: Sequence[float] | None = None) -> None:
+        """Move the joint of a part with its parent to a point at time 0."""
+        self._restructure(self.skeleton.with_joint(name, joint, axis), {})
+
+    def _restructure(self, skeleton: Skeleton, renamed: dict[str, str | None]) -> None:
+        """Replace the skeleton and adapt handles: ``renamed`` maps parts to their new names, None: gone."""
+        edit, handles = dataclasses.replace(self.edit, skeleton=skeleton), []
+        for handle in edit.handles:
+            if handle.part is not None:
+                part = renamed.get(handle.part, handle.part)
+                if part is None:
+                    edit = edit.without(handle.name)
+                    continue
+                handle = dataclasses.replace(handle, part=part, nodes=skeleton.part(part).nodes)
+            handles.append(handle)
+        self.apply(dataclasses.replace(edit, handles=tuple(handles)))
+
+    # Posing
+
+    def pose_part(self, part: str, time: float = 0.0) -> Handle:
+        """Return the handle that poses a part; add one if there is none.
+
+        Args:
+            time: scene time to which the target of a new handle refers.
+
+        Raises:
+            UserError: there is no such part.
+        """
+        edit, handle = _with_handle(self.edit, self.skeleton, part, time)
+        if edit is not self.edit:
+            self.apply(edit)
+        return handle
+
+    def chain(self, part: str) -> tuple[str, ...]:
+        """Return the parts that turn when this part is pulled, from it towards the root; all others hold still."""
+        return self.skeleton.chain(part)
+
+    def joint_of(self, part: str, time: float, at: float | None = None) -> np.ndarray:
+        """Return where a part's joint is under the edit, [3]."""
+        return self._motion_of(self.edit, part, time, at)[1]
+
+    def turn(self, part: str, degrees: float, axis: Sequence[float] | None = None, time: float = 0.0) -> Target:
+        """Turn a part, and all that hangs on it, about its joint: further than it is, relative to its parent.
+
+        Args:
+            degrees: from -180 to 180.
+            axis: [3] world direction at ``time``; None: the axis about which the motion turned the part most.
+            time: scene time at which the part is turned; at other times the turn follows the parent.
+
+        Raises:
+            UserError: there is no such part, the motion shows no axis and none is given, or a number is wrong.
+        """
+        skeleton = self.skeleton
+        if axis is None:
+            axis = skeleton.part(part).axis
+            if axis is None:
+                raise UserError(f"part {part!r}: the motion shows no axis; give one, such as (0, 0, 1)")
+        direction = np.asarray(axis, np.float64)
+        if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction) > 1e-6:
+            raise UserError(f"axis {list(axis)}: give 3 finite numbers, not all close to 0")
+        if not -180.0 <= degrees <= 180.0:
+            raise UserError(f"degrees {degrees:g}: give -180 to 180")
+        edit, handle = _with_handle(self.edit, skeleton, part, time)
+        old = edit.targets.get(handle.name, STAY)
+        further = self._into_frame(skeleton, handle, from_axis(direction, degrees), time)
+        target = Target.of(old.translation, multiply(further, np.array(old.rotation)).tolist())
+        self.apply(dataclasses.replace(edit, targets={**edit.targets, handle.name: target}))
+        return target
+
+    def pull(
+        self,
+        part: str,
+        to: Sequence[float],
+        time: float = 0.0,
+        grip: Sequence[float] | None = None,
+        *,
+        live: bool = False,
+    ) -> tuple[str, ...]:
+        """Pull a part to a place: the parts of its chain turn about their joints, as little as will do, and the rest
+        holds still. A part without a parent is moved as a whole, with all that hangs on it.
+
+        Args:
+            to: [3] where the grip goes. Out of reach, the chain points there.
+            time: scene time.
+            grip: [3] point of the part in its present pose that is pulled; None: the mean of its control points.
+            live: whether the pull belongs to a drag, which ``release`` ends. It is then measured from the pose, and the
+                grip from the part, before the drag.
+
+        Returns:
+            The parts that turned, from the pulled one towards the root.
+
+        Raises:
+            UserError: there is no such part, or a number is wrong.
+        """
+        place = _point("to", to)
+        before = self._before_drag or self.edit
+        skeleton = before.skeleton or self._run_skeleton()
+        names = skeleton.chain(part)
+        edit, handles = before, []
+        for name in names:
+            edit, handle = _with_handle(edit, skeleton, name, time)
+            handles.append(handle)
+        motion, _ = self._motion_of(edit, part, time, None)
+        now = self.engine.base_at(edit, time).positions
+        centre, scale = self.engine.units
+        if grip is None:
+            held = now[list(skeleton.part(part).nodes)].mean(0)
+        else:
+            held = _inverse(motion, (_point("grip", grip) - centre) * scale)
+        place = (place - centre) * scale
+        if skeleton.part(part).parent is None:
+            targets = {handles[0].name: self._shifted(edit, skeleton, handles[0], time, place - motion.apply(held))}
+        else:
+            targets = self._reached(edit, skeleton, handles, time, held, place)
+        edit = dataclasses.replace(edit, targets={**edit.targets, **targets})
+        self.preview(edit)
+        if not live:
+            self.release()
+        return names
+
+    def _reached(
+        self, edit: Edit, skeleton: Skeleton, handles: list[Handle], time: float, grip: np.ndarray, place: np.ndarray
+    ) -> dict[str, Target]:
+        """Solve for the targets that take a point of the first handle's part to a place, normalised units."""
+        poser, links, frames = self.engine.poser(skeleton), [], []
+        now = self.engine.base_at(edit, time).positions
+        for handle in reversed(handles):
+            then = self.engine.base_at(edit, handle.time).positions if handle.time != time else now
+            joint, frame = poser.joint_frame(handle, then, now)
+            target = edit.targets.get(handle.name, STAY)
+            quat = multiply(multiply(frame, np.array(target.rotation)), conjugate(frame))
+            shift = rotate(frame, self.engine.units[1] * np.array(target.translation))
+            part = skeleton.part(handle.part or "")
+            axis = None
+            if part.axis is not None:
+                lead = list(skeleton.part(part.parent or part.name).nodes)
+                axis = rotate(rigid_fit(poser.start[lead], now[lead])[0], np.array(part.axis))
+            links.append(Link(joint, quat, shift, axis))
+            frames.append(frame)
+        above = skeleton.part(handles[-1].part or "").parent
+        base = Rigid.none() if above is None else self._motion_of(edit, above, time, None)[0]
+        targets = {}
+        for handle, frame, quat in zip(reversed(handles), frames, reach(links, base, grip, place)):
+            own = multiply(multiply(conjugate(frame), quat), frame)
+            targets[handle.name] = Target.of(edit.targets.get(handle.name, STAY).translation, own.tolist())
+        return targets
+
+    def _shifted(self, edit: Edit, skeleton: Skeleton, handle: Handle, time: float, shift: np.ndarray) -> Target:
+        """Return the target of a root's handle after a further shift, normalised units."""
+        old = edit.targets.get(handle.name, STAY)
+        frame = self._frame(skeleton, handle, time)
+        further = rotate(conjugate(frame), shift) / self.engine.units[1]
+        return Target.of((np.array(old.translation) + further).tolist(), old.rotation)
+
+    def _frame(self, skeleton: Skeleton, handle: Handle, time: float) -> np.ndarray:
+        """Return the rotation of the part's parent from the handle's time to another time, [4]."""
+        now = self.engine.base_at(self.edit, time).positions
+        then = now if handle.time == time else self.engine.base_at(self.edit, handle.time).positions
+        return self.engine.poser(skeleton).joint_frame(handle, then, now).frame
+
+    def _into_frame(self, skeleton: Skeleton, handle: Handle, quat: np.ndarray, time: float) -> np.ndarray:
+        frame = self._frame(skeleton, handle, time)
+        return quat if not frame[1:].any() else multiply(multiply(conjugate(frame), quat), frame)
+
+    def _motion_of(self, edit: Edit, part: str, time: float, at: float | None) -> tuple[Rigid, np.ndarray]:
+        """Return how the edit moves a part, normalised units, and the place of its joint, [3] world units."""
+        skeleton = edit.skeleton or self._run_skeleton()
+        skeleton.part(part)
+        poser, now = self.engine.poser(skeleton), self.engine.base_at(edit, time).positions
+        targets, moves = self.engine.targets(edit, at), []
+        for handle in edit.handles:
+            share = handle.strength(time) if handle.part is not None else 0.0
+            if share > 0.0:
+                then = now if handle.time == time else self.engine.base_at(edit, handle.time).positions
+                moves.append(PartMove(handle, targets[handle.name], share, then))
+        motion = poser.motions(moves, now)[0][poser.rows[part]]
+        probe = Handle(part, skeleton.part(part).nodes, time, part=part)
+        joint = poser.joint_frame(probe, now, now).joint
+        return motion, self.engine.to_world(motion.apply(joint))
+
+
+def _with_handle(edit: Edit, skeleton: Skeleton, part: str, time: float) -> tuple[Edit, Handle]:
+    """Return the edit with a handle for a part, and that handle; the same edit if it has one."""
+    nodes = skeleton.part(part).nodes
+    for handle in edit.handles:
+        if handle.part == part:
+            return edit, handle
+    taken = {handle.name for handle in edit.handles}
+    names = [part, *(f"{part} ({i})" for i in range(2, len(taken) + 3))]
+    handle = Handle(next(name for name in names if name not in taken), nodes, float(time), part=part)
+    return dataclasses.replace(edit, handles=(*edit.handles, handle), skeleton=skeleton), handle
+
+
+def _point(name: str, value: Sequence[float]) -> np.ndarray:
+    point = np.asarray(value, np.float64)
+    if point.shape != (3,) or not np.isfinite(point).all() or np.abs(point).max() > 1e9:
+        raise UserError(f"{name} {list(value)}: give 3 finite numbers")
+    return point
+
+
+def _inverse(motion: Rigid, point: np.ndarray) -> np.ndarray:
+    return rotate(conjugate(motion.quat), point - motion.shift)

@@ -1,0 +1,413 @@
+"""Posing parts: forward kinematics against matrices, pulls against a general minimiser, skeletons, files, undo."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.sparse.csgraph import connected_components, shortest_path
+
+from helpers.edit_scenes import bar_scene, figure_scene
+from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
+from scgs_warp.edit import EditSession
+from scgs_warp.edit.handles import STAY
+from scgs_warp.edit.part_pose import FREE_RINGS, PartMove, Rigid, _rings_to_others
+from scgs_warp.edit.reach import BEND, OFF_AXIS, Link, _posed, reach
+from scgs_warp.edit.rotations import IDENTITY, conjugate, exponential, from_axis, logarithm, multiply, rotate, to_matrix
+from scgs_warp.edit.skeleton import Part, Skeleton
+from scgs_warp.errors import UserError
+
+ARM = ("shoulder_left", "elbow_left")
+
+
+def bone_skeleton(bones: list[str]) -> Skeleton:
+    """The figure's true bones as parts, of those that hold control points."""
+    there, joints = set(bones), bone_transforms(0.0)
+    parts = []
+    for name, bone in BONES.items():
+        if name in there:
+            parent = bone.parent
+            while parent is not None and parent not in there:
+                parent = BONES[parent].parent
+            nodes = tuple(np.flatnonzero(np.array(bones) == name).tolist())
+            parts.append(Part(name, nodes, parent, tuple(joints[name][:3, 3].tolist())))
+    return Skeleton(tuple(parts))
+
+
+@pytest.fixture(scope="module")
+def figure() -> EditSession:
+    scene, _, _ = figure_scene(256)
+    session = EditSession(scene)
+    session.edit = dataclasses.replace(session.edit, skeleton=bone_skeleton(scene.motion.bones))
+    return session
+
+
+@pytest.fixture
+def session(figure) -> EditSession:
+    """A session on the figure whose skeleton is that of its bones."""
+    return figure.fork()
+
+
+def matrix(quat: np.ndarray, point: np.ndarray, shift: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the homogeneous matrix of a turn about a point, then a shift."""
+    found = np.eye(4)
+    found[:3, :3] = to_matrix(quat)
+    found[:3, 3] = point + shift - found[:3, :3] @ point
+    return found
+
+
+def still_nodes(session: EditSession) -> list[int]:
+    """Return the control points that are more than ``FREE_RINGS`` edges from the left arm, and not of it."""
+    names = session.skeleton.names
+    arm = np.isin(session.skeleton.owners(), [names.index(name) for name in ARM])
+    away = shortest_path(session.engine.poser(session.skeleton).graph.matrix, unweighted=True)[:, arm].min(1)
+    return np.flatnonzero(away > FREE_RINGS).tolist()
+
+
+def furthest(session: EditSession, part: str) -> list[int]:
+    """Return the part's control points with the most edges to every other part, which are held in any case."""
+    inside = session.skeleton.owners() == session.skeleton.names.index(part)
+    away = shortest_path(session.engine.poser(session.skeleton).graph.matrix, unweighted=True)[:, ~inside].min(1)
+    return np.flatnonzero(inside & (away == away[inside].max())).tolist()
+
+
+def test_a_turned_part_carries_those_that_hang_on_it(session):
+    start = session.node_positions(0.0)
+    upper, lower = from_axis((0, -1, 0), 70), from_axis((1, 0, 0), 40)
+    session.turn("shoulder_left", 70, (0, -1, 0))
+    session.turn("elbow_left", 40, (1, 0, 0))
+    joints = bone_transforms(0.0)
+    first = matrix(upper, joints["shoulder_left"][:3, 3])
+    both = first @ matrix(lower, joints["elbow_left"][:3, 3])
+    poser = session.engine.poser(session.skeleton)
+    motions, body = poser.motions(_moves(session), session.engine.motion_at(0.0).positions)
+    for name, wanted in (("shoulder_left", first), ("elbow_left", both), ("torso", np.eye(4))):
+        motion = motions[poser.rows[name]]
+        np.testing.assert_allclose(to_matrix(motion.quat), wanted[:3, :3], atol=1e-12)
+        np.testing.assert_allclose(motion.shift, wanted[:3, 3], atol=1e-12)
+    posed = session.node_positions(0.0)
+    tip = furthest(session, "elbow_left")
+    truth = start[tip] @ both[:3, :3].T + both[:3, 3]
+    np.testing.assert_allclose(posed[tip], truth, atol=1e-9)
+    still = still_nodes(session)
+    assert len(still) > 100
+    assert np.array_equal(posed[still], start[still])
+    assert body[poser.rows["torso"]] == -1 and body[poser.rows["elbow_left"]] == poser.rows["elbow_left"]
+
+
+def _moves(session: EditSession):
+    then = session.engine.motion_at(0.0).positions
+    return [PartMove(h, session.edit.targets.get(h.name, STAY), 1.0, then) for h in session.edit.handles]
+
+
+def test_a_turn_follows_its_parent_through_the_motion(session):
+    """At another time the elbow's turn is given in the upper arm's frame, and its joint has moved with the arm."""
+    session.turn("elbow_left", 50, (0, 0, 1))
+    then, now = bone_transforms(0.0), bone_transforms(0.4)
+    frame = now["shoulder_left"][:3, :3] @ then["shoulder_left"][:3, :3].T
+    turn = np.eye(4)
+    turn[:3, :3] = frame @ to_matrix(from_axis((0, 0, 1), 50)) @ frame.T
+    joint = now["elbow_left"][:3, 3]
+    turn[:3, 3] = joint - turn[:3, :3] @ joint
+    start, posed = session.engine.motion_at(0.4).positions, session.node_positions(0.4)
+    tip = furthest(session, "elbow_left")
+    np.testing.assert_allclose(posed[tip], start[tip] @ turn[:3, :3].T + turn[:3, 3], atol=2e-4)
+    assert np.abs(posed[tip] - start[tip]).max() > 0.1
+
+
+def test_turns_add_up_and_are_undone_one_by_one(session):
+    before = session.edit
+    session.turn("shoulder_left", 30, (0, 1, 0))
+    once = session.edit
+    session.turn("shoulder_left", 30, (0, 1, 0))
+    angle = np.degrees(np.linalg.norm(logarithm(np.array(session.edit.targets["shoulder_left"].rotation))))
+    assert angle == pytest.approx(60)
+    assert session.undo() and session.edit == once
+    assert session.undo() and session.edit == before
+    assert session.redo() and session.edit == once
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_pull_costs_no_more_than_a_general_minimiser_finds(seed):
+    random = np.random.default_rng(seed)
+    joints = np.cumsum(np.vstack([np.zeros(3), random.normal(size=(2, 3)) * 0.2 + [0.4, 0, 0]]), 0)
+    grip = joints[-1] + [0.3, 0.1, 0.0]
+    axis = np.array([0.0, 0.0, 1.0])
+    links = [
+        Link(joint, exponential(0.2 * random.normal(size=3)), np.zeros(3), a)
+        for joint, a in zip(joints, (None, axis, None))
+    ]
+    base = Rigid(exponential(0.5 * random.normal(size=3)), random.normal(size=3))
+    now = _posed(links, [link.quat for link in links], base, grip)
+    place = now[0][0] + rotate(exponential(random.normal(size=3) * 0.7), 0.85 * (now[1] - now[0][0]))
+    turns = reach(links, base, grip, place)
+    assert np.linalg.norm(_posed(links, turns, base, grip)[1] - place) < 2e-3
+
+    def cost(vectors: np.ndarray) -> float:
+        total = 0.0
+        for row, (link, vector) in enumerate(zip(links, vectors.reshape(-1, 3))):
+            across = vector if link.axis is None else vector - (vector @ link.axis) * link.axis
+            own = vector @ vector + (OFF_AXIS - 1.0) * (0.0 if link.axis is None else across @ across)
+            total += own * (BEND if row else 1.0)
+        return total
+
+    def end(vectors: np.ndarray) -> np.ndarray:
+        quats = [multiply(exponential(v), link.quat) for v, link in zip(vectors.reshape(-1, 3), links)]
+        return _posed(links, quats, base, grip)[1] - place
+
+    ours = np.concatenate([logarithm(multiply(turn, conjugate(link.quat))) for turn, link in zip(turns, links)])
+    found = minimize(
+        cost, np.zeros(9), constraints={"type": "eq", "fun": end}, method="SLSQP", options={"maxiter": 500}
+    )
+    assert found.success
+    assert cost(ours) < 1.02 * found.fun + 1e-6
+
+
+def test_a_chain_that_is_too_short_points_to_the_place():
+    links = [Link(np.array([x, 0.0, 0.0]), IDENTITY, np.zeros(3), None) for x in (0.0, 1.0)]
+    turns = reach(links, Rigid.none(), np.array([2.0, 0.0, 0.0]), np.array([0.0, 9.0, 0.0]))
+    end = _posed(links, turns, Rigid.none(), np.array([2.0, 0.0, 0.0]))[1]
+    assert end[1] > 1.99 and abs(end[0]) < 0.02
+
+
+def test_a_pull_takes_the_grip_and_leaves_the_trunk(session):
+    start = session.node_positions(0.0)
+    hand = session.skeleton.part("elbow_left").nodes
+    grip = start[list(hand)].mean(0)
+    shoulder = bone_transforms(0.0)["shoulder_left"][:3, 3]
+    place = rotate(from_axis((0, -1, 0), 60), grip - shoulder) + shoulder
+    assert session.chain("elbow_left") == ("elbow_left", "shoulder_left")
+    assert session.pull("elbow_left", place) == ("elbow_left", "shoulder_left")
+    after = session.node_positions(0.0)
+    assert np.linalg.norm(after[list(hand)].mean(0) - place) < 0.02
+    still = still_nodes(session)
+    assert np.array_equal(after[still], start[still])
+    turned = session.edit.targets["shoulder_left"].rotation
+    assert np.degrees(np.linalg.norm(logarithm(np.array(turned)))) == pytest.approx(60, abs=4), "the limb swings whole"
+    assert session.undo()
+    assert not session.edit.handles, "a pull is one step"
+
+
+def test_a_dragged_pull_is_measured_from_its_beginning(session):
+    session.turn("shoulder_left", 20, (0, 1, 0))
+    begin = session.edit
+    for place in ((0.9, 0.1, 0.1), (0.7, -0.4, 0.3)):
+        session.pull("elbow_left", place, live=True)
+    session.release()
+    dragged = session.edit
+    assert session.undo() and session.edit == begin
+    session.pull("elbow_left", (0.7, -0.4, 0.3))
+    assert session.edit == dragged
+
+
+def test_a_pulled_root_moves_all(session):
+    root = next(part.name for part in session.skeleton.parts if part.parent is None)
+    start = session.node_positions(0.0)
+    session.pull(root, start[list(session.skeleton.part(root).nodes)].mean(0) + np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(
+        session.node_positions(0.0) - start, np.tile([0.1, 0.2, 0.3], (len(start), 1)), atol=1e-6
+    )
+
+
+def test_keyframes_interpolate_the_angle(session):
+    session.pose_part("elbow_left")
+    session.add_keyframe(0.0, "linear")
+    session.turn("elbow_left", 80, (1, 0, 0))
+    session.add_keyframe(2.0)
+    quat = np.array(session.engine.targets(session.edit, 0.5)["elbow_left"].rotation)
+    np.testing.assert_allclose(logarithm(quat), np.radians([20.0, 0, 0]), atol=1e-12)
+    assert not np.array_equal(session.node_positions(0.0, at=0.5), session.node_positions(0.0, at=0.0))
+
+
+def test_live_results_reach_the_exact_ones(session):
+    for place in np.linspace((0.56, -0.15, -0.4), (0.9, -0.2, 0.1), 12):
+        session.pull("elbow_left", place, live=True)
+        live = session.node_positions(0.0, live=True)
+    for _ in range(40):
+        live = session.node_positions(0.0, live=True)
+    session.release()
+    np.testing.assert_allclose(live, session.node_positions(0.0), atol=5e-3)
+
+
+def test_rings_are_numbers_of_edges(session):
+    graph = session.graph
+    label = session.skeleton.owners() % 3
+    found = _rings_to_others(graph, label, 4)
+    for node in range(0, len(graph), 7):
+        away = shortest_path(graph.matrix, unweighted=True, indices=node)[label != label[node]].min()
+        within = [other for other in range(len(graph)) if label[other] == label[node]]
+        inner = shortest_path(graph.matrix[within][:, within], unweighted=True, indices=within.index(node))
+        border = [i for i, other in enumerate(within) if (label[graph.ring([other], 1),] != label[node]).any()]
+        least = min((inner[i] + 1 for i in border), default=np.inf)
+        assert found[node] == min(least, 4) and found[node] >= min(away, 4)
+
+
+def test_no_edge_of_the_poser_bridges_a_gap_and_none_is_missed(session):
+    """The arm hangs beside the trunk: edges between them far from the shoulder go, but nothing falls apart."""
+    poser = session.engine.poser(session.skeleton)
+    assert len(np.unique(poser.graph.component)) == len(np.unique(session.graph.component))
+    assert connected_components(poser.graph.matrix)[0] == connected_components(session.graph.matrix)[0]
+    kept = {tuple(edge) for edge in poser.graph.edges.tolist()}
+    assert kept <= {tuple(edge) for edge in session.graph.edges.tolist()}
+    owner = session.skeleton.owners()
+    assert all(tuple(e) in kept for e in session.graph.edges.tolist() if owner[e[0]] == owner[e[1]])
+
+
+# The skeleton by hand
+
+
+def test_the_skeleton_is_changed_and_undone(session):
+    names = session.skeleton.names
+    session.turn("elbow_left", 30, (1, 0, 0))
+    session.rename_part("elbow_left", "left forearm")
+    assert session.edit.handles[0].part == "left forearm"
+    assert session.chain("left forearm") == ("left forearm", "shoulder_left")
+    nodes = session.skeleton.part("left forearm").nodes
+    low = [
+        n for n in nodes if session.node_positions(0.0)[n, 2] < np.median(session.node_positions(0.0)[list(nodes), 2])
+    ]
+    new = session.split_part("left forearm", low, "left hand")
+    assert session.skeleton.part(new).parent == "left forearm"
+    assert sorted((*session.skeleton.part(new).nodes, *session.skeleton.part("left forearm").nodes)) == list(nodes)
+    session.move_joint("left hand", (0.5, -0.1, -0.4), (0, 0, 2))
+    assert session.skeleton.part("left hand").axis == (0.0, 0.0, 1.0)
+    session.merge_parts("left forearm", "left hand")
+    assert session.skeleton.part("left forearm").nodes == nodes and session.skeleton.source == "edited"
+    session.merge_parts("shoulder_left", "left forearm")
+    assert not session.edit.handles, "the handle of a part that is gone goes with it"
+    for _ in range(6):
+        assert session.undo()
+    assert session.skeleton.names == names
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda s: s.turn("nose", 10, (1, 0, 0)), "no part is called 'nose'; there is "),
+        (lambda s: s.turn("head", 10), "the motion shows no axis"),
+        (lambda s: s.turn("head", 10, (0, 0, 0)), "not all close to 0"),
+        (lambda s: s.turn("head", 200, (0, 0, 1)), "give -180 to 180"),
+        (lambda s: s.pull("head", (0, float("nan"), 1)), "give 3 finite numbers"),
+        (lambda s: s.pull("head", (0, 0)), "give 3 finite numbers"),
+        (lambda s: s.rename_part("head", "torso"), "the name is taken"),
+        (lambda s: s.rename_part("head", ""), "give a name"),
+        (lambda s: s.merge_parts("head", "knee_left"), "are not neighbours"),
+        (lambda s: s.merge_parts("head", "head"), "with itself"),
+        (lambda s: s.split_part("head", [0, 1, 2]), "choose some but not all"),
+        (lambda s: s.move_joint("head", (0, 0, float("inf"))), "joint is"),
+        (lambda s: s.save_skeleton(), "no run folder"),
+    ],
+)
+def test_mistakes_give_one_line_and_change_nothing(session, call, message):
+    before = session.edit
+    with pytest.raises(UserError) as raised:
+        call(session)
+    assert message in str(raised.value) and "\n" not in str(raised.value)
+    assert session.edit == before
+
+
+def test_a_side_branch_of_equal_size_ends_a_chain():
+    """A finger moves without its hand, but a fragment on the upper arm does not stop the hand."""
+
+    def part(name, size, parent):
+        start = part.next
+        part.next += size
+        return Part(name, tuple(range(start, start + size)), parent, (0.0, 0.0, 0.0))
+
+    part.next = 0
+    tree = [("trunk", 50, None), ("arm", 9, "trunk"), ("fleck", 2, "arm"), ("forearm", 9, "arm")]
+    tree += [("hand", 6, "forearm"), ("index", 3, "hand"), ("thumb", 3, "hand"), ("leg", 20, "trunk")]
+    skeleton = Skeleton(tuple(part(*row) for row in tree))
+    assert skeleton.chain("thumb") == ("thumb",)
+    assert skeleton.chain("hand") == ("hand", "forearm", "arm")
+    assert skeleton.chain("leg") == ("leg",) and skeleton.chain("trunk") == ("trunk",)
+    assert skeleton.branch("arm") == ("arm", "fleck", "forearm", "hand", "index", "thumb")
+
+
+# Files
+
+
+def test_an_edit_of_parts_is_read_as_it_was_written(session, tmp_path):
+    session.turn("shoulder_left", 45, (0, 1, 0))
+    session.add_keyframe(1.0)
+    session.save(tmp_path / "edit.json")
+    content = json.loads((tmp_path / "edit.json").read_text())
+    assert "nodes" not in content["handles"][0] and content["handles"][0]["part"] == "shoulder_left"
+    other = session.fork()
+    other.reset()
+    other.load(tmp_path / "edit.json")
+    assert other.edit == session.edit
+    assert np.array_equal(other.node_positions(0.3, at=1.0), session.node_positions(0.3, at=1.0))
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"handles": [{"part": "tail"}]}, 'handles[0].part is "tail"; there is part-1'),
+        ({"handles": [{"part": "part-1", "nodes": [1]}]}, "give one of them"),
+        ({"handles": [{}]}, "name is missing"),
+        ({"skeleton": {"parts": []}}, "skeleton.parts do not hold each of the 60"),
+        ({"skeleton": {"parts": [{"name": "a", "nodes": [99], "joint": [0, 0, 0]}]}}, "names control point 99"),
+        ({"skeleton": {"parts": [{"name": "a", "nodes": [0]}]}}, "joint is missing"),
+    ],
+)
+def test_a_script_that_names_parts_is_checked(change, message, tmp_path):
+    path = tmp_path / "edit.json"
+    path.write_text(json.dumps({"format": "scgs-warp edit", "version": 2, **change}))
+    session = EditSession(bar_scene())
+    with pytest.raises(UserError) as raised:
+        session.load(path)
+    assert message in str(raised.value) and str(path) in str(raised.value)
+
+
+def test_a_script_may_name_a_part_alone(tmp_path):
+    path = tmp_path / "edit.json"
+    entry = {"part": "part-2", "time": 0.5}
+    turn = {"axis": [0, 1, 0], "degrees": 30}
+    content = {"format": "scgs-warp edit", "version": 2, "handles": [entry], "targets": {"part-2": turn}}
+    path.write_text(json.dumps(content))
+    session = EditSession(bar_scene())
+    session.load(path)
+    assert session.edit.skeleton == session.skeleton
+    assert session.edit.handles[0].nodes == session.skeleton.part("part-2").nodes
+    assert not np.array_equal(session.node_positions(0.5), EditSession(bar_scene()).node_positions(0.5))
+
+
+def test_a_run_keeps_its_skeleton(tmp_path):
+    def opened() -> EditSession:
+        scene = bar_scene()
+        scene.folder = tmp_path
+        return EditSession(scene)
+
+    session = opened()
+    names = session.skeleton.names
+    file = tmp_path / "skeleton.json"
+    assert file.is_file()
+    session.rename_part(names[0], "left half")
+    assert opened().skeleton.names == names, "the edit's skeleton is its own until it is saved"
+    session.save_skeleton()
+    assert opened().skeleton == session.skeleton
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({**content, "scene": {**content["scene"], "fingerprint": "00000000"}}))
+    assert opened().skeleton.names == names, "a skeleton of other control points is found anew"
+    file.write_text("{")
+    with pytest.raises(UserError, match=r"skeleton\.json: not valid JSON"):
+        _ = opened().skeleton
+
+
+def test_a_folder_that_cannot_be_written_is_read_only(tmp_path):
+    scene = bar_scene()
+    scene.folder = tmp_path / "missing"
+    assert len(EditSession(scene).skeleton.parts) >= 2
+
+
+def test_a_number_of_parts_replaces_the_skeleton(figure):
+    session = figure.fork()
+    session.turn("head", 20, (0, 0, 1))
+    session.add_handle([3, 4], 0.0, "free")
+    session.use_parts(6)
+    assert len(session.skeleton.parts) == 6 and [h.name for h in session.edit.handles] == ["free"]
+    assert session.undo() and session.edit.handle("head") is not None
