@@ -22,8 +22,8 @@ class Settings:
     """Settings of a training run."""
 
     preset: PresetName | None = None
-    """Schedule. quick: a few minutes on two cores; cpu: about a quarter of an hour; best: an hour or two, better on
-    scenes of large motion; paper: hours, the schedule of the SC-GS supplement. By default quick for the built-in scene
+    """Schedule. quick: a few minutes on two cores; cpu: about a quarter of an hour; best: half an hour to an
+    hour, a little better; paper: hours, the schedule of the SC-GS supplement. By default quick for the built-in scene
     and cpu for others."""
     config: Path | None = None
     """config.json of an earlier run, or a part of one; options override it."""

@@ -131,9 +131,10 @@ def beside(columns: tuple[Column, ...], rows: tuple[tuple[str, str], ...]) -> Ca
 OWN_ROWS = (
     ("cpu", "**`cpu`** (24,000 steps, one CPU core)"),
     ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
-    ("best-today", "**`best`** (80,000 steps, one CPU core)"),
-    ("best-40000", "`best --steps 40000 --set loss.log_error_from=0.58` (one CPU core)"),
-    ("best", "`best` (80,000 steps, one CPU core)"),
+    ("best-40000", "**`best`** (40,000 steps, one CPU core)"),
+    ("best-40000-seed-1", "`best` with `--seed 1`"),
+    ("best-today", "`best` as it was with 80,000 steps (one CPU core)"),
+    ("best", "`best` as it was with 80,000 steps (one CPU core)"),
     ("best-less-pruning", "`best` with `densify.min_contribution=0.02`"),
     ("paper", "`paper` (the supplement's schedule, 80,000 steps)"),
 )
@@ -298,10 +299,10 @@ def overview(source: Source) -> str:
         ("arap/on", "figure", "built-in scene, 400 x 400, `quick` (7,000 steps)"),
         *(("published/cpu", scene, f"D-NeRF {scene}, `--downscale 2`, `cpu` (24,000 steps)") for scene in DNERF),
         *(
-            ("published/best-today", scene, f"D-NeRF {scene}, `--downscale 2`, `best` (80,000 steps)")
-            for scene in ("jumpingjacks", "hook")
+            ("published/best-40000", scene, f"D-NeRF {scene}, `--downscale 2`, `best` (40,000 steps)")
+            for scene in DNERF
         ),
-        *(("published/best", scene, f"D-NeRF {scene}, `--downscale 2`, `best` (80,000 steps)") for scene in DNERF),
+        ("published/handheld", "handheld", "handheld, a real film, `--downscale 2`, `cpu --steps 6000`"),
     ):
         name, _, own = row.partition("/")
         run = source.runs.get((name, own, scene), {})

@@ -130,14 +130,14 @@ class MotionConfig:
 class PretrainConfig:
     """Stage 1: control points trained alone, rendered as same-sized spheres."""
 
-    steps: int = milestone(10_000, 0)
+    steps: int = milestone(5_000, 0)
     with_points: bool = False
     """Keep stage 1 if the data has points. Otherwise control points start as a sample of these points and learn with
     the Gaussians from the first step."""
-    densify_until: int = milestone(7_500)
+    densify_until: int = milestone(3_750)
     """Step at which spheres are no longer densified and pruned; farthest-point sampling of trajectories then reduces
     them to N_p."""
-    warm_up: int = milestone(100, 0)
+    warm_up: int = milestone(50, 0)
     """Number of steps before the network starts to move the spheres. After long at rest, only spheres of parts that
     hardly move are left."""
     densify_every: int = bounded(100, 1)
@@ -178,7 +178,7 @@ class PretrainConfig:
     should fade. auto: yes, unless ``silhouette`` leads spheres to a subject in separate parts, which is not thin."""
     progressive: bool = False
     """Begin with the first 20 % of the frames and add 20 % every ``progressive_every`` steps."""
-    progressive_every: int = milestone(1_000, 1)
+    progressive_every: int = milestone(500, 1)
     progressive_by: Literal["frame", "fifth"] = newer("frame", before="frame")
     """How frames are added. frame: one by one at that pace, with every other step on one of the newest 20 %, and
     spheres that begin in the first pose. fifth: 20 % at a time, all frames equally often (supplement)."""
@@ -195,7 +195,7 @@ class OptimConfig:
 
     means: float = 8e-4
     means_end: float = 8e-6
-    means_until: int = milestone(66_000, 1)
+    means_until: int = milestone(33_000, 1)
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
     opacity: float = 0.05
@@ -208,7 +208,7 @@ class OptimConfig:
     bodies that spin were lost."""
     network: float = 8e-4
     network_end: float = 1.6e-6
-    network_until: int = milestone(66_000, 1)
+    network_until: int = milestone(33_000, 1)
     network_from: Literal["motion", "stage"] = newer("motion", before="motion")
     """Step from which ``network_until`` counts. motion: the first that trains the network. stage: the first of each
     stage (official code)."""
@@ -232,8 +232,8 @@ class OptimConfig:
 class DensifyConfig:
     """Adaptive density control of Gaussians and control points, in main steps."""
 
-    start: int = milestone(500, 0)
-    until: int = milestone(40_000, 0)
+    start: int = milestone(250, 0)
+    until: int = milestone(20_000, 0)
     every: int = bounded(100, 1)
     """Smallest number of steps between two rounds: fewer steps see too few views to decide by."""
     rounds: int = bounded(132, 0)
@@ -261,11 +261,11 @@ class DensifyConfig:
     """Prune Gaussians that cover more than this share of the image (after the first opacity reset). 0: off."""
     max_scale: float = 0.1
     """Prune Gaussians larger than this share of the extent (after the first opacity reset)."""
-    opacity_reset_every: int = milestone(10_000, 1)
-    sh_every: int = milestone(1_500, 1)
+    opacity_reset_every: int = milestone(5_000, 1)
+    sh_every: int = milestone(750, 1)
     """Number of main steps between two degrees of spherical harmonics."""
-    nodes_every: int = milestone(5_000, 1)
-    nodes_until: int = milestone(25_000)
+    nodes_every: int = milestone(2_500, 1)
+    nodes_until: int = milestone(12_500)
     node_grad_threshold: float = 2e-4
     """Weighted mean gradient of the Gaussians that a control point moves above which it is cloned, in the units of
     ``grad_threshold`` and scaled likewise."""
@@ -290,7 +290,7 @@ class LossConfig:
     log_error: float = newer(0.002, before=0.0, least=0)
     """Weight of the logarithm of each view's mean squared error (not in the paper), which weighs views by their
     relative error, as PSNR does."""
-    log_error_from: float = newer(0.5, before=0.5, least=0, most=1)
+    log_error_from: float = newer(0.58, before=0.5, least=0, most=1)
     """Share of the main stage after which ``log_error`` applies."""
     pooled: Literal["auto", "always", "never"] = newer("auto", before="never")
     """Add the residual averaged over squares of 2, 4 and 8 % of the width in the main stage (not in the paper): a part
@@ -298,7 +298,7 @@ class LossConfig:
     for thin subjects; it lowers the scores of others."""
     arap: float = bounded(1e-4, 0)
     arap_end: float = bounded(1e-7, 0)
-    arap_until: int = milestone(10_000)
+    arap_until: int = milestone(5_000)
     """Main step until which the ARAP weight changes exponentially from ``arap`` to ``arap_end``; afterwards the term is
     off."""
     arap_every: int = bounded(5, 1)
@@ -322,10 +322,10 @@ class TrainConfig:
     """A complete run. ``steps`` is the total of both stages; every milestone is a number of steps."""
 
     preset: PresetName = "best"
-    steps: int = bounded(80_000, most=100_000_000)
-    freeze: int = milestone(3_000, 0)
+    steps: int = bounded(40_000, most=100_000_000)
+    freeze: int = milestone(1_500, 0)
     """Number of main steps at the beginning in which control points and network stay as stage 1 left them."""
-    coarse: int = milestone(6_000, 0)
+    coarse: int = milestone(3_000, 0)
     """Number of main steps at the beginning in which models without stage 1 learn a static scene."""
     shortest: int = newer(0, before=0, least=0)
     """Number of steps to which ``freeze``, ``coarse`` and ``densify.opacity_reset_every`` shrink at most in a shorter

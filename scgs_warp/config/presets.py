@@ -47,7 +47,7 @@ PRESETS: tuple[str, ...] = get_args(PresetName)
 
 def preset(name: PresetName) -> TrainConfig:
     """Make a configuration. ``quick`` suits the built-in scene, ``cpu`` takes minutes on two cores, ``best`` takes
-    80,000 steps, ``paper`` is the schedule of the SC-GS supplement in as many steps."""
+    40,000 steps, ``paper`` is the schedule of the SC-GS supplement in 80,000."""
     if name == "best":
         return TrainConfig()
     if name == "paper":
@@ -59,7 +59,7 @@ def preset(name: PresetName) -> TrainConfig:
         coarse=1_800,
         init_points=10_000,
         evaluate_every=5_000,
-        pretrain=PretrainConfig(steps=3_000, densify_until=2_000, progressive_every=300),
+        pretrain=PretrainConfig(steps=3_000, densify_until=2_000, warm_up=100, progressive_every=300),
         motion=MotionConfig(nodes=256),
         optim=OptimConfig(means_until=21_000, network_until=21_000),
         densify=DensifyConfig(
@@ -70,7 +70,7 @@ def preset(name: PresetName) -> TrainConfig:
             nodes_every=2_000,
             nodes_until=9_000,
         ),
-        loss=LossConfig(arap_until=3_000),
+        loss=LossConfig(log_error_from=0.5, arap_until=3_000),
     )
     if name == "cpu":
         return cpu

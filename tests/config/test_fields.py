@@ -26,7 +26,7 @@ def test_interval_of_densification_rounds():
 
 def test_only_control_points_have_a_first_stage():
     made = C.with_field(C.preset("best"), "motion.model", "static", "test")
-    assert made.pretrain_steps == 0 and made.main_steps == 80_000
+    assert made.pretrain_steps == 0 and made.main_steps == 40_000
 
 
 def test_rest_steps_follow_the_model():

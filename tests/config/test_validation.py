@@ -64,7 +64,7 @@ def test_choices_are_inclusive(name):
     [
         ("motion.nodes", 4, "--nodes 4: needs at least 5"),
         ("densify.max_gaussians", 99, "--max-gaussians 99: needs at least 100"),
-        ("pretrain.steps", 80_000, "steps 80000 leave nothing after 80000 pre-training steps; raise --steps"),
+        ("pretrain.steps", 80_000, "steps 40000 leave nothing after 80000 pre-training steps; raise --steps"),
         ("optim.settle", 1.5, "optim.settle is 1.5; it is a share of the run"),
         ("motion.skip", 8, "motion.skip is 8; it must be below motion.layers, 8"),
         ("motion.skip", 0, "motion.skip is 0; choose 1 to 7"),
