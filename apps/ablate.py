@@ -61,8 +61,8 @@ class Options(Settings, SweepOptions):
 
     preset: PresetName | None = None
     """Schedule of all cells. cpu (the default): about 15 minutes per cell, for zoo shortened to 6,000 steps; quick: a
-    few minutes; best: half an hour to an hour; paper: hours, the schedule of the SC-GS supplement. All cells are trained
-    for equally many steps."""
+    few minutes; best: half an hour to an hour; paper: hours, the schedule of the SC-GS supplement. All cells are
+    trained for equally many steps."""
 
 
 def words(texts: tuple[str, ...]) -> list[str]:
