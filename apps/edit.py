@@ -31,6 +31,10 @@ class Options:
     """File (.ply) to write the edited scene to, as it is at the moment --at of the film."""
     at: float = 0.0
     """Second of the film that --export writes."""
+    skeleton: bool = False
+    """Print the parts that moved together, with their joints, and end (docs/editing.md)."""
+    parts: int | None = None
+    """Number of parts, instead of as many as turn against their neighbours."""
     nodes: int = 512
     """Number of control points to make for a scene without motion."""
     size: int | None = None
@@ -64,6 +68,10 @@ def check(options: Options) -> None:
         raise UserError("edit.py: give one of --run and --ply")
     if not 1 <= options.nodes <= MAX_NODES:
         raise UserError(f"--nodes {options.nodes}: give 1 to {MAX_NODES}")
+    if options.parts is not None and not 1 <= options.parts <= MAX_NODES:
+        raise UserError(f"--parts {options.parts}: give 1 to {MAX_NODES}")
+    if options.skeleton and (options.output is not None or options.export is not None):
+        raise UserError("--skeleton prints and ends; leave --output and --export out")
     if options.size is not None and not 16 <= options.size <= 8192:
         raise UserError(f"--size {options.size}: give 16 to 8192 pixels")
     if options.output is not None:
@@ -93,6 +101,8 @@ def open_session(options: Options, device: str) -> EditSession:
         if isinstance(scene.motion, Static):
             scene = with_control_points(scene, options.nodes)
     session = EditSession(scene)
+    if options.parts is not None:
+        session.use_parts(options.parts)
     if options.script is not None:
         session.load(options.script)
     if options.size is not None:
@@ -135,18 +145,35 @@ def open_browser(session: EditSession, options: Options) -> None:
             editor.stop()
 
 
+def skeleton_lines(session: EditSession) -> list[str]:
+    """Describe the skeleton, a line for each part."""
+    rows = [("part", "hangs on", "points", "joint", "axis", "turns by", "confidence")]
+    for part in session.parts():
+        joint, axis = (
+            "" if v is None else " ".join(f"{x:.3g}" for x in v)
+            for v in (part.joint if part.parent else None, part.axis)
+        )
+        turns = (f"{part.degrees:.0f} degrees", f"{part.confidence:.2f}") if part.parent else ("", "")
+        rows.append((part.name, part.parent or "", str(len(part.nodes)), joint, axis, *turns))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+
+
 def main(args: list[str] | None) -> None:
     import tyro
 
     options = tyro.cli(Options, args=args, prog="edit.py")
     check(options)
-    browser = options.output is None and options.export is None
+    browser = options.output is None and options.export is None and not options.skeleton
     if browser:
         from scgs_warp.editor.app import import_viser
 
         import_viser()  # A missing package is reported before the scene is loaded.
     device = prepare(options.device, options.threads, options.memory_gib)
     session = open_session(options, device)
+    if options.skeleton:
+        print("\n".join(skeleton_lines(session)))
+        return
     if browser:
         open_browser(session, options)
         return

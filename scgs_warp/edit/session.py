@@ -350,12 +350,13 @@ class EditSession(Posing):
         write_atomically(Path(path), edit_file.to_json(self.edit, self.engine).encode())
 
     def load(self, path: str | Path) -> None:
-        """Replace the edit with the one in a file, as a step that can be undone.
+        """Replace the edit with the one in a file, as a step that can be undone. A file that names parts but holds no
+        skeleton means those of the present one.
 
         Raises:
             UserError: the file is missing, or a field is wrong; the edit stays unchanged.
         """
-        self.apply(edit_file.read(Path(path), self.engine, self._run_skeleton))
+        self.apply(edit_file.read(Path(path), self.engine, lambda: self.skeleton))
 
     def export_ply(self, path: str | Path, time: float, at: float | None = None) -> None:
         """Write the edited Gaussians at one moment as a 3D-GS file, world units."""
