@@ -258,10 +258,13 @@ class Posing:
             frames.append(frame)
         above = skeleton.part(handles[-1].part or "").parent
         base = Rigid.none() if above is None else self._motion_of(edit, above, time, None)[0]
-        targets = {}
-        for handle, frame, quat in zip(reversed(handles), frames, reach(links, base, grip, place)):
+        found, targets = reach(links, base, grip, place), {}
+        for handle, frame, quat in zip(reversed(handles), frames, found.turns):
             own = multiply(multiply(conjugate(frame), quat), frame)
             targets[handle.name] = Target.of(edit.targets.get(handle.name, STAY).translation, own.tolist())
+        first = handles[-1].name
+        shift = rotate(conjugate(frames[0]), found.shift) / self.engine.units[1]
+        targets[first] = Target.of(shift.tolist(), targets[first].rotation)
         return targets
 
     def _shifted(self, edit: Edit, skeleton: Skeleton, handle: Handle, time: float, shift: np.ndarray) -> Target:

@@ -11,11 +11,15 @@ from .part_pose import Rigid
 from .rotations import conjugate, exponential, logarithm, multiply, rotate, to_matrix
 
 OFF_AXIS = 4.0
-"""Cost of a turn across the axis about which the motion turned a joint, relative to a turn about it: a knee bends
-forwards."""
+"""Cost of a turn across the axis about which the motion turned an inner joint, relative to a turn about it: a knee
+bends forwards. The first joint swings in any direction alike."""
 BEND = 10.0
 """Cost of a turn of any joint but the first, relative to one of the first: a limb swings as a whole, and its inner
 joints bend as far as the distance of the place requires."""
+SLIDE = 300.0
+"""Cost of a squared shift of the first joint, in lengths of the chain, relative to squared angles. A nearly straight
+limb bends a lot for a small change of distance, so that a joint beside its true place would bend the elbow of an arm
+that only swings. The shoulder gives way a little instead."""
 PULL = 1e5
 """Weight of the squared distance from the place, in lengths of the chain, relative to squared angles."""
 STEPS = 6
@@ -26,6 +30,15 @@ LONGEST_TURN = 0.5
 """Largest turn of a joint in one iteration, radians."""
 TOLERANCE = 1e-6
 """Turn in one iteration below which iterations stop, radians."""
+
+
+class Reached(NamedTuple):
+    """Pose of a chain."""
+
+    turns: list[np.ndarray]
+    """Quaternions [4], one for each link."""
+    shift: np.ndarray
+    """[3] displacement of the first joint."""
 
 
 class Link(NamedTuple):
@@ -41,33 +54,30 @@ class Link(NamedTuple):
     """[3] unit direction about which the motion turned the joint most, in that frame; None: any direction alike."""
 
 
-def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -> list[np.ndarray]:
-    """Return the turns of all joints that take a point to a place, or as near as the chain reaches.
+def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -> Reached:
+    """Return the pose of a chain that takes a point to a place, or as near as the chain reaches.
 
-    Among the turns that reach it, those that differ least from the present ones are taken: the sum of squared angles is
-    least, where angles of inner joints count ``BEND`` times, and those across a known axis ``OFF_AXIS`` times. The
-    result depends on the arguments alone.
+    Among the poses that reach it, the one that differs least from the present one is taken: the sum of squared angles
+    is least, where angles of inner joints count ``BEND`` times, those across their known axes ``OFF_AXIS`` times more,
+    and a shift of the first joint counts ``SLIDE`` times. The result depends on the arguments alone.
 
     Args:
         links: joints from the base to the end.
         base: motion of the part that carries the first joint.
         grip: [3] point of the last part in its unturned pose.
         place: [3] where it goes.
-
-    Returns:
-        Quaternions [4], one for each link.
     """
-    turns = [link.quat for link in links]
-    points, now = _posed(links, turns, base, grip)
+    found = Reached([link.quat for link in links], links[0].shift)
+    points, now = posed_chain(links, found, base, grip)
     centre, here = points[0], now - points[0]
     length = max(sum(float(np.linalg.norm(b - a)) for a, b in pairwise(points)), 1e-12)
     there = (place - centre) * min(1.0, length / max(float(np.linalg.norm(place - centre)), 1e-300))
-    costs = [_cost(link.axis) * (BEND if row else 1.0) for row, link in enumerate(links)]
+    costs = [np.eye(3), *(BEND * _cost(link.axis) for link in links[1:])]
     for step in range(1, STEPS + 1):
         aim = centre + _between(here, there, step / STEPS)
         most = FINAL_ITERATIONS if step == STEPS else STEP_ITERATIONS
-        turns = _solve(links, turns, costs, base, grip, aim, length, most)
-    return turns
+        found = _solve(links, found, costs, base, grip, aim, length, most)
+    return found
 
 
 def _cost(axis: np.ndarray | None) -> np.ndarray:
@@ -75,47 +85,50 @@ def _cost(axis: np.ndarray | None) -> np.ndarray:
     return np.eye(3) if axis is None else OFF_AXIS * np.eye(3) - (OFF_AXIS - 1.0) * np.outer(axis, axis)
 
 
-def _posed(links: list[Link], turns: list[np.ndarray], base: Rigid, grip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def posed_chain(links: list[Link], pose: Reached, base: Rigid, grip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the posed joints with the point at their end, [C + 1, 3], and that point."""
     motion, points = base, []
-    for link, turn in zip(links, turns):
-        points.append(motion.apply(link.joint + link.shift))
-        motion = motion.after(Rigid(turn, link.joint + link.shift - rotate(turn, link.joint)))
+    for row, (link, turn) in enumerate(zip(links, pose.turns)):
+        joint = link.joint + (link.shift if row else pose.shift)
+        points.append(motion.apply(joint))
+        motion = motion.after(Rigid(turn, joint - rotate(turn, link.joint)))
     end = motion.apply(grip)
     return np.array([*points, end]), end
 
 
 def _solve(
     links: list[Link],
-    turns: list[np.ndarray],
+    pose: Reached,
     costs: list[np.ndarray],
     base: Rigid,
     grip: np.ndarray,
     aim: np.ndarray,
     length: float,
     iterations: int,
-) -> list[np.ndarray]:
-    """Minimise the cost of the turns since the present pose plus the pull, by Gauss-Newton steps."""
-    pull, turns = PULL / length**2, list(turns)
+) -> Reached:
+    """Minimise the cost of the change since the present pose plus the pull, by Gauss-Newton steps."""
+    pull, slide = PULL / length**2, SLIDE / length**2
     for _ in range(iterations):
-        points, end = _posed(links, turns, base, grip)
-        frame, columns = base.quat, []
-        for row, turn in enumerate(turns):
-            arm = end - points[row]
-            columns.append(_cross(-arm) @ to_matrix(frame))
+        points, end = posed_chain(links, pose, base, grip)
+        frame, columns = base.quat, [to_matrix(base.quat)]
+        for point, turn in zip(points, pose.turns):
+            columns.append(_cross(point - end) @ to_matrix(frame))
             frame = multiply(frame, turn)
         J = np.concatenate(columns, axis=1)
         normal, slope = pull * J.T @ J, pull * J.T @ (end - aim)
-        for row, (link, turn, cost) in enumerate(zip(links, turns, costs)):
+        normal[:3, :3] += slide * np.eye(3)
+        slope[:3] += slide * (pose.shift - links[0].shift)
+        for row, (link, turn, cost) in enumerate(zip(links, pose.turns, costs), 1):
             block = slice(3 * row, 3 * row + 3)
             normal[block, block] += cost
             slope[block] += cost @ logarithm(multiply(turn, conjugate(link.quat)))
         change = -np.linalg.solve(normal, slope).reshape(-1, 3)
-        change *= min(1.0, LONGEST_TURN / max(float(np.linalg.norm(change, axis=1).max()), 1e-300))
-        turns = [multiply(exponential(further), turn) for further, turn in zip(change, turns)]
-        if np.abs(change).max() < TOLERANCE:
+        change *= min(1.0, LONGEST_TURN / max(float(np.linalg.norm(change[1:], axis=1).max()), 1e-300))
+        turns = [multiply(exponential(further), turn) for further, turn in zip(change[1:], pose.turns)]
+        pose = Reached(turns, pose.shift + change[0])
+        if np.abs(change[1:]).max() < TOLERANCE:
             break
-    return turns
+    return pose
 
 
 def _cross(vector: np.ndarray) -> np.ndarray:

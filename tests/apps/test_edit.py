@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from helpers.edit_scenes import dress
+from helpers.edit_scenes import bar_scene, dress
 from helpers.edit_scripts import SCRIPT
 from scgs_warp.apps import edit as app
 from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
@@ -51,6 +51,8 @@ def test_the_app_films_and_exports(tmp_path, ply, capsys):
         (["--run", "a", "--nodes", "0"], "--nodes 0"),
         (["--run", "a", "--size", "5"], "--size 5"),
         (["--run", "a", "--at", "-1"], "--at -1"),
+        (["--run", "a", "--parts", "0"], "--parts 0"),
+        (["--run", "a", "--skeleton", "--export", "out.ply"], "--skeleton prints and ends"),
     ],
 )
 def test_mistakes_are_one_line_and_status_2(tmp_path, monkeypatch, capsys, arguments, words):
@@ -59,6 +61,25 @@ def test_mistakes_are_one_line_and_status_2(tmp_path, monkeypatch, capsys, argum
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_skeleton_is_printed(monkeypatch, capsys):
+    from scgs_warp.edit import EditSession
+
+    session = EditSession(bar_scene())
+    monkeypatch.setattr(app, "open_session", lambda options, device: session)
+    assert app.cli(["--run", "a", "--skeleton"]) == 0
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["part", "hangs", "on", "points", "joint", "axis", "turns", "by", "confidence"]
+    assert [line.split()[0] for line in lines] == list(session.skeleton.names)
+    hangs = next(part for part in session.parts() if part.parent)
+    own = next(line for line in lines if line.startswith(hangs.name))
+    assert f"{hangs.degrees:.0f} degrees" in own and f"{hangs.confidence:.2f}" in own and str(hangs.parent) in own
+
+
+def test_a_number_of_parts_is_taken(ply, capsys):
+    assert app.cli(["--ply", str(ply), "--nodes", "40", "--skeleton", "--parts", "1"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) >= 2
 
 
 def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
