@@ -147,14 +147,14 @@ def open_browser(session: EditSession, options: Options) -> None:
 
 def skeleton_lines(session: EditSession) -> list[str]:
     """Describe the skeleton, a line for each part."""
-    rows = [("part", "hangs on", "points", "joint", "axis", "turns by", "confidence")]
+    rows = [["part", "hangs on", "points", "joint", "axis", "turns by", "confidence"]]
     for part in session.parts():
         joint, axis = (
             "" if v is None else " ".join(f"{x:.3g}" for x in v)
             for v in (part.joint if part.parent else None, part.axis)
         )
-        turns = (f"{part.degrees:.0f} degrees", f"{part.confidence:.2f}") if part.parent else ("", "")
-        rows.append((part.name, part.parent or "", str(len(part.nodes)), joint, axis, *turns))
+        turns = [f"{part.degrees:.0f} degrees", f"{part.confidence:.2f}"] if part.parent else ["", ""]
+        rows.append([part.name, part.parent or "", str(len(part.nodes)), joint, axis, *turns])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
 
