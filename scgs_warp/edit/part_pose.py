@@ -24,6 +24,9 @@ from .solver import ArapSolver
 FREE_RINGS = 3
 """Number of rings of control points on either side of a turned joint that are free; fewer on a short part, so that some
 of its control points are held."""
+INNER_STIFFNESS = 0.03
+"""Stiffness (edges have 1) with which a short body between two others is pulled to its place. The bodies at its ends
+place it already; held firmly, it would leave the surface little room to bend."""
 BOUNDARY_REACH = 1.5
 """Distance of an edge from the joint of the parts that it connects, relative to the median of all their edges, beyond
 which it bridges a gap and is cut: an arm that hung beside the trunk shares Gaussians with it."""
@@ -97,7 +100,7 @@ class PartPoser:
         self.graph = _without_bridges(graph, self.owner, self._parent, self.joints, start)
         self.solver = ArapSolver(self.graph)
         self._members = [self._with_surroundings(row) for row in range(len(skeleton.parts))]
-        self._held: dict[tuple[int, ...], np.ndarray] = {}
+        self._held: dict[tuple[int, ...], tuple[np.ndarray, frozenset[int]]] = {}
 
     def _with_surroundings(self, row: int) -> np.ndarray:
         """Return the part's control points, and their neighbours if they alone show no rotation."""
@@ -158,29 +161,43 @@ class PartPoser:
         motions, body = self.motions(moves, now)
         if max(body) < 0:
             return []
-        held, of_node, goals = self._held_nodes(body), np.array(body)[self.owner], []
+        of_node, goals = np.array(body)[self.owner], []
+        held, short = self._held_nodes(body)
         for label in sorted(set(body)):
             nodes = np.flatnonzero(held & (of_node == label) & ~released)
-            if len(nodes):
-                goals.append(_goal(nodes, motions[label] if label >= 0 else Rigid.none(), now))
+            if not len(nodes):
+                continue
+            goal = _goal(nodes, motions[label] if label >= 0 else Rigid.none(), now)
+            if label in short and self._carries(label, body):
+                goal = goal._replace(stiffness=INNER_STIFFNESS, gives_rotation=False)
+            goals.append(goal)
         return goals
 
-    def _held_nodes(self, body: Sequence[int]) -> np.ndarray:
-        """Return which control points are held, [M] bool: those more than ``FREE_RINGS`` from every other body; of
-        a body that does not reach so far, those furthest away."""
+    def _carries(self, label: int, body: Sequence[int]) -> bool:
+        """Return whether another moved body hangs on this one."""
+        return label >= 0 and any(
+            other >= 0 and self._parent[other] >= 0 and body[self._parent[other]] == label
+            for other in set(body) - {label}
+        )
+
+    def _held_nodes(self, body: Sequence[int]) -> tuple[np.ndarray, frozenset[int]]:
+        """Return which control points are held, [M] bool: those more than ``FREE_RINGS`` from every other body; of a
+        body that does not reach so far, those furthest away. Also return the bodies that are so short."""
         key = tuple(body)
-        held = self._held.get(key)
-        if held is None:
+        found = self._held.get(key)
+        if found is None:
             of_node = np.array(body)[self.owner]
             rings = _rings_to_others(self.graph, of_node, FREE_RINGS + 1)
-            held = np.zeros(len(of_node), bool)
+            held, short = np.zeros(len(of_node), bool), set()
             for label in set(body):
                 own = of_node == label
-                held |= own & (rings > min(FREE_RINGS, int(rings[own].max()) - 1))
+                most = int(rings[own].max())
+                held |= own & (rings >= most)
+                short |= {label} if most <= FREE_RINGS else set()
             if len(self._held) >= 64:
                 self._held.clear()
-            self._held[key] = held
-        return held
+            found = self._held[key] = held, frozenset(short)
+        return found
 
 
 def _goal(nodes: np.ndarray, motion: Rigid, now: np.ndarray) -> Goal:

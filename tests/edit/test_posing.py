@@ -14,7 +14,7 @@ from helpers.edit_scenes import bar_scene, figure_scene
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.handles import STAY
-from scgs_warp.edit.part_pose import FREE_RINGS, PartMove, Rigid, _rings_to_others
+from scgs_warp.edit.part_pose import FREE_RINGS, INNER_STIFFNESS, PartMove, Rigid, _rings_to_others
 from scgs_warp.edit.reach import BEND, OFF_AXIS, SLIDE, Link, Reached, posed_chain, reach
 from scgs_warp.edit.rotations import IDENTITY, conjugate, exponential, from_axis, logarithm, multiply, rotate, to_matrix
 from scgs_warp.edit.skeleton import Part, Skeleton
@@ -241,6 +241,22 @@ def test_live_results_reach_the_exact_ones(session):
         live = session.node_positions(0.0, live=True)
     session.release()
     np.testing.assert_allclose(live, session.node_positions(0.0), atol=5e-3)
+
+
+def test_a_short_body_between_two_others_is_pulled_not_held(session):
+    session.turn("shoulder_left", 70, (0, -1, 0))
+
+    def stiffness() -> dict[str, float | None]:
+        poser = session.engine.poser(session.skeleton)
+        now = session.engine.motion_at(0.0).positions
+        goals = poser.goals(_moves(session), now, np.zeros(len(now), bool))
+        return {session.skeleton.names[poser.owner[goal.nodes[0]]]: goal.stiffness for goal in goals}
+
+    assert set(stiffness().values()) == {None}, "the whole arm is one body"
+    session.turn("elbow_left", 40, (1, 0, 0))
+    found = stiffness()
+    assert found.pop("shoulder_left") == INNER_STIFFNESS
+    assert "elbow_left" in found and set(found.values()) == {None}
 
 
 def test_rings_are_numbers_of_edges(session):

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from helpers.edit_scenes import figure_surface
 from scgs_warp.data.synthetic.figure_motion import bone_transforms
-from scgs_warp.edit import EditSession
+from scgs_warp.edit import ControlGraph, EditSession
 from scgs_warp.edit.rotations import from_axis, rotate, to_matrix
 from scgs_warp.geometry.cameras import look_at
 from scgs_warp.types import Camera
@@ -29,6 +29,7 @@ LIMBS = {
     "leg": (("hip_left", "knee_left"), "hip_left", (-1.0, 0.0, 0.0)),
 }
 """Bones, the joint turned about at time 0, the axis."""
+TRUNK = ("torso", "hips")
 
 
 class Bent(NamedTuple):
@@ -42,6 +43,10 @@ class Bent(NamedTuple):
     """95th percentile of the relative change of Gaussians' distances to their 8 nearest neighbours."""
     error: float
     """Mean distance of the limb's Gaussians from where the joint's rotation takes them, in limb lengths."""
+    worst_edge: float
+    """Largest relative change of an edge of the graph."""
+    torso_moved: float
+    """Mean distance by which the Gaussians of torso and hips move, in heights of the figure."""
 
 
 def grab(session: EditSession, node_bones: np.ndarray, limb: str, near: int = 2, far: int = 3) -> np.ndarray:
@@ -66,17 +71,35 @@ def bend(
         solid: [N] bool, which Gaussians count (the opaque ones).
         bones: of those.
     """
+    session.move(limb, rotation=from_axis(LIMBS[limb][2], degrees).tolist())
+    return measured(session, session.graph, node_bones, solid, bones, limb, degrees)
+
+
+def measured(
+    session: EditSession,
+    graph: ControlGraph,
+    node_bones: np.ndarray,
+    solid: np.ndarray,
+    bones: np.ndarray,
+    limb: str,
+    degrees: float,
+) -> Bent:
+    """Measure the present edit at time 0 as a turn of a limb about its joint.
+
+    Args:
+        graph: graph that bends.
+        solid, bones: as in ``bend``.
+    """
     own, joint = np.isin(node_bones, LIMBS[limb][0]), LIMBS[limb][1]
     pivot, turn = bone_transforms(0.0)[joint][:3, 3], from_axis(LIMBS[limb][2], degrees)
     start = session.scene.gaussians_at(0.0).means.double().numpy()[solid]
     rest = session.engine.to_world(session.engine.motion_at(0.0).positions)
-    session.move(limb, rotation=turn.tolist())
     bent = session.engine.bend(session.edit, 0.0)
     assert bent is not None
     posed = session.engine.to_world(bent.positions)
     zone = np.zeros(len(session), bool)
-    zone[list(session.ring(np.flatnonzero(own), 2))] = True
-    edges = session.graph.edges
+    zone[list(graph.ring(np.flatnonzero(own), 2))] = True
+    edges = graph.edges
     lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (rest, posed)]
     strain = np.abs(lengths[1] / lengths[0] - 1.0)[zone[edges].any(1)]
     moved = session.gaussians_at(0.0).means.double().numpy()[solid]
@@ -89,8 +112,14 @@ def bend(
     error = np.linalg.norm(moved[limb_of] - truth, axis=1).mean()
     length = np.linalg.norm(start[limb_of] - pivot, axis=1).max()
     determinant = determinants(rest, posed, to_matrix(bent.turns), edges)[zone].min()
+    trunk = np.linalg.norm(moved - start, axis=1)[np.isin(bones, TRUNK)].mean() / np.ptp(start[:, 2])
     return Bent(
-        float(np.percentile(strain, 95)), float(determinant), float(np.percentile(change, 95)), float(error / length)
+        float(np.percentile(strain, 95)),
+        float(determinant),
+        float(np.percentile(change, 95)),
+        float(error / length),
+        float(strain.max()),
+        float(trunk),
     )
 
 
@@ -113,15 +142,20 @@ VIEWS = {"arm": (0.4, -3.6, 0.3), "leg": (3.6, -0.6, 0.1)}
 """Return the camera of a picture."""
 
 
-def measure(session: EditSession, limb: str) -> list[Bent]:
-    """At all angles, for a trained scene: control points and Gaussians are of the bone whose surface is nearest."""
+def bones_of(session: EditSession) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return, for a trained figure, the bone of each control point [M], which Gaussians are opaque [N], and the bones
+    of those: the bone whose surface is nearest."""
     surface, bones = figure_surface(20000)
     tree = cKDTree(surface)
     nodes = session.engine.to_world(session.engine.motion_at(0.0).positions)
-    node_bones = bones[tree.query(nodes)[1]]
     gaussians = session.scene.gaussians_at(0.0)
     solid = (gaussians.opacities > 0.5).cpu().numpy()
-    own = bones[tree.query(gaussians.means.double().cpu().numpy()[solid])[1]]
+    return bones[tree.query(nodes)[1]], solid, bones[tree.query(gaussians.means.double().cpu().numpy()[solid])[1]]
+
+
+def measure(session: EditSession, limb: str) -> list[Bent]:
+    """At all angles, for a trained scene."""
+    node_bones, solid, own = bones_of(session)
     grab(session, node_bones, limb)
     return [bend(session, node_bones, solid, own, limb, degrees) for degrees in DEGREES]
 

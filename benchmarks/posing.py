@@ -1,0 +1,97 @@
+"""Measure gestures of the editor on trained runs of the built-in figure, against its true joints.
+
+    python benchmarks/posing.py --run runs/figure-quick ... --json benchmarks/results/posing.json
+
+Each limb is put where a turn of its joint takes it, without pins:
+
+- default: one click on the hand or foot, and one pull to where the turn takes it (`EditSession.pull`);
+- part: the limb's topmost part turned about the joint that was found (`EditSession.turn`);
+- point: one control point, moved there, and nothing else said.
+
+Rows hold `run`, `limb`, `gesture`, `degrees`, and as ratios `worst_edge` (largest relative change of an edge),
+`least_determinant`, `limb_error` (mean distance from the true turn, in limb lengths) and `torso_moved` (in heights).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from provenance import ROOT
+
+sys.path.insert(0, str(ROOT / "tests"))
+
+from helpers.limb_bending import LIMBS, bones_of, measured
+from scgs_warp.data.synthetic.figure_motion import bone_transforms
+from scgs_warp.edit import EditSession
+from scgs_warp.edit.rotations import from_axis, rotate
+from scgs_warp.runtime.environment import configure
+from scgs_warp.runtime.provenance import provenance
+from scgs_warp.scene.scene import Scene
+
+DEGREES = (45, 90, 135)
+
+
+def rows_of(run: Path) -> list[dict[str, Any]]:
+    """Measure all gestures on one run."""
+    session = EditSession(Scene.load(run, device="cpu"))
+    node_bones, solid, bones = bones_of(session)
+    points = session.node_positions(0.0)
+    rows = []
+    for limb, (own, joint, axis) in LIMBS.items():
+        pivot = bone_transforms(0.0)[joint][:3, 3]
+        tip = np.flatnonzero(node_bones == own[-1])
+        tip = int(tip[np.linalg.norm(points[tip] - pivot, axis=1).argmax()])
+        for degrees in DEGREES:
+            place = rotate(from_axis(axis, degrees), points[tip] - pivot) + pivot
+            for gesture in ("default", "part", "point"):
+                session.reset()
+                _act(session, gesture, tip, place, degrees, axis)
+                skeleton = session.edit.skeleton
+                graph = session.graph if skeleton is None else session.engine.poser(skeleton).graph
+                bent = measured(session, graph, node_bones, solid, bones, limb, degrees)
+                rows.append({
+                    "run": run.name, "limb": limb, "gesture": gesture, "degrees": degrees,
+                    "worst_edge": bent.worst_edge, "least_determinant": bent.determinant, "limb_error": bent.error,
+                    "torso_moved": bent.torso_moved,
+                })  # fmt: skip
+    return rows
+
+
+def _act(session: EditSession, gesture: str, tip: int, place: np.ndarray, degrees: float, axis: Any) -> None:
+    start = session.node_positions(0.0)[tip]
+    if gesture == "point":
+        session.add_handle([tip], 0.0, "tip")
+        session.move("tip", translation=(place - start).tolist())
+        return
+    part = next(part.name for part in session.parts() if tip in part.nodes)
+    if gesture == "default":
+        session.pull(part, place, grip=start)
+    else:
+        session.turn(session.chain(part)[-1], degrees, axis)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, nargs="+", required=True)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    configure(1)
+    rows = [row for run in options.run for row in rows_of(run)]
+    for row in rows:
+        numbers = " ".join(
+            f"{name} {row[name]:6.3f}" for name in ("worst_edge", "least_determinant", "limb_error", "torso_moved")
+        )
+        print(f"{row['run']:16} {row['limb']:4} {row['gesture']:8} {row['degrees']:4}  {numbers}")
+    if options.json:
+        content = {"provenance": "measured", **provenance("cpu"), "rows": rows}
+        options.json.write_text(json.dumps(content, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
