@@ -30,7 +30,7 @@ from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_axis, rotate
 from scgs_warp.runtime.environment import configure
-from scgs_warp.runtime.provenance import provenance
+from scgs_warp.runtime.provenance import command_line, provenance
 from scgs_warp.scene.scene import Scene
 
 DEGREES = (45, 90, 135)
@@ -88,7 +88,8 @@ def main() -> int:
         )
         print(f"{row['run']:16} {row['limb']:4} {row['gesture']:8} {row['degrees']:4}  {numbers}")
     if options.json:
-        content = {"provenance": "measured", **provenance("cpu"), "rows": rows}
+        origin = {"provenance": "measured", "command": command_line("benchmarks/posing.py", sys.argv[1:])}
+        content = {**origin, **provenance("cpu"), "rows": rows}
         options.json.write_text(json.dumps(content, indent=1) + "\n")
     return 0
 
