@@ -44,7 +44,7 @@ def test_schedule_of_a_short_run():
 @pytest.mark.parametrize(
     "name, first, last, rounds, resets",
     [
-        ("best", 600, 39_900, 132, [10_000, 20_000, 30_000]),
+        ("best", 300, 19_950, 132, [5_000, 10_000, 15_000]),
         ("paper", 500, 50_000, 496, list(range(3_000, 48_001, 3_000))),
         ("cpu", 400, 12_000, 117, [3_000, 6_000, 9_000]),
         ("quick", 200, 3_500, 34, [875, 1_750, 2_625]),
@@ -221,7 +221,7 @@ def test_switched_off_everything_stays(monkeypatch):
 
 @pytest.mark.parametrize(
     "name, steps, looks",
-    [("best", 80_000, (10, 20, 30, 40)), ("cpu", 24_000, (3, 6, 9, 12)), ("quick", 7_000, (3.5,))],
+    [("best", 40_000, (5, 10, 15, 20)), ("cpu", 24_000, (3, 6, 9, 12)), ("quick", 7_000, (3.5,))],
 )
 def test_when_the_presets_look(name, steps, looks, monkeypatch):
     """In thousands of main steps, with 150 frames; ``quick`` is too short for more than one."""
