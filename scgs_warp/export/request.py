@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 from ..errors import UserError
 from ..storage.output_folders import make_parent
+from ..storage.suffixes import longest_suffix
 
 Format = Literal["ply", "ply-sequence", "splat", "spz", "glb", "graph", "npz", "cameras", "html"]
 SUFFIXES: dict[Format, str] = {
@@ -21,7 +22,8 @@ SUFFIXES: dict[Format, str] = {
     "graph": ".glb",
     "ply-sequence": "",
 }
-"""Suffix of each format's output. Formats may share a suffix, which then selects the first of them."""
+"""Suffix of each format's output. Formats may share a suffix, which then selects the first of them. If a name ends in
+several suffixes, the longest of them counts."""
 OTHER_SUFFIXES = {".htm": ".html"}
 """Alternative suffixes."""
 STILL_FORMATS = ("ply", "splat", "spz", "glb")
@@ -70,8 +72,7 @@ class ExportRequest:
         """
         if self.format is not None:
             return self.format
-        suffix = self.output.suffix.lower()
-        suffix = OTHER_SUFFIXES.get(suffix, suffix)
+        suffix = output_suffix(self.output)
         for name, ending in SUFFIXES.items():
             if ending == suffix:
                 return name
@@ -85,6 +86,12 @@ class ExportRequest:
         if self.kind != "glb":
             return self.kind in STILL_FORMATS
         return self.time is not None or self.at is not None or (self.run is None and self.edit is None)
+
+
+def output_suffix(path: Path) -> str:
+    """Return the value of ``SUFFIXES`` that the name of an output stands for, or what follows its last dot."""
+    suffix = longest_suffix(path, [*filter(None, SUFFIXES.values()), *OTHER_SUFFIXES]) or path.suffix.lower()
+    return OTHER_SUFFIXES.get(suffix, suffix)
 
 
 def check_request(request: ExportRequest) -> None:
@@ -149,10 +156,10 @@ def check_output(path: Path, kind: Format) -> None:
     Raises:
         UserError: the suffix is wrong, a file or folder is in the way, or the folder cannot be written.
     """
-    ending = SUFFIXES[kind]
-    suffix = path.suffix.lower()
-    if ending and OTHER_SUFFIXES.get(suffix, suffix) != ending:
-        raise UserError(f"--output {path}: end the name in {ending} for --format {kind}")
+    ending, suffix = SUFFIXES[kind], output_suffix(path)
+    if ending and suffix != ending:
+        longer = f", not in {suffix}," if suffix.endswith(ending) else ""
+        raise UserError(f"--output {path}: end the name in {ending}{longer} for --format {kind}")
     if ending and path.is_dir():
         raise UserError(f"--output {path}: is a folder; give another name")
     if not ending and path.exists() and not path.is_dir():

@@ -12,7 +12,15 @@ from scgs_warp.export.request import ExportRequest, check_request
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [("a.ply", "ply"), ("a.SPZ", "spz"), ("a.glb", "glb"), ("a.npz", "npz"), ("a.json", "cameras"), ("a.htm", "html")],
+    [
+        ("a.ply", "ply"),
+        ("a.SPZ", "spz"),
+        ("a.glb", "glb"),
+        ("a.npz", "npz"),
+        ("a.json", "cameras"),
+        ("a.htm", "html"),
+        ("frames", "ply-sequence"),
+    ],
 )
 def test_the_suffix_decides_the_format(name, kind):
     assert ExportRequest(Path(name)).kind == kind
