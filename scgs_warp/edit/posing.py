@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
+from ..types import Gaussians
 from . import edit_file, skeleton_file
 from .document import Edit
 from .engine import Engine
@@ -17,8 +18,8 @@ from .handles import STAY, Handle, Target
 from .part_pose import PartMove, Rigid
 from .reach import Link, reach
 from .rotations import conjugate, from_axis, multiply, rigid_fit, rotate
-from .skeleton import Part, Skeleton
-from .skeleton_from_motion import find_skeleton
+from .skeleton import Part, Skeleton, strongest
+from .skeleton_from_motion import MIN_OPACITY, find_skeleton
 
 
 class Posing:
@@ -31,6 +32,7 @@ class Posing:
     apply: Callable[[Edit], None]
     preview: Callable[[Edit], None]
     release: Callable[[], None]
+    gaussians_at: Callable[..., Gaussians]
 
     # The skeleton
 
@@ -136,6 +138,26 @@ class Posing:
 
     # Posing
 
+    def part_at(self, point: Sequence[float], time: float, at: float | None = None) -> str:
+        """Return the part of the surface at a point of the edited scene: of the opaque Gaussian nearest to it.
+
+        Args:
+            point: [3], from ``pick`` for example.
+            time, at: moment at which the surface passes the point, as in ``node_positions``.
+        """
+        means = self.gaussians_at(time, at).means.cpu().double().numpy()
+        opaque = np.flatnonzero((self.engine.scene.gaussians.opacities() > MIN_OPACITY).cpu().numpy())
+        if len(opaque):
+            means = means[opaque]
+        nearest = int(((means - _point("point", point)) ** 2).sum(1).argmin())
+        return self.skeleton.names[int(self.gaussian_parts()[opaque[nearest] if len(opaque) else nearest])]
+
+    def gaussian_parts(self) -> np.ndarray:
+        """Return the row of the part to which each Gaussian belongs, [N]: of its control points' parts, the one with
+        the largest weight."""
+        indices, weights = (part.cpu().numpy() for part in self.engine.binding)
+        return strongest(self.skeleton.owners()[indices], weights)
+
     def pose_part(self, part: str, time: float = 0.0) -> Handle:
         """Return the handle that poses a part; add one if there is none.
 
@@ -194,6 +216,7 @@ class Posing:
         grip: Sequence[float] | None = None,
         *,
         live: bool = False,
+        since: Edit | None = None,
     ) -> tuple[str, ...]:
         """Pull a part to a place: the parts of its chain turn about their joints, as little as will do, and the rest
         holds still. A part without a parent is moved as a whole, with all that hangs on it.
@@ -204,6 +227,7 @@ class Posing:
             grip: [3] point of the part in its present pose that is pulled; None: the mean of its control points.
             live: whether the pull belongs to a drag, which ``release`` ends. It is then measured from the pose, and the
                 grip from the part, before the drag.
+            since: edit from which a pull of a drag is measured; None: the one before the drag.
 
         Returns:
             The parts that turned, from the pulled one towards the root.
@@ -212,7 +236,7 @@ class Posing:
             UserError: there is no such part, or a number is wrong.
         """
         place = _point("to", to)
-        before = self._before_drag or self.edit
+        before = since or self._before_drag or self.edit
         skeleton = before.skeleton or self._run_skeleton()
         names = skeleton.chain(part)
         edit, handles = before, []
@@ -236,6 +260,41 @@ class Posing:
         if not live:
             self.release()
         return names
+
+    def rotate(
+        self,
+        part: str,
+        rotation: Sequence[float],
+        time: float = 0.0,
+        *,
+        live: bool = False,
+        since: Edit | None = None,
+    ) -> Target:
+        """Turn a part, and all that hangs on it, about its joint, as seen in its present pose. ``turn`` counts axes
+        from the pose without edits instead.
+
+        Args:
+            rotation: [4] wxyz, world.
+            time, live, since: as in ``pull``.
+
+        Raises:
+            UserError: there is no such part, or a number is wrong.
+        """
+        asked = np.array(Target.of(None, rotation).rotation)
+        before = since or self._before_drag or self.edit
+        edit, handle = _with_handle(before, before.skeleton or self._run_skeleton(), part, time)
+        skeleton = edit.skeleton or self._run_skeleton()
+        above = skeleton.part(part).parent
+        if above is not None:
+            turned = self._motion_of(edit, above, time, None)[0].quat
+            asked = multiply(multiply(conjugate(turned), asked), turned)
+        old = edit.targets.get(handle.name, STAY)
+        further = self._into_frame(skeleton, handle, asked, time)
+        target = Target.of(old.translation, multiply(further, np.array(old.rotation)).tolist())
+        self.preview(dataclasses.replace(edit, targets={**edit.targets, handle.name: target}))
+        if not live:
+            self.release()
+        return target
 
     def _reached(
         self, edit: Edit, skeleton: Skeleton, handles: list[Handle], time: float, grip: np.ndarray, place: np.ndarray

@@ -190,6 +190,16 @@ class Skeleton:
         return Skeleton(tuple(part if other.name == name else other for other in self.parts), "edited")
 
 
+def strongest(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the label with the largest sum of weights in each row, [N]; of equal ones, the first.
+
+    Args:
+        labels, weights: [N, K]
+    """
+    sums = ((labels[:, :, None] == labels[:, None, :]) * weights[:, None, :]).sum(2)
+    return labels[np.arange(len(labels)), sums.argmax(1)]
+
+
 def unit_axis(direction: Vector3, fields: FieldReader) -> Vector3:
     """Return a direction with length 1.
 

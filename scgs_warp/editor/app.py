@@ -17,6 +17,7 @@ import numpy as np
 
 from ..edit import EditSession, Target
 from ..edit.handles import STAY
+from ..edit.rotations import IDENTITY
 from ..errors import UserError
 from ..geometry.cameras import orbit_camera
 from . import gizmo_pose
@@ -25,6 +26,7 @@ from .frame_image import FINE_QUALITY, QUALITY, Picture, take_picture
 from .model import Combine, EditorModel, Moment
 from .overlays import GIZMO, Overlays
 from .panel.panel import Panel
+from .parts_tool import Hit, PartFrame, PartsTool, hit
 from .proxy import guarded
 from .views import FULL, ClientCamera, Pace, PictureSchedule
 from .worker import Worker
@@ -65,8 +67,8 @@ class Editor:
         key: secret of the proxy in front of the editor, if there is one.
 
     Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``gizmo_frame`` (a pair, or
-    None if no gizmo is shown: the gizmo's frame, and the handle's target, translation and rotation, when a drag
-    begins), ``latency`` (seconds from a drag to its picture, the latest hundred).
+    None if no gizmo is shown: the gizmo's frame, of a handle or of a part, and the handle's target, translation and
+    rotation, when a drag begins), ``parts`` (what clicks and drags do with parts), ``latency`` (seconds from a drag to its picture, the latest hundred).
 
     Raises:
         UserError: viser is not installed.
@@ -81,6 +83,7 @@ class Editor:
         self.quick, self.full = Pace(MOVING_SECONDS, 256, 512), Pace(STILL_SECONDS, min(640, size), size)
         self.worker = Worker(self.schedule, self._draw, lambda: self.model.busy, failed=self.picture_failed)
         self.model = EditorModel(session, self.refresh)
+        self.parts = PartsTool(self.model)
         self.latency: list[float] = []
         self._notified: dict[str, float] = {}
         self._first = True
@@ -88,7 +91,7 @@ class Editor:
         self._waiting: dict[int, Any] = {}
         self._dragger: int | None = None
         self._dragged_at: float | None = None
-        self.gizmo_frame: tuple[gizmo_pose.GizmoFrame, Target] | None = None
+        self.gizmo_frame: tuple[gizmo_pose.GizmoFrame | PartFrame, Target] | None = None
         self.display = Display.of(session.scene.overview)
         with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # viser's banner names its own port
             self.server: viser.ViserServer = viser.ViserServer(HOST, port, label="scgs_warp", verbose=False)
@@ -213,7 +216,11 @@ class Editor:
     def color_overlays(self) -> None:
         model, edit = self.model, self.session.edit
         held = {node for handle in edit.handles for node in handle.nodes}
-        self.overlays.color(model.selection, held, edit.pins)
+        part = self.parts.shown()
+        if part is None:
+            self.overlays.color(model.selection, held, edit.pins)
+        else:
+            self.overlays.color(*part)
 
     # Pictures
 
@@ -268,15 +275,21 @@ class Editor:
         """Update overlays, gizmo and panel after the picture."""
         points = self.session.node_positions(moment.time, moment.at, live=moment.live)
         self.overlays.move(self.display.show(points))
-        self._place_gizmo(moment)
+        self._place_gizmo(moment, points)
         self.panel.show_time()
         again = self.model.playing or (moment.live and not self.session.engine.settled(self.session.edit))
         if again:
             self.refresh()
 
-    def _place_gizmo(self, moment: Moment) -> None:
+    def _place_gizmo(self, moment: Moment, points: np.ndarray) -> None:
+        """Place the gizmo at the control points' positions [M, 3]."""
         model = self.model
         if model.dragging:
+            return
+        part = self.parts.frame(points)
+        if part is not None and moment.show not in ("original", "side by side"):
+            self.gizmo_frame = part, STAY
+            self.overlays.place_gizmo((self.display.show(part.point), IDENTITY))
             return
         handle = self.session.edit.handle(model.active or "")
         if moment.show in ("original", "side by side") or (handle is None and not model.selection):
@@ -284,11 +297,11 @@ class Editor:
             self.overlays.place_gizmo(None)
             return
         if handle is None:
-            self.gizmo_frame = gizmo_pose.frame_of_selection(self.session, model.selection, moment)
+            frame, target = gizmo_pose.frame_of_selection(self.session, model.selection, moment)
         else:
             target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
-            self.gizmo_frame = gizmo_pose.frame_of_handle(self.session, handle, moment), target
-        frame, target = self.gizmo_frame
+            frame = gizmo_pose.frame_of_handle(self.session, handle, moment)
+        self.gizmo_frame = frame, target
         position, wxyz = frame.pose(target)
         self.overlays.place_gizmo((self.display.show(position), wxyz))
 
@@ -298,21 +311,15 @@ class Editor:
         self.guarded(lambda event: self.pick(event.client, event.screen_pos, how))(event)
 
     def pick(self, client: viser.ClientHandle, screen: tuple[float, float], how: Combine | None = None) -> None:
-        """Select by a click at a point of the canvas (0 to 1 from the upper left); the background clears the selection
-        unless it is to be extended or reduced."""
+        """Select by a click at a point of the canvas (0 to 1 from the upper left): a part, at the second click its
+        control points. The background clears the selection unless it is to be extended or reduced."""
         model, moment = self.model, self.model.moment()
-        how = how or model.combine
 
-        def find() -> tuple[int, ...]:
+        def find() -> Hit | None:
             point = gizmo_pose.surface_point(self.session, self.camera(client), screen, moment)
-            return () if point is None else gizmo_pose.region_at(self.session, point, model.region, moment)
+            return None if point is None else hit(self.session, point, model.region, moment)
 
-        nodes = self.worker.call(find)
-        held = [h.name for h in self.session.edit.handles if nodes and how == "replace" and set(nodes) <= set(h.nodes)]
-        if held:
-            model.activate(held[-1])
-        elif nodes or how == "replace":
-            model.select(nodes, how)
+        self.parts.click(self.worker.call(find), how or model.combine)
 
     async def _gizmo_moved(self, event: Any) -> None:
         """Handle gizmo events in order on the server's loop, without waiting for solutions. One client drags at a
@@ -332,18 +339,28 @@ class Editor:
             return
         frame, target = self.gizmo_frame
         if phase == "start":
-            self.model.grab(target)
+            if isinstance(frame, PartFrame):
+                self.parts.grab()
+            else:
+                self.model.grab(target)
         elif phase == "update":
             if self.model.dragging:
                 self._dragged_at = self._dragged_at or time.monotonic()
-                self.model.drag(frame.target(position, wxyz))
+                if isinstance(frame, PartFrame):
+                    self.parts.drag(frame, position, wxyz)
+                else:
+                    self.model.drag(frame.target(position, wxyz))
         else:
             self._dragged_at = None
             self.model.release()
             self.panel.show()
 
     def put(self, target: Target) -> None:
-        """Move the chosen handle to a target in one step, for the number fields of the panel."""
+        """Move the chosen handle, or the joint of the chosen part, to a target in one step, for the number fields of the
+        panel."""
+        if self.parts.part is not None:
+            self.parts.put(target)
+            return
         self.model.grab(STAY if self.gizmo_frame is None else self.gizmo_frame[1])
         try:
             self.model.drag(target)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..edit import EditSession, Target, edit_file
+from ..edit import Edit, EditSession, Target, edit_file
 from ..edit.handles import STAY
 from ..errors import UserError
 
@@ -247,16 +247,32 @@ class EditorModel:
             self._let_go()
             if self.active is None and not self.selection:
                 raise UserError("nothing is chosen; click on the picture first")
-            self._dragged, self._led = False, self._following
-            self._take_over()
-            if self.active is None:
-                draft = self.session.fork()
-                self.active = self._take_hold(draft, target)
-                self.session.preview(draft.edit)
-            self.dragging, name = True, self.active
-            self._played_from = None
+            self.begin_drag()
+            try:
+                if self.active is None:
+                    draft = self.session.fork()
+                    self.active = self._take_hold(draft, target)
+                    self.session.preview(draft.edit)
+            except UserError:
+                self._let_go()
+                raise
+            name = self.active
         self.changed()
         return name
+
+    def begin_drag(self) -> Edit:
+        """Begin a drag; return the edit from which it is measured, in which keyframes no longer place the handles. Until
+        ``dragged`` is called, ``release`` restores the edit before it."""
+        with self.lock:
+            self._let_go()
+            self._dragged, self._led = False, self._following
+            self._take_over()
+            self.dragging, self._played_from = True, None
+            return self.session.edit
+
+    def dragged(self) -> None:
+        """Say that the drag has changed the edit."""
+        self._dragged = True
 
     def _take_hold(self, draft: EditSession, target: Target) -> str:
         """Add a handle on the selection and return its name."""

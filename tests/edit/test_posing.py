@@ -17,7 +17,7 @@ from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.part_pose import FREE_RINGS, INNER_STIFFNESS, PartMove, Rigid, _rings_to_others
 from scgs_warp.edit.reach import BEND, OFF_AXIS, SLIDE, Link, Reached, posed_chain, reach
 from scgs_warp.edit.rotations import IDENTITY, conjugate, exponential, from_axis, logarithm, multiply, rotate, to_matrix
-from scgs_warp.edit.skeleton import Part, Skeleton
+from scgs_warp.edit.skeleton import Part, Skeleton, strongest
 from scgs_warp.errors import UserError
 
 ARM = ("shoulder_left", "elbow_left")
@@ -438,3 +438,26 @@ def test_a_number_of_parts_replaces_the_skeleton(figure):
     session.use_parts(6)
     assert len(session.skeleton.parts) == 6 and [h.name for h in session.edit.handles] == ["free"]
     assert session.undo() and session.edit.handle("head") is not None
+
+
+def test_a_gaussian_belongs_to_the_part_with_most_of_its_weight(session):
+    random = np.random.default_rng(0)
+    labels, weights = random.integers(0, 3, (50, 4)), random.random((50, 4))
+    wanted = [max(range(3), key=lambda part: weights[row, labels[row] == part].sum()) for row in range(50)]
+    assert strongest(labels, weights).tolist() == wanted
+    owner, found = session.skeleton.owners(), session.gaussian_parts()
+    assert found.shape == (session.scene.gaussian_count,)
+    assert (owner[session.engine.binding[0].numpy()] == found[:, None]).any(1).all()
+    points = session.gaussians_at(0.3).means.double().numpy()
+    for index in random.integers(0, len(points), 5).tolist():
+        assert session.part_at(points[index].tolist(), 0.3) == session.skeleton.names[found[index]]
+
+
+def test_a_part_is_found_where_an_edit_has_put_it(session):
+    names = session.skeleton.names
+    mine = int(np.flatnonzero(session.gaussian_parts() == names.index("elbow_left"))[0])
+    session.turn("shoulder_left", 90, (0, -1, 0))
+    point = session.gaussians_at(0.0).means[mine].double().numpy()
+    assert session.part_at(point.tolist(), 0.0) == "elbow_left"
+    with pytest.raises(UserError, match="3 finite numbers"):
+        session.part_at((float("nan"), 0.0, 0.0), 0.0)

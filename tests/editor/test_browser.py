@@ -162,6 +162,17 @@ def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
         assert changed(begin, np.zeros_like(begin)) > 0.1, "the scene is on the screen"
 
         take_arm(window)
+        part = editor.parts.part
+        assert part is not None, "a click takes a part"
+        before = window.picture()
+        pull(window)
+        assert {handle.part for handle in session.edit.handles} == set(session.chain(part))
+        assert editor.latency and changed(before, window.picture()) > 0.005
+        window.press("Undo")
+        until(lambda: not session.edit.handles)
+
+        take_arm(window)
+        assert editor.parts.part is None, "a second click takes control points"
         chosen = window.picture()
         pull(window)
         assert len(session.edit.handles) == 1 and session.edit.pins
@@ -248,6 +259,7 @@ def test_mistakes_are_said_and_the_shared_editor_survives(tmp_path):
             says(window, "take letters, digits")
             assert list(tmp_path.rglob("*.json")) == []
 
+            editor.parts.set(False)
             take_arm(window)
             place = editor.gizmo_frame[0]
             with pytest.raises(UserError, match="finite"):

@@ -10,6 +10,7 @@ from ...edit import Target
 from ..frame_image import Picture
 from ..model import EditorModel, Moment
 from ..overlays import Overlays
+from ..parts_tool import PartsTool
 from ..views import ClientCamera
 from ..worker import Worker
 
@@ -20,6 +21,7 @@ class Host(Protocol):
     server: Any
     """viser's server."""
     model: EditorModel
+    parts: PartsTool
     worker: Worker
     overlays: Overlays
     folder: Path

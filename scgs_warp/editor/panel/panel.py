@@ -16,8 +16,8 @@ from .shape import ShapeSection
 from .view import ViewSection
 
 HELP = (
-    "**Click** the scene to choose control points (shift: more, ctrl: fewer), then drag the **gizmo**: arrows move, "
-    "arcs turn."
+    "**Click** the scene to choose a part; click again for its control points (shift: more, ctrl: fewer). Then drag the "
+    "**gizmo**: arrows pull, arcs turn."
 )
 
 
@@ -93,7 +93,12 @@ class Panel:
     def _said(self) -> str:
         model = self.host.model
         edit = model.session.edit
-        chosen = f"**{plain(model.active)}**" if model.active else f"{len(model.selection)} control points chosen"
+        part = self.host.parts.part
+        if part is not None:
+            way = ", ".join(plain(name) for name in model.session.chain(part)[1:])
+            chosen = f"**{plain(part)}**" + (f", pulled together with {way}" if way else "")
+        else:
+            chosen = f"**{plain(model.active)}**" if model.active else f"{len(model.selection)} control points chosen"
         counts = f"handles: {len(edit.handles)}, pinned: {len(edit.pins)}, keyframes: {len(edit.keyframes)}"
         return f"{chosen}; {counts}"
 

@@ -32,6 +32,12 @@ class ShapeSection:
         gui, model, on = self.host.server.gui, self.model, self.host.on_value
         unit = self.host.edge_length
         with gui.add_folder("Selection"):
+            self.parts = on(
+                gui.add_checkbox(
+                    "Parts first", True, hint="A click takes the part under it, a second one its control points"
+                ),
+                self.host.parts.set,
+            )
             self.kind = on(gui.add_dropdown("A click takes", ("rings", "brush")), lambda kind: self._region(kind=kind))
             self.rings = on(gui.add_slider("Rings", 0, 12, 1, model.region.rings), lambda n: self._region(rings=n))
             self.radius = on(
@@ -154,6 +160,7 @@ class ShapeSection:
 
     def show(self) -> None:
         model, edit = self.model, self.model.session.edit
+        self.parts.value = self.host.parts.on
         self.kind.value, self.rings.value, self.combine.value = model.region.kind, model.region.rings, model.combine
         self.rings.visible, self.radius.visible = model.region.kind == "rings", model.region.kind == "brush"
         labels = self.handle_labels()

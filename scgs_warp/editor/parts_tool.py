@@ -1,0 +1,237 @@
+"""Posing parts by clicks and drags: which part a click takes, and what a drag does with it. Independent of the browser.
+
+A click takes the part under it, a second click on the same part its control points. A drag that moves a part pulls it
+(inverse kinematics), a drag that turns it turns its joint (forward kinematics).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..edit import EditSession, Target
+from ..edit.rotations import rigid_fit, rotate
+from ..errors import UserError
+from .gizmo_pose import NOISE, region_at
+from .model import Combine, EditorModel, Moment, Region
+
+
+class Hit(NamedTuple):
+    """What a click at a surface point means; world units."""
+
+    point: np.ndarray
+    """[3]"""
+    part: str | None
+    """None: the scene has a single part, which nobody wants to pose."""
+    nodes: tuple[int, ...]
+    """Control points that a click on the surface selects."""
+    places: np.ndarray
+    """[M, 3] control points at the moment of the click."""
+
+
+class Shown(NamedTuple):
+    """Control points to be coloured while a part is chosen."""
+
+    chosen: tuple[int, ...]
+    moving: tuple[int, ...]
+    """Of the parts that turn when the chosen one is pulled, and all that hangs on them."""
+    still: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _Grip:
+    """Point by which a part is held, given at the moment when it was clicked; world units."""
+
+    part: str
+    nodes: tuple[int, ...]
+    point: np.ndarray
+    """[3]"""
+    places: np.ndarray
+    """[M, 3] control points at that moment."""
+
+    def carried(self, places: np.ndarray) -> np.ndarray:
+        """Return the point when the control points [M, 3] are elsewhere, [3]."""
+        rows = list(self.nodes)
+        turn, before, after = rigid_fit(self.places[rows], places[rows])
+        return rotate(turn, self.point - before) + after
+
+
+@dataclass(frozen=True)
+class PartFrame:
+    """Gizmo of a part before a drag, world units: at the point by which it is held, with the axes of the world."""
+
+    point: np.ndarray
+    """[3]"""
+
+
+def hit(session: EditSession, point: np.ndarray, region: Region, moment: Moment) -> Hit:
+    """Say what a click at a surface point [3] means. This may solve, and find the skeleton: call it on the worker's
+    thread."""
+    single = len(session.parts()) < 2
+    part = None if single else session.part_at(point.tolist(), moment.time, moment.at)
+    places = session.node_positions(moment.time, moment.at)
+    return Hit(np.asarray(point, np.float64), part, region_at(session, point, region, moment), places)
+
+
+class PartsTool:
+    """Choice and posing of one part.
+
+    Args:
+        model: shared state; its lock guards this object, too.
+
+    Attributes: ``on``, whether clicks take parts at all.
+    """
+
+    def __init__(self, model: EditorModel) -> None:
+        self.model = model
+        self.on = True
+        self._grip: _Grip | None = None
+        self._inside: str | None = None
+        """Part whose control points a second click has selected; further clicks on it select control points."""
+        self._since = model.session.edit
+        """Edit from which the present drag is measured."""
+
+    @property
+    def part(self) -> str | None:
+        """The chosen part; None: none is chosen. Selecting anything else, and changes of the skeleton, unchoose it."""
+        grip = self._grip
+        if grip is None or grip.nodes != self.model.selection:
+            return None
+        there = any(part.name == grip.part and part.nodes == grip.nodes for part in self.model.session.skeleton.parts)
+        return grip.part if there else None
+
+    def click(self, hit: Hit | None, how: Combine = "replace") -> None:
+        """Choose what a click means.
+
+        Args:
+            hit: None: the click was beside the scene, which clears the selection unless it is to be changed.
+        """
+        model = self.model
+        with model.lock:
+            part, inside = self.part, self._inside
+            if hit is None:
+                self._inside = None
+                if how == "replace":
+                    model.select(())
+            elif self.on and how == "replace" and hit.part is not None and hit.part not in (part, inside):
+                self.choose(hit.part, hit.point, hit.places)
+            else:
+                self._inside = hit.part
+                self._take_points(hit, how)
+
+    def _take_points(self, hit: Hit, how: Combine) -> None:
+        handles = self.model.session.edit.handles
+        held = [h.name for h in handles if h.part is None and how == "replace" and set(hit.nodes) <= set(h.nodes)]
+        if held:
+            self.model.activate(held[-1])
+        else:
+            self.model.select(hit.nodes, how)
+
+    def choose(self, part: str, point: Sequence[float] | np.ndarray, places: np.ndarray) -> None:
+        """Choose a part, held at a point.
+
+        Args:
+            point: [3]
+            places: [M, 3] control points at the moment to which the point refers.
+        """
+        with self.model.lock:
+            nodes = self.model.session.skeleton.part(part).nodes
+            self._grip = _Grip(part, nodes, np.asarray(point, np.float64), places)
+            self._inside = None
+            self.model.select(nodes)
+
+    def frame(self, places: np.ndarray) -> PartFrame | None:
+        """Return the gizmo of the chosen part for the present control points [M, 3]; None: no part is chosen."""
+        with self.model.lock:
+            return None if self.part is None or self._grip is None else PartFrame(self._grip.carried(places))
+
+    def shown(self) -> Shown | None:
+        """Return which control points move when the chosen part is pulled; None: no part is chosen."""
+        with self.model.lock:
+            part = self.part
+            if part is None:
+                return None
+            skeleton = self.model.session.skeleton
+            top = skeleton.chain(part)[-1]
+            moving = {node for name in skeleton.branch(top) for node in skeleton.part(name).nodes}
+            chosen = skeleton.part(part).nodes
+            still = tuple(node for node in range(len(self.model.session)) if node not in moving)
+            return Shown(chosen, tuple(sorted(moving - set(chosen))), still)
+
+    def set(self, on: bool) -> None:
+        """Set whether clicks take parts."""
+        with self.model.lock:
+            self.on, self._inside = on, None
+        self.model.changed()
+
+    # Dragging
+
+    def grab(self) -> None:
+        """Begin to drag the chosen part.
+
+        Raises:
+            UserError: no part is chosen.
+        """
+        model = self.model
+        with model.lock:
+            if self.part is None:
+                raise UserError("no part is chosen; click on the picture first")
+            self._since = model.begin_drag()
+        model.changed()
+
+    def drag(self, frame: PartFrame, position: np.ndarray, wxyz: np.ndarray) -> None:
+        """Pose the chosen part for a pose of the gizmo: turn it if the gizmo is turned, else pull it.
+
+        Args:
+            frame: gizmo before the drag.
+            position: [3]
+            wxyz: [4] turn since the beginning of the drag.
+
+        Raises:
+            UserError: a number is not finite.
+        """
+        quat = np.asarray(wxyz, np.float64)
+        if all(abs(x) < NOISE for x in quat[1:]):
+            self.pull(position, frame.point)
+        else:
+            self.turn(quat)
+
+    def pull(self, to: Sequence[float] | np.ndarray, grip: Sequence[float] | np.ndarray) -> None:
+        """Pull the chosen part, as part of a drag: take the point ``grip`` [3], as it was before, to ``to`` [3]."""
+        with self.model.lock:
+            if self.part is not None and self.model.dragging:
+                at = np.asarray(to).tolist(), self.model.time, np.asarray(grip).tolist()
+                self.model.session.pull(self.part, *at, live=True, since=self._since)
+                self._moved()
+        self.model.changed()
+
+    def turn(self, rotation: Sequence[float] | np.ndarray) -> None:
+        """Turn the chosen part about its joint, as part of a drag, by a rotation [4] wxyz since its beginning."""
+        with self.model.lock:
+            if self.part is not None and self.model.dragging:
+                quat = np.asarray(rotation, np.float64).tolist()
+                self.model.session.rotate(self.part, quat, self.model.time, live=True, since=self._since)
+                self._moved()
+        self.model.changed()
+
+    def put(self, target: Target) -> None:
+        """Set the target of the chosen part's joint in one step."""
+        self.grab()
+        with self.model.lock:
+            draft = self.model.session.fork()
+            handle = draft.pose_part(self.part or "", self.model.time)
+            draft.move(handle.name, target.translation, target.rotation)
+            self.model.session.preview(draft.edit)
+            self._moved()
+        self.release()
+
+    def _moved(self) -> None:
+        self.model.dragged()
+        self.model.active = next((h.name for h in self.model.session.edit.handles if h.part == self.part), None)
+
+    def release(self) -> None:
+        """End the drag, which is one step for undo."""
+        self.model.release()
