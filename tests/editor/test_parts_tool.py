@@ -16,6 +16,7 @@ from scgs_warp.editor.model import EditorModel, Region
 from scgs_warp.editor.parts_tool import PartsTool, hit
 from scgs_warp.errors import UserError
 
+AWAY = np.array([0.05, -0.1, 0.2])
 HAND, CHEST = (0.55, -0.1, -0.2), (0.0, -0.3, 0.2)
 
 
@@ -101,17 +102,17 @@ def test_a_drag_pulls_and_is_one_step(tool):
     assert frame is not None
     np.testing.assert_allclose(frame.point, HAND, atol=1e-9)
     tool.grab()
-    for height in (0.05, 0.1, 0.2):
-        tool.drag(frame, frame.point + [0.05, -0.1, height], IDENTITY)
+    for share in (0.2, 0.5, 1.0):
+        tool.drag(frame, frame.point + share * AWAY, IDENTITY)
         assert model.moment().live
     tool.release()
     assert not model.moment().live and tool.part is not None
     once = session.fork()
     once.apply(before)
-    once.pull(tool.part, (frame.point + [0.05, -0.1, 0.2]).tolist(), grip=frame.point.tolist())
+    once.pull(tool.part, (frame.point + AWAY).tolist(), grip=frame.point.tolist())
     assert once.edit == session.edit, "the way of the drag does not matter"
     after = tool.frame(session.node_positions(0.0))
-    assert after is not None and np.linalg.norm(after.point - frame.point - [0.05, -0.1, 0.2]) < 0.03
+    assert after is not None and np.linalg.norm(after.point - frame.point - AWAY) < 0.03
     assert model.active == session.edit.handles[0].name and session.edit.handles[0].part == tool.part
     assert model.undo() and session.edit == before and not model.undo()
 
