@@ -66,9 +66,10 @@ class Editor:
         size: upper limit for the longer side of a picture in pixels.
         key: secret of the proxy in front of the editor, if there is one.
 
-    Attributes: ``server`` (viser's), ``model``, ``worker``, ``port``, ``gizmo_frame`` (a pair, or
-    None if no gizmo is shown: the gizmo's frame, of a handle or of a part, and the handle's target, translation and
-    rotation, when a drag begins), ``parts`` (what clicks and drags do with parts), ``latency`` (seconds from a drag to its picture, the latest hundred).
+    Attributes: ``server`` (viser's), ``model``, ``parts`` (what clicks and drags do with parts), ``worker``, ``port``,
+    ``gizmo_frame`` (a pair, or None if no gizmo is shown: the gizmo's frame, of a handle or of a part, and the handle's
+    target, translation and rotation, when a drag begins), ``latency`` (seconds from a drag to its picture, the latest
+    hundred).
 
     Raises:
         UserError: viser is not installed.
@@ -356,8 +357,8 @@ class Editor:
             self.panel.show()
 
     def put(self, target: Target) -> None:
-        """Move the chosen handle, or the joint of the chosen part, to a target in one step, for the number fields of the
-        panel."""
+        """Move the chosen handle, or the joint of the chosen part, to a target in one step, for the panel's number
+        fields."""
         if self.parts.part is not None:
             self.parts.put(target)
             return

@@ -261,8 +261,8 @@ class EditorModel:
         return name
 
     def begin_drag(self) -> Edit:
-        """Begin a drag; return the edit from which it is measured, in which keyframes no longer place the handles. Until
-        ``dragged`` is called, ``release`` restores the edit before it."""
+        """Begin a drag; return the edit from which it is measured, in which keyframes no longer place the handles.
+        Until ``dragged`` is called, ``release`` restores the edit before it."""
         with self.lock:
             self._let_go()
             self._dragged, self._led = False, self._following

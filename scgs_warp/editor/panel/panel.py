@@ -16,8 +16,8 @@ from .shape import ShapeSection
 from .view import ViewSection
 
 HELP = (
-    "**Click** the scene to choose a part; click again for its control points (shift: more, ctrl: fewer). Then drag the "
-    "**gizmo**: arrows pull, arcs turn."
+    "**Click** the scene to choose a part; click again for its control points (shift: more, ctrl: fewer). Then drag "
+    "the **gizmo**: arrows pull, arcs turn."
 )
 
 
