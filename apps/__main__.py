@@ -18,8 +18,8 @@ APPS = {
 }
 
 
-def main() -> int:
-    arguments = sys.argv[1:]
+def main(arguments: list[str] | None = None) -> int:
+    arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["--version"]:
         from scgs_warp import __version__
 

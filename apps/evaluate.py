@@ -38,19 +38,20 @@ class Options:
 
 
 def load_data(scene: Scene, options: Options) -> Dataset:
-    """Load the split with the size and the background of the training images.
+    """Load the split with the size, the background and the choice of the training images.
 
     Raises:
         UserError: the run does not name its data folder, the folder is missing, or it has no such split.
     """
     from scgs_warp import data
+    from scgs_warp.config.fields import IMAGE_SETTINGS
     from scgs_warp.errors import UserError
 
     settings: dict[str, Any] = scene.settings.get("data", {})
     folder = options.data or settings.get("folder")
     if not folder:
         raise UserError(f"{options.run}/config.json: data.folder is missing; say where the data lies with --data DIR")
-    kept = {key: settings[key] for key in ("downscale", "resample", "background") if key in settings}
+    kept = {key: settings[key] for key in IMAGE_SETTINGS if key in settings}
     if options.data is None and not Path(folder).is_dir():
         raise UserError(f"{folder}: the run's data are no longer there; say where they lie with --data DIR")
     return data.load(folder, options.split, **kept)
@@ -111,6 +112,7 @@ def main(args: list[str] | None) -> None:
 
         lpips = LPIPS(options.lpips_weights, device)
     dataset = load_data(scene, options)
+    print("\n".join(dataset.notes), end="\n" if dataset.notes else "")
     poses = "given"
     if options.split == "train":
         from scgs_warp.training.camera_refinement import refined

@@ -33,6 +33,13 @@ class Settings:
     """Filter that reduces images: area, or bicubic as in the official code."""
     background: Literal["black", "white", "random"] | None = None
     """Colour behind transparent pixels."""
+    frames: str | None = None
+    """Instants to use, as A:B:C (first, end, step): 0:300:2 takes every other one of the first 300."""
+    only_cameras: str | None = None
+    """Names of the cameras to use, separated by commas (docs/data.md)."""
+    min_frames: int | None = None
+    """Smallest number of frames whose images must exist; by default half of them. Frames without images are left
+    out."""
     batch: int | None = None
     """Views per step; their gradients are averaged. With torchrun, the default is one per process (docs/scaling.md)."""
     steps: int | None = None
@@ -97,6 +104,9 @@ def configuration(
         "data.downscale": options.downscale,
         "data.resample": options.resample,
         "data.background": options.background,
+        "data.frames": options.frames,
+        "data.only_cameras": options.only_cameras,
+        "data.min_frames": options.min_frames,
         "motion.nodes": options.nodes,
         "pretrain.progressive": options.progressive or None,
         "densify.max_gaussians": options.max_gaussians,

@@ -12,6 +12,8 @@ from typing import Any, Literal
 
 MotionName = Literal["control-points", "per-gaussian", "hexplane", "static"]
 PresetName = Literal["quick", "cpu", "best", "paper"]
+IMAGE_SETTINGS = ("downscale", "resample", "background", "frames", "only_cameras", "min_frames")
+"""Fields of ``DataConfig`` that say which images a run sees, and how: arguments of ``data.load``."""
 CACHE_MIB = 2048
 """Default size of the cache of decoded images: 200 images of 800 x 800 pixels with alpha."""
 
@@ -50,6 +52,12 @@ class DataConfig:
     """Filter of the reduction. bicubic (Pillow, 8 bits) reduces the images as the official code does."""
     background: Literal["black", "white", "random"] = "black"
     """Colour behind transparent pixels. random: a new colour in every step, and black for evaluation."""
+    frames: str = newer("", before="")
+    """Instants to read, as A:B:C (first, end, step) in their order; their times then go from 0 to 1. Empty: all."""
+    only_cameras: str = newer("", before="")
+    """Names of the cameras to read, separated by commas (docs/data.md says what is a camera's name). Empty: all."""
+    min_frames: int = newer(0, before=0, least=0)
+    """Smallest number of frames whose images must exist; frames without images are left out. 0: half of the frames."""
     cache_mib: int = bounded(CACHE_MIB, 0)
     """Size of the cache of decoded images, MiB. Images beyond it are decoded at each use. The result is bit-identical
     for every size."""

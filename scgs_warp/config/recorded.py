@@ -8,7 +8,7 @@ from typing import Any
 
 from .fields import TrainConfig
 
-FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds", "data.cache_mib")
+FREE_TO_CHANGE = ("evaluate_every", "checkpoint_seconds", "data.cache_mib", "data.min_frames")
 """Settings that do not affect the result (it stays bit-identical): left out of checkpoints, and free to change when a
 run is resumed."""
 

@@ -42,6 +42,8 @@ class FrameRecord:
     name: str
     mask: Path | None = None
     """Path of the frame's own mask, an image that is black where the frame is not valid; None without a mask."""
+    states_size: bool = True
+    """Whether the camera states the size of its images, which decides on the EXIF orientation."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ def assemble(
     split: str,
     one_size: bool = False,
     border: np.ndarray | None = None,
+    notes: Sequence[str] = (),
 ) -> Dataset:
     """Decode every frame once and return the data set.
 
@@ -75,6 +78,7 @@ def assemble(
     Args:
         one_size: whether to refuse files of different sizes.
         border: [H, W] bool, False on the border of the video; applied to images without alpha.
+        notes: lines for the user, kept with the data set.
 
     Raises:
         UserError: one line naming the file, the field and the remedy.
@@ -115,7 +119,7 @@ def assemble(
         views.append(
             StoredFrame(fact.camera, record.time, record.name, _reader(record, options), has_alpha, common, key)
         )
-    return Dataset(views, folder=folder, split=split, background=options.background, cache=cache)
+    return Dataset(views, folder=folder, split=split, background=options.background, cache=cache, notes=notes)
 
 
 def with_points(data: Dataset, points: np.ndarray | None, colors: np.ndarray | None) -> Dataset:
@@ -130,7 +134,7 @@ def with_points(data: Dataset, points: np.ndarray | None, colors: np.ndarray | N
 
 
 def _decode(record: FrameRecord, options: ReadOptions) -> Decoded:
-    return read_image(record.file, options, record.lens, record.mask)
+    return read_image(record.file, options, record.lens, record.mask, record.states_size)
 
 
 def _reader(record: FrameRecord, options: ReadOptions) -> Callable[[], Pixels]:

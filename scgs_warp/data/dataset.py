@@ -80,6 +80,7 @@ class Dataset(Sequence[Frame]):
         points: Tensor | None = None,
         colors: Tensor | None = None,
         cache: ImageCache | None = None,
+        notes: Sequence[str] = (),
     ) -> None:
         self.entries = tuple(frames)
         """Camera, time and name of each frame, without pixels unless the frame is in memory."""
@@ -92,6 +93,8 @@ class Dataset(Sequence[Frame]):
         self.colors = colors
         """[P, 3] colours of the initial points in [0, 1]; None if the data has none."""
         self.cache = cache if cache is not None else ImageCache()
+        self.notes = tuple(notes)
+        """Lines on what was left out, for the user."""
 
     def _with(self, entries: Sequence[Frame | StoredFrame]) -> Dataset:
         return Dataset(
@@ -102,6 +105,7 @@ class Dataset(Sequence[Frame]):
             points=self.points,
             colors=self.colors,
             cache=self.cache,
+            notes=self.notes,
         )
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Dataset:

@@ -22,6 +22,7 @@ from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
 from .lens import Lens, undistort, valid_pixels
+from .orientation import TAG, UPRIGHT, read_orientation, swaps_sides, upright
 
 RESAMPLES = ("area", "bicubic")
 SMALLEST_SIDE = 8
@@ -31,7 +32,10 @@ TRUSTED_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 64
 """Limits on the size that a file's header may announce. Up to ``TRUSTED_PIXELS`` any size is trusted, beyond it at most
 ``MAX_PIXELS_PER_BYTE`` for each byte of the file: a megabyte of zeros may decompress to a gigabyte."""
 
-# Pixels do not depend on EXIF data, so the warning would only clutter the terminal.
+INSPECTED = 1024
+"""Number of bytes by which a file that is no image is recognised."""
+
+# Only the orientation is read from EXIF data, so the warning would only clutter the terminal.
 warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
 
 T = TypeVar("T")
@@ -64,6 +68,12 @@ class ReadOptions(NamedTuple):
     """Called with (done, total) after each image."""
     cache: ImageCache | None = None
     """Cache of decoded images; None: a new one."""
+    frames: str = ""
+    """Instants to read, as ``A:B:C``; empty: all."""
+    only_cameras: str = ""
+    """Names of cameras to read, separated by commas; empty: all."""
+    min_frames: int = 0
+    """Smallest number of frames whose images exist; 0: half of them."""
 
 
 def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[[int, int], None] | None = None):
@@ -108,7 +118,11 @@ def reduced_size(width: int, height: int, downscale: float, path: Path) -> tuple
 
 
 def read_image(
-    path: Path, options: ReadOptions, lens_of: Callable[[tuple[int, int]], Lens], mask_path: Path | None = None
+    path: Path,
+    options: ReadOptions,
+    lens_of: Callable[[tuple[int, int]], Lens],
+    mask_path: Path | None = None,
+    states_size: bool = True,
 ) -> Decoded:
     """Decode one file, undistort it, reduce it, and composite it on the background once.
 
@@ -119,13 +133,13 @@ def read_image(
     Args:
         lens_of: function from the (width, height) of the file to the lens; raises UserError if the size does not fit.
         mask_path: an image that is black where the frame is not valid, and not black everywhere.
+        states_size: whether the camera states the size of its images.
 
     Raises:
         UserError: a file is missing or does not decode, or the mask has another size than the image.
     """
-    pixels = decode(path)
+    pixels, lens = _as_the_camera_sees(path, lens_of, states_size)
     height, width = pixels.shape[:2]
-    lens = lens_of((width, height))
     size = reduced_size(width, height, options.downscale, path)
     mask = None if mask_path is None else read_mask(mask_path, path, (width, height))
     if lens.distorted:
@@ -141,6 +155,37 @@ def read_image(
     mask_tensor = None if mask is None else torch.from_numpy(reduce_mask(mask, size))
     reduced = Pixels(planar.permute(1, 2, 0), alpha_tensor, mask_tensor)
     return Decoded(reduced, (width, height), is_transparent(pixels), lens)
+
+
+def _as_the_camera_sees(
+    path: Path, lens_of: Callable[[tuple[int, int]], Lens], states_size: bool
+) -> tuple[np.ndarray, Lens]:
+    """Decode a file and find its lens.
+
+    A photograph with an EXIF orientation is turned if only the turned image has the size of its camera, or if the
+    camera states no size. If both sizes fit, its pixels stay as they are stored, as for COLMAP and nerfstudio.
+    """
+    data = _read(path)
+    pixels = _decoded(path, data)
+    stored = (pixels.shape[1], pixels.shape[0])
+    orientation = read_orientation(data.data)
+    if orientation == UPRIGHT:
+        return pixels, lens_of(stored)
+    if not states_size:
+        turned = upright(pixels, orientation)
+        return turned, lens_of((turned.shape[1], turned.shape[0]))
+    try:
+        return pixels, lens_of(stored)
+    except UserError:
+        if not swaps_sides(orientation):
+            raise
+        try:
+            lens = lens_of(stored[::-1])
+        except UserError:
+            lens = None
+        if lens is None:  # the stored size is the one that the user knows
+            raise
+        return upright(pixels, orientation), lens
 
 
 def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
@@ -166,7 +211,13 @@ def is_transparent(pixels: np.ndarray) -> bool:
 
 
 def decode(path: Path) -> np.ndarray:
-    """Decode a file to RGB(A) [H, W, 3 or 4], uint8 or uint16; raise UserError if it is missing or not an image."""
+    """Decode a file to RGB(A) [H, W, 3 or 4], uint8 or uint16, as it is stored; raise UserError if it is missing or not
+    an image."""
+    return _decoded(path, _read(path))
+
+
+def _read(path: Path) -> np.ndarray:
+    """Read the bytes of an image file; raise UserError if it is missing or claims to be too large."""
     try:
         if not is_regular(path):
             raise UserError(f"{path}: is not a regular file; give an image, or drop the frame")
@@ -178,6 +229,13 @@ def decode(path: Path) -> np.ndarray:
     claim = oversized_claim(data.data)
     if claim is not None:
         raise UserError(f"{path}: says it is {claim} in {data.size} bytes; save it again, smaller")
+    return data
+
+
+def _decoded(path: Path, data: np.ndarray) -> np.ndarray:
+    other = instead_of_image(data[:INSPECTED].tobytes())
+    if other is not None:
+        raise UserError(f"{path}: {other}")
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if is_complete(data) else None
     except cv2.error:
@@ -189,6 +247,15 @@ def decode(path: Path) -> np.ndarray:
     if code is None:
         raise UserError(f"{path}: has {channels} channels; save it as grey, RGB or RGBA")
     return cv2.cvtColor(pixels, code)
+
+
+def instead_of_image(start: bytes) -> str | None:
+    """Say what a file is that came in place of an image, by its first bytes; None for anything else."""
+    if start.startswith(b"version https://git-lfs.github.com"):
+        return "is a pointer of Git LFS, not an image; run 'git lfs pull' in its repository"
+    if any(mark in start.lower() for mark in (b"<!doctype html", b"<html")):
+        return "is a web page, not an image; download the image itself"
+    return None
 
 
 def oversized_claim(data: bytes | memoryview) -> str | None:
@@ -225,15 +292,17 @@ def is_complete(data: np.ndarray) -> bool:
     return len(content) > 0
 
 
-def header_size(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) from the file's header; None if the file is missing or its header is unreadable."""
+def header_sizes(path: Path) -> list[tuple[int, int]]:
+    """Return (width, height) from the file's header, and that of the turned image if its EXIF orientation swaps the
+    sides; an empty list if the file is missing or its header is unreadable."""
     from PIL import Image
 
     try:
         with Image.open(path) as image:
-            return image.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None
+            turned = image.format in ("JPEG", "WEBP") and swaps_sides(image.getexif().get(TAG, UPRIGHT))
+            return [image.size, image.size[::-1]] if turned else [image.size]
+    except (OSError, ValueError, SyntaxError, TypeError, KeyError, struct.error, Image.DecompressionBombError):
+        return []
 
 
 def _area(

@@ -162,7 +162,7 @@ def metrics_of(
     """Make the content of ``metrics.json``: the metrics of ``evaluate``, and a description of scene and data.
 
     If the data folder has ``ground_truth.npz``, the content includes ``epe`` and ``jitter`` of the motion; if it has
-    ``rods.npz``, the fields of ``RodCheck.summary``.
+    ``rods.npz``, the fields of ``RodCheck.summary``. Neither is included if the run uses only some of the frames.
 
     Args:
         seconds: duration of the training, if known.
@@ -170,12 +170,14 @@ def metrics_of(
     Raises:
         UserError: ``render_dir`` cannot be written, or the ground truth cannot be read.
     """
-    rods = load_rods(dataset.folder, dataset.split, len(dataset))
+    data = scene.settings.get("data", {})
+    # The true motion and the rods are those of all frames, at the times of all frames.
+    whole = not (data.get("frames") or data.get("only_cameras") or dataset.notes)
+    rods = load_rods(dataset.folder, dataset.split, len(dataset)) if whole else None
     check = None if rods is None else RodCheck(rods)
     watch = None if check is None else check.add
     measured = evaluate(scene, dataset, lpips=lpips, render_dir=render_dir, progress=progress, watch=watch)
     rows = measured.pop("per_image")
-    data = scene.settings.get("data", {})
     metrics = {
         **measured,
         "split": dataset.split,
@@ -187,9 +189,10 @@ def metrics_of(
         "device": torch.device(getattr(scene, "device", "cpu")).type,
         "data": str(dataset.folder),
         **{key: data.get(key) for key in ("downscale", "resample", "background")},
+        **{key: data[key] for key in ("frames", "only_cameras") if data.get(key)},
         "seed": scene.settings.get("seed"),
     }
-    truth = load_ground_truth(dataset.folder)
+    truth = load_ground_truth(dataset.folder) if whole else None
     if truth is not None:
         opacities = scene.gaussians_at(float(truth.times[0])).opacities
         metrics.update(score_motion(truth, lambda time: scene.gaussians_at(time).means, opacities)._asdict())

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from .. import data
+from ..config.fields import IMAGE_SETTINGS
 from ..edit import EditSession
 from ..errors import UserError
 from ..formats.gaussian_files import read_gaussians, shortage_as_user_error
@@ -235,7 +236,7 @@ def _export_cameras(request: ExportRequest, device: str) -> str:
     folder = settings.get("folder")
     if not isinstance(folder, str) or not Path(folder).is_dir():
         raise UserError(f"{request.run}/config.json: data.folder {folder} is no folder; put it back or correct it")
-    how = {key: settings[key] for key in ("downscale", "resample", "background") if key in settings}
+    how = {key: settings[key] for key in IMAGE_SETTINGS if key in settings}
     splits = {split: data.load(folder, split, **how) for split in ("train", "test")}
     splits["train"] = refined(splits["train"], request.run, scene.normalisation) or splits["train"]
     count = write_cameras(request.output, splits)

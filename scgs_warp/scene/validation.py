@@ -103,9 +103,11 @@ def check_settings(settings: Any, source: str) -> None:
     data = settings.get("data", {}) if isinstance(settings, dict) else None
     if not isinstance(data, dict):
         raise UserError(f"{source}: must hold a JSON object, and data another; restore it or train again")
-    for name in ("folder", "resample", "background"):
+    for name in ("folder", "resample", "background", "frames", "only_cameras"):
         if not isinstance(data.get(name, ""), (str, type(None))):
             raise UserError(f"{source}: data.{name} is not text; restore it or train again")
+    if not isinstance(data.get("min_frames", 0), int):
+        raise UserError(f"{source}: data.min_frames is not a whole number; restore it or train again")
 
 
 def _number(value: Any, low: float, high: float) -> bool:

@@ -17,7 +17,7 @@ from ..errors import UserError, one_line
 from ..evaluation.coverage import coverage_line
 from ..evaluation.evaluate import Lpips, metrics_of, write_metrics
 from ..geometry import cameras
-from ..runtime.progress import progress
+from ..runtime.progress import progress, say
 from ..runtime.provenance import provenance
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
@@ -58,7 +58,10 @@ def load_splits(config: TrainConfig, folder: Path) -> tuple[Dataset, Dataset]:
 
             return load(folder, split, **options, cache=cache, progress=show)
 
-    return read("train"), read("test")
+    train, test = read("train"), read("test")
+    for note in dict.fromkeys([*train.notes, *test.notes]):
+        say(note)
+    return train, test
 
 
 def train_and_evaluate(

@@ -123,8 +123,10 @@ def test_memory_is_bounded_by_the_cache(tmp_path, monkeypatch):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     monkeypatch.setattr("scgs_warp.data.assemble.BORDER_FRAMES", 4)
     decoded = []
-    original = images.decode
-    monkeypatch.setattr("scgs_warp.data.images.decode", lambda path: decoded.append(path) or original(path))
+    original = images.read_image
+    monkeypatch.setattr(
+        "scgs_warp.data.assemble.read_image", lambda path, *rest: decoded.append(path) or original(path, *rest)
+    )
     tracemalloc.start()
     data = load(tmp_path, cache_mib=8)
     for _ in range(2):

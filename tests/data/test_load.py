@@ -24,6 +24,7 @@ WRITERS = {
 
 
 def test_nothing_known(tmp_path):
+    (tmp_path / "notes.txt").write_text("nothing")
     text = message(tmp_path)
     names = (
         "transforms_train.json",

@@ -48,7 +48,15 @@ def text(path: str, content: str):
 
 
 def gone(path: str):
-    return lambda folder: (folder / path).unlink()
+    """A fault: the file, or the files below the folder, do not exist."""
+
+    def remove(folder: Path) -> None:
+        target = folder / path
+        for file in [target] if target.is_file() else list(target.rglob("*.*")):
+            if file.is_file():
+                file.unlink()
+
+    return remove
 
 
 def noise(path: str):

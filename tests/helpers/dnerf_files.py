@@ -13,7 +13,7 @@ IDENTITY = [[1, 0, 0, 0.5], [0, 1, 0, 0.25], [0, 0, 1, 4], [0, 0, 0, 1]]
 
 
 def write_scene(folder: Path, frames: int = 3, mode: str = "RGBA", seed: int = 0, **fields) -> list[np.ndarray]:
-    """A tiny valid data set of random pixels; returns the images."""
+    """A tiny valid data set of random pixels, whose first frame is the test frame, too; returns the images."""
     rng = np.random.default_rng(seed)
     (folder / "train").mkdir(parents=True)
     images, entries = [], []
@@ -25,6 +25,7 @@ def write_scene(folder: Path, frames: int = 3, mode: str = "RGBA", seed: int = 0
         entries.append({"file_path": f"./train/r_{index:03d}", "time": time, "transform_matrix": IDENTITY})
     content = {"camera_angle_x": 0.8, "frames": entries, **fields}
     (folder / "transforms_train.json").write_text(json.dumps(content))
+    (folder / "transforms_test.json").write_text(json.dumps({**content, "frames": entries[:1]}))
     return images
 
 

@@ -10,12 +10,16 @@ from pathlib import Path, PurePosixPath
 from ...errors import UserError
 from ...storage.safe_paths import inside
 from ..assemble import FrameRecord, assemble, video_border, with_points
+from ..choice import choose
 from ..dataset import Dataset
 from ..held_out import held_out
-from ..images import ReadOptions, header_size, size_text
+from ..images import ReadOptions, header_sizes, size_text
 from ..lens import Lens, make_lens
 from ..natural_order import natural
 from .colmap_model import ModelCamera, ModelImage, find_model, read_model
+
+MADE_FROM = "give the images that the model was made from, with their names"
+"""What to do about missing images."""
 
 
 def recognises(folder: Path) -> bool:
@@ -40,20 +44,22 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     base = _image_folder(folder, model_folder)
     files = [_file(base, image, model_folder) for image in images]
     lenses = [partial(_lens, model_folder, image, model.cameras[image.camera]) for image in images]
-    _check_sizes(files, lenses)
     times = times_from_names([image.name for image in images])
-    chosen = held_out(model_folder, range(len(images)), split)
+    choice = choose(model_folder, files, times, options, _cameras(images), MADE_FROM)
+    _check_sizes([files[index] for index in choice.indices], [lenses[index] for index in choice.indices])
+    chosen = held_out(model_folder, choice.indices, split)
     records = [
         FrameRecord(
             files[index],
             images[index].viewmat,
-            times[index],
+            choice.times[index],
             lenses[index],
             PurePosixPath(images[index].name).with_suffix("").as_posix().replace("/", "_"),
         )
         for index in chosen
     ]
-    data = assemble(records, options, folder=folder, split=split, border=video_border(files, times))
+    border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
+    data = assemble(records, options, folder=folder, split=split, border=border, notes=choice.notes)
     return with_points(data, model.points, model.colors) if len(model.points) else data
 
 
@@ -66,19 +72,27 @@ def _file(base: Path, image: ModelImage, model_folder: Path) -> Path:
     return inside(base, image.name, f"{model_folder}: the name of an image", "image")
 
 
+def _cameras(images: list[ModelImage]) -> list[str]:
+    """Name the camera of each image: the folder in the image's name or, if no name has one, COLMAP's number."""
+    folders = [PurePosixPath(image.name).parent.as_posix() for image in images]
+    return folders if any(folder != "." for folder in folders) else [str(image.camera) for image in images]
+
+
 def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Lens]]) -> None:
     """Check the presence and the sizes of the files of all splits before any is decoded, so that a model of other
     images is refused at once."""
     for file, lens in zip(files, lenses):
-        size = header_size(file)
-        if size is not None:
-            lens(size)
-    missing = [file for file in files if not file.is_file()]
-    if missing:
-        raise UserError(
-            f"{missing[0]}: no such image, though the model has it ({len(missing)} of {len(files)} are missing); give "
-            "the images that the model was made from, with their names"
-        )
+        sizes = header_sizes(file)
+        if sizes and not any(_fits(lens, size) for size in sizes):
+            lens(sizes[0])  # raises
+
+
+def _fits(lens: Callable[[tuple[int, int]], Lens], size: tuple[int, int]) -> bool:
+    try:
+        lens(size)
+    except UserError:
+        return False
+    return True
 
 
 def times_from_names(names: list[str]) -> list[float]:

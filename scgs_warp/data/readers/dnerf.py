@@ -10,8 +10,11 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from ...errors import UserError
 from ..assemble import FrameRecord, assemble
+from ..choice import Choice, choose, choose_instants, of_cameras, present
 from ..dataset import Dataset
+from ..held_out import held_out
 from ..images import ReadOptions
 from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
 
@@ -26,20 +29,55 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
-    """Read one split.
+    """Read one split. If the files of ``test`` and ``val`` are both missing, every eighth frame of ``train`` is held
+    out; if one of them is missing, the other one serves for both.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
     """
-    path = transforms_path(folder, split)
+    path, shared = _path(folder, split)
     content = read_transforms(path)
     entries = content["frames"]
     poses = [read_pose(path, index, entry) for index, entry in enumerate(entries)]
     times = read_times(path, entries)
     files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
+    if options.only_cameras:
+        of_cameras([""] * len(files), options)
+    if shared or split == "train":
+        choice = choose(path, files, times, options)
+    else:
+        choice = _within_training(folder, path, files, times, options)
+    chosen = held_out(path, choice.indices, split) if shared else choice.indices
     records = []
-    for index, (entry, viewmat, time, file) in enumerate(zip(entries, poses, times, files)):
-        fields = {**content, **entry}
+    for index in chosen:
+        fields = {**content, **entries[index]}
         read_distortion(path, fields)
-        records.append(FrameRecord(file, viewmat, time, partial(read_lens, path, fields, index), file.stem))
-    return assemble(records, options, folder=folder, split=split, one_size=True)
+        lens = partial(read_lens, path, fields, index)
+        states_size = "w" in fields or "h" in fields
+        frame = (files[index], poses[index], choice.times[index], lens, files[index].stem)
+        records.append(FrameRecord(*frame, states_size=states_size))
+    return assemble(records, options, folder=folder, split=split, one_size=True, notes=choice.notes)
+
+
+def _path(folder: Path, split: str) -> tuple[Path, bool]:
+    """Return the file of the split, and whether the file is shared by all splits. A missing file for ``test`` or
+    ``val`` is replaced by the other one or, without either, by the file for ``train``, which is then shared."""
+    there = [name for name in ("test", "val") if transforms_path(folder, name).is_file()]
+    if not there and transforms_path(folder, "train").is_file():
+        return transforms_path(folder, "train"), True
+    return transforms_path(folder, split if split in ("train", *there) else (there or [split])[0]), False
+
+
+def _within_training(folder: Path, path: Path, files: list[Path], times: list[float], options: ReadOptions) -> Choice:
+    """Choose the held-out frames from the first to the last of the instants that ``--frames`` chooses for training."""
+    indices, scaled = list(range(len(files))), times
+    if options.frames:
+        training = transforms_path(folder, "train")
+        instants = choose_instants(read_times(training, read_transforms(training)["frames"]), options)
+        assert instants is not None
+        indices = [index for index in indices if instants.first <= times[index] <= instants.last]
+        scaled = instants.scaled(times)
+        if not indices:
+            raise UserError(f"{path}: no frame is of the instants that --frames {options.frames} chooses; choose more")
+    kept, notes = present(path, files, indices, options)
+    return Choice(kept, scaled, notes)

@@ -23,6 +23,7 @@ from ...geometry.rotation import is_rotation
 from ...storage.json_files import as_array, as_number, read_json
 from ...storage.numpy_files import read_npy
 from ..assemble import FrameRecord, assemble, with_points
+from ..choice import choose
 from ..dataset import Dataset
 from ..held_out import held_out
 from ..images import ReadOptions, size_text
@@ -48,37 +49,39 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the ids listed in ``dataset.json``, each with its camera and image.
 
     ``test`` and ``val`` are ``val_ids``, which are never trained on; if that list is empty, every eighth id is held
-    out. Times are ``time_id``, scaled to [0, 1] over all listed frames.
+    out. Times are ``time_id``, scaled to [0, 1] over all listed frames. The camera of a frame is ``camera_id``.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
     """
-    listed, chosen = _ids(folder / FILE, split)
-    times = _times(folder / "metadata.json", listed)
+    lists = _lists(folder / FILE)
+    everything = list(dict.fromkeys([*lists["ids"], *lists["train_ids"], *lists["val_ids"]]))
+    times, cameras = _times(folder / "metadata.json", everything)
     world = _world(folder / "scene.json")
     images, ratio = _images(folder / "rgb", options.downscale)
+    files = [_image(images, name) for name in everything]
+    choice = choose(folder / FILE, files, [times[name] for name in everything], options, cameras)
+    chosen = {everything[index]: index for index in choice.indices}
     records = []
-    for name in chosen:
+    for name in _of_split(folder / FILE, lists, list(chosen), split, bool(options.only_cameras)):
         path = folder / "camera" / f"{name}.json"
         content = read_json(path, "each listed id needs its camera; restore it or drop the id from dataset.json")
-        file = next((images / f"{name}{s}" for s in SUFFIXES if (images / f"{name}{s}").is_file()), None)
         records.append(
             FrameRecord(
-                file if file is not None else images / f"{name}.png",
+                files[chosen[name]],
                 _viewmat(path, content, world),
-                times[name],
+                choice.times[chosen[name]],
                 partial(_lens, path, content, ratio),
                 name,
             )
         )
-    data = assemble(
-        records, options._replace(downscale=max(1.0, options.downscale / ratio)), folder=folder, split=split
-    )
+    reduced = options._replace(downscale=max(1.0, options.downscale / ratio))
+    data = assemble(records, reduced, folder=folder, split=split, notes=choice.notes)
     return with_points(data, _points(folder / "points.npy", world), None)
 
 
-def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
-    """Return the ids of all listed frames, and those of this split."""
+def _lists(path: Path) -> dict[str, list[str]]:
+    """Read the lists ``ids``, ``train_ids`` and ``val_ids``; at least one of them is not empty."""
     content = read_json(path)
     lists: dict[str, list[str]] = {}
     for key in ("ids", "train_ids", "val_ids"):
@@ -89,28 +92,43 @@ def _ids(path: Path, split: str) -> tuple[list[str], list[str]]:
         for item in lists[key]:
             if not re.fullmatch(r"[\w.+=@, -]{1,200}", item) or item.strip() != item or item[0] == ".":
                 raise UserError(f"{path}: {key} holds {item[:40]!r}, which names no file; correct the id")
-    everything = list(dict.fromkeys([*lists["ids"], *lists["train_ids"], *lists["val_ids"]]))
-    if not everything:
+    if not any(lists.values()):
         raise UserError(f"{path}: ids, train_ids and val_ids are missing or empty; list the frames there")
-    outside = set(lists["val_ids"])
-    if outside and split != "train":
-        return everything, lists["val_ids"]
-    if outside:
-        chosen = [item for item in lists["train_ids"] or everything if item not in outside]
-        if not chosen:
-            raise UserError(f"{path}: train_ids are all among val_ids, nothing is left to train on; correct the lists")
-        return everything, chosen
-    pool = lists["train_ids"] or everything
-    return everything, [pool[index] for index in held_out(path, range(len(pool)), split)]
+    return lists
 
 
-def _times(path: Path, names: list[str]) -> dict[str, float]:
-    """Return times in [0, 1] from the metadata of all frames; without metadata, times are evenly spaced in the listed
-    order."""
+def _of_split(
+    path: Path, lists: dict[str, list[str]], chosen: list[str], split: str, chosen_cameras: bool
+) -> list[str]:
+    """Return those of the ``chosen`` ids that belong to this split."""
+    known = set(chosen)
+    held = [item for item in lists["val_ids"] if item in known]
+    pool = [item for item in lists["train_ids"] if item in known] or chosen
+    outside = set(held)
+    rest = [item for item in pool if item not in outside]
+    if not held or (not rest and chosen_cameras):  # of one camera of a rig, all frames may be held out
+        return [pool[index] for index in held_out(path, range(len(pool)), split)]
+    if split != "train":
+        return held
+    if not rest:
+        raise UserError(f"{path}: train_ids are all among val_ids, nothing is left to train on; correct the lists")
+    return rest
+
+
+def _image(folder: Path, name: str) -> Path:
+    """Return the image of an id."""
+    candidates = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
+    return next((file for file in candidates if file.is_file()), candidates[0])
+
+
+def _times(path: Path, names: list[str]) -> tuple[dict[str, float], list[str]]:
+    """Return times in [0, 1] and the names of the cameras from the metadata of all frames; without metadata, times are
+    evenly spaced in the listed order, and the cameras have no names."""
     if not path.is_file():
-        return {name: index / max(len(names) - 1, 1) for index, name in enumerate(names)}
+        return {name: index / max(len(names) - 1, 1) for index, name in enumerate(names)}, [""] * len(names)
     content = read_json(path)
     values: dict[str, float] = {}
+    cameras = []
     for name in names:
         entry = content.get(name)
         key = "time_id" if isinstance(entry, dict) and "time_id" in entry else "warp_id"
@@ -118,8 +136,11 @@ def _times(path: Path, names: list[str]) -> dict[str, float]:
         if value is None:
             raise UserError(f"{path}: {name}.{key} is missing or not a number; give each frame its instant")
         values[name] = value
+        camera = as_number(entry.get("camera_id")) if isinstance(entry, dict) else None
+        cameras.append("" if camera is None else f"{camera:g}")
     first, last = min(values.values()), max(values.values())
-    return {name: (value - first) / (last - first) if last > first else 0.0 for name, value in values.items()}
+    scaled = {name: (value - first) / (last - first) if last > first else 0.0 for name, value in values.items()}
+    return scaled, cameras
 
 
 def _world(path: Path) -> World:

@@ -19,6 +19,7 @@ from ...errors import UserError
 from ...storage.safe_paths import inside
 from ...types import Camera
 from ..assemble import FrameRecord, assemble, video_border, with_points
+from ..choice import choose
 from ..dataset import Dataset
 from ..held_out import held_out
 from ..images import ReadOptions
@@ -40,7 +41,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     Frames without times are evenly spaced in the order of their names (9 before 10). Without lists of files, every
     eighth frame is held out for ``test`` and ``val`` alike. If only one of the lists for ``test`` and ``val`` is
     present and not empty, it serves for both splits. A frame's mask is False where ``mask_path`` is black and on the
-    borders of undistorted images.
+    borders of undistorted images. The camera of a frame is the folder of its image.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -52,10 +53,11 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     times = _times(path, entries, files)
     for entry in entries:
         read_distortion(path, {**content, **entry})
-    chosen = _chosen(path, content, files, split)
-    records = [_record(path, folder, content, index, files[index], times[index]) for index in chosen]
-    border = video_border(files, times)
-    data = assemble(records, options, folder=folder, split=split, one_size=True, border=border)
+    choice = choose(path, files, times, options, [file.relative_to(folder).parent.as_posix() for file in files])
+    chosen = _of_split(path, content, files, choice.indices, split)
+    records = [_record(path, folder, content, index, files[index], choice.times[index]) for index in chosen]
+    border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
+    data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=choice.notes)
     return with_points(data, *_points(path, folder, content, data.cameras))
 
 
@@ -72,6 +74,7 @@ def _record(path: Path, folder: Path, content: dict[str, Any], index: int, file:
         partial(read_lens, path, fields, index),
         file.stem,
         None if mask is None else inside(folder, mask, f"{path}: frames[{index}].mask_path", "mask"),
+        "w" in fields or "h" in fields,
     )
 
 
@@ -86,14 +89,15 @@ def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list
     return times
 
 
-def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) -> list[int]:
-    """Return the indices of the frames of this split, in the order of the file."""
+def _of_split(path: Path, content: dict[str, Any], files: list[Path], indices: list[int], split: str) -> list[int]:
+    """Return those of the ascending ``indices`` that belong to this split."""
     lists = {name: content[f"{name}_filenames"] for name in ("train", "val", "test") if f"{name}_filenames" in content}
     for name in ("val", "test"):  # Exporters write all three lists, of which one may be empty.
         if lists.get(name) == []:
             del lists[name]
     if not lists:
-        return held_out(path, by_name(files), split)
+        allowed = set(indices)
+        return held_out(path, [index for index in by_name(files) if index in allowed], split)
     substitute = {"val": "test", "test": "val"}.get(split, split)
     name = split if split in lists else substitute
     if name not in lists:
@@ -107,7 +111,10 @@ def _chosen(path: Path, content: dict[str, Any], files: list[Path], split: str) 
             raise UserError(
                 f"{path}: {name}_filenames names {item!r}, which no frame has as file_path; write it as the frame does"
             )
-    return sorted({known[item] for item in listed})
+    chosen = sorted({known[item] for item in listed} & set(indices))
+    if not chosen:
+        raise UserError(f"{path}: no frame of {name}_filenames is left; choose more frames, or restore their images")
+    return chosen
 
 
 def _points(

@@ -7,6 +7,7 @@ colours in [0, 1], foreground. ``seg/`` separates people from the dome and is ig
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ...storage.json_files import as_array, as_number, read_json
 from ...storage.numpy_files import read_npy
 from ...storage.safe_paths import inside
 from ..assemble import FrameRecord, assemble, with_points
+from ..choice import choose
 from ..dataset import Dataset
 from ..images import ReadOptions, size_text
 from ..lens import Lens
@@ -35,7 +37,8 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the cameras of ``train_meta.json``, or of ``test_meta.json`` for ``test`` and ``val``.
 
-    All cameras of an instant share its time; instants are evenly spaced in the order of the list.
+    All cameras of an instant share its time; instants are evenly spaced in the order of the list. The camera of a frame
+    is the folder of its image; ``only_cameras`` restricts the training cameras alone.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -65,7 +68,10 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
             records.append(FrameRecord(file, pose, instant / last, partial(_lens, path, content, K), label))
     if not records:
         raise UserError(f"{path}: fn lists no frame; list at least one")
-    data = assemble(records, options, folder=folder, split=split)
+    cameras = [record.file.parent.name for record in records] if split == "train" else None
+    choice = choose(path, [r.file for r in records], [r.time for r in records], options, cameras)
+    chosen = [replace(records[index], time=choice.times[index]) for index in choice.indices]
+    data = assemble(chosen, options, folder=folder, split=split, notes=choice.notes)
     return with_points(data, *_points(folder / POINTS))
 
 

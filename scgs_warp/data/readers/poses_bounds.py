@@ -8,6 +8,7 @@ et al., LLFF, 2019; Li et al., Neural 3D Video Synthesis, CVPR 2022.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from ...errors import UserError
 from ...geometry.rotation import is_rotation
 from ...storage.numpy_files import read_npy
 from ..assemble import FrameRecord, assemble, with_points
+from ..choice import choose, of_cameras
 from ..dataset import Dataset
 from ..images import ReadOptions, size_text
 from ..lens import Lens
@@ -27,7 +29,7 @@ from .transforms import SUFFIXES
 FILE = "poses_bounds.npy"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
 HELD_OUT_CAMERA = 0
-"""Index of the held-out camera: the central one of Neural 3D Video, as in published results."""
+"""Index of the held-out camera among the chosen ones: the central one of Neural 3D Video, as in published results."""
 POINTS = ("points3D.ply", "points3D_downsample2.ply", "points3d.ply")
 MAX_ASPECT_ERROR = 0.01
 """Largest relative difference between the scale factors of width and height that is attributed to rounding."""
@@ -39,7 +41,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
-    """Read one split: the first camera is ``test`` and ``val``, the others are ``train``.
+    """Read one split: the first of the chosen cameras is ``test`` and ``val``, the others are ``train``.
 
     All cameras share the same times, which are evenly spaced in the order of the images' names.
 
@@ -58,14 +60,18 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
             f"{path}: has {len(rows)} rows, but {folder} holds {len(cameras)} folders of images "
             f"({cameras[0].name} to {cameras[-1].name}); give each camera a row and a folder"
         )
-    chosen = [index for index in range(len(cameras)) if (index == HELD_OUT_CAMERA) != (split == "train")]
+    wanted = of_cameras([_label(folder, camera) for camera in cameras], options)
+    if len(wanted) < 2:
+        raise UserError(f"--only-cameras {options.only_cameras}: name two cameras or more; the first is held out")
+    held_out = wanted[HELD_OUT_CAMERA]
+    chosen = [index for index in wanted if (index == held_out) != (split == "train")]
     files = [_files(camera) for camera in cameras]
     records = []
     for index in chosen:
-        if len(files[index]) != len(files[HELD_OUT_CAMERA]):
+        if len(files[index]) != len(files[held_out]):
             raise UserError(
-                f"{cameras[index]}: holds {len(files[index])} images, but {cameras[HELD_OUT_CAMERA].name} "
-                f"{len(files[HELD_OUT_CAMERA])}; all cameras need the same instants"
+                f"{cameras[index]}: holds {len(files[index])} images, but {cameras[held_out].name} "
+                f"{len(files[held_out])}; all cameras need the same instants"
             )
         viewmat = _viewmat(path, index, rows[index, :15].reshape(3, 5))
         lens = partial(_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4])
@@ -74,7 +80,9 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
             records.append(
                 FrameRecord(file, viewmat, instant / last, lens, f"{_label(folder, cameras[index])}_{file.stem}")
             )
-    data = assemble(records, options, folder=folder, split=split)
+    choice = choose(path, [r.file for r in records], [r.time for r in records], options)
+    frames = [replace(records[index], time=choice.times[index]) for index in choice.indices]
+    data = assemble(frames, options, folder=folder, split=split, notes=choice.notes)
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     return data if points is None else with_points(data, *read_points(points))
 

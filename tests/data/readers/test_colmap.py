@@ -179,7 +179,7 @@ FAULTS = {
     "size": (model_text("cameras.txt", words(0, 2, "81")), "is of 81 x 60 pixels, but the image is 80 x 60"),
     "binary": (lambda folder: (folder / "sparse/0/images.txt").write_bytes(b"\xff\xfe\x80"), "truncated or damaged"),
     "points": (model_text("points3D.txt", words(0, 2, "far")), "points3D.txt: truncated or damaged"),
-    "no image": (gone("images/frame_3.png"), "frame_3.png: no such image, though the model has it (1 of 14"),
+    "no images": (gone("images"), "the images of 14 of 14 frames are missing (frame_1.png, frame_2.png, frame_3.png"),
     "undecodable": (noise("images/frame_3.png"), "frame_3.png: not an image"),
 }
 

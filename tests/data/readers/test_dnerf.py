@@ -64,7 +64,10 @@ BAD_CONTENT = {
     "time beyond": (frame_field("time", 1.5), "frames[1].time is 1.5"),
     "time before": (frame_field("time", -0.1), "frames[1].time is -0.1"),
     "time absent": (lambda content: content["frames"][1].pop("time"), "frames[1].time"),
-    "image missing": (frame_field("file_path", "./train/nowhere"), "nowhere.png"),
+    "images missing": (
+        lambda content: [entry.update(file_path="./train/nowhere") for entry in content["frames"][1:]],
+        "the images of 2 of 3 frames are missing (nowhere.png, nowhere.png)",
+    ),
     "path no text": (frame_field("file_path", 7), "frames[1].file_path"),
     "angle": (lambda content: content.__setitem__("camera_angle_x", -1), "camera_angle_x"),
     "no angle": (lambda content: content.pop("camera_angle_x"), "camera_angle_x"),
@@ -98,10 +101,9 @@ def test_bad_files(tmp_path):
     scene = tmp_path / "s"
     assert "no such folder" in message(scene)
     scene.mkdir()
-    assert "transforms_train.json" in message(scene)
+    assert "is empty" in message(scene)
     write_scene(tmp_path / "t")
     scene = tmp_path / "t"
-    assert "transforms_test.json" in message(scene, "test")
     assert "downscale" in message(scene, downscale=0)
     assert "at most 2" in message(scene, downscale=4)
     assert "resample" in message(scene, resample="best")

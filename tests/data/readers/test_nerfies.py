@@ -95,7 +95,7 @@ FAULTS = {
     "outside": (put("dataset.json", "train_ids", value=["../../x"]), "train_ids holds '../../x'"),
     "nothing left": (put("dataset.json", "train_ids", value=["000002"]), "train_ids are all among val_ids"),
     "no camera": (gone(CAMERA), "000003.json: no such file"),
-    "no image": (gone(IMAGE), "000003.png: no such image"),
+    "no images": (gone("rgb/1x"), "the images of 12 of 12 frames are missing (000001.png, 000002.png, 000003.png"),
     "undecodable": (noise(IMAGE), "000003.png: not an image"),
     "size": (small(IMAGE), "image_size is 80 x 60, but the images in rgb/1x are 60 x 40"),
     "no time": (put("metadata.json", "000003", value=...), "000003.warp_id is missing"),

@@ -55,7 +55,7 @@ FAULTS = {
     "mirrored": (put(META, "w2c", 1, 2, value=np.diag([1.0, 1, -1, 1]).tolist()), "w2c[1][2] is not a rigid"),
     "camera": (put(META, "k", 1, 2, 0, 0, value=-5), "k[1][2] is not a 3 x 3 matrix"),
     "width": (put(META, "w", value=99), "w is 99, but the images are 80 x 60"),
-    "no image": (gone("ims/1/000002.jpg"), "000002.jpg: no such image"),
+    "no images": (gone("ims"), "the images of 15 of 15 frames are missing (000000.jpg, 000000.jpg, 000000.jpg"),
     "undecodable": (noise("ims/1/000002.jpg"), "000002.jpg: not an image"),
     "points": (noise("init_pt_cld.npz"), "init_pt_cld.npz: no sound numpy file"),
     "no data": (lambda folder: np.savez(folder / "init_pt_cld.npz", points=1), "no array named 'data'"),

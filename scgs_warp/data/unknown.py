@@ -1,0 +1,100 @@
+"""Messages about a path that holds no data set: what it is instead, and what to do with it."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from ..errors import UserError
+from .readers.transforms import SUFFIXES as IMAGES
+
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
+SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")
+DEEPEST, MOST_FOLDERS = 3, 200
+"""Depth to which, and number of folders in which, a data set is looked for."""
+FEWEST_PHOTOS = 3
+
+
+def not_a_folder(path: Path) -> UserError:
+    """Return the error for a path that is no folder."""
+    suffix = path.suffix.lower()
+    if not path.exists():
+        parent = path.parent
+        others = [entry.name for entry in parent.iterdir() if entry.is_dir()] if parent.is_dir() else []
+        near = difflib.get_close_matches(path.name, others, 1)
+        hint = f"; did you mean {parent / near[0]}?" if near else ""
+        return UserError(
+            f"{path}: no such folder{hint or '; give the folder of a data set (docs/data.md lists the layouts)'}"
+        )
+    if suffix in VIDEOS:
+        return UserError(
+            f"{path}: a video has no cameras yet; find them with: scgs-warp capture {path} --output data/{path.stem}"
+        )
+    if suffix in ARCHIVES:
+        return UserError(f"{path}: is an archive; unpack it and give the folder that it makes")
+    if suffix in SPLATS:
+        return UserError(
+            f"{path}: holds Gaussians or points, not images; to see a file of Gaussians: scgs-warp view --ply {path} "
+            "--output film.mp4"
+        )
+    if suffix == ".json" or path.name == "poses_bounds.npy":
+        return UserError(f"{path}: is a file of a data set; give its folder: --data {path.parent}")
+    if suffix in IMAGES:
+        return UserError(f"{path}: is one image; give the folder of a data set (docs/data.md lists the layouts)")
+    return UserError(f"{path}: is a file; give the folder of a data set (docs/data.md lists the layouts)")
+
+
+def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
+    """Return the error for a folder without a known layout.
+
+    Args:
+        recognised: whether a folder holds a layout that can be read.
+    """
+    if (folder / "checkpoint.safetensors").is_file():
+        return UserError(
+            f"{folder}: is the folder of a run, which view and evaluate take as --run; --data takes a folder of images "
+            "with cameras"
+        )
+    entries = sorted(folder.iterdir())
+    if not entries:
+        return UserError(f"{folder}: is empty; give the folder of a data set (docs/data.md lists the layouts)")
+    for inner in _below(folder):
+        if recognised(inner):
+            return UserError(f"{folder}: the data set is in a folder below; give --data {inner}")
+    above = next((outer for outer in list(folder.parents)[:2] if recognised(outer)), None)
+    if above is not None:
+        return UserError(f"{folder}: is a part of a data set; give its folder: --data {above}")
+    if sum(entry.suffix.lower() in IMAGES for entry in entries) >= FEWEST_PHOTOS:
+        return UserError(
+            f"{folder}: holds images without cameras; find them with: scgs-warp capture {folder} --output "
+            f"data/{folder.resolve().name}-cameras"
+        )
+    film = next((entry for entry in entries if entry.suffix.lower() in VIDEOS), None)
+    if film is not None:
+        return not_a_folder(film)
+    return UserError(
+        f"{folder}: holds no known layout: no transforms_train.json (D-NeRF, Blender), transforms.json (nerfstudio), "
+        "dataset.json (HyperNeRF, NeRF-DS), train_meta.json (Panoptic), poses_bounds.npy (Neural 3D Video) or sparse/0 "
+        "(COLMAP); give the folder that holds one of these"
+    )
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    """Yield the folders below ``folder``, the nearest first, up to ``DEEPEST`` and ``MOST_FOLDERS``."""
+    level, seen = [folder], 0
+    for _ in range(DEEPEST):
+        found: list[Path] = []
+        for outer in level:
+            try:
+                found += sorted(Path(entry.path) for entry in os.scandir(outer) if entry.is_dir(follow_symlinks=False))
+            except OSError:
+                continue
+        for inner in found:
+            seen += 1
+            if seen > MOST_FOLDERS:
+                return
+            yield inner
+        level = found

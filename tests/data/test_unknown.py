@@ -1,0 +1,68 @@
+"""Paths that hold no data set: the message says what they are and what to do with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from helpers.nerfstudio_files import write
+from scgs_warp.data import load
+from scgs_warp.errors import UserError
+
+
+def said(path: Path) -> str:
+    with pytest.raises(UserError) as caught:
+        load(path)
+    assert "\n" not in str(caught.value) and str(caught.value).startswith(str(path))
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("film.MP4", "scgs-warp capture {path} --output data/film"),
+        ("scene.tar.gz", "unpack it"),
+        ("cloud.spz", "scgs-warp view --ply {path}"),
+        ("transforms.json", "give its folder: --data {path.parent}"),
+        ("one.jpg", "is one image"),
+        ("notes", "is a file"),
+    ],
+)
+def test_files(name, expected, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(b"")
+    assert expected.format(path=path) in said(path)
+
+
+def test_a_mistyped_name(tmp_path):
+    (tmp_path / "garden").mkdir()
+    assert said(tmp_path / "graden").endswith(f"no such folder; did you mean {tmp_path / 'garden'}?")
+    assert "did you mean" not in said(tmp_path / "nowhere" / "else")
+
+
+def test_folders_around_a_data_set(tmp_path):
+    write(tmp_path / "a/b/scene")
+    (tmp_path / "a/b/scene/images/small").mkdir(parents=True)
+    (tmp_path / "a/b/scene/images/small/x.png").write_bytes(b"")
+    assert f"--data {tmp_path / 'a/b/scene'}" in said(tmp_path / "a")
+    assert said(tmp_path / "a/b/scene/images/small").endswith(f"--data {tmp_path / 'a/b/scene'}")
+
+
+def test_folders_of_something_else(tmp_path):
+    for name in ("photos", "run", "films", "empty"):
+        (tmp_path / name).mkdir()
+    for index in range(3):
+        cv2.imwrite(str(tmp_path / f"photos/{index}.jpg"), np.zeros((9, 9, 3), np.uint8))
+    (tmp_path / "run/checkpoint.safetensors").write_bytes(b"")
+    assert f"scgs-warp capture {tmp_path / 'photos'}" in said(tmp_path / "photos")
+    assert "is the folder of a run" in said(tmp_path / "run")
+    assert "is empty" in said(tmp_path / "empty")
+
+
+def test_a_folder_that_holds_a_film(tmp_path):
+    (tmp_path / "take.mov").write_bytes(b"")
+    with pytest.raises(UserError, match=r"take\.mov: a video has no cameras yet"):
+        load(tmp_path)
