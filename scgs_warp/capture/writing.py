@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ..data.held_out import held_out
+from ..data.points import write_points
 from ..data.readers.transforms import OPENGL_TO_OPENCV
 from ..visualization.video import write_png
 from .features import FrameFiles, quiet
@@ -140,14 +141,3 @@ def write_text(path: Path, text: str) -> None:
     part = path.with_name(f".{path.name}.part")
     part.write_text(text, encoding="utf-8")
     os.replace(part, path)
-
-
-def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write a binary PLY file of points [P, 3] and colours [P, 3] uint8."""
-    from plyfile import PlyData, PlyElement
-
-    fields = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
-    rows = np.empty(len(points), fields)
-    for k, (name, _) in enumerate(fields):
-        rows[name] = (points if k < 3 else colors)[:, k % 3]
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))

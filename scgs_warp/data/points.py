@@ -82,3 +82,14 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         raise UserError(f"{path}: says it has more points than fit into memory; export the points again") from None
     kept = finite_points(points)
     return points[kept], None if colors is None else colors[kept]
+
+
+def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    """Write a binary PLY file of points [P, 3] and colours [P, 3] uint8."""
+    from plyfile import PlyData, PlyElement
+
+    fields = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+    rows = np.empty(len(points), fields)
+    for k, (name, _) in enumerate(fields):
+        rows[name] = (points if k < 3 else colors)[:, k % 3]
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))

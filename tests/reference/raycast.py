@@ -79,3 +79,20 @@ def highlight(normal: Tensor, toward_light: Tensor, toward_eye: Tensor, exponent
     """Return the highlight of Blinn and Phong for unit vectors [3]."""
     half = torch.nn.functional.normalize(toward_light + toward_eye, dim=0)
     return max(float(normal @ half), 0.0) ** exponent
+
+
+def first_hit_on(
+    vertices: Tensor, faces: Tensor, camera_to_world: Tensor, K: Tensor, x: float, y: float
+) -> tuple[int, Tensor, float]:
+    """Return the face that the ray through pixel position (x, y) hits first (-1: none), the barycentric coordinates [3]
+    of the hit, and its depth along the optical axis.
+
+    Args:
+        camera_to_world: [3, 4], OpenCV.
+    """
+    local = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones((), dtype=K.dtype)])
+    t, u, v = intersections(vertices, faces, camera_to_world[:, 3], camera_to_world[:, :3] @ local)
+    face = int(t.argmin())
+    if not math.isfinite(float(t[face])):
+        return -1, torch.zeros(3, dtype=K.dtype), 0.0
+    return face, torch.stack([1.0 - u[face] - v[face], u[face], v[face]]), float(t[face])

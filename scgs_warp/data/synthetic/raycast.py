@@ -66,6 +66,7 @@ class Raycaster:
         self.frequencies = self._tensor([material.frequency for material in materials])
         self.shine = self._tensor([(material.shine, material.exponent) for material in materials])
         self.light_direction = torch.nn.functional.normalize(self._tensor([self.shading.light]), dim=1)
+        self._moved: tuple[Tensor, wp.Mesh] | None = None
 
     def _tensor(self, values) -> Tensor:
         return torch.as_tensor(np.asarray(values, np.float32)).to(self.device)
@@ -84,17 +85,43 @@ class Raycaster:
             )  # fmt: skip
         return PosedSurface(mesh, points, normals, light, key)
 
+    def pose_lit_as(self, lit: PosedSurface | None, time: float) -> PosedSurface:
+        """Pose the surface at ``time``, with the light of a pose at nearly the same time, or unlit. The result is valid
+        until the next call, which moves the same mesh."""
+        points, normals = (self._tensor(values) for values in self.surface.posed(time))
+        if self._moved is None:
+            self._moved = points, mesh_over(points, self.faces)
+        vertices, mesh = self._moved
+        vertices.copy_(points)
+        if vertices.is_cuda:
+            with on_torch_stream(vertices.device):
+                mesh.refit()
+        else:
+            mesh.refit()
+        if lit is None:
+            return PosedSurface(mesh, vertices, normals, torch.ones_like(vertices), torch.zeros_like(vertices[:, 0]))
+        return PosedSurface(mesh, vertices, normals, lit.light, lit.key)
+
     def render(self, posed: PosedSurface, camera: Camera, samples: int = 4) -> Tensor:
         """Render [H, W, 4] premultiplied colour and coverage with ``samples`` x ``samples`` rays per pixel."""
         image = torch.zeros(camera.height, camera.width, 4, device=self.device)
-        left, top, columns, rows = pixel_window(posed.vertices, camera)
+        self._cast(posed, camera, pixel_window(posed.vertices, camera), samples, image)
+        return image
+
+    def render_rows(self, posed: PosedSurface, camera: Camera, rows: range, samples: int, image: Tensor) -> None:
+        """Write some rows of ``image`` [H, W, 4], over their whole width."""
+        self._cast(posed, camera, (0, rows.start, camera.width, len(rows)), samples, image)
+
+    def _cast(
+        self, posed: PosedSurface, camera: Camera, window: tuple[int, int, int, int], samples: int, image: Tensor
+    ) -> None:
+        left, top, columns, rows = window
         camera_to_world = torch.linalg.inv(camera.viewmat.double())[:3].float().contiguous().to(self.device)
         launch(
             kernels.raycast, columns * rows, posed.mesh.id, self.faces, self.rest, posed.light, posed.normals,
             posed.key, self.light_direction, self.face_part, self.kinds, self.colors, self.frequencies, self.shine,
             camera_to_world, camera.K.to(self.device), left, top, columns, samples, image, grain=64,
         )  # fmt: skip
-        return image
 
     def visible(self, posed: PosedSurface, camera: Camera, points: Tensor) -> Tensor:
         """Return [P] bool, True for surface points [P, 3] that the camera sees."""
