@@ -22,7 +22,7 @@ class Options:
     run: Path | None = None
     """Run folder, as apps/train.py writes it."""
     ply: Path | None = None
-    """File of 3D Gaussian splatting (.ply, .splat or .spz) to edit instead of a run; it does not move by itself."""
+    """Instead of a run: a file of Gaussians (.ply, .compressed.ply, .splat or .spz), which does not move by itself."""
     script: Path | None = None
     """Edit to load, as JSON (docs/editing.md). Without an output, the editor opens with it."""
     output: Path | None = None
@@ -62,6 +62,7 @@ def check(options: Options) -> None:
         UserError: names the option and the remedy.
     """
     from scgs_warp.errors import UserError
+    from scgs_warp.storage.suffixes import longest_suffix
     from scgs_warp.visualization import video
 
     if (options.run is None) == (options.ply is None):
@@ -78,7 +79,7 @@ def check(options: Options) -> None:
         if options.script is None:
             raise UserError(f"--output {options.output}: a film needs --script")
         video.check_path(options.output)
-    if options.export is not None and options.export.suffix.lower() != ".ply":
+    if options.export is not None and longest_suffix(options.export, (".ply", ".compressed.ply")) != ".ply":
         raise UserError(f"--export {options.export}: end the name in .ply")
     if not 0 <= options.port <= 65535:
         raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")

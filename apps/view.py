@@ -24,7 +24,7 @@ class Options:
     run: Path | None = None
     """Run folder, as apps/train.py writes it."""
     ply: Path | None = None
-    """File of 3D Gaussian splatting (.ply, .splat or .spz) to show instead of a run; it does not move."""
+    """Instead of a run: a file of Gaussians (.ply, .compressed.ply, .splat or .spz), which does not move."""
     mode: Literal["turntable", "time", "both"] = "both"
     """turntable: the camera moves round a still scene; time: the scene moves; both: both at once. If the training
     cameras saw the scene from one side only, the camera swings within that range."""

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
-from ..formats.gaussian_files import gaussian_points
+from ..formats.gaussian_compressed_ply import is_packed
+from ..formats.gaussian_files import READERS, gaussian_points
 from ..formats.ply_header import check_ply_counts
 from ..gaussians import SH_C0
 from ..storage.safe_paths import is_regular
+from ..storage.suffixes import longest_suffix
 
 
 def finite_points(points: np.ndarray) -> np.ndarray:
@@ -43,12 +45,12 @@ def unit_colors(vertices: np.ndarray) -> np.ndarray | None:
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Read initial points [P, 3] float64 and their colours [P, 3] in [0, 1] from a PLY file of points or of Gaussians,
-    or from the Gaussians of a ``.splat`` or ``.spz``.
+    or from the Gaussians of another file.
 
     Raises:
         UserError: in the same cases as :func:`read_ply` and ``gaussian_files.read_gaussians``.
     """
-    if path.suffix.lower() in (".splat", ".spz"):
+    if longest_suffix(path, READERS) not in ("", ".ply"):
         return gaussian_points(path)
     return read_ply(path)
 
@@ -69,6 +71,8 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         with np.errstate(over="ignore"):  # Numbers in text may overflow to infinity; such points are left out.
             check_ply_counts(path)
             elements = PlyData.read(str(path))
+        if is_packed(elements):
+            return gaussian_points(path)
         vertices = elements["vertex"].data
         points = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
         colors = unit_colors(vertices)

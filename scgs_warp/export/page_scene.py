@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..errors import UserError
 from ..gaussians import GaussianParameters
+from ..geometry.morton import morton_order
 from ..kernels.types import ALPHA_MIN
 from ..motion.control_points import ControlPoints
 from ..motion.static_nodes import StaticNodes
@@ -76,7 +77,8 @@ def page_scene(scene: Scene, sh_degree: int) -> PageScene:
         if not len(kept):
             raise UserError("--format html: the scene has no Gaussian that can be seen; train it first")
         kept = kept[near(gaussians.means[kept])]
-        kept = kept[morton_order(gaussians.means[kept])]
+        order = morton_order(_array(gaussians.means[kept]))  # neighbours together: deflate compresses them better
+        kept = kept[torch.from_numpy(order).to(kept.device)]
         columns = _gaussian_columns(gaussians, kept, sh_degree)
         facts = _facts(scene, len(kept), sh_degree)
         if isinstance(motion, ControlPoints):
@@ -100,18 +102,6 @@ def near(points: Tensor) -> Tensor:
     """Return [N] bool: all points but far outliers, which would coarsen the positions of all others."""
     sizes = points.abs().amax(dim=1)
     return sizes <= max(FAR, common_size(_array(sizes)))
-
-
-def morton_order(points: Tensor) -> Tensor:
-    """Return indices [N] int64 along a curve that keeps neighbours together, so that deflate compresses better."""
-    cloud = points.cpu().double().numpy()
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
-    cells = ((cloud - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.uint64)
-    code = np.zeros(len(cloud), np.uint64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return torch.from_numpy(np.argsort(code, kind="stable")).to(points.device)
 
 
 def _array(values: Tensor) -> np.ndarray:

@@ -10,9 +10,10 @@ from ..errors import UserError
 from ..storage.output_folders import make_parent
 from ..storage.suffixes import longest_suffix
 
-Format = Literal["ply", "ply-sequence", "splat", "spz", "glb", "graph", "npz", "cameras", "html"]
+Format = Literal["ply", "ply-sequence", "compressed.ply", "splat", "spz", "glb", "graph", "npz", "cameras", "html"]
 SUFFIXES: dict[Format, str] = {
     "ply": ".ply",
+    "compressed.ply": ".compressed.ply",
     "splat": ".splat",
     "spz": ".spz",
     "glb": ".glb",
@@ -26,7 +27,7 @@ SUFFIXES: dict[Format, str] = {
 several suffixes, the longest of them counts."""
 OTHER_SUFFIXES = {".htm": ".html"}
 """Alternative suffixes."""
-STILL_FORMATS = ("ply", "splat", "spz", "glb")
+STILL_FORMATS = ("ply", "compressed.ply", "splat", "spz", "glb")
 """Formats of Gaussians at one instant; ``glb`` holds the motion if no instant is given."""
 MAX_FRAMES = 100_000
 
@@ -40,12 +41,13 @@ class ExportRequest:
     run: Path | None = None
     """Folder of a run, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: Gaussians to convert, in a .ply of 3D Gaussian splatting, a .splat or a .spz."""
+    """Instead of a run: Gaussians to convert, in a .ply of 3D Gaussian splatting, a .compressed.ply, a .splat or a
+    .spz."""
     format: Format | None = None
-    """ply, splat, spz: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF with Gaussians, moved
-    by control points as an animated skeleton; still with --time. graph: the control points and their edges as an
-    animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras as nerfstudio's
-    transforms.json. html: a page that plays the scene. By default the output's suffix decides."""
+    """ply, compressed.ply, splat, spz: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF with
+    Gaussians, moved by control points as an animated skeleton; still with --time. graph: the control points and their
+    edges as an animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras as
+    nerfstudio's transforms.json. html: a page that plays the scene. By default the output's suffix decides."""
     time: float | None = None
     """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion."""
     edit: Path | None = None
@@ -57,6 +59,8 @@ class ExportRequest:
     film."""
     fps: float | None = None
     """Frames per second of an animation; 30 by default."""
+    spz_version: Literal[3, 4] | None = None
+    """Version of a .spz; 4 by default, 3 for readers that know no newer one."""
     title: str = ""
     """Title of the page; the run's name by default."""
     max_mib: float | None = None
@@ -140,6 +144,8 @@ def _check_unused(request: ExportRequest) -> None:
     if kind != "html" and (request.title or request.max_mib is not None):
         name = "--title" if request.title else "--max-mib"
         raise UserError(f"{name}: belongs to a page; leave it out, or give --format html")
+    if kind != "spz" and request.spz_version is not None:
+        raise UserError(f"--spz-version: --format {kind} has no such versions; leave it out")
     name = "--frames" if request.frames is not None else "--fps" if request.fps is not None else None
     if name is not None and request.still:
         remedy = "leave out --time" if kind == "glb" and request.time is not None else "give --format ply-sequence"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,10 +14,7 @@ from .. import data
 from ..config.fields import IMAGE_SETTINGS
 from ..edit import EditSession
 from ..errors import UserError
-from ..formats.gaussian_files import read_gaussians, shortage_as_user_error
-from ..formats.gaussian_ply import write_gaussian_ply
-from ..formats.gaussian_splat import write_splat
-from ..formats.gaussian_spz import read_antialiased, write_spz
+from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
 from ..motion.control_points import ControlPoints
 from ..runtime.progress import progress
 from ..scene.from_gaussians import open_gaussians
@@ -27,7 +25,7 @@ from .control_graph import write_graph
 from .glb import write_glb
 from .npz import write_npz
 from .plain import plain_scene
-from .request import ExportRequest, check_request
+from .request import ExportRequest, check_request, output_suffix
 from .sequence import check_folder, write_sequence
 from .skeleton import (
     AnimationMoment,
@@ -106,37 +104,36 @@ def _export_still(request: ExportRequest, device: str) -> str:
         else:
             gaussians = _with_mean_colors(scene, None, even_moments(FRAMES, FPS))
     gaussians = keep_finite(gaussians)
-    clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased)
-    note = f" ({clipped:,} values clipped to what .spz can hold)" if clipped else ""
+    version = request.spz_version or 4
+    clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased, spz_version=version)
+    note = f" ({clipped:,} values clipped to what {output_suffix(request.output)} can hold)" if clipped else ""
     return f"{len(gaussians.means):,} Gaussians {when}{note}"
 
 
 def write_still(
-    path: Path, gaussians: Gaussians, *, up: tuple[float, float, float] = FILE_UP, antialiased: bool = False
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    up: tuple[float, float, float] = FILE_UP,
+    antialiased: bool = False,
+    spz_version: Literal[3, 4] = 4,
 ) -> int:
-    """Write activated Gaussians, world units, in the format of the suffix: .ply, .splat, .spz or .glb.
+    """Write activated Gaussians, world units, in the format of the longest suffix: .glb, or one of
+    ``gaussian_files.READERS``.
 
     Args:
         up: unit vector, used by .glb alone.
-        antialiased: whether the Gaussians were trained with the antialiasing compensation, which .spz alone records.
+        antialiased, spz_version: as for :func:`~scgs_warp.formats.gaussian_files.write_gaussians`.
 
     Returns:
-        Number of values clipped to the range of .spz.
+        Number of values clipped to the range of the format.
 
     Raises:
         UserError: the suffix is none of these, or the file cannot be written.
     """
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        write_gaussian_ply(path, gaussians)
-    elif suffix == ".splat":
-        write_splat(path, gaussians)
-    elif suffix == ".spz":
-        return write_spz(path, gaussians, antialiased=antialiased)
-    elif suffix == ".glb":
-        write_glb(path, gaussians, up)
-    else:
-        raise UserError(f"{path}: Gaussians are written as .ply, .splat, .spz or .glb; end the name in one of these")
+    if path.suffix.lower() != ".glb":
+        return write_gaussians(path, gaussians, antialiased=antialiased, spz_version=spz_version)
+    write_glb(path, gaussians, up)
     return 0
 
 

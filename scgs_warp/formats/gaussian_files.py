@@ -1,34 +1,85 @@
-"""Files of Gaussians; the reader is chosen by the suffix."""
+"""Files of Gaussians; the longest suffix of the name chooses the reader."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from ..errors import UserError, is_shortage
 from ..gaussians import SH_C0, GaussianParameters
-from .gaussian_ply import read_gaussian_ply
-from .gaussian_splat import read_splat
-from .gaussian_spz import read_spz
+from ..storage.suffixes import longest_suffix
+from ..types import Gaussians
+from .gaussian_compressed_ply import SUFFIX, write_compressed_ply
+from .gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from .gaussian_splat import read_splat, write_splat
+from .gaussian_spz import VERSION, read_antialiased_flag, read_spz, write_spz
+from .ply_header import has_antialiased_comment
 
-READERS = {".ply": read_gaussian_ply, ".splat": read_splat, ".spz": read_spz}
+READERS: dict[str, Callable[[Path], GaussianParameters]] = {
+    ".ply": read_gaussian_ply,
+    SUFFIX: read_gaussian_ply,
+    ".splat": read_splat,
+    ".spz": read_spz,
+}
 
 
 def read_gaussians(path: str | Path) -> GaussianParameters:
-    """Read raw parameters, world units, from a ``.ply`` of 3D Gaussian splatting, a ``.splat`` or a ``.spz``.
+    """Read raw parameters, world units, from a ``.ply`` of 3D Gaussian splatting, a ``.compressed.ply``, a ``.splat``
+    or a ``.spz``.
 
     Raises:
         UserError: the file is of another kind, missing, damaged or too large for memory, or it has no finite Gaussian.
     """
     path = Path(path)
-    reader = READERS.get(path.suffix.lower())
+    reader = READERS.get(longest_suffix(path, READERS))
     if reader is None:
         raise UserError(f"{path}: Gaussians are read from {', '.join(READERS)}; give one of these or convert it")
     with shortage_as_user_error(path):
         return reader(path)
+
+
+def read_antialiased(path: str | Path) -> bool:
+    """Return whether a file is marked as trained with the antialiasing compensation; False for what cannot be read."""
+    path = Path(path)
+    suffix = longest_suffix(path, READERS)
+    if suffix in (".ply", SUFFIX):
+        return has_antialiased_comment(path)
+    return suffix == ".spz" and read_antialiased_flag(path)
+
+
+def write_gaussians(
+    path: str | Path, gaussians: Gaussians, *, antialiased: bool = False, spz_version: Literal[3, 4] = VERSION
+) -> int:
+    """Write activated Gaussians, world units, in the format of the longest suffix, one of ``READERS``.
+
+    Args:
+        antialiased: whether the Gaussians were trained with the antialiasing compensation; a ``.splat`` does not record
+            it.
+        spz_version: version of a ``.spz``.
+
+    Returns:
+        Number of values clipped to the range of the format.
+
+    Raises:
+        UserError: the suffix is another, or the file cannot be written.
+    """
+    path = Path(path)
+    suffix = longest_suffix(path, READERS)
+    if suffix == SUFFIX:
+        return write_compressed_ply(path, gaussians, antialiased=antialiased)
+    if suffix == ".spz":
+        return write_spz(path, gaussians, antialiased=antialiased, version=spz_version)
+    if suffix == ".ply":
+        write_gaussian_ply(path, gaussians, antialiased=antialiased)
+    elif suffix == ".splat":
+        write_splat(path, gaussians)
+    else:
+        raise UserError(f"{path}: Gaussians are written as {', '.join(READERS)} or .glb; end the name in one of these")
+    return 0
 
 
 @contextmanager

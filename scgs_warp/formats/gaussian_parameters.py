@@ -1,4 +1,4 @@
-"""Conversion of a file's rows to Gaussian parameters, with the checks shared by all formats."""
+"""Conversion between the rows of a file and Gaussians, with the checks shared by all formats."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 
 from ..errors import UserError
 from ..gaussians import GaussianParameters
+from ..types import Gaussians
 
 MAX_VALUES = {"means": 1e15, "log_scales": 80.0, "quats": 1e15}
 """Largest magnitudes of parameters, so that squares and activated values stay in the range of float32. Parameters not
@@ -37,3 +38,14 @@ def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParamete
             rows = value if good.all() else value[good]  # Avoid copying large files needlessly.
             getattr(made, name).copy_(torch.from_numpy(np.ascontiguousarray(rows)))
     return made
+
+
+def to_arrays(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Convert activated Gaussians to rows of a file, float64: ``means`` [N, 3], unit ``quats`` [N, 4] wxyz,
+    ``log_scales`` [N, 3], ``opacities`` [N], ``sh_dc`` [N, 3], ``sh_rest`` [N, K - 1, 3]. Sharp Gaussians are
+    approximated (``Gaussians.plain``).
+    """
+    parts = {name: value.detach().cpu().double() for name, value in gaussians.plain().tensors().items()}
+    parts["quats"] = torch.nn.functional.normalize(parts["quats"], dim=1)
+    parts["log_scales"] = parts.pop("scales").clamp_min(1e-30).log()
+    return {name: value.numpy() for name, value in parts.items()}

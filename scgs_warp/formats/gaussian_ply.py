@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -10,9 +11,14 @@ import torch
 from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..storage.files import write_atomically
+from ..storage.suffixes import longest_suffix
 from ..types import Gaussians
+from .gaussian_compressed_ply import SUFFIX, is_packed, unpack
 from .gaussian_parameters import to_parameters
-from .ply_header import check_ply_counts
+from .ply_header import ANTIALIASED_COMMENT, check_ply_counts
+
+if TYPE_CHECKING:
+    from plyfile import PlyData
 
 REST_COLUMNS = (0, 9, 24, 45)
 """Numbers of ``f_rest_*`` columns for degrees 0 to 3."""
@@ -21,13 +27,19 @@ OPAQUE_LOGIT = 80.0
 
 
 def read_gaussian_ply(path: str | Path) -> GaussianParameters:
-    """Read raw parameters, world units; non-finite Gaussians are left out.
+    """Read raw parameters, world units; non-finite Gaussians are left out. A file of packed Gaussians is read, too,
+    whatever its name (:mod:`.gaussian_compressed_ply`).
 
     Raises:
         UserError: the file is missing, is not a PLY of Gaussians, or has no finite Gaussian.
     """
     path = Path(path)
-    data = _vertices(path)
+    elements = _elements(path)
+    if is_packed(elements):
+        return to_parameters(path, unpack(path, elements))
+    data = np.asarray(elements["vertex"].data)
+    if "O" in [data.dtype[name].kind for name in data.dtype.names or ()]:
+        raise UserError(f"{path}: its vertices hold lists; give a .ply of 3D Gaussian splatting")
     names = set(data.dtype.names or ())
     needed = [
         "x",
@@ -58,7 +70,8 @@ def read_gaussian_ply(path: str | Path) -> GaussianParameters:
     return to_parameters(path, values)
 
 
-def _vertices(path: Path) -> np.ndarray:
+def _elements(path: Path) -> PlyData:
+    """Parse a file, and make sure that it has vertices."""
     from plyfile import PlyData, PlyParseError
 
     if not path.is_file():
@@ -72,23 +85,23 @@ def _vertices(path: Path) -> np.ndarray:
         raise UserError(f"{path}: no PLY file with vertices ({type(error).__name__}); export it again") from None
     if data.dtype.names is None or len(data) == 0:
         raise UserError(f"{path}: holds no vertices; give a .ply of 3D Gaussian splatting")
-    kinds = [data.dtype[name].kind for name in data.dtype.names]
-    if "O" in kinds:
-        raise UserError(f"{path}: its vertices hold lists; give a .ply of 3D Gaussian splatting")
-    return data
+    return elements
 
 
-def write_gaussian_ply(path: str | Path, gaussians: Gaussians) -> None:
+def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
     """Write activated Gaussians, world units, in the layout of 3D-GS: logits of opacities, logarithms of scales, unit
     quaternions, harmonics channel by channel. The file is binary, little endian; the same Gaussians give the same
     bytes. Sharp Gaussians are approximated (``Gaussians.plain``).
+
+    Args:
+        antialiased: whether the Gaussians were trained with the antialiasing compensation, which a comment records.
 
     Raises:
         UserError: the name does not end in .ply, or the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() != ".ply":
-        raise UserError(f"{path}: end the name in .ply")
+    if longest_suffix(path, (".ply", SUFFIX)) != ".ply":
+        raise UserError(f"{path}: end the name in .ply, not in {SUFFIX}")
     gaussians = gaussians.plain()
     count, rest = gaussians.means.shape[0], 3 * gaussians.sh_rest.shape[1]
     opacities = gaussians.opacities.detach().cpu().double().clamp(1e-6, 1.0 - 1e-6)
@@ -104,7 +117,8 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians) -> None:
     }
     names = [name for group in columns for name in group.split()]
     table = torch.cat([value.detach().cpu().float() for value in columns.values()], dim=1)
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    head = ["ply", "format binary_little_endian 1.0", *[f"comment {ANTIALIASED_COMMENT}"] * antialiased]
+    head += [f"element vertex {count}"]
     head += [f"property float {name}" for name in names] + ["end_header", ""]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

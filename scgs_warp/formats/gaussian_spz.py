@@ -1,18 +1,18 @@
 """``.spz`` files (Niantic): Gaussians of 20 to 64 bytes before compression.
 
-A header of 16 bytes is followed by arrays: positions (24-bit fixed point), opacities, colours of degree 0, logarithms
-of scales (a byte each), rotations, harmonics (coefficient by coefficient, channels innermost). Versions 1 to 3 are one
-gzip stream; version 4 is a plain header of 32 bytes, a table and one zstd stream per array.
-Positions are in a frame with x right, y up, z back; a ``.ply`` has x right, y down, z forward.
+Arrays of positions (24-bit fixed point), opacities, colours of degree 0, logarithms of scales (a byte each), rotations
+and harmonics (coefficient by coefficient, channels innermost) are in a container (:mod:`.spz_container`).
+Positions are in a frame with x right, y up, z back, unless an extension names another; a ``.ply`` has x right, y down,
+z forward.
 """
 
 from __future__ import annotations
 
-import gzip
 import math
 import struct
 import zlib
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,11 +22,11 @@ from ..gaussians import GaussianParameters
 from ..storage.files import read_bytes, write_atomically
 from ..types import Gaussians
 from .gaussian_parameters import to_parameters
+from .spz_axes import NAMES, STANDARD, turn_axes
+from .spz_container import ANTIALIASED, MAGIC, REMEDY, SH_COUNTS, SpzHead, pack_gzip, pack_streams, unpack
 
-MAGIC = 0x5053474E
-VERSION = 3
-"""Version to write: the last that a plain gzip reader can open, and the first with four bytes per rotation."""
-ANTIALIASED = 1
+VERSION = 4
+"""Version that is written unless another is asked for: the only one that PlayCanvas reads."""
 COLOR_SCALE = 0.15
 """Factor on coefficients of degree 0: a byte of colour is ``127.5 + 255 * COLOR_SCALE * sh_dc``."""
 SCALE_STEPS, SCALE_OFFSET = 16.0, 10.0
@@ -35,16 +35,11 @@ SCALE_STEPS, SCALE_OFFSET = 16.0, 10.0
 POSITION_BITS = 16
 """Resolution of positions: they are rounded to (size of the scene) / ``2 ** POSITION_BITS``."""
 MAX_FRACTION_BITS = 24
-MAX_GAUSSIANS = 10_000_000
-"""Largest number of Gaussians in a file, as in the format's reference reader."""
-SH_COUNTS = (0, 3, 8, 15)
-"""Numbers of coefficients above degree 0, for maximum degrees 0 to 3."""
+READ_COUNT = 15
+"""Number of coefficients that are read: those of degrees 1 to 3."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """Signs by which a half turn about x multiplies the harmonics of degrees 1 to 3."""
 SQRT_HALF = math.sqrt(0.5)
-MAX_GZIP_RATIO = 1040
-"""Largest number of bytes to which one byte of a gzip stream can decompress."""
-REMEDY = "export the .spz again"
 
 
 def fraction_bits(means: np.ndarray) -> int:
@@ -63,21 +58,25 @@ def fraction_bits(means: np.ndarray) -> int:
     return max(0, min(wanted, room, MAX_FRACTION_BITS))
 
 
-def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
-    """Write activated Gaussians, world units, as version 3.
+def write_spz(
+    path: str | Path, gaussians: Gaussians, *, antialiased: bool = False, version: Literal[3, 4] = VERSION
+) -> int:
+    """Write activated Gaussians, world units.
 
     Values are rounded: positions to ``2 ** -fraction_bits``, opacities and colours to 8 bits, scales to 6 %, rotations
     to 10 bits a component, harmonics to 1 / 128 within [-1, 1]. Sharp Gaussians are approximated (``Gaussians.plain``).
 
     Args:
         antialiased: whether the Gaussians were trained with the antialiasing compensation.
+        version: 4, or 3 for older readers: the same values in one gzip stream.
 
     Returns:
         Number of values that were clipped to the range of a byte: scales outside [4.5e-5, 377], harmonics of degrees 1
         to 3 outside [-1, 1], harmonics of degree 0 outside [-3.3, 3.3].
 
     Raises:
-        UserError: the file cannot be written, or the scene is too large for the format.
+        UserError: the file cannot be written, the scene is too large for the format, or version 4 lacks the package
+            zstandard.
     """
     gaussians = gaussians.plain()
     means = gaussians.means.detach().cpu().double().numpy() * (1, -1, -1)
@@ -87,7 +86,7 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
     rest = gaussians.sh_rest.detach().cpu().double().numpy()
     degree = SH_COUNTS.index(rest.shape[1])
     scales = np.log(np.maximum(gaussians.scales.detach().cpu().double().numpy(), 1e-30))
-    head = struct.pack("<IIIBBBB", MAGIC, VERSION, len(means), degree, bits, ANTIALIASED * antialiased, 0)
+    head = SpzHead(version, len(means), degree, bits, ANTIALIASED * antialiased)
     bytes_ = (
         255.0 * gaussians.opacities.detach().cpu().double().numpy(),
         127.5 + 255.0 * COLOR_SCALE * gaussians.sh_dc.detach().cpu().double().numpy(),
@@ -95,16 +94,16 @@ def write_spz(path: str | Path, gaussians: Gaussians, *, antialiased: bool = Fal
         128.0 + 128.0 * rest * FLIPS[: rest.shape[1], None],
     )
     opacity, color, scale, harmonics = (_byte(values) for values in bytes_)
-    parts = (
+    parts = [
         np.ascontiguousarray(fixed).view("u1").reshape(-1, 3, 4)[:, :, :3],
         opacity,
         color,
         scale,
         pack_quats(quats),
         harmonics,
-    )
-    content = gzip.compress(head + b"".join(part.tobytes() for part in parts), mtime=0)
-    write_atomically(Path(path), content)
+    ]
+    path = Path(path)
+    write_atomically(path, pack_gzip(head, parts) if version == 3 else pack_streams(path, head, parts))
     return sum(int(((values < -0.5) | (values > 256.0)).sum()) for values in bytes_)
 
 
@@ -142,53 +141,60 @@ def unpack_quats(packed: np.ndarray) -> np.ndarray:
 
 
 def _three_bytes(packed: np.ndarray) -> np.ndarray:
-    """Unpack the rotations of version 2 to [N, 4] wxyz: x, y, z are bytes, and w completes the quaternion to unit
-    length."""
+    """Unpack the rotations of versions 1 and 2 to [N, 4] wxyz: x, y, z are bytes, and w completes the quaternion to
+    unit length."""
     axis = packed.astype(np.float64) / 127.5 - 1.0
     w = np.sqrt(np.maximum(1.0 - (axis**2).sum(axis=1), 0.0))
     return np.column_stack([w, axis * (1, -1, -1)])
 
 
+def _places(head: SpzHead, part: np.ndarray) -> np.ndarray:
+    """Unpack positions to [N, 3] float32 in the frame of a ``.ply``: half floats in version 1, else 24-bit numbers."""
+    signs = np.array([1, -1, -1], np.float32)
+    if head.version == 1:
+        with np.errstate(invalid="ignore"):  # Signalling NaN would warn; such Gaussians are left out.
+            return part.view("<f2").reshape(head.count, 3).astype(np.float32) * signs
+    fixed = np.zeros((head.count, 3, 4), "u1")
+    fixed[:, :, 1:] = part.reshape(head.count, 3, 3)
+    means = (fixed.view("<i4")[:, :, 0] >> 8).astype(np.float32)  # The shift extends the sign; 24 bits are exact.
+    means *= signs * np.float32(2.0**-head.bits)
+    return means
+
+
 def read_spz(path: str | Path) -> GaussianParameters:
-    """Read raw parameters in the frame of a ``.ply`` from versions 2 to 4.
+    """Read raw parameters in the frame of a ``.ply`` from versions 1 to 4. Harmonics of degree 4 are left out.
 
     Raises:
         UserError: the file is missing, damaged or of another version, or it is of version 4 and the package zstandard
             is missing.
     """
     path = Path(path)
-    content = read_bytes(path, "give a .spz")
-    if content[:4] == struct.pack("<I", MAGIC):
-        version, count, degree, bits, parts = _read_streams(path, content)
-    else:
-        version, count, degree, bits, parts = _read_gzip(path, content)
-    fixed = np.zeros((count, 3, 4), "u1")
-    fixed[:, :, 1:] = parts[0].reshape(count, 3, 3)
-    means = (fixed.view("<i4")[:, :, 0] >> 8).astype(np.float32)  # The shift extends the sign; 24 bits are exact.
-    means *= np.array([1, -1, -1], np.float32) * np.float32(2.0**-bits)
+    head, parts = unpack(path, read_bytes(path, "give a .spz"))
+    axes = head.axes()
+    if axes is not None and axes > len(NAMES):
+        raise UserError(f"{path}: its positions have axes number {axes}, which is none of 1 to {len(NAMES)}; {REMEDY}")
+    count, rest_count = head.count, min(SH_COUNTS[head.degree], READ_COUNT)
     opacity = np.linspace(0.0, 1.0, 256).clip(1e-6, 1.0 - 1e-6)  # The opacity of every byte.
-    quats = _three_bytes(parts[4].reshape(count, 3)) if version == 2 else unpack_quats(parts[4].view("<u4"))
-    rest = parts[5].reshape(count, SH_COUNTS[degree], 3).astype(np.float32)
+    quats = _three_bytes(parts[4].reshape(count, 3)) if head.version < 3 else unpack_quats(parts[4].view("<u4"))
+    rest = parts[5].reshape(count, SH_COUNTS[head.degree], 3)[:, :rest_count].astype(np.float32)
     rest -= 128.0
-    rest *= FLIPS[: SH_COUNTS[degree], None] / 128.0
+    rest *= FLIPS[:rest_count, None] / 128.0
     steps = np.arange(256)
     values = {
-        "means": means,
+        "means": _places(head, parts[0]),
         "sh_dc": ((steps / 255.0 - 0.5) / COLOR_SCALE).astype(np.float32)[parts[2].reshape(count, 3)],
         "sh_rest": rest,
         "opacity_logits": np.log(opacity / (1.0 - opacity)).astype(np.float32)[parts[1]],
         "log_scales": (steps / SCALE_STEPS - SCALE_OFFSET).astype(np.float32)[parts[3].reshape(count, 3)],
         "quats": quats.astype(np.float32),
     }
+    if axes and NAMES[axes - 1] != STANDARD:
+        turn_axes(values, NAMES[axes - 1])
     return to_parameters(path, values)
 
 
-def read_antialiased(path: str | Path) -> bool:
-    """Return whether a ``.spz`` is marked as trained with the antialiasing compensation; return False for other
-    files."""
-    path = Path(path)
-    if path.suffix.lower() != ".spz":
-        return False
+def read_antialiased_flag(path: Path) -> bool:
+    """Return whether a ``.spz`` is marked as trained with the antialiasing compensation; False if it is damaged."""
     try:
         with open(path, "rb") as file:
             start = file.read(4096)
@@ -197,68 +203,3 @@ def read_antialiased(path: str | Path) -> bool:
         return bool(start[14] & ANTIALIASED)
     except (OSError, zlib.error, IndexError):
         return False  # The reader of the Gaussians reports the damage.
-
-
-def _sizes(path: Path, version: int, count: int, degree: int) -> list[int]:
-    """Return the number of bytes of each array."""
-    if not 2 <= version <= 4:
-        raise UserError(f"{path}: version {version} of .spz; 2 to 4 are read: convert it, for example to .ply")
-    if count == 0 or degree >= len(SH_COUNTS):
-        raise UserError(f"{path}: {count} Gaussians with harmonics of degree {degree}; at least 1 of degree 0 to 3")
-    if count > MAX_GAUSSIANS:
-        raise UserError(
-            f"{path}: says it holds {count:,} Gaussians; up to {MAX_GAUSSIANS:,} are read: {REMEDY} in parts"
-        )
-    return [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * SH_COUNTS[degree] * count]
-
-
-def _read_gzip(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
-    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
-    try:
-        head = stream.decompress(content, 16)
-        magic, version, count, degree, bits = struct.unpack("<IIIBBxx", head)
-    except (zlib.error, struct.error):
-        raise UserError(f"{path}: neither a gzip stream nor a .spz of version 4; {REMEDY}") from None
-    if magic != MAGIC:
-        raise UserError(f"{path}: a gzip stream of something else than Gaussians; give a .spz")
-    sizes = _sizes(path, version, count, degree)
-    if sum(sizes) > MAX_GZIP_RATIO * len(content):
-        raise UserError(f"{path}: cut short: {len(content):,} bytes cannot hold {count:,} Gaussians; {REMEDY}")
-    try:
-        rows = stream.decompress(stream.unconsumed_tail, sum(sizes))  # The size is bounded by the header.
-    except zlib.error:
-        rows = b""
-    if len(rows) != sum(sizes):
-        raise UserError(f"{path}: cut short or damaged; {REMEDY}")
-    return version, count, degree, bits, np.split(np.frombuffer(rows, "u1"), np.cumsum(sizes)[:-1])
-
-
-def _read_streams(path: Path, content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
-    """Read version 4: one stream for each non-empty array."""
-    try:
-        import zstandard
-    except ImportError:
-        raise UserError(
-            f"{path}: .spz of version 4 needs the package zstandard: pip install -e '.[export]' in a clone"
-        ) from None
-    parts = []
-    try:
-        version, count, degree, bits, _, streams, table = struct.unpack_from("<4xIIBBBBI", content)
-        sizes = _sizes(path, version, count, degree)
-        offset, decoder = table + 16 * streams, zstandard.ZstdDecompressor()
-        used = [size for size in sizes if size]
-        if streams != len(used):
-            raise ValueError
-        for index, size in enumerate(used):
-            packed, plain = struct.unpack_from("<QQ", content, table + 16 * index)
-            if plain != size or offset + packed > len(content):
-                raise ValueError
-            # The size claimed by the zstd frame is not trusted: decoding is bounded by the header.
-            with decoder.stream_reader(content[offset : offset + packed]) as reader:
-                parts.append(np.frombuffer(reader.read(size), "u1"))
-            if len(parts[-1]) != size:
-                raise ValueError
-            offset += packed
-    except (struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError):
-        raise UserError(f"{path}: damaged; {REMEDY}") from None
-    return version, count, degree, bits, [*parts, *[np.zeros(0, "u1")] * (len(sizes) - len(parts))]

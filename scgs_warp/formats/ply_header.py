@@ -1,8 +1,15 @@
-"""Plausibility check of PLY headers, done before a reader allocates memory for the announced rows."""
+"""PLY headers: a plausibility check, done before a reader allocates memory for the announced rows, and comments."""
 
 from __future__ import annotations
 
 from pathlib import Path
+
+ANTIALIASED_COMMENT = "SplatRenderMode: mip"
+"""Comment that marks Gaussians trained with the antialiasing compensation, as Brush writes it."""
+ANTIALIASED_WORDS = ([b"SplatRenderMode:", b"mip"], [b"antialiased", b"1"])
+"""Comments that mark them, by Brush and by Postshot."""
+HEAD_BYTES = 1 << 16
+"""Longest header that is searched."""
 
 
 def check_ply_counts(path: Path) -> None:
@@ -14,8 +21,19 @@ def check_ply_counts(path: Path) -> None:
     """
     size = path.stat().st_size
     with open(path, "rb") as file:
-        head = file.read(1 << 16).split(b"end_header")[0]
+        head = file.read(HEAD_BYTES).split(b"end_header")[0]
     for line in head.splitlines():
         words = line.split()
         if len(words) == 3 and words[0] == b"element" and words[2].isdigit() and int(words[2][:20]) > size:
             raise ValueError(f"counts {words[2][:20].decode()} rows in {size} bytes")
+
+
+def has_antialiased_comment(path: Path) -> bool:
+    """Return whether a comment marks the Gaussians of a PLY file as trained with the antialiasing compensation; False
+    if the file cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            lines = file.read(HEAD_BYTES).split(b"end_header")[0].splitlines()
+    except OSError:
+        return False  # The reader of the Gaussians reports this.
+    return any(words[:1] == [b"comment"] and words[1:] in ANTIALIASED_WORDS for words in map(bytes.split, lines))

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from ..config.presets import preset
-from ..formats.gaussian_files import read_gaussians, shortage_as_user_error
-from ..formats.gaussian_spz import read_antialiased
+from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error
 from ..gaussians import GaussianParameters
 from ..geometry.cameras import Overview
 from ..geometry.normalisation import COMMON_RADIUS, Normalisation
@@ -28,7 +27,7 @@ MIN_OPACITY = 0.1
 def open_gaussians(
     path: str | Path, device: str = "cpu", nodes: int = COUNT, up: tuple[float, float, float] | None = None
 ) -> Scene:
-    """Open a file of Gaussians (``.ply``, ``.splat`` or ``.spz``) as a static scene with control points.
+    """Open a file of Gaussians (``gaussian_files.READERS``) as a static scene with control points.
 
     Args:
         nodes: number of control points, sampled from the Gaussians.

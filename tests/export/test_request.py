@@ -20,6 +20,8 @@ from scgs_warp.export.request import ExportRequest, check_request
         ("a.json", "cameras"),
         ("a.htm", "html"),
         ("frames", "ply-sequence"),
+        ("a.compressed.ply", "compressed.ply"),
+        ("compressed.ply", "ply"),
     ],
 )
 def test_the_suffix_decides_the_format(name, kind):
@@ -51,6 +53,8 @@ def test_a_glb_is_still_where_an_instant_is_given():
         ("a.html", {"max_mib": 0.0}, "--max-mib 0"),
         ("a.html", {"edit": Path("e.json")}, "--format html"),
         ("a.ply", {"format": "glb"}, "end the name in .glb"),
+        ("a.ply", {"format": "compressed.ply"}, "end the name in .compressed.ply"),
+        ("a.compressed.ply", {"format": "ply"}, "end the name in .ply, not in .compressed.ply"),
     ],
 )
 def test_options_that_cannot_work_are_refused_in_one_line(tmp_path, name, fields, words):

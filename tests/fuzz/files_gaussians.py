@@ -1,4 +1,4 @@
-"""Files of Gaussians: PLY in text and binary, .splat, .spz of versions 2, 3 and 4; and glTF."""
+"""Files of Gaussians: PLY in text, binary and packed, .splat, .spz of versions 1 to 4; and glTF."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from fuzz.files_cases import Format, check_gaussians, expect, finite, within
 from helpers.edit_scenes import bar_points, dress
 from helpers.gltf_files import bar, box, quad
 from scgs_warp.data.synthetic.from_mesh import SynthesisRequest, load_subject
+from scgs_warp.formats.gaussian_compressed_ply import write_compressed_ply
 from scgs_warp.formats.gaussian_files import gaussian_points
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
 from scgs_warp.formats.gaussian_splat import write_splat
@@ -38,25 +39,22 @@ def write_text_ply(path: Path) -> None:
     PlyData(list(found.elements), text=True).write(str(path))
 
 
-def write_old_spz(path: Path) -> None:
-    """Write version 2: three bytes per rotation."""
+def write_old_spz(path: Path, version: int) -> None:
+    """Write version 1 or 2: three bytes per rotation; in version 1 half floats as positions."""
     import gzip
 
     random = np.random.default_rng(0)
-    head = struct.pack("<IIIBBBB", 0x5053474E, 2, COUNT, 1, 12, 0, 0)
-    path.write_bytes(gzip.compress(head + random.integers(0, 256, COUNT * (9 + 1 + 3 + 3 + 3 + 9), np.uint8).tobytes()))
+    head = struct.pack("<IIIBBBB", 0x5053474E, version, COUNT, 1, 12, 0, 0)
+    size = (6 if version == 1 else 9) + 1 + 3 + 3 + 3 + 9
+    path.write_bytes(gzip.compress(head + random.integers(0, 256, COUNT * size, np.uint8).tobytes()))
 
 
-def write_new_spz(path: Path) -> None:
-    """Write version 4: a plain header, a table, a zstd stream per array."""
-    import zstandard
-
-    random = np.random.default_rng(0)
-    plain = [random.integers(0, 256, COUNT * size, np.uint8).tobytes() for size in (9, 1, 3, 3, 4, 9)]
-    packed = [zstandard.ZstdCompressor().compress(part) for part in plain]
-    table = b"".join(struct.pack("<QQ", len(p), len(raw)) for p, raw in zip(packed, plain))
-    head = struct.pack("<IIIBBBBI", 0x5053474E, 4, COUNT, 1, 12, 0, len(plain), 32)
-    path.write_bytes(head + bytes(32 - len(head)) + table + b"".join(packed))
+def write_extended_spz(path: Path) -> None:
+    """Write version 4 with an extension that names other axes."""
+    write_spz(path, cloud())
+    content, extra = path.read_bytes(), struct.pack("<III", 0xADBE0003, 4, 11)
+    head = content[:14] + bytes([content[14] | 2, content[15]]) + struct.pack("<I", 32 + len(extra)) + content[20:32]
+    path.write_bytes(head + extra + content[32:])
 
 
 def maker(name: str, write: Any) -> Any:
@@ -114,10 +112,13 @@ def _mesh(name: str, write: Any, share: float = 1.0) -> Format:
 FORMATS = (
     _gaussians("ply", ".ply", lambda path: write_gaussian_ply(path, cloud()), 2.0),
     _gaussians("ply-text", ".ply", write_text_ply),
+    _gaussians("ply-packed", ".compressed.ply", lambda path: write_compressed_ply(path, cloud()), 2.0),
     _gaussians("splat", ".splat", lambda path: write_splat(path, cloud())),
-    _gaussians("spz-2", ".spz", write_old_spz, 0.7),
-    _gaussians("spz-3", ".spz", lambda path: write_spz(path, cloud())),
-    _gaussians("spz-4", ".spz", write_new_spz),
+    _gaussians("spz-1", ".spz", functools.partial(write_old_spz, version=1), 0.4),
+    _gaussians("spz-2", ".spz", functools.partial(write_old_spz, version=2), 0.6),
+    _gaussians("spz-3", ".spz", lambda path: write_spz(path, cloud(), version=3)),
+    _gaussians("spz-4", ".spz", lambda path: write_spz(path, cloud())),
+    _gaussians("spz-axes", ".spz", write_extended_spz, 0.5),
     _mesh("glb-moving", lambda path: box().save(path)),
     _mesh("glb-skinned", lambda path: bar(4)[0].save(path), 1.5),
     _mesh("glb-textured", write_textured),

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from scipy.spatial import KDTree
 
 from helpers.edit_scenes import dress
 from helpers.scenes import look_at
+from scgs_warp.edit.rotations import multiply
 from scgs_warp.gaussians import SH_C0
+from scgs_warp.ops.harmonics_rotation import rotate_harmonics
 from scgs_warp.rendering.render import render
 from scgs_warp.types import Camera, Gaussians
 
@@ -68,6 +71,36 @@ def ply_columns(path: Path, sort: bool = False) -> dict[str, np.ndarray]:
     data = PlyData.read(str(path))["vertex"].data
     order = np.argsort(data["x"], kind="stable") if sort else np.arange(len(data))
     return {name: np.asarray(data[name], np.float64)[order] for name in data.dtype.names}
+
+
+def turned(found: dict[str, np.ndarray], signs: tuple[int, int, int]) -> dict[str, np.ndarray]:
+    """The columns of a .ply, turned by half a turn, or not at all; ``signs`` says which coordinates change sign."""
+    if signs == (1, 1, 1):
+        return found
+    half = torch.tensor([[float(sign > 0) if sum(signs) < 0 else 0.0 for sign in signs]])
+    half = torch.cat([torch.zeros(1, 1), half], 1).expand(len(found["x"]), 4).contiguous()
+    found = found | {axis: sign * found[axis] for axis, sign in zip("xyz", signs)}
+    quats = multiply(half.double().numpy(), columns(found, "rot", 4))
+    found |= {f"rot_{i}": quats[:, i] for i in range(4)}
+    rest = len([name for name in found if name.startswith("f_rest_")])
+    if rest:
+        values = torch.from_numpy(columns(found, "f_rest", rest)).float().reshape(len(half), 3, -1).transpose(1, 2)
+        rotated = rotate_harmonics(values.contiguous(), half).double().transpose(1, 2).reshape(len(half), rest).numpy()
+        found |= {f"f_rest_{i}": rotated[:, i] for i in range(rest)}
+    return found
+
+
+def matched(found: dict[str, np.ndarray], truth: Gaussians) -> dict[str, np.ndarray]:
+    """The rows of a .ply in the order of the Gaussians whose positions they have, for files that sort and round."""
+    rows = nearest(np.stack([found[axis] for axis in "xyz"], 1), truth)
+    return {name: values[rows] for name, values in found.items()}
+
+
+def nearest(places: np.ndarray, truth: Gaussians) -> np.ndarray:
+    """The row of the nearest of the places, for every Gaussian; each is the nearest of one."""
+    _, rows = KDTree(places).query(truth.means.detach().double().numpy())
+    assert len(places) == len(truth.means) and len(set(rows)) == len(rows), "positions have moved too far to be matched"
+    return rows
 
 
 def columns(found: dict[str, np.ndarray], name: str, count: int) -> np.ndarray:

@@ -15,6 +15,7 @@ import pytest
 
 from helpers.paths import ROOT
 
+SPLAT_TRANSFORM = "@playcanvas/splat-transform"
 INSTALL = "npm install --prefix .node @playcanvas/splat-transform gltf-validator three"
 """Command that installs the packages, as in .ci/run."""
 
@@ -51,9 +52,15 @@ def node(*arguments: str | Path) -> str:
 
 def splat_transform(source: Path, target: Path, *options: str) -> Path:
     """Convert a file by splat-transform."""
-    program = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
+    program = package(SPLAT_TRANSFORM) / "bin" / "cli.mjs"
     node(program, "-q", "-w", source, target, *options)
     return target
+
+
+def version_of(folder: Path) -> tuple[int, ...]:
+    """The version of a node package, by its folder."""
+    text = json.loads((folder / "package.json").read_text(encoding="utf-8"))["version"]
+    return tuple(int(part) for part in text.split("-")[0].split("."))
 
 
 def gltf_errors(path: Path) -> list[dict]:
