@@ -16,6 +16,7 @@ from scgs_warp.runtime.torchrun import process_rank
 
 if TYPE_CHECKING:
     from scgs_warp.data import Dataset
+    from scgs_warp.live.training_view import TrainingView
 
 RUNS = Path("runs")
 
@@ -41,6 +42,10 @@ class Options(Settings, RunFolders):
     """Random seed; the same seed gives bit-identical results on the same machine."""
     resume: bool = False
     """Continue the run in --output."""
+    live: bool = False
+    """Show the scene in the browser while it trains (docs/page.md); the result stays bit-identical."""
+    port: int = 8080
+    """With --live: port on 127.0.0.1; if it is taken, one of the next."""
     tensorboard: bool = False
     """Also write curves and images for TensorBoard to the run folder: tensorboard --logdir runs."""
 
@@ -49,6 +54,24 @@ def default_output(options: Options) -> Path:
     """Return runs/NAME-PRESET, with the name of the data folder."""
     name = (options.data or BUILTIN).resolve().name
     return RUNS / f"{name}-{options.preset or ('cpu' if options.data else 'quick')}"
+
+
+def live_view(options: Options, output: Path, steps: int) -> TrainingView:
+    """Start the page that follows the training.
+
+    Raises:
+        UserError: the page cannot be served.
+    """
+    from scgs_warp.errors import UserError
+    from scgs_warp.live.training_view import TrainingView
+    from scgs_warp.live.viewer import SceneView
+    from scgs_warp.runtime.progress import say
+
+    if not 0 <= options.port <= 65535:
+        raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
+    view = SceneView(output.resolve().name, port=options.port)
+    say(f"watch the training: open {view.server.url} in a browser")
+    return TrainingView(view, steps)
 
 
 def main(args: list[str] | None) -> None:
@@ -73,6 +96,8 @@ def main(args: list[str] | None) -> None:
     if options.tensorboard:
         check_installed()
     refuse_existing(output, options.resume)
+    first = where is None or where.rank == 0
+    watcher = live_view(options, output, config.steps) if options.live and first else None
 
     def show_advice(data: Dataset) -> None:
         say("\n".join(advise(survey(data), config, device)))
@@ -82,6 +107,7 @@ def main(args: list[str] | None) -> None:
         if folder is None:  # Only one of several processes makes it.
             folder = group.in_turn(lambda: builtin_scene(device)) if group else builtin_scene(device)
         rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "group": group}
+        rest["watcher"] = watcher
         command = command_line("apps/train.py", sys.argv[1:] if args is None else args)
         metrics = train_and_evaluate(config, folder, output, before_training=show_advice, command=command, **rest)
         say(summary(metrics))

@@ -1,4 +1,4 @@
-"""Render a film of a trained scene to a file: a turntable, the motion, or both."""
+"""Render a film of a trained scene to a file: a turntable, the motion, or both. Or show the scene in the browser."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ LARGEST_SIDE = 8192
 
 @dataclass(frozen=True)
 class Options:
-    """Render a film of a trained scene to a file."""
+    """Render a film of a trained scene to a file, or show the scene in the browser (--live)."""
 
-    output: Path
+    output: Path | None = None
     """Film to write: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     run: Path | None = None
     """Run folder, as apps/train.py writes it."""
@@ -38,6 +38,12 @@ class Options:
     """Frames per second."""
     time: float = 0.5
     """Time that a turntable shows, from 0 to 1."""
+    live: bool = False
+    """Instead of a film, show the scene in the browser (docs/page.md), also while another process trains it."""
+    port: int = 8080
+    """With --live: port on 127.0.0.1; if it is taken, one of the next. With --share, the port for other machines."""
+    share: bool = False
+    """With --live: serve the page to other machines, too. The printed address has a token."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
@@ -58,6 +64,16 @@ def check(options: Options) -> None:
 
     if (options.run is None) == (options.ply is None):
         raise UserError("view.py: give one of --run and --ply")
+    if options.live:
+        if options.output is not None:
+            raise UserError("--live shows the scene in the browser and writes nothing; leave --output out")
+        if not 0 <= options.port <= 65535:
+            raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
+        return
+    if options.output is None:
+        raise UserError("view.py: give --output for a film, or --live for the browser")
+    if options.share:
+        raise UserError("--share: belongs to --live; leave it out for a film")
     if options.frames < 1:
         raise UserError(f"--frames {options.frames}: a film needs at least 1")
     if not 16 <= options.size <= LARGEST_SIDE:
@@ -83,12 +99,44 @@ def open_scene(options: Options, device: str) -> Scene:
     return Scene.load(options.run, device=device)
 
 
+def show_live(options: Options, device: str) -> None:
+    """Serve the scene until Ctrl-C.
+
+    Raises:
+        UserError: the scene cannot be shown, or the page cannot be served.
+    """
+    from scgs_warp.live.run_view import view_file, view_run
+    from scgs_warp.live.viewer import SceneView
+    from scgs_warp.runtime.progress import say
+    from scgs_warp.runtime.stop_signals import stop_signals
+
+    source = options.run or options.ply
+    assert source is not None
+    with stop_signals() as stop, SceneView(source.resolve().name, port=options.port, shared=options.share) as view:
+        say(f"reading {source}")
+        watcher = view_run(source, view, device) if options.run is not None else None
+        if watcher is None:
+            view_file(source, view, device)
+        print(view.invitation, flush=True)
+        stop.wait()
+        if watcher is not None:
+            watcher.stop()
+
+
 def main(args: list[str] | None) -> None:
     import tyro
 
     options = tyro.cli(Options, args=args, prog="view.py")
     check(options)
+    if options.live:
+        from scgs_warp.live.server import import_aiohttp
+
+        import_aiohttp()  # A missing package is reported before the scene is loaded.
     device = prepare(options.device, options.threads, options.memory_gib)
+    if options.live:
+        show_live(options, device)
+        return
+    assert options.output is not None
 
     from scgs_warp.geometry import cameras
     from scgs_warp.runtime.progress import progress

@@ -7,23 +7,51 @@ import hashlib
 import html
 import json
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 from ..errors import UserError
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
 from .page_data import pack
 from .page_scene import page_scene
+from .poster import CARD_SIZE, poster
 
-SCRIPTS = ("data", "camera", "renderer", "player", "controls", "main")
+SCRIPTS = ("loading", "data", "camera", "renderer", "player", "controls", "page")
 SHADERS = ("shared", "splat.frag", "draw.vert", "draw.frag", "screen.vert", "screen.frag")
 MAX_DEGREE = 3
 WEB = Path(__file__).parent / "web"
 TITLE = "Moving scene"
 MIB = 2**20
+PART = 768 << 10
+"""Bytes of data in one element, a multiple of 3. The page decodes one element while the browser reads the next."""
 
 
-def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | None = None) -> int:
+@dataclass(frozen=True)
+class Card:
+    """What other sites show of a link to the page."""
+
+    description: str = "A moving scene in three dimensions: turn it, stop it, look from anywhere."
+    url: str = ""
+    """Address at which the page will be; with it, the card has a picture of the same name that ends in .jpg."""
+
+    def tags(self, title: str) -> str:
+        """Return the elements of the page's head."""
+        values = {"og:type": "website", "og:title": title, "og:description": self.description}
+        if self.url:
+            values |= {"og:url": self.url, "og:image": self.image, "twitter:card": "summary_large_image"}
+        rows = [f'<meta property="{name}" content="{html.escape(value)}">' for name, value in values.items()]
+        return "\n".join([f'<meta name="description" content="{html.escape(self.description)}">', *rows]) + "\n"
+
+    @property
+    def image(self) -> str:
+        """Address of the card's picture."""
+        return re.sub(r"\.html?$", "", self.url, flags=re.IGNORECASE) + ".jpg"
+
+
+def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | None = None, url: str = "") -> int:
     """Write one HTML file that plays ``scene``; an existing file is replaced once the new one is complete.
 
     Args:
@@ -32,6 +60,7 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
         title: text shown on the page.
         max_mib: largest size of the file in MiB. Colours lose their highest degrees of spherical harmonics, one by one,
             until it fits.
+        url: address at which the page will be published. A picture for links to it is then written beside the page.
 
     Returns:
         Number of Gaussians on the page, which holds the visible ones only.
@@ -47,21 +76,23 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
         raise UserError(f"{path}: is a folder; give the page another name")
     if max_mib is not None and not max_mib > 0:
         raise UserError(f"--max-mib (max_mib) is {max_mib:g}; give a size in MiB above 0, or none")
-    page, count = _fitting(scene, path, title, max_mib)
+    page, count = _fitting(scene, path, title, max_mib, Card(url=url))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{path.parent}: cannot be made ({error.strerror}); give another folder") from None
+    if url:
+        write_atomically(path.with_suffix(".jpg"), poster(scene, CARD_SIZE))
     write_atomically(path, page)
     return count
 
 
-def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> tuple[bytes, int]:
+def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None, card: Card) -> tuple[bytes, int]:
     """Return the page with the highest degree of spherical harmonics that fits, and its number of Gaussians."""
     page = b""
     for degree in range(min(scene.gaussians.sh_degree, MAX_DEGREE), -1, -1):
         content = page_scene(scene, degree)
-        page = assemble(pack(content.facts, content.columns), title)
+        page = assemble(pack(content.facts, content.columns), title, poster(scene), card)
         if max_mib is None or len(page) <= max_mib * MIB:
             return page, content.facts["gaussians"]
     least = len(page) / MIB
@@ -71,38 +102,71 @@ def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None) -> tup
     )
 
 
-def assemble(data: bytes, title: str = "") -> bytes:
-    """Assemble the page from packed data, program and style, as UTF-8."""
-    program, style = program_text(), _read("style.css")
+def assemble(data: bytes, title: str = "", picture: bytes = b"", card: Card | None = None) -> bytes:
+    """Assemble the page from packed data, program and style, as UTF-8.
+
+    Args:
+        data: result of ``pack``.
+        picture: JPEG that is shown while the page loads.
+        card: what a link to the page shows; None: the title alone.
+    """
+    parts = [base64.b64encode(data[i : i + PART]).decode("ascii") for i in range(0, len(data), PART)]
+    scripts = "".join(f'<script class="data" type="text/plain">{part}</script>\n' for part in parts)
+    return document(
+        program_text((*SCRIPTS, "main")), title, data=scripts, parts=f' data-parts="{len(parts)}"', picture=picture,
+        card=card,
+    )  # fmt: skip
+
+
+def document(
+    program: str,
+    title: str,
+    *,
+    data: str = "",
+    parts: str = "",
+    picture: bytes = b"",
+    card: Card | None = None,
+    network: str = "'none'",
+) -> bytes:
+    """Return the page's HTML around a program; ``network`` is the policy for its connections."""
+    style = read_web("style.css")
     policy = (
         # No network access and no other script, whatever the title contains.
         f"default-src 'none'; script-src {_hash(program)} blob:; worker-src blob:; style-src {_hash(style)}; "
-        "base-uri 'none'; form-action 'none'"
+        f"img-src data:; connect-src {network}; base-uri 'none'; form-action 'none'"
     )
     title = title.encode("utf-8", "replace").decode()  # file names may contain surrogates
-    parts = {
+    shown = " ".join(title.split()) or TITLE
+    drawn = base64.b64encode(picture).decode("ascii")
+    values = {
         "policy": policy,
-        "title": html.escape(" ".join(title.split()) or TITLE),
+        "card": (card or Card()).tags(shown),
+        "title": html.escape(shown),
+        "icon": quote(read_web("icon.svg")),
         "style": style,
-        "data": base64.b64encode(data).decode("ascii"),
+        "poster": f'<img id="poster" alt="" src="data:image/jpeg;base64,{drawn}">\n' if picture else "",
+        "parts": parts,
         "program": program,
+        "data": data,
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match.group(1)], _read("index.html")).encode()
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], read_web("index.html")).encode()
 
 
-def program_text() -> str:
-    """Return all scripts as one program, with the shaders and the worker's source as strings."""
-    shaders = json.dumps({name: _read(f"{name}.glsl") for name in SHADERS})
-    sort = _read("sort.js")
+def program_text(scripts: Sequence[str], further: Sequence[str] = ()) -> str:
+    """Return scripts of ``web/`` and further texts as one program, with the shaders and the worker's source as
+    strings."""
+    shaders = json.dumps({name: read_web(f"{name}.glsl") for name in SHADERS})
+    sort = read_web("sort.js")
     texts = [f"const SHADERS = {shaders};", f"const SHARED = {json.dumps({'sort': sort})};", sort]
-    texts += [_read(f"{name}.js") for name in SCRIPTS]
+    texts += [*(read_web(f"{name}.js") for name in scripts), *further]
     program = '(() => {\n"use strict";\n' + "\n".join(texts) + "\n})();\n"
     if "</" in program or "<!--" in program:
         raise AssertionError("the program would end its own script element")
     return program
 
 
-def _read(name: str) -> str:
+def read_web(name: str) -> str:
+    """Return the text of a file of ``web/``."""
     return (WEB / name).read_text(encoding="utf-8")  # newlines as \n, as the browser hashes them
 
 

@@ -70,7 +70,7 @@ def quantise(name: str, values: np.ndarray, step: float, *, most_bits: int = 24,
     """
     values = values.astype(np.float64)
     if not np.isfinite(values).all():
-        raise UserError(f"--format html: {name} is not finite; train again with a lower rate")
+        raise UserError(f"web page: {name} is not finite; train again with a lower rate")
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     if (room := ((1 << most_bits) - 1) * step) < high - low:
         reach = max(common_size(values), room / 2)
@@ -93,13 +93,13 @@ def integers(name: str, values: np.ndarray, *, delta: bool = False) -> Column:
     return Column(name, values.astype(np.uint32), max(1, largest.bit_length()), delta=delta)
 
 
-def pack(facts: dict[str, Any], columns: list[Column]) -> bytes:
+def pack(facts: dict[str, Any], columns: list[Column], level: int = LEVEL) -> bytes:
     """Pack facts and columns: length of the header (little endian, 4 bytes), header (JSON), planes, all deflated. The
     same input gives the same bytes."""
     described = {"version": VERSION, **facts, "columns": [column.header() for column in columns]}
     header = json.dumps(described, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     header += b" " * (-len(header) % 4)
-    packer = zlib.compressobj(LEVEL)
+    packer = zlib.compressobj(level)
     parts = [packer.compress(struct.pack("<I", len(header)) + header)]
     parts += [packer.compress(column.planes()) for column in columns]
     return b"".join([*parts, packer.flush()])

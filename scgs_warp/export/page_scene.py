@@ -57,11 +57,12 @@ class PageScene:
     columns: list[Column]
 
 
-def page_scene(scene: Scene, sh_degree: int) -> PageScene:
+def page_scene(scene: Scene, sh_degree: int, samples: int | None = None) -> PageScene:
     """Quantise a scene for a page.
 
     Args:
         sh_degree: degree of the spherical harmonics, at most the scene's own.
+        samples: number of times at which control points are sampled; None: as many as the motion needs.
 
     Raises:
         UserError: the motion model has no control points to skin by, or no Gaussian can be seen.
@@ -69,21 +70,22 @@ def page_scene(scene: Scene, sh_degree: int) -> PageScene:
     gaussians, motion = scene.gaussians, scene.motion
     if not isinstance(motion, ControlPoints | StaticNodes) and motion.moves:
         raise UserError(
-            f"--format html: the motion model {motion.name} has no control points for a page to move Gaussians by; "
+            f"web page: the motion model {motion.name} has no control points for a page to move Gaussians by; "
             "train with --motion control-points, or export a film with apps/view.py"
         )
     with torch.no_grad():
         kept = visible(gaussians)
         if not len(kept):
-            raise UserError("--format html: the scene has no Gaussian that can be seen; train it first")
+            raise UserError("web page: the scene has no Gaussian that can be seen; train it first")
         kept = kept[near(gaussians.means[kept])]
-        order = morton_order(_array(gaussians.means[kept]))  # neighbours together: deflate compresses them better
+        order = morton_order(to_array(gaussians.means[kept]))  # neighbours together: deflate compresses them better
         kept = kept[torch.from_numpy(order).to(kept.device)]
-        columns = _gaussian_columns(gaussians, kept, sh_degree)
-        facts = _facts(scene, len(kept), sh_degree)
+        columns = gaussian_columns(gaussians, kept, sh_degree)
+        facts = scene_facts(scene, len(kept), sh_degree)
         if isinstance(motion, ControlPoints):
             columns += _binding_columns(motion, gaussians, kept, facts)
-            columns += _pose_columns(motion, facts)
+            poses = sample_poses(motion) if samples is None else one_sided(_poses_at(motion, even_times(samples)))
+            columns += pose_columns(to_array(motion.positions), poses, facts)
     return PageScene(facts, columns)
 
 
@@ -101,14 +103,15 @@ def visible(gaussians: GaussianParameters) -> Tensor:
 def near(points: Tensor) -> Tensor:
     """Return [N] bool: all points but far outliers, which would coarsen the positions of all others."""
     sizes = points.abs().amax(dim=1)
-    return sizes <= max(FAR, common_size(_array(sizes)))
+    return sizes <= max(FAR, common_size(to_array(sizes)))
 
 
-def _array(values: Tensor) -> np.ndarray:
+def to_array(values: Tensor) -> np.ndarray:
     return values.detach().cpu().double().numpy()
 
 
-def _facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
+def scene_facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
+    """Return the header's facts for ``count`` Gaussians without control points."""
     unit = scene.normalisation
     return {
         "gaussians": count,
@@ -130,20 +133,23 @@ def _facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
     }
 
 
-def _gaussian_columns(gaussians: GaussianParameters, kept: Tensor, sh_degree: int) -> list[Column]:
-    means, dc = _array(gaussians.means[kept]), _array(gaussians.sh_dc[kept])
+def gaussian_columns(
+    gaussians: GaussianParameters, kept: Tensor, sh_degree: int, log_scales: Tensor | None = None
+) -> list[Column]:
+    """Store the Gaussians ``kept``; ``log_scales`` [N, 3] replace their own."""
+    means, dc = to_array(gaussians.means[kept]), to_array(gaussians.sh_dc[kept])
     columns = [quantise(f"mean{a}", means[:, a], STEPS["mean"], delta=True) for a in range(3)]
-    columns += _quaternion_columns("quat", _array(gaussians.quats[kept]))
-    scales = _array(gaussians.log_scales[kept])
+    columns += _quaternion_columns("quat", to_array(gaussians.quats[kept]))
+    scales = to_array((gaussians.log_scales if log_scales is None else log_scales)[kept])
     columns += [quantise(f"scale{a}", scales[:, a], STEPS["log_scale"]) for a in range(3)]
-    columns.append(quantise("opacity", _array(gaussians.opacities()[kept]), STEPS["opacity"]))
+    columns.append(quantise("opacity", to_array(gaussians.opacities()[kept]), STEPS["opacity"]))
     columns += [quantise(f"dc{c}", dc[:, c], STEPS["sh_dc"]) for c in range(3)]
-    rest = _array(gaussians.sh_rest[kept])
+    rest = to_array(gaussians.sh_rest[kept])
     for k in range((sh_degree + 1) ** 2 - 1):
         columns += [quantise(f"sh{k}_{c}", rest[:, k, c], STEPS["sh_rest"], most_bits=BYTE) for c in range(3)]
-    shading = _array(gaussians.shading[kept])
+    shading = to_array(gaussians.shading[kept])
     columns += [quantise(f"shading{k}", shading[:, k], STEPS["shading"]) for k in range(shading.shape[1])]
-    correctives = _array(gaussians.correctives[kept])
+    correctives = to_array(gaussians.correctives[kept])
     for k in range(correctives.shape[1]):
         columns.append(quantise(f"corrective{k}", correctives[:, k], STEPS["corrective"]))
     return columns
@@ -168,23 +174,25 @@ def _binding_columns(
     count = indices.shape[1]
     facts.update(nodes=len(motion), neighbors=count, masked=bool(motion.config.mask))
     columns = [integers(f"node{k}", indices[:, k].cpu().numpy()) for k in range(count)]
-    columns += [quantise(f"weight{k}", _array(weights[:, k]), STEPS["weight"]) for k in range(1, count)]
+    columns += [quantise(f"weight{k}", to_array(weights[:, k]), STEPS["weight"]) for k in range(1, count)]
     if motion.config.mask:
-        columns.append(quantise("share", _array(gaussians.hyper[kept, -1].sigmoid()), STEPS["opacity"]))
+        columns.append(quantise("share", to_array(gaussians.hyper[kept, -1].sigmoid()), STEPS["opacity"]))
     return columns
 
 
-def _pose_columns(motion: ControlPoints, facts: dict[str, Any]) -> list[Column]:
-    """Store rest positions, and poses at evenly spaced times, node by node."""
-    poses = sample_poses(motion)
+def pose_columns(rest: np.ndarray, poses: dict[str, np.ndarray], facts: dict[str, Any]) -> list[Column]:
+    """Store rest positions [M, 3], and poses [T, M, ...] at evenly spaced times, node by node."""
     facts.update(samples=len(poses["translation"]), shapes="shape" in poses)
     facts.update(scaled="log_scale" in poses, tinted="tint" in poses)
-    rest = _array(motion.positions)
     columns = [quantise(f"rest{a}", rest[:, a], STEPS["rest"]) for a in range(3)]
     for name, values in poses.items():
         for a in range(values.shape[2]):
             columns.append(quantise(f"{name}{a}", values[:, :, a].T.reshape(-1), STEPS["pose"], delta=True))
     return columns
+
+
+def even_times(count: int) -> Tensor:
+    return torch.linspace(0.0, 1.0, count)
 
 
 def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
@@ -195,7 +203,7 @@ def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
         UserError: a pose is not finite.
     """
     count = MIN_SAMPLES
-    poses = _poses_at(motion, torch.linspace(0.0, 1.0, count))
+    poses = _poses_at(motion, even_times(count))
     while count < MAX_SAMPLES:
         between = _poses_at(motion, (torch.arange(count - 1) + 0.5) / (count - 1))
         errors = [(2.0 if name in QUATERNIONS else 1.0) * _error(poses[name], between[name]) for name in poses]
@@ -203,7 +211,12 @@ def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
         count = 2 * count - 1
         if max(errors) <= COARSE_ERROR:
             break
-    return {name: _one_sided(rows) if name in QUATERNIONS else rows for name, rows in poses.items()}
+    return one_sided(poses)
+
+
+def one_sided(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Make the signs of all quaternions continuous over time."""
+    return {name: _continuous(rows) if name in QUATERNIONS else rows for name, rows in poses.items()}
 
 
 def _interleaved(values: np.ndarray, between: np.ndarray) -> np.ndarray:
@@ -213,7 +226,7 @@ def _interleaved(values: np.ndarray, between: np.ndarray) -> np.ndarray:
     return merged
 
 
-def _one_sided(quats: np.ndarray) -> np.ndarray:
+def _continuous(quats: np.ndarray) -> np.ndarray:
     """Flip signs of quaternions [T, M, 4] such that they are continuous over time."""
     flips = (quats[1:] * quats[:-1]).sum(axis=2, keepdims=True) < 0
     quats = quats.copy()
@@ -237,11 +250,11 @@ def _poses_at(motion: ControlPoints, times: Tensor) -> dict[str, np.ndarray]:
             fields = pose.translations, pose.rotations, pose.shape_rotations, pose.log_scales, pose.tints
             for name, value in zip(POSE_PARTS, fields, strict=True):
                 if value is not None:
-                    samples.setdefault(name, []).append(_array(value))
+                    samples.setdefault(name, []).append(to_array(value))
     poses = {name: np.stack(rows) for name, rows in samples.items()}
     if not all(np.isfinite(rows).all() for rows in poses.values()):
         raise UserError(
-            "--format html: the control points' motion is not finite; train again with a lower rate, or put the "
+            "web page: the control points' motion is not finite; train again with a lower rate, or put the "
             "previous checkpoint back"
         )
     return poses

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -61,6 +62,8 @@ class ExportRequest:
     """Frames per second of an animation; 30 by default."""
     spz_version: Literal[3, 4] | None = None
     """Version of a .spz; 4 by default, 3 for readers that know no newer one."""
+    url: str = ""
+    """Address at which a page will be published, for links to it: a picture (.jpg) is then written beside the page."""
     title: str = ""
     """Title of the page; the run's name by default."""
     max_mib: float | None = None
@@ -133,6 +136,8 @@ def check_request(request: ExportRequest) -> None:
     _check_unused(request)
     if request.max_mib is not None and not request.max_mib > 0:
         raise UserError(f"--max-mib {request.max_mib:g}: give more than 0 MiB")
+    if request.url and not re.fullmatch(r"https?://[^\s/]+/\S*\.html?", request.url, re.IGNORECASE):
+        raise UserError(f"--url {request.url}: give the page's whole address, such as https://example.org/scene.html")
     check_output(request.output, kind)
 
 
@@ -141,8 +146,8 @@ def _check_unused(request: ExportRequest) -> None:
     kind = request.kind
     if request.time is not None and request.run is None:
         raise UserError(f"--time {request.time:g}: a file of Gaussians has no times; leave it out")
-    if kind != "html" and (request.title or request.max_mib is not None):
-        name = "--title" if request.title else "--max-mib"
+    if kind != "html" and (request.title or request.url or request.max_mib is not None):
+        name = "--title" if request.title else "--url" if request.url else "--max-mib"
         raise UserError(f"{name}: belongs to a page; leave it out, or give --format html")
     if kind != "spz" and request.spz_version is not None:
         raise UserError(f"--spz-version: --format {kind} has no such versions; leave it out")

@@ -248,5 +248,5 @@ def _export_page(request: ExportRequest, device: str) -> str:
     assert request.run is not None
     scene = Scene.load(request.run, device=device)
     title = request.title or request.run.resolve().name
-    count = write_page(scene, request.output, title=title, max_mib=request.max_mib)
+    count = write_page(scene, request.output, title=title, max_mib=request.max_mib, url=request.url)
     return f"{count:,} Gaussians {'and their motion' if scene.motion.moves else 'that stand still'}"

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -47,6 +47,7 @@ def fit(
     settings: dict[str, Any] | None = None,
     tensorboard: bool = False,
     group: ProcessGroup | None = None,
+    watcher: Watcher | None = None,
 ) -> Scene:
     """Train a scene; the run directory holds a resumable checkpoint at any time.
 
@@ -64,6 +65,7 @@ def fit(
         tensorboard: also write event files for TensorBoard to ``output``; the scene stays bit-identical.
         group: the processes that share each step's views (``process_group.join_processes``); ``config.batch`` must be a
             multiple of their number. The first process writes to ``output``; all read from it.
+        watcher: shown the state between steps whenever it asks for it; the scene stays bit-identical.
 
     Returns:
         the scene after the last step, in every process.
@@ -99,7 +101,7 @@ def fit(
             folder.tell = bar.print
             try:
                 check_replicas(state)
-                _train(state, frames, folder, test, bar, stop)
+                _train(state, frames, folder, test, bar, stop, watcher)
             except ProcessLost as lost:
                 raise _process_lost(state, folder, lost) from lost
         state.motion.eval()
@@ -118,6 +120,16 @@ def _start_or_resume(folder: RunFolder, config: TrainConfig, data: Dataset, devi
             folder.tell(f"warning: {checkpoint.fall_back(folder.path, error)}")
         return TrainState.resume(folder.path, config, data, device)
     return TrainState.begin(config, data, device)
+
+
+class Watcher(Protocol):
+    """Observer of a training, which reads the state between steps and changes nothing."""
+
+    def due(self) -> bool:
+        """Return whether the state after the next step is to be shown."""
+        ...
+
+    def show(self, state: TrainState) -> None: ...
 
 
 class PlainSteps:
@@ -147,7 +159,13 @@ def steps_of(
 
 
 def _train(
-    state: TrainState, frames: Frames, folder: RunFolder, test: Dataset | None, bar: Progress, stop: threading.Event
+    state: TrainState,
+    frames: Frames,
+    folder: RunFolder,
+    test: Dataset | None,
+    bar: Progress,
+    stop: threading.Event,
+    watcher: Watcher | None,
 ) -> None:
     config, noted, steps = state.config, False, steps_of(state, frames, bar.print)
     saved_at = time.monotonic()
@@ -161,7 +179,8 @@ def _train(
         # 2. Render, compare and update the parameters.
         done = state.step + 1
         tested = test is not None and (done % config.evaluate_every == 0 or done == config.steps)
-        results, visible = _take(state, frames, folder, bar, steps, tested or folder.shows(done))
+        watched = watcher is not None and watcher.due()
+        results, visible = _take(state, frames, folder, bar, steps, tested or watched or folder.shows(done))
         for result in results:
             _count_failure(state, steps, result, folder, bar)
 
@@ -185,7 +204,9 @@ def _train(
         if last or stopping or state.step % COMPARE_EVERY == 0:
             check_replicas(state)
 
-        # 6. Log, save, stop.
+        # 6. Show, log, save, stop.
+        if watched and watcher is not None:
+            watcher.show(state)
         for result in results:
             folder.record(state, result, bar)
         if time.monotonic() - saved_at >= config.checkpoint_seconds or last or stopping:

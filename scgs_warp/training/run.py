@@ -24,7 +24,7 @@ from ..storage.files import write_atomically
 from ..visualization import video
 from ..visualization.figures import curves
 from ..visualization.overlay import Painter
-from .loop import fit
+from .loop import Watcher, fit
 from .process_group import ProcessGroup
 from .run_folder import read_seconds
 
@@ -77,6 +77,7 @@ def train_and_evaluate(
     tensorboard: bool = False,
     group: ProcessGroup | None = None,
     command: str | None = None,
+    watcher: Watcher | None = None,
 ) -> dict[str, Any]:
     """Load, train and evaluate, as ``apps/train.py`` does.
 
@@ -90,6 +91,7 @@ def train_and_evaluate(
         tensorboard: also write event files for TensorBoard to ``output``.
         group: the processes that share the training; the first one evaluates.
         command: the command that trains, for ``provenance`` in ``metrics.json``.
+        watcher: as for ``fit``.
 
     Returns:
         the content of ``metrics.json``; empty in processes other than the first.
@@ -113,6 +115,7 @@ def train_and_evaluate(
         settings=settings_of(config, data),
         tensorboard=tensorboard,
         group=group,
+        watcher=watcher,
     )
     if group is not None and not group.first:
         return {}

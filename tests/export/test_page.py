@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from helpers.edit_scenes import bar_scene, rich_scene, tinted_scene
 from helpers.page_reader import PagePlayer, read_page
 from scgs_warp.errors import UserError
 from scgs_warp.export import page
+from scgs_warp.export.poster import poster
 from scgs_warp.geometry.cameras import orbit_camera
 
 
@@ -44,7 +48,7 @@ class Parts(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.found.append((tag, dict(attrs), ""))
-        if tag not in ("meta", "input", "br", "path"):
+        if tag not in ("meta", "input", "br", "path", "link", "img"):
             self.open.append(len(self.found) - 1)
 
     def handle_endtag(self, tag):
@@ -75,7 +79,7 @@ def test_only_its_own_program_may_run(tmp_path):
     page.write_page(bar_scene(nodes=12, gaussians=20), tmp_path / "page.html")
     parts = Parts(tmp_path / "page.html")
     policy = next(attrs["content"] for tag, attrs, _ in parts.found if tag == "meta" and "http-equiv" in attrs)
-    for text in (parts.texts("script")[1], parts.texts("style")[0]):
+    for text in (parts.texts("script")[0], parts.texts("style")[0]):
         assert base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() in policy
     assert "default-src 'none'" in policy and "unsafe" not in policy
 
@@ -85,8 +89,9 @@ def test_the_program_is_small_and_the_same_scene_gives_the_same_page(tmp_path):
     for name in ("a", "b"):
         page.write_page(scene, tmp_path / f"{name}.html")
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
-    assert len(page.assemble(b"")) < 64 * 1024
-    assert "http://" not in page.program_text() and "https://" not in page.program_text()
+    assert len(page.assemble(b"")) < 80 * 1024
+    program = page.program_text((*page.SCRIPTS, "main"))
+    assert "http://" not in program and "https://" not in program
 
 
 def test_a_page_gives_up_degrees_until_it_fits_and_refuses_otherwise(tmp_path):
@@ -117,3 +122,17 @@ def test_bad_places_are_refused(tmp_path):
         page.write_page(scene, tmp_path / "file" / "page.html")
     assert page.write_page(scene, tmp_path / "new" / "page.HTM") == 20
     assert (tmp_path / "new" / "page.HTM").is_file()
+
+
+def test_a_link_to_a_published_page_has_a_picture(tmp_path):
+    scene = bar_scene(gaussians=300)
+    page.write_page(scene, tmp_path / "page.html", title="A & B", url='https://example.org/a"b/page.html')
+    parts = Parts(tmp_path / "page.html")
+    card = {attrs["property"]: attrs["content"] for tag, attrs, _ in parts.found if "property" in attrs}
+    assert card["og:image"] == 'https://example.org/a"b/page.jpg' and card["og:title"] == "A & B"
+    with Image.open(tmp_path / "page.jpg") as picture, Image.open(io.BytesIO(poster(scene))) as small:
+        assert max(picture.size) == 1200 and max(small.size) == 480
+        assert np.asarray(small).max() > 50, "there is something to see"
+    page.write_page(scene, tmp_path / "other.html")
+    assert not any("og:image" in attrs.values() for _, attrs, _ in Parts(tmp_path / "other.html").found)
+    assert not (tmp_path / "other.jpg").exists()

@@ -19,9 +19,9 @@ from scgs_warp.types import Pose
 def read_page(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Facts and columns of a page's embedded data."""
     text = path.read_text(encoding="utf-8")
-    found = re.search(r'<script id="data" type="text/plain">([^<]*)</script>', text)
-    assert found is not None, "the page holds its data"
-    return unpack(base64.b64decode(found.group(1)))
+    found = re.findall(r'<script class="data" type="text/plain">([^<]*)</script>', text)
+    assert found, "the page holds its data"
+    return unpack(b"".join(map(base64.b64decode, found)))
 
 
 def stack(columns: dict[str, np.ndarray], *names: str) -> torch.Tensor:

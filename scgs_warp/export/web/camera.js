@@ -27,6 +27,14 @@ class Orbit {
     this.distance = radius;
   }
 
+  // A row of facts.path: azimuth, elevation (degrees), distance, target.
+  place([azimuth, elevation, distance, ...target]) {
+    this.azimuth = (azimuth * Math.PI) / 180;
+    this.elevation = (elevation * Math.PI) / 180;
+    this.distance = distance;
+    this.target = target;
+  }
+
   turn(azimuth, elevation) {
     this.azimuth += azimuth;
     this.elevation = Math.min(Math.max(this.elevation + elevation, -STEEPEST), STEEPEST);

@@ -3,6 +3,8 @@
 const element = (id) => document.getElementById(id);
 const hex = (color) => "#" + color.map((v) => Math.round(255 * v).toString(16).padStart(2, "0")).join("");
 const numbers = (text) => [1, 3, 5].map((k) => parseInt(text.slice(k, k + 2), 16) / 255);
+const asked = new URLSearchParams(location.search); // of the page's address: ?noui, ?paused, ?t=SECONDS
+const IDLE = 2500; // milliseconds without an input after which the bar hides while the scene plays
 
 class Clock {
   constructor(player) {
@@ -27,7 +29,7 @@ class Clock {
     const passed = Math.min(Math.max(now - this.last, 0), 250) / 1000; // a page that was hidden does not jump
     this.last = now;
     if (ending !== "back") this.direction = 1;
-    let time = player.time + (this.direction * passed * Number(element("speed").value)) / SECONDS;
+    let time = player.time + (this.direction * passed * Number(element("speed").value)) / player.seconds;
     if (ending === "again") time %= 1;
     else if (time > 1 || time < 0) {
       if (ending === "stop") this.play(false);
@@ -38,8 +40,22 @@ class Clock {
 }
 
 function showTime(player) {
-  element("time").value = player.time;
-  element("clock").value = player.time.toFixed(3);
+  const { seconds } = player, at = player.time * seconds;
+  element("time").max = seconds;
+  element("time").value = at;
+  element("time").setAttribute("aria-valuetext", `${at.toFixed(2)} seconds`);
+  const total = document.createElement("span");
+  total.className = "total";
+  total.textContent = ` / ${seconds.toFixed(2)}`;
+  element("clock").replaceChildren(at.toFixed(2), total, " s");
+  showCaption(player, at);
+}
+
+function showCaption(player, at) {
+  const said = (player.model.facts.captions ?? []).find(({ from, to }) => at >= from && at < to);
+  const text = said ? said.text : "", place = element("caption");
+  if (place.textContent !== text) place.textContent = text;
+  place.hidden = !text;
 }
 
 function setBackground(player, color) {
@@ -48,28 +64,66 @@ function setBackground(player, color) {
   element("background").value = hex(color);
 }
 
+// One sheet at a time.
+function toggleSheet(sheet, button) {
+  const opens = element(sheet).hidden;
+  for (const [other, its] of [["settings", "more"], ["keys", "help"]]) {
+    element(other).hidden = !(opens && other === sheet);
+    element(its).setAttribute("aria-expanded", String(opens && its === button));
+  }
+}
+
+const toggleHelp = () => toggleSheet("keys", "help");
+
+function toggleWhole() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else document.documentElement.requestFullscreen?.().catch(() => {});
+}
+
+function followFilm(player, follows) {
+  player.follows = follows && Boolean(player.model.facts.path);
+  element("follow").checked = player.follows;
+  player.changed();
+}
+
 function listenToPanel(player, clock) {
-  element("controls").addEventListener("submit", (event) => event.preventDefault());
+  for (const form of [element("controls"), element("settings")]) {
+    form.addEventListener("submit", (event) => event.preventDefault());
+  }
   element("play").addEventListener("click", () => clock.play(!clock.playing));
   element("time").addEventListener("input", () => {
     clock.play(false);
-    player.seek(Number(element("time").value));
+    player.seek(Number(element("time").value) / player.seconds);
     showTime(player);
   });
   element("background").addEventListener("input", () => setBackground(player, numbers(element("background").value)));
   element("reset").addEventListener("click", () => resetView(player));
+  element("more").addEventListener("click", () => toggleSheet("settings", "more"));
   element("help").addEventListener("click", toggleHelp);
+  element("whole").addEventListener("click", toggleWhole);
+  element("whole").hidden = !document.fullscreenEnabled;
+  element("follow").addEventListener("change", () => followFilm(player, element("follow").checked));
+}
+
+// While the scene plays and nobody does anything, the picture is all there is.
+function hideWhenIdle(clock) {
+  let timer = 0;
+  const busy = () => !clock.playing || !element("settings").hidden || !element("keys").hidden
+    || element("controls").matches(":hover") || element("controls").contains(document.activeElement);
+  const wake = () => {
+    document.body.classList.remove("idle");
+    clearTimeout(timer);
+    timer = setTimeout(() => (busy() ? wake() : document.body.classList.add("idle")), IDLE);
+  };
+  for (const name of ["pointermove", "pointerdown", "keydown", "wheel", "focusin"]) {
+    document.addEventListener(name, wake, { passive: true });
+  }
+  wake();
 }
 
 function resetView(player) {
   player.orbit.reset();
-  player.changed();
-}
-
-function toggleHelp() {
-  const keys = element("keys");
-  keys.hidden = !keys.hidden;
-  element("help").setAttribute("aria-expanded", String(!keys.hidden));
+  followFilm(player, true);
 }
 
 function listenToPointers(player) {
@@ -83,6 +137,7 @@ function listenToPointers(player) {
     if (!fingers.has(event.pointerId)) return;
     const before = middle();
     fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    if (player.follows) followFilm(player, false); // the view is the visitor's from here on
     const after = middle(), dx = after.x - before.x, dy = after.y - before.y;
     if (fingers.size > 1 || event.shiftKey || event.buttons & 6) {
       orbit.pan(dx, dy, orbit.focal(canvas.clientWidth, canvas.clientHeight));
@@ -94,6 +149,7 @@ function listenToPointers(player) {
     player.changed();
   };
   canvas.addEventListener("pointerdown", (event) => {
+    if (player.hand?.takes(event, fingers.size)) return; // it pulls a part of the scene
     canvas.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
   });
@@ -104,34 +160,41 @@ function listenToPointers(player) {
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
+    if (player.follows) followFilm(player, false);
     const pixels = event.deltaY * [1, 33, 400][event.deltaMode];
     orbit.zoom(Math.exp(0.0015 * Math.min(Math.max(pixels, -400), 400)));
     player.changed();
   }, { passive: false });
 }
 
-function listenToKeys(player, clock) {
+function listenToKeys(player, clock, further = {}) {
   const step = (by) => () => {
     clock.play(false);
     player.seek(player.time + by);
     showTime(player);
   };
   const turn = (azimuth, elevation) => () => player.orbit.turn(azimuth, elevation);
-  const keys = {
-    " ": () => clock.play(!clock.playing), ArrowLeft: step(-0.01), ArrowRight: step(0.01), Home: step(-1), End: step(1),
+  const views = {
     "shift ArrowLeft": turn(-0.05, 0), "shift ArrowRight": turn(0.05, 0), ArrowUp: turn(0, 0.05),
     ArrowDown: turn(0, -0.05), "shift ArrowUp": turn(0, 0.05), "shift ArrowDown": turn(0, -0.05),
     "+": () => player.orbit.zoom(0.9), "=": () => player.orbit.zoom(0.9), "-": () => player.orbit.zoom(1 / 0.9),
-    r: () => player.orbit.reset(), h: toggleHelp,
+  };
+  const keys = {
+    " ": () => clock.play(!clock.playing), ArrowLeft: step(-0.01), ArrowRight: step(0.01), Home: step(-1), End: step(1),
+    r: () => resetView(player), h: toggleHelp, "?": toggleHelp, f: toggleWhole,
+    c: () => followFilm(player, !player.follows),
     b: () => setBackground(player, player.background[0] < 0.5 ? [1, 1, 1] : [0, 0, 0]),
+    ...further,
   };
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (/^(select|input|button)$/i.test(event.target.tagName)) return; // they have keys of their own
     const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-    const act = (event.shiftKey && keys["shift " + name]) || keys[name];
+    const view = (event.shiftKey && views["shift " + name]) || views[name];
+    const act = view && (event.shiftKey || !keys[name]) ? view : keys[name];
     if (!act) return;
     event.preventDefault();
+    if (act === view && player.follows) followFilm(player, false);
     act();
     player.changed();
   });

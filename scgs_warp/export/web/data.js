@@ -2,40 +2,45 @@
 
 const WIDTH = 2048; // of all data textures
 
-async function inflate(text) {
-  const letters = atob(text);
-  const bytes = new Uint8Array(letters.length);
-  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
-}
+// Columns are decoded when they are asked for, and not kept: codes of all of them take more memory than the scene.
+class Columns {
+  constructor(raw) {
+    const length = new DataView(raw.buffer).getUint32(0, true);
+    this.raw = raw;
+    this.facts = JSON.parse(new TextDecoder().decode(raw.subarray(4, 4 + length)));
+    this.places = {};
+    let offset = 4 + length;
+    for (const column of this.facts.columns) {
+      this.places[column.name] = { ...column, offset };
+      offset += column.rows * Math.ceil(column.bits / 8);
+    }
+  }
 
-function readColumns(raw) {
-  const length = new DataView(raw.buffer).getUint32(0, true);
-  const facts = JSON.parse(new TextDecoder().decode(raw.subarray(4, 4 + length)));
-  const columns = {};
-  let offset = 4 + length;
-  for (const { name, rows, bits, low, step, delta } of facts.columns) {
+  // { codes, low, step }
+  read(name) {
+    const { rows, bits, low, step, delta, offset } = this.places[name];
     const codes = new Uint32Array(rows);
-    for (let shift = 0; shift < bits; shift += 8) {
-      for (let i = 0; i < rows; i++) codes[i] |= raw[offset + i] << shift;
-      offset += rows;
+    for (let plane = 0; 8 * plane < bits; plane++) {
+      const at = offset + plane * rows, shift = 8 * plane;
+      for (let i = 0; i < rows; i++) codes[i] |= this.raw[at + i] << shift;
     }
     if (delta) {
       const mask = 2 ** bits - 1;
       for (let i = 1; i < rows; i++) codes[i] = (codes[i] + codes[i - 1]) & mask;
     }
-    columns[name] = { codes, low, step };
+    return { codes, low, step };
   }
-  return { facts, columns };
 }
 
 // Values of several columns side by side, `stride` numbers a row, from number `first` of the row on.
-function fill(target, stride, first, columns) {
-  columns.forEach(({ codes, low, step }, k) => {
+function fill(target, stride, first, columns, names) {
+  names.forEach((name, k) => {
+    const { codes, low, step } = columns.read(name);
     for (let i = 0; i < codes.length; i++) target[stride * i + first + k] = low + step * codes[i];
   });
 }
+
+const numbered = (name, amount) => Array.from({ length: amount }, (_, k) => name + k);
 
 // An array for `rows` rows of `stride` numbers in texels of four, filled up to whole lines of a texture.
 function room(Type, rows, stride) {
@@ -44,23 +49,22 @@ function room(Type, rows, stride) {
 }
 
 function readQuaternions(columns, target, stride) {
-  const largest = columns.quat_largest.codes;
-  const others = [0, 1, 2].map((k) => columns["quat" + k]);
-  for (let i = 0; i < largest.length; i++) {
-    let rest = 1;
-    others.forEach(({ codes, low, step }, k) => {
+  const largest = columns.read("quat_largest").codes, count = largest.length, rest = new Float32Array(count).fill(1);
+  for (let k = 0; k < 3; k++) {
+    const { codes, low, step } = columns.read("quat" + k);
+    for (let i = 0; i < count; i++) {
       const value = low + step * codes[i];
-      rest -= value * value;
+      rest[i] -= value * value;
       target[stride * i + ((largest[i] + 1 + k) & 3)] = value;
-    });
-    target[stride * i + largest[i]] = Math.sqrt(Math.max(rest, 0));
+    }
   }
+  for (let i = 0; i < count; i++) target[stride * i + largest[i]] = Math.sqrt(Math.max(rest[i], 0));
 }
 
 function readBinding(facts, columns, model) {
   const { count, stride, indices, weights } = model;
-  for (let k = 0; k < facts.neighbors; k++) fill(indices, stride, k, [columns["node" + k]]);
-  for (let k = 1; k < facts.neighbors; k++) fill(weights, stride, k, [columns["weight" + k]]);
+  for (let k = 0; k < facts.neighbors; k++) fill(indices, stride, k, columns, ["node" + k]);
+  for (let k = 1; k < facts.neighbors; k++) fill(weights, stride, k, columns, ["weight" + k]);
   for (let i = 0; i < count; i++) {
     let first = 1; // weights sum to one
     for (let k = 1; k < facts.neighbors; k++) first -= weights[stride * i + k];
@@ -68,30 +72,31 @@ function readBinding(facts, columns, model) {
   }
   if (facts.masked) {
     model.shares = new Float32Array(count);
-    fill(model.shares, 1, 0, [columns.share]);
-    fill(model.scales, 4, 3, [columns.share]);
+    fill(model.shares, 1, 0, columns, ["share"]);
+    fill(model.scales, 4, 3, columns, ["share"]);
   }
 }
 
-function readHarmonics(facts, columns, model) {
+async function readHarmonics(facts, columns, model) {
   const coefficients = (facts.sh_degree + 1) ** 2 - 1, stride = 4 * Math.ceil(coefficients / 4);
   model.harmonics = room(Uint32Array, model.count, stride);
   model.shLow = new Float32Array(45);
   model.shStep = new Float32Array(45);
   for (let k = 0; k < coefficients; k++) {
     for (let c = 0; c < 3; c++) {
-      const { codes, low, step } = columns[`sh${k}_${c}`];
+      const { codes, low, step } = columns.read(`sh${k}_${c}`);
       model.shLow[3 * k + c] = low;
       model.shStep[3 * k + c] = step;
       for (let i = 0; i < codes.length; i++) model.harmonics[stride * i + k] |= codes[i] << (8 * c);
     }
+    await nextTurn();
   }
 }
 
 function readNodes(facts, columns) {
   const read = (name, width, rows) => {
     const values = new Float32Array(width * rows);
-    fill(values, width, 0, Array.from({ length: width }, (_, a) => columns[name + a]));
+    fill(values, width, 0, columns, numbered(name, width));
     return values;
   };
   const rows = facts.nodes * facts.samples;
@@ -104,8 +109,9 @@ function readNodes(facts, columns) {
   };
 }
 
-async function readModel(text) {
-  const { facts, columns } = readColumns(await inflate(text));
+// raw: the inflated bytes.
+async function readModel(raw) {
+  const columns = new Columns(raw), { facts } = columns;
   const count = facts.gaussians, stride = 4 * Math.ceil(facts.neighbors / 4);
   const colorStride = facts.shaded ? 16 : 4;
   const model = {
@@ -117,20 +123,22 @@ async function readModel(text) {
     indices: room(Uint16Array, count, stride),
     weights: room(Float32Array, count, stride),
   };
-  const named = (name, amount) => Array.from({ length: amount }, (_, k) => columns[name + k]);
-  fill(model.means, 4, 0, [...named("mean", 3), columns.opacity]);
-  fill(model.scales, 4, 0, named("scale", 3));
-  fill(model.colors, colorStride, 0, named("dc", 3));
+  fill(model.means, 4, 0, columns, [...numbered("mean", 3), "opacity"]);
+  await nextTurn();
+  fill(model.scales, 4, 0, columns, numbered("scale", 3));
+  fill(model.colors, colorStride, 0, columns, numbered("dc", 3));
+  await nextTurn();
   if (facts.shaded) {
-    fill(model.colors, colorStride, 3, [columns.shading9]);
-    fill(model.colors, colorStride, 4, named("shading", 9));
+    fill(model.colors, colorStride, 3, columns, ["shading9"]);
+    fill(model.colors, colorStride, 4, columns, numbered("shading", 9));
   }
   if (facts.corrected) {
     model.correctives = room(Float32Array, count, 28);
-    fill(model.correctives, 28, 0, named("corrective", 27));
+    fill(model.correctives, 28, 0, columns, numbered("corrective", 27));
   }
+  await nextTurn();
   readQuaternions(columns, model.quats, 4);
-  readHarmonics(facts, columns, model);
+  await readHarmonics(facts, columns, model);
   if (facts.nodes) {
     readBinding(facts, columns, model);
     model.trajectories = readNodes(facts, columns);

@@ -1,6 +1,6 @@
 // The page: time, camera, the worker that sorts, and frames when something has changed.
 
-const SECONDS = 4; // a scene's whole time at speed 1
+const SECONDS = 4; // a scene's whole time at speed 1, unless its facts say otherwise
 const SLOW = 50; // milliseconds a frame: slower machines draw fewer pixels while something moves ...
 const COARSEST = 0.4; // ... but not fewer than so many of each side's
 const REST = 250; // milliseconds of stillness after which a frame is drawn in full
@@ -9,12 +9,11 @@ const BREAK = 3000; // milliseconds between two frames that do not belong to one
 class Player {
   constructor(canvas, model) {
     this.canvas = canvas;
-    this.model = model;
     this.gl = canvas.getContext("webgl2", { antialias: false, depth: false, alpha: false });
     if (!this.gl) throw new Error("WebGL 2 is missing");
     this.orbit = new Orbit(model.facts.overview);
     this.background = model.facts.background;
-    this.table = new Float32Array(20 * Math.max(model.nodes, 1));
+    this.follows = false; // the film's camera, if there is one
     this.time = 0;
     this.frames = 0;
     this.adaptive = true;
@@ -22,22 +21,35 @@ class Player {
     this.moving = false;
     this.interval = SLOW / 2; // milliseconds between frames, of late
     this.drawn = 0;
-    this.stale = this.unsorted = true; // the picture, the order
-    this.order = new Uint32Array(model.count);
-    this.spare = new Uint32Array(model.count);
-    this.amount = 0;
-    this.startSorter();
-    this.renderer = new Renderer(this.gl, model);
+    this.take(model);
     canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault(); // else it never comes back
       this.renderer = null;
     });
     canvas.addEventListener("webglcontextrestored", () => {
-      this.renderer = new Renderer(this.gl, model);
+      this.renderer = new Renderer(this.gl, this.model);
       this.takeOrder(this.order, this.amount);
     });
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
+  }
+
+  // Show a model, in place of the present one if there is one.
+  take(model) {
+    this.model = model;
+    this.table = new Float32Array(20 * Math.max(model.nodes, 1));
+    this.stale = this.unsorted = true; // the picture, the order
+    this.order = new Uint32Array(model.count);
+    this.spare = new Uint32Array(model.count);
+    this.amount = 0;
+    this.worker?.terminate();
+    this.startSorter();
+    this.renderer?.dispose();
+    this.renderer = this.gl.isContextLost() ? null : new Renderer(this.gl, model);
+  }
+
+  get seconds() {
+    return this.model.facts.seconds ?? SECONDS;
   }
 
   startSorter() {
@@ -47,7 +59,9 @@ class Player {
     this.sorting = false;
     try {
       const text = `${SHARED.sort}\nserveSorter(self);`;
-      this.worker = new Worker(URL.createObjectURL(new Blob([text], { type: "text/javascript" })));
+      const address = URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
+      this.worker = new Worker(address);
+      URL.revokeObjectURL(address);
       this.worker.onmessage = ({ data }) => {
         this.sorting = false;
         this.spare = this.order;
@@ -114,7 +128,11 @@ class Player {
   }
 
   view() {
-    const { width, height } = this.canvas;
+    const { width, height } = this.canvas, { path } = this.model.facts;
+    if (this.follows && path) {
+      const at = this.time * (path.length - 1), row = Math.min(Math.floor(at), path.length - 2), share = at - row;
+      this.orbit.place(path[row].map((value, k) => value + share * (path[row + 1][k] - value)));
+    }
     return normalised(this.orbit.camera(width, height), this.model.facts.normalisation);
   }
 

@@ -11,6 +11,7 @@ function compile(gl, vertex, fragment, defines) {
     gl.shaderSource(shader, head + text);
     gl.compileShader(shader);
     gl.attachShader(program, shader);
+    gl.deleteShader(shader); // with the program
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
       throw new Error("shader: " + gl.getShaderInfoLog(shader));
     }
@@ -45,8 +46,28 @@ class Renderer {
     // Halves, where they can be drawn to: sums of many faint Gaussians lose what 8 bits round away.
     const precise = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.sumFormat = precise ? gl.RGBA16F : gl.RGBA8;
+    this.owned = []; // textures and framebuffers
     this.makeData();
     this.makeOrder();
+  }
+
+  dispose() {
+    const { gl } = this;
+    for (const { program } of [this.splat, this.draw, this.screen]) gl.deleteProgram(program);
+    for (const thing of this.owned) {
+      if (thing instanceof WebGLTexture) gl.deleteTexture(thing);
+      else gl.deleteFramebuffer(thing);
+    }
+    gl.deleteVertexArray(this.nothing);
+    this.dropSum();
+  }
+
+  dropSum() {
+    const { gl, sum } = this;
+    if (!sum) return;
+    gl.deleteTexture(sum.texture);
+    gl.deleteFramebuffer(sum.target);
+    this.sum = null;
   }
 
   texture(format, width, height) {
@@ -60,6 +81,7 @@ class Renderer {
   upload(format, layout, type, data) {
     const { gl } = this, height = data.length / (4 * WIDTH), texture = this.texture(format, WIDTH, height);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, height, layout, type, data);
+    this.owned.push(texture);
     return texture;
   }
 
@@ -93,6 +115,7 @@ class Renderer {
     this.splats = { u_place: this.texture(gl.RGBA32UI, WIDTH, this.rows),
       u_color: this.texture(gl.RGBA32UI, WIDTH, this.rows) };
     this.splatTarget = this.target(this.splats.u_place, this.splats.u_color);
+    this.owned.push(this.splats.u_place, this.splats.u_color, this.splatTarget);
     if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE && !gl.isContextLost()) {
       throw new Error("this graphics driver cannot draw to integer textures");
     }
@@ -102,6 +125,7 @@ class Renderer {
     const { gl } = this;
     this.nothing = gl.createVertexArray();
     this.splats.u_order = this.texture(gl.R32UI, WIDTH, this.rows);
+    this.owned.push(this.splats.u_order);
     this.padded = new Uint32Array(WIDTH * this.rows);
     this.amount = 0;
   }
@@ -118,10 +142,7 @@ class Renderer {
   sized(width, height) {
     const { gl } = this;
     if (this.sum && this.sum.width === width && this.sum.height === height) return this.sum;
-    if (this.sum) {
-      gl.deleteTexture(this.sum.texture);
-      gl.deleteFramebuffer(this.sum.target);
-    }
+    this.dropSum();
     const texture = this.texture(this.sumFormat, width, height);
     this.sum = { width, height, texture, target: this.target(texture) };
     return this.sum;
