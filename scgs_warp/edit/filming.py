@@ -24,6 +24,13 @@ FIELDS = ("azimuth", "elevation", "distance")
 
 def film_camera(session: EditSession, at: float, size: int | None = None) -> Camera:
     """Return the film's camera at a moment in seconds, on the CPU."""
+    overview, azimuth, elevation = film_view(session, at)
+    return cameras.orbit_camera(overview, azimuth, size or session.edit.film.size, elevation)
+
+
+def film_view(session: EditSession, at: float) -> tuple[cameras.Overview, float, float]:
+    """Return the film's camera at a moment in seconds: its sphere around a point, and its azimuth and elevation on the
+    sphere, degrees."""
     settings = session.edit.film
     shot, overview = settings.shot, session.scene.overview
     changes: dict[str, Any] = {}
@@ -38,7 +45,7 @@ def film_camera(session: EditSession, at: float, size: int | None = None) -> Cam
         azimuth += 360.0 * shot.turns * at / settings.seconds
     x, y, z = view["target"].tolist()
     moved = dataclasses.replace(overview, centre=(x, y, z), radius=float(view["distance"][0]), **changes)
-    return cameras.orbit_camera(moved, azimuth, size or settings.size, float(view["elevation"][0]))
+    return moved, float(azimuth), float(view["elevation"][0])
 
 
 def _view_at(views: tuple[View, ...], at: float, overview: cameras.Overview) -> dict[str, np.ndarray]:

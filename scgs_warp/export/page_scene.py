@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ COARSE_ERROR = 8e-4
 number of times is doubled until the error is below this, and then once more, which leaves about a quarter of the
 error."""
 POSE_PARTS = ("translation", "rotation", "shape", "log_scale", "tint")
-QUATERNIONS = ("rotation", "shape")
+QUATERNIONS = ("rotation", "shape", "own", "turn")
 TIMES_AT_ONCE = 16
 """Number of times per evaluation of the network; it limits the memory for many control points."""
 STEPS = {
@@ -57,12 +57,33 @@ class PageScene:
     columns: list[Column]
 
 
-def page_scene(scene: Scene, sh_degree: int, samples: int | None = None) -> PageScene:
+@dataclass(frozen=True)
+class PageMotion:
+    """Control points that move Gaussians on a page in another way than the scene's own motion, such as under an
+    edit."""
+
+    rest: np.ndarray
+    """[M, 3] at rest, normalised units."""
+    binding: tuple[Tensor, Tensor]
+    """Control points and weights of each Gaussian, [N, K] each."""
+    poses: dict[str, np.ndarray]
+    """As from :func:`sample_poses`; under an edit also ``own`` and ``turn`` [T, M, 4]: the rotations that shading and
+    correctives follow, and those that turn colours."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Further facts, which replace those of the scene."""
+    columns: list[Column] = field(default_factory=list)
+    """Further columns."""
+
+
+def page_scene(
+    scene: Scene, sh_degree: int, samples: int | None = None, motion_of: PageMotion | None = None
+) -> PageScene:
     """Quantise a scene for a page.
 
     Args:
         sh_degree: degree of the spherical harmonics, at most the scene's own.
         samples: number of times at which control points are sampled; None: as many as the motion needs.
+        motion_of: replaces the scene's motion.
 
     Raises:
         UserError: the motion model has no control points to skin by, or no Gaussian can be seen.
@@ -82,10 +103,14 @@ def page_scene(scene: Scene, sh_degree: int, samples: int | None = None) -> Page
         kept = kept[torch.from_numpy(order).to(kept.device)]
         columns = gaussian_columns(gaussians, kept, sh_degree)
         facts = scene_facts(scene, len(kept), sh_degree)
-        if isinstance(motion, ControlPoints):
-            columns += _binding_columns(motion, gaussians, kept, facts)
+        if motion_of is None and isinstance(motion, ControlPoints):
             poses = sample_poses(motion) if samples is None else one_sided(_poses_at(motion, even_times(samples)))
-            columns += pose_columns(to_array(motion.positions), poses, facts)
+            motion_of = PageMotion(to_array(motion.positions), motion.binding(gaussians), poses)
+        if motion_of is not None:
+            facts.update(masked=bool(scene.config.motion.mask) and motion.moves)
+            columns += _binding_columns(motion_of, gaussians, kept, facts)
+            columns += pose_columns(motion_of.rest, motion_of.poses, facts) + motion_of.columns
+            facts.update(motion_of.facts)
     return PageScene(facts, columns)
 
 
@@ -130,6 +155,7 @@ def scene_facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
         "shapes": False,
         "scaled": False,
         "tinted": False,
+        "edited": False,
     }
 
 
@@ -167,15 +193,15 @@ def _quaternion_columns(name: str, quats: np.ndarray) -> list[Column]:
 
 
 def _binding_columns(
-    motion: ControlPoints, gaussians: GaussianParameters, kept: Tensor, facts: dict[str, Any]
+    motion: PageMotion, gaussians: GaussianParameters, kept: Tensor, facts: dict[str, Any]
 ) -> list[Column]:
     """Store each Gaussian's control points, and all of its weights but the first, since weights sum to one."""
-    indices, weights = (value[kept] for value in motion.binding(gaussians))
+    indices, weights = (value[kept] for value in motion.binding)
     count = indices.shape[1]
-    facts.update(nodes=len(motion), neighbors=count, masked=bool(motion.config.mask))
+    facts.update(nodes=len(motion.rest), neighbors=count)
     columns = [integers(f"node{k}", indices[:, k].cpu().numpy()) for k in range(count)]
     columns += [quantise(f"weight{k}", to_array(weights[:, k]), STEPS["weight"]) for k in range(1, count)]
-    if motion.config.mask:
+    if facts["masked"]:
         columns.append(quantise("share", to_array(gaussians.hyper[kept, -1].sigmoid()), STEPS["opacity"]))
     return columns
 
@@ -183,7 +209,7 @@ def _binding_columns(
 def pose_columns(rest: np.ndarray, poses: dict[str, np.ndarray], facts: dict[str, Any]) -> list[Column]:
     """Store rest positions [M, 3], and poses [T, M, ...] at evenly spaced times, node by node."""
     facts.update(samples=len(poses["translation"]), shapes="shape" in poses)
-    facts.update(scaled="log_scale" in poses, tinted="tint" in poses)
+    facts.update(scaled="log_scale" in poses, tinted="tint" in poses, edited="turn" in poses)
     columns = [quantise(f"rest{a}", rest[:, a], STEPS["rest"]) for a in range(3)]
     for name, values in poses.items():
         for a in range(values.shape[2]):

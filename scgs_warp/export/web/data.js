@@ -2,6 +2,10 @@
 
 const WIDTH = 2048; // of all data textures
 
+// Numbers of a control point's pose: three rows of the map x -> R (x - p) + p + t, the rotation of shapes, the change of
+// log scales or the tint, and the glow; under an edit also the rotation that shading follows, and that of colours.
+const nodeWidth = (facts) => (facts.edited ? 28 : 20);
+
 // Columns are decoded when they are asked for, and not kept: codes of all of them take more memory than the scene.
 class Columns {
   constructor(raw) {
@@ -105,6 +109,8 @@ function readNodes(facts, columns) {
     translation: read("translation", 3, rows),
     rotation: read("rotation", 4, rows),
     shape: facts.shapes ? read("shape", 4, rows) : null,
+    own: facts.edited ? read("own", 4, rows) : null,
+    turn: facts.edited ? read("turn", 4, rows) : null,
     extra: facts.scaled ? read("log_scale", 3, rows) : facts.tinted ? read("tint", 3, rows) : null,
   };
 }
@@ -146,17 +152,16 @@ async function readModel(raw) {
   return model;
 }
 
-// Control points at a time in [0, 1]: 20 numbers each, the rows of x -> R (x - p) + p + t, the rotation of shapes, and
-// the change of log scales, or the tint.
+// Control points at a time in [0, 1], nodeWidth(facts) numbers each.
 function poseAt(model, time, table) {
   const { nodes, facts, trajectories } = model;
   if (!nodes) return table;
-  const last = facts.samples - 1, at = Math.min(Math.max(time, 0), 1) * last;
-  const sample = Math.min(Math.floor(at), last - 1), share = at - sample;
+  const last = facts.samples - 1, at = Math.min(Math.max(time, 0), 1) * last, width = nodeWidth(facts);
+  const sample = Math.min(Math.floor(at), last - 1), share = facts.jumps?.includes(sample) ? 0 : at - sample;
   const quat = [0, 0, 0, 0];
-  const blend = (values, width, m, into) => {
-    const from = width * (facts.samples * m + sample);
-    for (let a = 0; a < width; a++) into[a] = (1 - share) * values[from + a] + share * values[from + width + a];
+  const blend = (values, size, m, into) => {
+    const from = size * (facts.samples * m + sample);
+    for (let a = 0; a < size; a++) into[a] = (1 - share) * values[from + a] + share * values[from + size + a];
   };
   const unit = (values, m) => {
     blend(values, 4, m, quat);
@@ -165,23 +170,34 @@ function poseAt(model, time, table) {
   };
   const shift = [0, 0, 0], extra = [0, 0, 0];
   for (let m = 0; m < nodes; m++) {
+    const row = width * m, rest = trajectories.rest.subarray(3 * m, 3 * m + 3);
     unit(trajectories.rotation, m);
     blend(trajectories.translation, 3, m, shift);
-    const rows = rotationRows(quat);
-    for (let r = 0; r < 3; r++) {
-      let offset = shift[r] + trajectories.rest[3 * m + r];
-      for (let c = 0; c < 3; c++) {
-        table[20 * m + 4 * r + c] = rows[3 * r + c];
-        offset -= rows[3 * r + c] * trajectories.rest[3 * m + c];
-      }
-      table[20 * m + 4 * r + 3] = offset;
-    }
+    setMap(table, row, quat, rest, shift);
     if (trajectories.shape) unit(trajectories.shape, m);
+    table.set(quat, row + 12);
     if (trajectories.extra) blend(trajectories.extra, 3, m, extra);
-    table.set(quat, 20 * m + 12);
-    table.set(extra, 20 * m + 16);
+    table.set(extra, row + 16);
+    if (!facts.edited) continue;
+    unit(trajectories.own, m);
+    table.set(quat, row + 20);
+    unit(trajectories.turn, m);
+    table.set(quat, row + 24);
   }
   return table;
+}
+
+// The rows of x -> R (x - rest) + rest + shift.
+function setMap(table, row, quat, rest, shift) {
+  const rows = rotationRows(quat);
+  for (let r = 0; r < 3; r++) {
+    let offset = shift[r] + rest[r];
+    for (let c = 0; c < 3; c++) {
+      table[row + 4 * r + c] = rows[3 * r + c];
+      offset -= rows[3 * r + c] * rest[c];
+    }
+    table[row + 4 * r + 3] = offset;
+  }
 }
 
 function rotationRows([w, x, y, z]) {

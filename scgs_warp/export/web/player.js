@@ -37,7 +37,7 @@ class Player {
   // Show a model, in place of the present one if there is one.
   take(model) {
     this.model = model;
-    this.table = new Float32Array(20 * Math.max(model.nodes, 1));
+    this.table = new Float32Array(nodeWidth(model.facts) * Math.max(model.nodes, 1));
     this.stale = this.unsorted = true; // the picture, the order
     this.order = new Uint32Array(model.count);
     this.spare = new Uint32Array(model.count);
@@ -54,7 +54,7 @@ class Player {
 
   startSorter() {
     const { count, stride, nodes, means, indices, weights, shares, correctives } = this.model;
-    const model = { count, stride, nodes, means, indices, weights, shares, correctives };
+    const width = nodeWidth(this.model.facts), model = { count, stride, nodes, width, means, indices, weights, shares, correctives };
     this.sort = makeSorter(model);
     this.sorting = false;
     try {

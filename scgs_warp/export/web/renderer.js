@@ -1,3 +1,5 @@
+const LIGHT = [0.45, 0.8, 1]; // of what the pointer is on
+
 // Three passes: one fragment a Gaussian (splat), their quads (draw), the background (screen).
 
 function compile(gl, vertex, fragment, defines) {
@@ -35,9 +37,9 @@ class Renderer {
     const { facts } = model, texels = Math.ceil(((facts.sh_degree + 1) ** 2 - 1) / 4);
     const defines = {
       NODES: model.nodes, BLOCKS: model.stride / 4, DEGREE: facts.sh_degree, SH_TEXELS: texels,
-      COLOR_TEXELS: facts.shaded ? 4 : 1, SHARPNESS,
+      COLOR_TEXELS: facts.shaded ? 4 : 1, SHARPNESS, NODE_TEXELS: nodeWidth(facts) / 4,
     };
-    for (const name of ["shaded", "tinted", "corrected", "masked", "antialiased"]) {
+    for (const name of ["shaded", "tinted", "corrected", "masked", "antialiased", "edited"]) {
       if (facts[name]) defines[name.toUpperCase()] = 1;
     }
     this.splat = compile(gl, SHADERS["screen.vert"], SHADERS["splat.frag"], defines);
@@ -109,7 +111,7 @@ class Renderer {
       u_indices: this.upload(gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, model.indices),
     };
     if (model.correctives) this.data.u_correctives = this.upload(gl.RGBA16F, gl.RGBA, gl.FLOAT, model.correctives);
-    this.table = room(Float32Array, Math.max(model.nodes, 1), 20);
+    this.table = room(Float32Array, Math.max(model.nodes, 1), nodeWidth(model.facts));
     this.data.u_nodes = floats(this.table);
     this.rows = Math.ceil(model.count / WIDTH);
     this.splats = { u_place: this.texture(gl.RGBA32UI, WIDTH, this.rows),
@@ -174,6 +176,7 @@ class Renderer {
     gl.uniform3fv(splat.place("u_eye"), view.eye);
     gl.uniform4fv(splat.place("u_lens"), view.lens);
     gl.uniform2f(splat.place("u_size"), view.width, view.height);
+    gl.uniform3fv(splat.place("u_light"), LIGHT);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.splatTarget);
     gl.viewport(0, 0, WIDTH, this.rows);
     gl.disable(gl.BLEND);

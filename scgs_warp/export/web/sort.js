@@ -1,9 +1,9 @@
 // Farthest first. The same text runs in a worker, beside the page, and in the page where an exact frame is asked for.
 
-// model: count, stride (neighbours a Gaussian, padded), nodes, means [N * 4], indices, weights [N * stride], shares,
-// correctives [N * 28]
+// model: count, stride (neighbours a Gaussian, padded), nodes, width (numbers of a pose), means [N * 4], indices,
+// weights [N * stride], shares, correctives [N * 28]
 function makeSorter(model) {
-  const { count, stride, nodes, means, indices, weights, shares, correctives } = model;
+  const { count, stride, nodes, width, means, indices, weights, shares, correctives } = model;
   const BINS = 4096; // 12 bits a pass, two passes: as fine as depths in float32 are over a scene
   const depths = new Float32Array(count), keys = new Uint32Array(count);
   const ids = new Uint32Array(count), half = new Uint32Array(count);
@@ -15,18 +15,17 @@ function makeSorter(model) {
     for (let m = 0; m < nodes; m++) {
       for (let c = 0; c < 4; c++) {
         let sum = c === 3 ? shift : 0;
-        for (let r = 0; r < 3; r++) sum += row[r] * table[20 * m + 4 * r + c];
+        for (let r = 0; r < 3; r++) sum += row[r] * table[width * m + 4 * r + c];
         planes[4 * m + c] = sum;
       }
     }
   }
 
-  // What a corrective adds to the depth: as corrective() in splat.frag.glsl.
-  const turn = new Float64Array(9);
-  function correctiveDepth(i, row, table) {
-    const quat = [0, 0, 0, 0], reference = 20 * indices[stride * i] + 12;
+  // Rotation matrix of the control points' blended quaternions at number `first` of their poses.
+  function rotationOf(i, first, table, into) {
+    const quat = [0, 0, 0, 0], reference = width * indices[stride * i] + first;
     for (let k = stride * i; k < stride * (i + 1); k++) {
-      const at = 20 * indices[k] + 12;
+      const at = width * indices[k] + first;
       let dot = 0;
       for (let a = 0; a < 4; a++) dot += table[at + a] * table[reference + a];
       const weight = dot < 0 ? -weights[k] : weights[k];
@@ -34,14 +33,23 @@ function makeSorter(model) {
     }
     const norm = Math.hypot(quat[0], quat[1], quat[2], quat[3]);
     const w = quat[0] / norm, x = quat[1] / norm, y = quat[2] / norm, z = quat[3] / norm;
-    turn[0] = -2 * (y * y + z * z), turn[1] = 2 * (x * y - w * z), turn[2] = 2 * (x * z + w * y);
-    turn[3] = 2 * (x * y + w * z), turn[4] = -2 * (x * x + z * z), turn[5] = 2 * (y * z - w * x);
-    turn[6] = 2 * (x * z - w * y), turn[7] = 2 * (y * z + w * x), turn[8] = -2 * (x * x + y * y);
+    into[0] = 1 - 2 * (y * y + z * z), into[1] = 2 * (x * y - w * z), into[2] = 2 * (x * z + w * y);
+    into[3] = 2 * (x * y + w * z), into[4] = 1 - 2 * (x * x + z * z), into[5] = 2 * (y * z - w * x);
+    into[6] = 2 * (x * z - w * y), into[7] = 2 * (y * z + w * x), into[8] = 1 - 2 * (x * x + y * y);
+  }
+
+  // What a corrective adds to the depth: as corrective() in splat.frag.glsl.
+  const turn = new Float64Array(9), carried = new Float64Array(9);
+  function correctiveDepth(i, row, table) {
+    rotationOf(i, 12, table, carried);
+    if (width > 20) rotationOf(i, 20, table, turn);
+    else turn.set(carried);
+    for (const k of [0, 4, 8]) turn[k] -= 1;
     let depth = 0;
     for (let a = 0; a < 3; a++) {
       let shift = 0;
       for (let k = 0; k < 9; k++) shift += correctives[28 * i + 9 * a + k] * turn[k];
-      depth += shift * (row[a] + row[0] * turn[a] + row[1] * turn[3 + a] + row[2] * turn[6 + a]);
+      depth += shift * (row[0] * carried[a] + row[1] * carried[3 + a] + row[2] * carried[6 + a]);
     }
     return 0.1 * depth;
   }

@@ -9,17 +9,20 @@ uniform usampler2D u_harmonics; // SH_TEXELS a Gaussian, a word a coefficient, a
 uniform vec3 u_sh_low[15], u_sh_step[15];
 uniform usampler2D u_indices;   // BLOCKS a Gaussian
 uniform sampler2D u_weights;    // BLOCKS a Gaussian
-uniform sampler2D u_nodes;      // five a control point: affine map by rows, rotation of shapes, change of log scales, or tint
+// NODE_TEXELS a control point: affine map by rows, rotation of shapes, change of log scales or tint with the glow; with
+// EDITED also the rotation that shading and correctives follow, and the one that turns colours
+uniform sampler2D u_nodes;
 uniform int u_count;
 uniform vec3 u_view[3];         // rows of the rotation, world to camera
 uniform vec3 u_shift, u_eye;
 uniform vec4 u_lens;            // fx fy cx cy
 uniform vec2 u_size;
+uniform vec3 u_light;           // of Gaussians that glow
 
 layout(location = 0) out uvec4 o_place;  // mean x, mean y (pixels, float bits), two half axes (pixels, half floats)
 layout(location = 1) out uvec4 o_color;  // red and green, blue (half floats), opacity (float bits)
 
-const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.3;
+const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.3, GLOW = 0.4;
 
 vec4 multiply(vec4 a, vec4 b) {  // wxyz: turns by b, then by a
   return vec4(a.x * b.x - dot(a.yzw, b.yzw), a.x * b.yzw + b.x * a.yzw + cross(a.yzw, b.yzw));
@@ -33,55 +36,87 @@ mat3 matrix(vec4 q) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-// Displacement that follows a rotation since rest.
-vec3 corrective(int i, vec4 quat) {
+// Displacement that follows a rotation since rest, `own`, and is carried along by `quat`.
+vec3 corrective(int i, vec4 quat, vec4 own) {
 #ifdef CORRECTED
-  mat3 rotation = matrix(quat), turn = rotation - mat3(1.0);
+  mat3 turn = matrix(own) - mat3(1.0);
   vec4 values[7];
   for (int t = 0; t < 7; t++) values[t] = texelFetch(u_correctives, at(7 * i + t), 0);
   vec3 shift = vec3(0.0);
   for (int n = 0; n < 27; n++) shift[n / 9] += values[n / 4][n % 4] * turn[n % 3][(n % 9) / 3];
-  return 0.1 * (rotation * shift);
+  return 0.1 * (matrix(quat) * shift);
 #else
   return vec3(0.0);
 #endif
 }
 
-void follow(int i, inout vec3 mean, inout vec4 quat, inout vec3 scale, inout vec3 tint, float share) {
+struct Pose {
+  vec3 mean;
+  vec4 quat;    // of the shape
+  vec4 own;     // of the shape as shading follows it
+  vec4 turn;    // of the colours
+  vec3 scale;   // logarithms
+  vec3 tint;
+  float glow;
+};
+
+vec4 towards(vec4 a, vec4 b) {
+  return dot(a, b) < 0.0 ? -a : a;
+}
+
+void follow(int i, inout Pose pose, float share) {
 #if NODES > 0
-  vec3 moved = vec3(0.0), extra = vec3(0.0);
-  vec4 blend = vec4(0.0), reference = vec4(0.0);
+  vec3 moved = vec3(0.0);
+  vec4 blend = vec4(0.0), own = vec4(0.0), turned = vec4(0.0), extra = vec4(0.0), first[3];
   for (int block = 0; block < BLOCKS; block++) {
     uvec4 indices = texelFetch(u_indices, at(BLOCKS * i + block), 0);
     vec4 weights = texelFetch(u_weights, at(BLOCKS * i + block), 0);
     for (int k = 0; k < 4; k++) {
-      int m = 5 * int(indices[k]);
+      int m = NODE_TEXELS * int(indices[k]);
       float w = weights[k];
-      vec4 homogeneous = vec4(mean, 1.0);
+      vec4 homogeneous = vec4(pose.mean, 1.0);
       moved += w * vec3(
         dot(texelFetch(u_nodes, at(m), 0), homogeneous),
         dot(texelFetch(u_nodes, at(m + 1), 0), homogeneous),
         dot(texelFetch(u_nodes, at(m + 2), 0), homogeneous));
-      vec4 turn = texelFetch(u_nodes, at(m + 3), 0);
-      if (block == 0 && k == 0) reference = turn;
-      blend += (dot(turn, reference) < 0.0 ? -w : w) * turn;
-      extra += w * texelFetch(u_nodes, at(m + 4), 0).xyz;
+      vec4 rotation = texelFetch(u_nodes, at(m + 3), 0);
+      if (block == 0 && k == 0) first[0] = rotation;
+      blend += w * towards(rotation, first[0]);
+      extra += w * texelFetch(u_nodes, at(m + 4), 0);
+#ifdef EDITED
+      vec4 its = texelFetch(u_nodes, at(m + 5), 0), color = texelFetch(u_nodes, at(m + 6), 0);
+      if (block == 0 && k == 0) {
+        first[1] = its;
+        first[2] = color;
+      }
+      own += w * towards(its, first[1]);
+      turned += w * towards(color, first[2]);
+#endif
     }
   }
   blend = normalize(blend);
-  moved += corrective(i, blend);
-  vec4 turned = multiply(blend, quat);
-#ifdef MASKED
-  moved = mean + share * (moved - mean);
-  turned = normalize(quat + share * ((dot(quat, turned) < 0.0 ? -1.0 : 1.0) * turned - quat));
-  extra *= share;
-#endif
-  mean = moved;
-  quat = turned;
-#ifdef TINTED
-  tint = extra;
+#ifdef EDITED
+  own = normalize(own);
+  pose.turn = normalize(turned);
 #else
-  scale += extra;
+  own = blend;
+#endif
+  moved += corrective(i, blend, own);
+  vec4 rest = pose.quat, quat = multiply(blend, rest), other = multiply(own, rest);
+#ifdef MASKED
+  moved = pose.mean + share * (moved - pose.mean);
+  quat = normalize(rest + share * (towards(quat, rest) - rest));
+  other = normalize(rest + share * (towards(other, rest) - rest));
+  extra.xyz *= share;
+#endif
+  pose.mean = moved;
+  pose.quat = quat;
+  pose.own = other;
+  pose.glow = extra.w;
+#ifdef TINTED
+  pose.tint = extra.xyz;
+#else
+  pose.scale += extra.xyz;
 #endif
 #endif
 }
@@ -138,16 +173,16 @@ void main() {
   vec4 known = texelFetch(u_means, at(i), 0);
   vec4 rest = texelFetch(u_quats, at(i), 0);
   vec4 size = texelFetch(u_scales, at(i), 0);
-  vec3 mean = known.xyz, scale = size.xyz, tint = vec3(0.0);
-  vec4 quat = rest;
-  follow(i, mean, quat, scale, tint, size.w);
+  Pose pose = Pose(known.xyz, rest, rest, vec4(1.0, 0.0, 0.0, 0.0), size.xyz, vec3(0.0), 0.0);
+  follow(i, pose, size.w);
+  vec3 mean = pose.mean;
 
   vec3 point = vec3(dot(u_view[0], mean), dot(u_view[1], mean), dot(u_view[2], mean)) + u_shift;
   if (!(point.z >= NEAR)) return;
   vec2 focal = u_lens.xy, middle = u_lens.zw, margin = MARGIN * 0.5 * u_size / focal;
   vec2 slope = clamp(point.xy / point.z, -middle / focal - margin, (u_size - middle) / focal + margin);
-  mat3 axes = matrix(quat);
-  vec3 sizes = exp(scale), row_x, row_y;
+  mat3 axes = matrix(pose.quat);
+  vec3 sizes = exp(pose.scale), row_x, row_y;
   for (int k = 0; k < 3; k++) {
     vec3 axis = vec3(dot(u_view[0], axes[k]), dot(u_view[1], axes[k]), dot(u_view[2], axes[k])) * sizes[k];
     row_x[k] = focal.x / point.z * (axis.x - slope.x * axis.z);
@@ -172,8 +207,14 @@ void main() {
   float longer = min(sqrt(large * extent), 6e4), shorter = min(sqrt(determinant / large * extent), 6e4);
 
   vec4 base = texelFetch(u_colors, at(COLOR_TEXELS * i), 0);
-  vec3 color = gain(i, rest, quat, base.w) * exp(clamp(tint, -3.0, 1.0)) * (0.28209479177387814 * base.rgb + 0.5);
-  color = max(color + harmonics(i, normalize(mean - u_eye)), 0.0);
+  vec3 color = gain(i, rest, pose.own, base.w) * exp(clamp(pose.tint, -3.0, 1.0));
+  color *= 0.28209479177387814 * base.rgb + 0.5;
+  vec3 direction = normalize(mean - u_eye);
+#ifdef EDITED
+  direction = direction * matrix(pose.turn); // harmonics turned along are those of the direction turned back
+#endif
+  color = max(color + harmonics(i, direction), 0.0);
+  color = mix(color, u_light, GLOW * pose.glow);
   vec2 center = focal * point.xy / point.z + middle;
   o_place = uvec4(floatBitsToUint(center), packHalf2x16(longer * along),
     packHalf2x16(shorter * vec2(-along.y, along.x)));
