@@ -26,6 +26,9 @@ BOUNDARY_COST = 1.7e-3
 MIN_PATCHES = 3
 """Number of patches below which a part joins a neighbour: the skin between two parts moves half with each."""
 SWEEPS = 10
+MAX_ROUNDS = 4
+"""Number of merges, relative to the first number of parts, after which patches stay in their parts: where a few patches
+keep moving back and forth, this may split off as many pieces as merge."""
 ROBUST_FITS = 2
 
 
@@ -38,8 +41,11 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
     """
     first = max(FIRST_PARTS, 3 * count if count else 0)
     labels = _merge_by_cost(patches, first)
+    rounds = MAX_ROUNDS * (int(labels.max()) + 1)
     while True:
-        labels = _refined(patches, labels)
+        if rounds > 0:
+            labels = _refined(patches, labels)
+        rounds -= 1
         parts = int(labels.max()) + 1
         if count is not None and parts <= count:
             break

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
+from ..errors import UserError
 from ..scene.scene import Scene
 from .joints import Joint, find_joints
 from .parts import find_parts
@@ -37,7 +38,11 @@ def find_skeleton(scene: Scene, binding: tuple[np.ndarray, np.ndarray], count: i
 
 
 def observe(scene: Scene, binding: tuple[np.ndarray, np.ndarray]) -> Patches:
-    """Sample the motion of the opaque Gaussians, normalised units."""
+    """Sample the motion of the opaque Gaussians, normalised units.
+
+    Raises:
+        UserError: none of them moves finitely.
+    """
     with torch.no_grad():
         opaque = np.flatnonzero((scene.gaussians.opacities() > MIN_OPACITY).cpu().numpy())
         if not len(opaque):
@@ -45,7 +50,11 @@ def observe(scene: Scene, binding: tuple[np.ndarray, np.ndarray]) -> Patches:
         chosen = opaque[:: max(1, math.ceil(len(opaque) / MAX_GAUSSIANS))]
         times = torch.linspace(0.0, 1.0, INSTANTS).tolist()
         tracks = [scene.motion.gaussians_at(scene.gaussians, time).means[chosen].cpu().double() for time in times]
-    return make_patches(torch.stack(tracks).numpy(), binding[0][chosen], binding[1][chosen])
+    found = torch.stack(tracks).numpy()
+    finite = np.isfinite(found).all(axis=(0, 2))
+    if not finite.any():
+        raise UserError("no Gaussian's motion is finite; train again with a lower rate")
+    return make_patches(found[:, finite], binding[0][chosen[finite]], binding[1][chosen[finite]])
 
 
 def _labels_of_nodes(scene: Scene, patches: Patches, labels: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..edit.rotations import unit
+from ..edit.rotations import conjugate, multiply, rotate, unit
 from ..errors import UserError
 from ..storage.files import write_atomically
-from .skeleton import Skeleton
+from .skeleton import Skeleton, continuous
 
 COMPONENTS = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}
 KINDS = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
@@ -124,23 +124,30 @@ def xyzw(quats: np.ndarray) -> np.ndarray:
 
 
 def add_skeleton(document: GltfDocument, skeleton: Skeleton, up: tuple[float, float, float], name: str) -> int:
-    """Append joints ``node_0000`` and so on under one root, their animation, and the skin that binds vertices at rest.
+    """Append joints under one root, their animation, and the skin that binds vertices at rest. Joints without names are
+    called ``node_0000`` and so on.
 
     Returns:
         Index of the skin.
     """
-    positions = skeleton.positions.transpose(1, 0, 2)
-    turns = xyzw(skeleton.rotations.transpose(1, 0, 2))
+    turns, positions = _local_poses(skeleton)
+    positions, turns = positions.transpose(1, 0, 2), xyzw(turns.transpose(1, 0, 2))
+    count = positions.shape[0]
+    names = skeleton.names or tuple(f"node_{index:04d}" for index in range(count))
+    parents = skeleton.parents or (-1,) * count
     joints = [
-        document.append(
-            "nodes",
-            {"name": f"node_{index:04d}", "translation": position[0].tolist(), "rotation": turn[0].tolist()},
-        )
-        for index, (position, turn) in enumerate(zip(positions.astype("<f4"), turns))
+        document.append("nodes", {"name": title, "translation": position[0].tolist(), "rotation": turn[0].tolist()})
+        for title, position, turn in zip(names, positions.astype("<f4"), turns)
     ]
-    root = document.append("nodes", {"name": "control points", "rotation": upright(up), "children": joints})
+    nodes = document.json["nodes"]
+    for joint, parent in zip(joints, parents):
+        if parent >= 0:
+            nodes[joints[parent]].setdefault("children", []).append(joint)
+    tops = [joint for joint, parent in zip(joints, parents) if parent < 0]
+    title = "control points" if skeleton.names is None else "rig"
+    root = document.append("nodes", {"name": title, "rotation": upright(up), "children": tops})
     document.json["scenes"][0]["nodes"].append(root)
-    bind = np.tile(np.eye(4), (len(joints), 1, 1))
+    bind = np.tile(np.eye(4), (count, 1, 1))
     bind[:, 3, :3] = -skeleton.rest  # column-major
     skin = {"inverseBindMatrices": document.accessor(bind.astype("<f4")), "joints": joints, "skeleton": root}
     if len(skeleton.seconds) > 1:
@@ -152,6 +159,20 @@ def add_skeleton(document: GltfDocument, skeleton: Skeleton, up: tuple[float, fl
                 samplers.append({"input": when, "output": track, "interpolation": "LINEAR"})
         document.append("animations", {"name": name, "samplers": samplers, "channels": channels})
     return document.append("skins", skin)
+
+
+def _local_poses(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotations [T, M, 4] wxyz and positions [T, M, 3] of joints relative to their parents."""
+    turns, positions = skeleton.rotations, skeleton.positions
+    if skeleton.parents is None:
+        return turns, positions
+    above = np.array(skeleton.parents)
+    held = np.flatnonzero(above >= 0)
+    above, turns, positions = above[held], turns.copy(), positions.copy()
+    back = conjugate(skeleton.rotations[:, above])
+    turns[:, held] = multiply(back, skeleton.rotations[:, held])
+    positions[:, held] = rotate(back, skeleton.positions[:, held] - skeleton.positions[:, above])
+    return continuous(turns), positions
 
 
 def influences(indices: np.ndarray, weights: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -17,6 +17,8 @@ from ..motion.control_points import ControlPoints
 from ..motion.static_nodes import StaticNodes
 from ..scene.scene import Scene
 from .page_data import Column, common_size, integers, quantise
+from .page_parts import part_columns
+from .skeleton import continuous
 
 MIN_SAMPLES, MAX_SAMPLES = 33, 257
 """Smallest and largest number of times at which control points are sampled; see ``COARSE_ERROR``."""
@@ -105,7 +107,9 @@ def page_scene(
         facts = scene_facts(scene, len(kept), sh_degree)
         if motion_of is None and isinstance(motion, ControlPoints):
             poses = sample_poses(motion) if samples is None else one_sided(_poses_at(motion, even_times(samples)))
-            motion_of = PageMotion(to_array(motion.positions), motion.binding(gaussians), poses)
+            parts, owners = part_columns(scene) if samples is None else ([], [])  # not while the scene trains
+            rest, binding = to_array(motion.positions), motion.binding(gaussians)
+            motion_of = PageMotion(rest, binding, poses, {"parts": parts}, owners)
         if motion_of is not None:
             facts.update(masked=bool(scene.config.motion.mask) and motion.moves)
             columns += _binding_columns(motion_of, gaussians, kept, facts)
@@ -151,6 +155,7 @@ def scene_facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
         "nodes": 0,
         "neighbors": 0,
         "samples": 0,
+        "parts": [],
         "masked": False,
         "shapes": False,
         "scaled": False,
@@ -242,7 +247,7 @@ def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
 
 def one_sided(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Make the signs of all quaternions continuous over time."""
-    return {name: _continuous(rows) if name in QUATERNIONS else rows for name, rows in poses.items()}
+    return {name: continuous(rows) if name in QUATERNIONS else rows for name, rows in poses.items()}
 
 
 def _interleaved(values: np.ndarray, between: np.ndarray) -> np.ndarray:
@@ -250,14 +255,6 @@ def _interleaved(values: np.ndarray, between: np.ndarray) -> np.ndarray:
     merged = np.empty((len(values) + len(between), *values.shape[1:]))
     merged[::2], merged[1::2] = values, between
     return merged
-
-
-def _continuous(quats: np.ndarray) -> np.ndarray:
-    """Flip signs of quaternions [T, M, 4] such that they are continuous over time."""
-    flips = (quats[1:] * quats[:-1]).sum(axis=2, keepdims=True) < 0
-    quats = quats.copy()
-    quats[1:] *= np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
-    return quats
 
 
 def _error(values: np.ndarray, between: np.ndarray) -> float:

@@ -64,6 +64,9 @@ class ExportRequest:
     """Version of a .spz; 4 by default, 3 for readers that know no newer one."""
     url: str = ""
     """Address at which a page will be published, for links to it: a picture (.jpg) is then written beside the page."""
+    skeleton: Literal["control-points", "parts"] = "control-points"
+    """Joints of a moving glb: the control points, which hold the motion exactly, or the parts found in it, a rig of a
+    dozen named joints that comes close to it."""
     title: str = ""
     """Title of the page; the run's name by default."""
     max_mib: float | None = None
@@ -157,6 +160,9 @@ def _check_unused(request: ExportRequest) -> None:
         raise UserError(f"{name}: --output {request.output} is to hold one instant; leave {name} out, or {remedy}")
     if name is not None and kind in ("html", "cameras"):
         raise UserError(f"{name}: --format {kind} has no frames; leave it out")
+    if request.skeleton == "parts" and (kind != "glb" or request.still):
+        remedy = "leave out --time" if kind == "glb" and request.time is not None else "give --format glb and --run"
+        raise UserError(f"--skeleton parts: --output {request.output} is to hold no skeleton; {remedy}")
     if request.fps is not None and kind == "ply-sequence":
         raise UserError("--fps: a ply-sequence does not say how fast it is; leave it out, and give --frames")
 

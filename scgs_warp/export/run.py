@@ -13,6 +13,7 @@ import torch
 from .. import data
 from ..config.fields import IMAGE_SETTINGS
 from ..edit import EditSession
+from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
 from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
 from ..motion.control_points import ControlPoints
@@ -24,6 +25,7 @@ from .cameras import write_cameras
 from .control_graph import write_graph
 from .glb import write_glb
 from .npz import write_npz
+from .part_rig import build_rig
 from .plain import plain_scene
 from .request import ExportRequest, check_request, output_suffix
 from .sequence import check_folder, write_sequence
@@ -138,7 +140,7 @@ def write_still(
 
 
 def _export_moving(request: ExportRequest, device: str) -> str:
-    scene = _open(request, device)
+    scene = opened = _open(request, device)
     if request.kind != "graph":
         scene = plain_scene(scene)
     session = None
@@ -155,6 +157,9 @@ def _export_moving(request: ExportRequest, device: str) -> str:
     if request.kind == "ply-sequence":
         return _write_frames(request, scene, session, moments)
     assert session is not None
+    if request.skeleton == "parts":
+        parts = session.edit.skeleton or EditSession(opened).skeleton  # that of the run, not of its plain Gaussians
+        return _write_rig(request.output, session, parts, moments)
     return _write_skeleton(request, session, moments)
 
 
@@ -193,6 +198,14 @@ def _write_skeleton(request: ExportRequest, session: EditSession, moments: list[
         correctives = scene.normalisation.undo_scale(scene.gaussians.correctives.detach()).cpu().numpy()[rows]
         write_npz(request.output, rest, skeleton, shading=shading, correctives=correctives, up=up)
     return f"{len(rest.means):,} Gaussians, {length}"
+
+
+def _write_rig(path: Path, session: EditSession, parts: Parts, moments: list[AnimationMoment]) -> str:
+    with progress(len(moments), "export") as shown:
+        rig = build_rig(session, parts, moments, _usable(session.scene), shown.advance)
+    write_glb(path, rig.gaussians, session.scene.overview.up, rig.skeleton)
+    joints = f"{len(rig.skeleton.rest)} joints at {len(moments)} instants"
+    return f"{len(rig.gaussians.means):,} Gaussians, {joints} ({rig.loss})"
 
 
 def _finite(scene: Scene, skeleton: Skeleton) -> tuple[Gaussians, np.ndarray, Skeleton]:

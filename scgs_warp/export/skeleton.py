@@ -59,6 +59,10 @@ class Skeleton:
     """[N, K] rows sum to 1."""
     own_rotations: np.ndarray | None = None
     """[T, M, 4] rotations of the motion, which shading and correctives follow where an edit turns joints further."""
+    names: tuple[str, ...] | None = None
+    """Names of joints; None: numbers."""
+    parents: tuple[int, ...] | None = None
+    """Row of each joint's parent, -1: none; None: no joint has one."""
 
     def select(self, rows: np.ndarray) -> Skeleton:
         """Restrict the binding to the Gaussians of ``rows`` [N] bool."""
@@ -210,9 +214,14 @@ def _stack(values: list[Tensor]) -> np.ndarray:
 def _unit(rotations: list[Tensor]) -> np.ndarray:
     """Return unit quaternions [T, M, 4] with signs continuous over time, as players interpolate linearly."""
     quats = _stack(rotations)
-    quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
-    for frame in range(1, len(quats)):
-        quats[frame] *= np.where((quats[frame] * quats[frame - 1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    return continuous(quats / np.linalg.norm(quats, axis=-1, keepdims=True))
+
+
+def continuous(quats: np.ndarray) -> np.ndarray:
+    """Flip signs of quaternions [T, M, 4] such that they are continuous over time."""
+    flips = (quats[1:] * quats[:-1]).sum(axis=2, keepdims=True) < 0
+    quats = quats.copy()
+    quats[1:] *= np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
     return quats
 
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from scipy.optimize import linear_sum_assignment
 
 from helpers.edit_scenes import bar_scene, figure_scene
@@ -193,3 +194,14 @@ def test_parts_do_not_depend_on_threads(all_threads):
         environment.configure(threads=threads)
         parts.append(EditSession(bar_scene()).parts())
     assert parts[0] == parts[1] and len(parts[0]) >= 2, "one half swings, the other rests"
+
+
+def test_a_few_patches_that_keep_changing_parts_come_to_an_end():
+    assert EditSession(bar_scene(nodes=12, gaussians=20)).skeleton.names == ("part-1",)
+
+
+def test_gaussians_that_are_not_finite_do_not_count():
+    scene = bar_scene(nodes=24, gaussians=200)
+    with torch.no_grad():
+        scene.gaussians.means[5, 1] = float("nan")
+    assert sum(len(part.nodes) for part in EditSession(scene).skeleton.parts) == 24

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from helpers.chromium import chromium
-from helpers.edit_scenes import bar_scene
+from helpers.edit_scenes import bar_scene, figure_scene
 from helpers.node_packages import package
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import rotate
 from scgs_warp.export.control_graph import write_graph
 from scgs_warp.export.glb import write_glb
 from scgs_warp.export.gltf import upright
+from scgs_warp.export.part_rig import build_rig
 from scgs_warp.export.run import write_still
 from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
 from scgs_warp.gaussians import SH_C0
@@ -140,6 +141,22 @@ def test_the_moving_scene_plays_in_three(page):
         assert np.abs(np.array(frame["vertices"]) - means).max() < 5e-6
     first, last = (np.array(found["frames"][i]["vertices"]) for i in (0, 2))
     assert np.abs(first - last).max() > 0.1
+
+
+def test_the_rig_plays_in_three(page):
+    window, folder = page
+    scene, _, _ = figure_scene(nodes=96, points=1500)
+    session, up = EditSession(scene), scene.overview.up
+    rig = build_rig(session, session.skeleton, even_moments(FRAMES, FPS), np.ones(len(scene.gaussians), bool))
+    write_glb(folder / "r.glb", rig.gaussians, up, rig.skeleton)
+    found = window.evaluate("([url, times]) => window.play(url, times)", ["/r.glb", [0.0, 1.0, 2.0]])
+    low, high = np.quantile(rig.gaussians.means.numpy(), [0.01, 0.99], axis=0)
+    for frame, place in zip(found["frames"], (0, 4, 8)):
+        joints = turned(rig.skeleton.positions[place], up)
+        assert np.abs(np.array(frame["joints"]) - joints).max() < 5e-6
+        means = turned(scene.gaussians_at(place / 8).means.double().numpy(), up)
+        off = np.linalg.norm(np.array(frame["vertices"]) - means, axis=1) / np.linalg.norm(high - low)
+        assert off.mean() < 2 * rig.loss.mean
 
 
 def test_the_graph_plays_in_three(page):

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.edit_scenes import bar_scene, rich_scene
+from helpers.edit_scenes import bar_scene, figure_scene, rich_scene
 from helpers.page_reader import gaussians_of
+from scgs_warp.edit import EditSession
 from scgs_warp.errors import UserError
 from scgs_warp.export import page, page_scene
 from scgs_warp.export.page_data import pack, unpack
+from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.motion import build_motion
 from scgs_warp.types import Pose
 
@@ -72,6 +74,22 @@ def test_rotations_do_not_turn_over_between_samples():
     scene.motion.poses = flipping  # type: ignore[method-assign]
     found = page_scene.sample_poses(scene.motion)["rotation"]
     assert ((found[1:] * found[:-1]).sum(axis=2) > 0.5).all()
+
+
+def test_parts_and_joints_are_on_the_page():
+    scene, _, _ = figure_scene(nodes=96, points=3000)
+    scene.normalisation = Normalisation(np.array([0.3, -0.2, 0.5]), 0.5)
+    skeleton = EditSession(scene).skeleton
+    content = page_scene.page_scene(scene, 0)
+    facts, columns = unpack(pack(content.facts, content.columns))
+    assert 4 <= len(facts["parts"]) == len(skeleton.parts)
+    for row, (found, part) in enumerate(zip(facts["parts"], skeleton.parts)):
+        assert found["name"] == part.name
+        np.testing.assert_array_equal(np.flatnonzero(columns["part"] == row), part.nodes)
+        above = facts["parts"][found["parent"]]["name"] if found["parent"] >= 0 else None
+        assert above == part.parent
+        np.testing.assert_allclose(np.array(found["joint"]) / 0.5 + [0.3, -0.2, 0.5], part.joint, atol=1e-12)
+        assert found["axis"] == (None if part.axis is None else list(part.axis))
 
 
 @pytest.mark.parametrize("name", ["hexplane", "per-gaussian"])

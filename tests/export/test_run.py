@@ -134,6 +134,19 @@ def test_a_still_at_rest_has_the_mean_colours(run, tmp_path):
     assert not np.allclose(mean, scene.gaussians.sh_dc.detach(), atol=1e-2)
 
 
+def test_a_rig_of_the_parts_of_the_run(run, tmp_path, capsys):
+    session = EditSession(Scene.load(run))
+    names = session.skeleton.names
+    session.rename_part(names[-1], "left arm")
+    session.save_skeleton()
+    export("--run", run, "--output", tmp_path / "a.glb", "--skeleton", "parts", "--frames", 3)
+    said = capsys.readouterr().out
+    assert f"120 Gaussians, {len(names)} joints at 3 instants (blending parts is off by" in said
+    gltf = gltf_arrays(tmp_path / "a.glb")[1]["gltf"]
+    assert {gltf.nodes[joint].name for joint in gltf.skins[0].joints} == {*names[:-1], "left arm"}
+    (run / "skeleton.json").unlink()
+
+
 def test_graph_is_valid(run, tmp_path):
     export("--run", run, "--format", "graph", "--output", tmp_path / "g.glb", "--frames", 4)
     assert gltf_errors(tmp_path / "g.glb") == []
@@ -246,6 +259,8 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         (["--run", run, "--output", "b.htm", "--fps", 9], "--fps: --format html has no frames"),
         (["--run", run, "--output", "b.json", "--fps", 9], "--fps: --format cameras has no frames"),
         (["--run", run, "--output", "b", "--format", "ply-sequence", "--fps", 9], "--fps: a ply-sequence"),
+        (["--run", run, "--output", "b.npz", "--skeleton", "parts"], "--skeleton parts: "),
+        (["--run", run, "--output", "b.glb", "--skeleton", "parts", "--time", 0.1], "leave out --time"),
         (["--run", run, "--output", "b.npz", "--title", "x"], "--title: belongs to a page"),
         (["--run", run, "--output", "b.glb", "--max-mib", 3], "--max-mib: belongs to a page"),
         (["--run", run, "--output", "b.html", "--max-mib", 0.001], "0.001 MiB of --max-mib"),
