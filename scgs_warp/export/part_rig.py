@@ -85,8 +85,8 @@ def build_rig(
     start = select_gaussians(start, rows)
     colors = sum(sh_dc[rows].astype(np.float64) for _, sh_dc in frames) / len(frames)
     tracks, rest = [means[rows] for means, _ in frames], start.means.double().numpy()
-    binding = (value.detach().cpu().numpy()[rows] for value in session.engine.binding)
-    indices, weights = part_weights(*binding, parts.owners())
+    nodes, shares = (value.detach().cpu().numpy()[rows] for value in session.engine.binding)
+    indices, weights = part_weights(nodes, shares, parts.owners())
     rotations, shifts = _rigid_motions(tracks, rest, indices, weights, len(parts.parts))
     joints = np.array([part.joint for part in parts.parts])
     row_of = {name: row for row, name in enumerate(parts.names)}
