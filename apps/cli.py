@@ -11,6 +11,7 @@ from typing import Literal
 
 from scgs_warp.errors import UserError, is_shortage, one_line
 from scgs_warp.runtime import environment
+from scgs_warp.runtime.standard_streams import prepare_standard_streams
 from scgs_warp.runtime.torchrun import process_label
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -48,8 +49,23 @@ def _tell(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def _more_memory() -> str:
+    """Return the remedy for a lack of memory."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        limit = -1
+    else:
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        limit = -1 if limit == resource.RLIM_INFINITY else limit
+    if limit < 0:
+        return "free some, or give less at once"
+    return f"this process may use {limit >> 20} MiB of addresses (ulimit -v): allow more, or give less at once"
+
+
 def run(main: Callable[[list[str] | None], None], args: list[str] | None = None) -> int:
     """Run an app; a user's mistake gives one line on stderr and status 2, Ctrl-C status 130."""
+    prepare_standard_streams()
     try:
         main(args)
     except UserError as error:
@@ -61,10 +77,10 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
             return 0
         _tell(f"error: {one_line(error)}")
         return 2
-    except (MemoryError, RuntimeError) as error:
+    except (MemoryError, RuntimeError, ImportError) as error:
         if not is_shortage(error):
             raise
-        _tell(f"error{process_label()}: there is not enough memory for this; free some, or give less at once")
+        _tell(f"error{process_label()}: there is not enough memory for this; {_more_memory()}")
         return 2
     except KeyboardInterrupt:
         _tell("interrupted")

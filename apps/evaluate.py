@@ -59,10 +59,11 @@ def load_data(scene: Scene, options: Options) -> Dataset:
 
 def training_seconds(folder: Path) -> float | None:
     """Return the training time in ``metrics.json`` of the run; None if it is missing."""
+    from scgs_warp.storage.files import read_text
     from scgs_warp.storage.json_files import as_number, parse_json
 
     try:
-        value = parse_json((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]
+        value = parse_json(read_text(folder / "metrics.json"))["seconds"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
     seconds = as_number(value)

@@ -32,10 +32,18 @@ def one_line(error: Exception) -> str:
     return printable(error)
 
 
+SHORTAGE = ("allocate memory", "out of memory", "failed to map segment")
+"""Words of errors that mean a lack of memory."""
+
+
 class FrameError(UserError):
     """Error that a frame's pixels can no longer be read. The training step that requested them has changed nothing."""
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Return whether an error means that memory ran out: by its type (Python, NumPy) or its message (PyTorch)."""
-    return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)
+    """Return whether an error means that memory ran out: by its type (Python, NumPy), or by the message (PyTorch, the
+    loader of libraries) of the error or its cause."""
+    if isinstance(error, MemoryError):
+        return True
+    texts = [str(error), str(error.__cause__ or "")]
+    return any(words in text for words in SHORTAGE for text in texts)

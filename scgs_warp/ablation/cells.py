@@ -23,6 +23,7 @@ from ..errors import UserError, printable
 from ..evaluation.coverage import coverage_line
 from ..storage.checkpoint import FILE as CHECKPOINT
 from ..storage.checkpoint import PREVIOUS
+from ..storage.files import read_text
 from ..storage.json_files import as_number, parse_json
 
 if TYPE_CHECKING:
@@ -213,7 +214,7 @@ def read_metrics(folder: Path) -> dict[str, Any] | None:
     """
     path = folder / "metrics.json"
     try:
-        values = parse_json(path.read_text(encoding="utf-8"))
+        values = parse_json(read_text(path))
     except FileNotFoundError:
         return None
     except (OSError, ValueError):

@@ -17,6 +17,7 @@ from typing import IO, NamedTuple
 
 from ..runtime import environment, memory
 from ..runtime.progress import clock
+from ..storage.files import read_text
 from .cells import ERROR, LOG, Cell, attempt, cell_from_json, cell_to_json, is_done, read_metrics
 
 POLL_SECONDS = 0.1
@@ -122,7 +123,7 @@ def _failure(job: _Job) -> str | None:
         return None
     file = Path(job.cell.folder) / ERROR
     if status == 2 and file.is_file():
-        return file.read_text(encoding="utf-8").splitlines()[0]
+        return read_text(file).splitlines()[0]
     reason = f"ended by signal {-status}" if status < 0 else f"ended with status {status}"
     return f"{reason}; see {Path(job.cell.folder) / LOG}"
 

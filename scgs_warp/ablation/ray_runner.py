@@ -21,6 +21,7 @@ from ..runtime.environment import available_threads
 from ..runtime.progress import Progress, progress
 from ..runtime.stop_signals import stop_signals
 from ..storage.checkpoint import FILE as CHECKPOINT
+from ..storage.files import open_regular, read_text
 from ..storage.json_files import parse_json
 from . import ray_cluster
 from .cells import LOG, Cell, cell_to_json
@@ -366,7 +367,7 @@ def _changed(folder: Path) -> int:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        values = parse_json(path.read_text(encoding="utf-8"))
+        values = parse_json(read_text(path))
     except (OSError, ValueError):
         return {}
     return values if isinstance(values, dict) else {}
@@ -375,7 +376,7 @@ def _read(path: Path) -> dict[str, Any]:
 def steps_done(folder: Path) -> int:
     """Read the last step from the log; return 0 if there is none."""
     try:
-        with open(folder / "log.jsonl", "rb") as file:
+        with open_regular(folder / "log.jsonl") as file:
             file.seek(max(0, file.seek(0, 2) - TAIL))
             lines = file.read().splitlines()
     except OSError:

@@ -21,7 +21,7 @@ from .. import __version__
 from ..errors import UserError
 from ..runtime import environment, memory
 from ..runtime.provenance import processor
-from ..storage.files import write_atomically
+from ..storage.files import read_text, write_atomically
 from ..training.run_folder import LOCK
 from .cells import LOG, attempt, cell_from_json
 
@@ -105,7 +105,7 @@ def inspect_machine(question: dict[str, Any]) -> dict[str, Any]:
 def _folder_problem(file: Path, token: str) -> str | None:
     """Check that the cells' folder is the shared one, can be written, and shows the locks of other machines."""
     try:
-        same = file.read_text(encoding="utf-8") == token
+        same = read_text(file) == token
     except OSError:
         same = False
     if not same:

@@ -10,6 +10,7 @@ from ..data.synthetic import builtin, from_mesh, zoo
 from ..data.synthetic.orbit_cameras import FilmingSettings
 from ..errors import UserError, printable
 from ..runtime.progress import progress
+from ..storage.files import read_text
 from ..storage.json_files import as_number, parse_json
 from .cells import NUMBER_LIMIT
 
@@ -75,7 +76,7 @@ def read_table(folder: Path) -> dict[str, Any]:
     """
     path = folder / "zoo.json"
     try:
-        report = parse_json(path.read_text(encoding="utf-8"))
+        report = parse_json(read_text(path))
     except FileNotFoundError:
         raise UserError(f"--compare {folder}: holds no zoo.json; name the --output of another zoo") from None
     except (OSError, ValueError):

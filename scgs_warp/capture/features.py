@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from ..errors import UserError
+from ..runtime.pycolmap_import import import_pycolmap
 from .source import read_rgb
 
 Tensor = torch.Tensor
@@ -60,8 +61,7 @@ def quiet() -> Iterator[Any]:
     Raises:
         UserError: pycolmap is too old.
     """
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     if not hasattr(pycolmap, "FeatureExtractor"):
         raise UserError(f"pycolmap {pycolmap.__version__} is too old for capture; pip install 'pycolmap>=4.1'")
     before = pycolmap.logging.minloglevel

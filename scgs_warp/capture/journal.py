@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..storage.files import read_text
 from ..storage.json_files import parse_json
 from .writing import FILE, write_text
 
@@ -102,7 +103,7 @@ class Journal:
 
 def _read(file: Path) -> dict[str, Any] | None:
     try:
-        content = parse_json(file.read_text(encoding="utf-8"))
+        content = parse_json(read_text(file))
         return content if isinstance(content["stages"], dict) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

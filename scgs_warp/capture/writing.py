@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +13,7 @@ import numpy as np
 from ..data.held_out import held_out
 from ..data.points import write_points
 from ..data.readers.transforms import OPENGL_TO_OPENCV
+from ..storage.files import write_atomically
 from ..visualization.video import write_png
 from .features import FrameFiles, quiet
 from .mapping import CameraSolution
@@ -138,6 +138,4 @@ def write_scene(folder: Path, scene: CapturedScene) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
+    write_atomically(path, text.encode("utf-8"))

@@ -18,13 +18,19 @@ CACHE_MIB = 2048
 """Default size of the cache of decoded images: 200 images of 800 x 800 pixels with alpha."""
 
 
-def bounded(default: float, least: float | None = None, most: float | None = None, **more: Any) -> Any:
-    """Declare a number with inclusive bounds. ``most`` limits sizes that take memory, because a configuration may come
-    from an untrusted file.
+MAGNITUDE = 1e9
+"""Largest value of a number without a limit of its own."""
 
-    Without ``least``, the field is checked by a separate rule in ``validation.py`` or may be any number.
-    """
+
+def bounded(default: float, least: float, most: float = MAGNITUDE, **more: Any) -> Any:
+    """Declare a number with inclusive bounds. ``most`` also limits sizes that take memory, because a configuration may
+    come from an untrusted file."""
     return field(default=default, metadata={"least": least, "most": most, **more})
+
+
+def rate(default: float, **more: Any) -> Any:
+    """Declare a learning rate of Adam: at a rate of 1, every step moves a parameter by about 1."""
+    return bounded(default, 0, 1, **more)
 
 
 def chosen(default: int, least: int, most: int) -> Any:
@@ -33,11 +39,14 @@ def chosen(default: int, least: int, most: int) -> Any:
 
 
 def newer(default: Any, before: Any, **bounds: Any) -> Any:
-    """Declare a field that older versions did not have; ``before`` is the value that does what they did."""
-    return bounded(default, before=before, **bounds)
+    """Declare a field that older versions did not have; ``before`` is the value that does what they did. Numbers need
+    bounds as in :func:`bounded`."""
+    if "least" in bounds:
+        return bounded(default, before=before, **bounds)
+    return field(default=default, metadata={"before": before})
 
 
-def milestone(steps: int, least: int | None = None) -> Any:
+def milestone(steps: int, least: int = 0) -> Any:
     """Declare a step count that scales with the length of the run."""
     return bounded(steps, least, milestone=True)
 
@@ -68,13 +77,13 @@ class MotionConfig:
     """Control points and the network that moves them (paper section 4.1)."""
 
     model: MotionName = "control-points"
-    nodes: int = bounded(512, most=1_000_000)
+    nodes: int = bounded(512, 1, 1_000_000)
     """Number of control points, N_p."""
     neighbors: int = chosen(4, 1, 16)
     """Number of control points that move each Gaussian, K."""
     layers: int = bounded(8, 1, 64)
     width: int = bounded(256, 1, 2_048)
-    skip: int = 4
+    skip: int = bounded(4, 0, 64)
     """Index of the layer whose output is concatenated with the network's input."""
     position_frequencies: int = bounded(10, 1, 32)
     time_frequencies: int = bounded(6, 1, 32)
@@ -109,7 +118,7 @@ class MotionConfig:
     ``network_until`` (official code, for real video)."""
     bfloat16: bool = False
     """Compute the hidden layers in bfloat16 while training."""
-    plane_times: int = 0
+    plane_times: int = bounded(0, 0, 4_096)
     """Number of texels of the feature planes along t; 0: half the number of training times (4D-GS)."""
 
     @property
@@ -138,14 +147,14 @@ class MotionConfig:
 class PretrainConfig:
     """Stage 1: control points trained alone, rendered as same-sized spheres."""
 
-    steps: int = milestone(5_000, 0)
+    steps: int = milestone(5_000)
     with_points: bool = False
     """Keep stage 1 if the data has points. Otherwise control points start as a sample of these points and learn with
     the Gaussians from the first step."""
     densify_until: int = milestone(3_750)
     """Step at which spheres are no longer densified and pruned; farthest-point sampling of trajectories then reduces
     them to N_p."""
-    warm_up: int = milestone(50, 0)
+    warm_up: int = milestone(50)
     """Number of steps before the network starts to move the spheres. After long at rest, only spheres of parts that
     hardly move are left."""
     densify_every: int = bounded(100, 1)
@@ -166,15 +175,15 @@ class PretrainConfig:
     evaluated at each sphere."""
     grey: bool = newer(False, before=False)
     """Start with grey spheres (official code), not with the colours of the points."""
-    opacity_rate: float = 0.02
+    opacity_rate: float = rate(0.02)
     """Learning rate of the spheres' opacities; ``color_rate`` is that of their colours. With the learning rates of the
     Gaussians, spheres would turn transparent before they find their colour."""
-    color_rate: float = 1e-2
-    arap_weight: float = bounded(1e-3, 0)
+    color_rate: float = rate(1e-2)
+    arap_weight: float = bounded(1e-3, 0, 1e6)
     random_background: bool = True
     """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
     space."""
-    silhouette: float = newer(0.5, before=0.0, least=0)
+    silhouette: float = newer(0.5, before=0.0, least=0, most=1e6)
     """Weight of the distance between the spheres' projected centres and the silhouette (not in the paper), in units of
     the image's width; needs alpha. It brings spheres to thin and fast parts, which the photometric loss makes
     transparent. If above 0, spheres are not larger than thin subjects are thick."""
@@ -192,7 +201,7 @@ class PretrainConfig:
     spheres that begin in the first pose. fifth: 20 % at a time, all frames equally often (supplement)."""
     solid_opacity: float = newer(0.1, before=0.1, least=0, most=1)
     """Opacity below which a sphere is not used to place control points or Gaussians, if there are enough others."""
-    least_radius: float = newer(1.0, before=1.0, least=0)
+    least_radius: float = newer(1.0, before=1.0, least=0, most=1e3)
     """Smallest radius of control points after stage 1, as a share of their typical spacing, so that neighbours blend.
     Their radius is otherwise that of the spheres."""
 
@@ -201,38 +210,38 @@ class PretrainConfig:
 class OptimConfig:
     """Learning rates. ``NAME_end`` is the final rate of a log-linear decay (official values, normalised scene)."""
 
-    means: float = 8e-4
-    means_end: float = 8e-6
+    means: float = rate(8e-4)
+    means_end: float = rate(8e-6)
     means_until: int = milestone(33_000, 1)
-    sh_dc: float = 2.5e-3
-    sh_rest: float = 1.25e-4
-    opacity: float = 0.05
-    scales: float = 5e-3
-    quats: float = 1e-3
-    hyper: float = 2.5e-3
-    shading: float = bounded(2.5e-3, 0)
-    correctives: float = newer(8e-4, before=2.5e-3, least=0)
+    sh_dc: float = rate(2.5e-3)
+    sh_rest: float = rate(1.25e-4)
+    opacity: float = rate(0.05)
+    scales: float = rate(5e-3)
+    quats: float = rate(1e-3)
+    hyper: float = rate(2.5e-3)
+    shading: float = rate(2.5e-3)
+    correctives: float = rate(8e-4, before=2.5e-3)
     """A step then moves a mean about as far as a step of the mean itself, at any rotation. At three times the rate,
     bodies that spin were lost."""
-    network: float = 8e-4
-    network_end: float = 1.6e-6
+    network: float = rate(8e-4)
+    network_end: float = rate(1.6e-6)
     network_until: int = milestone(33_000, 1)
     network_from: Literal["motion", "stage"] = newer("motion", before="motion")
     """Step from which ``network_until`` counts. motion: the first that trains the network. stage: the first of each
     stage (official code)."""
-    nodes: float = 8e-4
+    nodes: float = rate(8e-4)
     """Learning rate of the radii, weights and hyper-coordinates of the control points."""
-    node_positions: float = 8e-5
+    node_positions: float = rate(8e-5)
     nodes_decay: bool = newer(True, before=True)
     """Let ``nodes`` decay like the network's rate; otherwise it is constant (official code). ``node_positions`` always
     decays like it."""
-    settle: float = bounded(0.15, 0)
+    settle: float = bounded(0.15, 0, 1)
     """Share of the main stage, at its end, over which the otherwise constant rates of the Gaussians decay to a
     twentieth."""
-    cameras: float = bounded(0.0, 0)
+    cameras: float = rate(0.0)
     """Learning rate of the corrections to the training cameras' poses (radians, normalised units) after ``freeze``; 0:
     no corrections."""
-    planes: float = 8e-3
+    planes: float = rate(8e-3)
     """Learning rate of the feature planes of the hexplane model."""
 
 
@@ -240,8 +249,8 @@ class OptimConfig:
 class DensifyConfig:
     """Adaptive density control of Gaussians and control points, in main steps."""
 
-    start: int = milestone(250, 0)
-    until: int = milestone(20_000, 0)
+    start: int = milestone(250)
+    until: int = milestone(20_000)
     every: int = bounded(100, 1)
     """Smallest number of steps between two rounds: fewer steps see too few views to decide by."""
     rounds: int = bounded(132, 0)
@@ -250,14 +259,14 @@ class DensifyConfig:
     grad_threshold: float = bounded(1.4e-4, 0)
     """Gradient of the loss with respect to the 2D mean above which Gaussians are densified, in normalised device
     coordinates, at 800 pixels (official code: 2e-4 at any size)."""
-    resolution_exponent: float = 0.66
+    resolution_exponent: float = bounded(0.66, 0, 10)
     """Exponent of (800 / image size), by which the threshold is multiplied: in small images, each Gaussian has larger
     gradients."""
     absolute_grad: bool = False
     """Densify by the sum of absolute per-pixel gradients."""
-    percent_dense: float = 0.01
+    percent_dense: float = bounded(0.01, 0, 1e3)
     """Split Gaussians larger than this share of the extent, and clone smaller ones."""
-    min_opacity: float = bounded(0.005, 0)
+    min_opacity: float = bounded(0.005, 0, 1)
     min_contribution: float = bounded(0.05, 0)
     """Visibility pruning, before each opacity reset and at the end of densification: remove Gaussians that contribute
     less than this many pixels to every sampled view (sum of blending weights, at the size of the training images). 0:
@@ -265,23 +274,23 @@ class DensifyConfig:
     prune_large: Literal["auto", "always", "never"] = "auto"
     """Apply max_screen and max_scale. auto: only if the images have alpha, because images without alpha show bare
     walls, which need large Gaussians."""
-    max_screen: float = 0.05
+    max_screen: float = bounded(0.05, 0, 1e3)
     """Prune Gaussians that cover more than this share of the image (after the first opacity reset). 0: off."""
-    max_scale: float = 0.1
+    max_scale: float = bounded(0.1, 0, 1e3)
     """Prune Gaussians larger than this share of the extent (after the first opacity reset)."""
     opacity_reset_every: int = milestone(5_000, 1)
     sh_every: int = milestone(750, 1)
     """Number of main steps between two degrees of spherical harmonics."""
     nodes_every: int = milestone(2_500, 1)
     nodes_until: int = milestone(12_500)
-    node_grad_threshold: float = 2e-4
+    node_grad_threshold: float = bounded(2e-4, 0)
     """Weighted mean gradient of the Gaussians that a control point moves above which it is cloned, in the units of
     ``grad_threshold`` and scaled likewise."""
     node_impact: float = newer(1e-2, before=1e-2, least=0)
     """Prune control points whose weights, summed over all Gaussians, are less than this."""
     node_growth: float = newer(0.1, before=0.1, least=0, most=1)
     """Clone at most this share of the control points at a time, those with the largest gradients."""
-    max_gaussians: int = bounded(300_000, most=100_000_000)
+    max_gaussians: int = bounded(300_000, 1, 100_000_000)
 
     @property
     def interval(self) -> int:
@@ -294,8 +303,8 @@ class LossConfig:
     """Settings of the losses: L1 + D-SSIM and terms beside them, and ARAP on the control points' trajectories (paper
     Eq. 10)."""
 
-    ssim: float = bounded(0.2, 0)
-    log_error: float = newer(0.002, before=0.0, least=0)
+    ssim: float = bounded(0.2, 0, 1)
+    log_error: float = newer(0.002, before=0.0, least=0, most=1e3)
     """Weight of the logarithm of each view's mean squared error (not in the paper), which weighs views by their
     relative error, as PSNR does."""
     log_error_from: float = newer(0.58, before=0.5, least=0, most=1)
@@ -304,8 +313,8 @@ class LossConfig:
     """Add the residual averaged over squares of 2, 4 and 8 % of the width in the main stage (not in the paper): a part
     beside its true place then costs less than a missing one, so it is moved instead of turned transparent. auto: only
     for thin subjects; it lowers the scores of others."""
-    arap: float = bounded(1e-4, 0)
-    arap_end: float = bounded(1e-7, 0)
+    arap: float = bounded(1e-4, 0, 1e6)
+    arap_end: float = bounded(1e-7, 0, 1e6)
     arap_until: int = milestone(5_000)
     """Main step until which the ARAP weight changes exponentially from ``arap`` to ``arap_end``; afterwards the term is
     off."""
@@ -318,9 +327,9 @@ class LossConfig:
     """Number of sampled times, N_t; the trajectories over them define the neighbours."""
     arap_neighbors: int = chosen(8, 1, 15)
     arap_refresh: int = bounded(200, 1)
-    hexplane_tv: float = bounded(1e-4, 0)
-    hexplane_smooth: float = bounded(1e-2, 0)
-    hexplane_rest: float = bounded(1e-4, 0)
+    hexplane_tv: float = bounded(1e-4, 0, 1e6)
+    hexplane_smooth: float = bounded(1e-2, 0, 1e6)
+    hexplane_rest: float = bounded(1e-4, 0, 1e6)
     """Weight of the term that keeps the time planes near 1, the value at rest (feature planes, 4D-GS). ``hexplane_tv``
     is the weight of differences in space, ``hexplane_smooth`` that of second differences in time."""
 
@@ -330,10 +339,10 @@ class TrainConfig:
     """A complete run. ``steps`` is the total of both stages; every milestone is a number of steps."""
 
     preset: PresetName = "best"
-    steps: int = bounded(40_000, most=100_000_000)
-    freeze: int = milestone(1_500, 0)
+    steps: int = bounded(40_000, 1, 100_000_000)
+    freeze: int = milestone(1_500)
     """Number of main steps at the beginning in which control points and network stay as stage 1 left them."""
-    coarse: int = milestone(3_000, 0)
+    coarse: int = milestone(3_000)
     """Number of main steps at the beginning in which models without stage 1 learn a static scene."""
     shortest: int = newer(0, before=0, least=0)
     """Number of steps to which ``freeze``, ``coarse`` and ``densify.opacity_reset_every`` shrink at most in a shorter
@@ -355,10 +364,10 @@ class TrainConfig:
     exp(-u - s u^2), where u is half the squared distance in units of the covariance. Opaque outlines become as sharp as
     in the images. 0: exact Gaussians, as other programs draw them; exports to their formats approximate others."""
     seed: int = bounded(0, 0)
-    batch: int = bounded(1, 1)
+    batch: int = bounded(1, 1, 100_000)
     """Number of views per step; their gradients are averaged. Several processes can share the views
     (docs/scaling.md)."""
-    half_size: int = milestone(0, 0)
+    half_size: int = milestone(0)
     """Number of steps, over both stages, that use the images at half their size: coarse first, and twice as fast."""
     evaluate_every: int = milestone(5_000, 1)
     """Number of steps between two evaluations on a few test images, for the curve only: they do not influence the

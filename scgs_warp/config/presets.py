@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from ..errors import UserError
+from ..storage.files import read_text
 from ..storage.json_files import parse_json
 from .fields import (
     DataConfig,
@@ -226,7 +227,7 @@ def read_config(path: Path) -> dict[str, Any]:
         UserError: the file is missing, not JSON, or not an object.
     """
     try:
-        values = parse_json(path.read_text(encoding="utf-8"))
+        values = parse_json(read_text(path))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give a config.json of an earlier run") from error
     except ValueError as error:

@@ -8,10 +8,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from ..errors import UserError
+from .fields import MAGNITUDE
 from .presets import TrainConfig
-
-MAGNITUDE = 1e9
-"""Largest magnitude of any number in a configuration."""
 
 
 def check(config: TrainConfig) -> TrainConfig:
@@ -43,8 +41,6 @@ def _check_rules(config: TrainConfig) -> None:
         raise UserError(f"motion.plane_times is {motion.plane_times}; choose 2 to 4096, or 0 for half of the times")
     if motion.nodes < motion.neighbors + 1:
         raise UserError(f"--nodes {motion.nodes}: needs at least {motion.neighbors + 1}")
-    if config.optim.settle > 1:
-        raise UserError(f"optim.settle is {config.optim.settle}; it is a share of the run, choose 0 to 1")
     if config.densify.max_gaussians < 100:
         raise UserError(f"--max-gaussians {config.densify.max_gaussians}: needs at least 100")
 
@@ -60,7 +56,7 @@ def check_sizes(config: TrainConfig, prefix: str = "") -> None:
         UserError: names the field and the remedy.
     """
     for name, value, bounds in _numbers(config):
-        most = bounds.get("most") or MAGNITUDE
+        most = bounds.get("most", MAGNITUDE)
         if not -MAGNITUDE <= value <= most:  # refuses NaN, too
             shown = str(value) if isinstance(value, float) else str(value)[:20]
             raise UserError(f"{prefix}{name} is {shown}; it must be at most {most:g}")

@@ -18,6 +18,7 @@ import torch
 from ..config.fields import BACKGROUND_COLORS
 from ..errors import UserError
 from ..runtime import environment
+from ..storage.files import open_regular
 from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
@@ -298,7 +299,7 @@ def header_sizes(path: Path) -> list[tuple[int, int]]:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with open_regular(path) as file, Image.open(file) as image:
             turned = image.format in ("JPEG", "WEBP") and swaps_sides(image.getexif().get(TAG, UPRIGHT))
             return [image.size, image.size[::-1]] if turned else [image.size]
     except (OSError, ValueError, SyntaxError, TypeError, KeyError, struct.error, Image.DecompressionBombError):

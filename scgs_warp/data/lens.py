@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ..runtime.pycolmap_import import import_pycolmap
+
 ROWS = 64
 """Number of image rows whose rays are projected at once, to limit memory."""
 DIRECTIONS = 16
@@ -58,8 +60,7 @@ def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
     Raises:
         ValueError: the model is unknown, the number of parameters is wrong, or their values are impossible.
     """
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     known = pycolmap.CameraModelId.__members__
     if model not in known or model == "INVALID":
         raise ValueError(f"camera model {model[:40]!r} is not known")
@@ -81,8 +82,7 @@ def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
 def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
     """Project camera rays [N, 3] (x right, y down, z forward) to pixels [N, 2] of the file; NaN where the model is
     undefined."""
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     model, params = lens.model, lens.params
     if not params:
         model, params = "PINHOLE", (lens.fx, lens.fy, lens.cx, lens.cy)

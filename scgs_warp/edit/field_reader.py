@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UserError
+from ..storage.files import read_text
 from ..storage.json_files import parse_json
 
 MAX_BYTES = 64 << 20
@@ -26,13 +27,13 @@ def read_object(path: Path) -> dict[str, Any]:
         UserError: the file is missing, too large, not JSON, or not an object.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise UserError(f"{path}: larger than {MAX_BYTES >> 20} MiB; give an edit's JSON")
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, MAX_BYTES)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; give an edit's JSON") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as UTF-8 text ({type(error).__name__}); give an edit's JSON") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); give an edit's JSON") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: is no UTF-8 text; give an edit's JSON") from None
     return parse_object(text, str(path))
 
 

@@ -29,16 +29,31 @@ def prepare_environment() -> None:
 
 
 def init_warp() -> None:
-    """Initialise Warp without its banner, and without the CUDA driver's message on a machine that has no GPU."""
+    """Initialise Warp without its banner, and without the CUDA driver's message on a machine that has no GPU.
+
+    Raises:
+        UserError: there is no folder for compiled kernels.
+    """
     import warp as wp
 
+    from .kernel_cache import initialise_warp
+
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    if os.path.exists("/dev/nvidiactl") or os.name != "posix":
+    driver = os.path.exists("/dev/nvidiactl") or os.name != "posix"
+    initialise_warp(wp.init if driver else _init_silently)
+
+
+def _init_silently() -> None:
+    import warp as wp
+
+    try:
+        saved = os.dup(2)
+    except OSError:  # a daemon's standard error may be closed
         wp.init()
         return
-    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)  # the driver's message comes from C
+    sink = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(sink, 2)
+        os.dup2(sink, 2)  # the driver's message comes from C
         wp.init()
     finally:
         os.dup2(saved, 2)

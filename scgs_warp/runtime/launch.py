@@ -19,6 +19,7 @@ from .cpu_threads import cut_by_load, cut_evenly, share
 from .cuda_graph import warp_stream
 from .cuda_launch import RecordedKernel
 from .kernel_arguments import ArgumentPacker, warp_arguments
+from .kernel_cache import prepared
 
 CPU = torch.device("cpu")
 
@@ -81,7 +82,7 @@ def launch(
             break
     cpu = _cpu_kernels.get(kernel)
     if cpu is None:
-        cpu = _cpu_kernels[kernel] = CpuKernel(kernel, args)
+        cpu = _cpu_kernels[kernel] = prepared(kernel, lambda: CpuKernel(kernel, args))
     call = cpu.bind(cpu.pack(args), args, begin)
     threads = min(environment.thread_count(), -(-count // grain))
     if threads <= 1:
@@ -102,7 +103,7 @@ def _launch_on_cuda(
     key = kernel, device.index, block_dim
     ready = _cuda_kernels.get(key)
     if ready is None:
-        ready = _cuda_kernels[key] = RecordedKernel(kernel, args, dim, device, block_dim)
+        ready = _cuda_kernels[key] = prepared(kernel, lambda: RecordedKernel(kernel, args, dim, device, block_dim))
     ready.launch(dim, args, warp_stream(device), begin)
 
 

@@ -23,6 +23,7 @@ from ..motion.base import Motion
 from ..motion.spheres import Spheres
 from ..rendering.render import render
 from ..storage import checkpoint
+from ..storage.files import read_text
 from ..storage.json_files import parse_json
 from ..types import Camera, Gaussians, Image
 from .frame_graph import FrameGraph
@@ -86,9 +87,9 @@ class Scene:
         scene = scene_from(tensors, metadata, device, str(folder / checkpoint.FILE))
         scene.folder = folder
         settings_path = folder / "config.json"
-        if settings_path.is_file():
+        if settings_path.exists():
             try:
-                scene.settings = parse_json(settings_path.read_text(encoding="utf-8"))
+                scene.settings = parse_json(read_text(settings_path))
             except (OSError, ValueError) as error:
                 raise UserError(f"{settings_path}: cannot be read ({error}); restore it or train again") from error
         check_settings(scene.settings, str(settings_path))

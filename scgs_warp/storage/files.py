@@ -1,17 +1,65 @@
-"""Whole files: reading with helpful error messages, and atomic writing."""
+"""Whole files: bounded reading of regular files only, and atomic writing."""
 
 from __future__ import annotations
 
+import errno
 import os
+import re
+import secrets
+import stat
 from contextlib import suppress
 from pathlib import Path
+from typing import IO, BinaryIO
 
 from ..errors import UserError
-from .safe_paths import is_regular
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+MAX_TEXT = 2**27
+"""Largest text file accepted, in bytes: the poses of 100,000 frames take about half of it."""
+
+
+def open_regular(path: Path | str) -> BinaryIO:
+    """Open a regular file for reading.
+
+    A pipe without a writer is refused instead of waited for, and so are devices: ``/dev/zero`` never ends.
+
+    Raises:
+        OSError: the file is missing, cannot be opened, or is not a regular file.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+    number = os.open(path, flags)
+    try:
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        return os.fdopen(number, "rb")
+    except BaseException:
+        os.close(number)
+        raise
+
+
+def read_text(path: Path | str, most: int = MAX_TEXT, errors: str = "strict") -> str:
+    """Read a UTF-8 text of at most ``most`` bytes from a regular file; line ends become ``\\n``.
+
+    Args:
+        errors: treatment of bytes that are no UTF-8, as for ``bytes.decode``.
+
+    Raises:
+        OSError: the file is missing, not a regular file, cannot be read, or is too large.
+        UnicodeDecodeError: the bytes are no UTF-8 text.
+    """
+    with open_regular(path) as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"larger than {most >> 20} MiB", str(path))
+    return content.decode("utf-8", errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_bytes(path: Path, remedy: str) -> bytes:
-    """Read a whole file.
+    """Read a whole regular file.
 
     Args:
         remedy: advice for a missing file; ends the message.
@@ -20,9 +68,8 @@ def read_bytes(path: Path, remedy: str) -> bytes:
         UserError: the file is missing or cannot be read.
     """
     try:
-        if not is_regular(path):
-            raise UserError(f"{path}: not a file; {remedy}")
-        return path.read_bytes()
+        with open_regular(path) as file:
+            return file.read()
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; {remedy}") from None
     except OSError as error:
@@ -30,7 +77,8 @@ def read_bytes(path: Path, remedy: str) -> bytes:
 
 
 def temporary_of(path: Path) -> Path:
-    """Return the temporary name for writing ``path``. It is fixed, so that killed processes leave one file at most."""
+    """Return the temporary name for writing ``path`` in a folder that has one writer. It is fixed, so that killed
+    processes leave one file at most."""
     return path.with_name(f".{path.name}.tmp")
 
 
@@ -65,17 +113,59 @@ def write_and_flush(path: Path, content: bytes) -> None:
 def write_atomically(path: Path, content: bytes) -> None:
     """Write to a temporary file, flush it, and rename it.
 
-    Readers see either the old file or the complete new one, even after a loss of power.
+    Readers see either the old file or the complete new one, even after a loss of power. Several processes may write one
+    file: each has a temporary file of its own, and the last one to finish wins.
 
     Raises:
         UserError: the disk is full or the folder cannot be written; the old file is intact.
     """
-    temporary = temporary_of(path)
+    temporary: Path | None = None
     try:
-        write_and_flush(temporary, content)
-        os.replace(temporary, path)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        _remove_leftovers(path)
+        temporary, file = _open_temporary(path)
+        with file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            if os.name == "posix":  # renamed while its lock is held; Windows cannot rename an open file
+                os.replace(temporary, path)
+        if os.name != "posix":
+            os.replace(temporary, path)
+    except BaseException as error:
+        if temporary is not None:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+        if not isinstance(error, OSError):
+            raise
         raise UserError(f"{path}: cannot be written ({error.strerror}); the previous file is intact") from error
     sync_folder(path.parent)
+
+
+def _open_temporary(path: Path) -> tuple[Path, IO[bytes]]:
+    """Create a temporary file for ``path`` under a new name, and lock it to show that its writer is alive."""
+    while True:
+        temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+        file = open(temporary, "xb")
+        try:
+            if fcntl is not None:
+                with suppress(OSError):  # a file system without locks
+                    fcntl.flock(file.fileno(), fcntl.LOCK_EX)
+            if os.fstat(file.fileno()).st_nlink or os.name != "posix":
+                return temporary, file
+        except BaseException:
+            file.close()
+            raise
+        file.close()  # Another process took it for a leftover before it was locked.
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove temporary files of ``path`` whose writers were killed; a file that is locked has a writer."""
+    if fcntl is None:
+        return
+    pattern = re.compile(re.escape(f".{path.name}.") + r"[0-9a-f]{8}\.tmp")
+    with suppress(OSError):
+        names = [entry.name for entry in os.scandir(path.parent) if pattern.fullmatch(entry.name)]
+        for left in (path.with_name(name) for name in names):
+            with suppress(OSError), open_regular(left) as file:
+                fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+                left.unlink()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UserError
+from .files import read_text
 
 
 def parse_json(text: str | bytes, **hooks: Any) -> Any:
@@ -34,11 +35,13 @@ def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
         UserError: the file is missing, is not JSON, or holds something other than an object.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; {needed}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as UTF-8 text ({type(error).__name__}); restore the file") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); restore the file") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: is no UTF-8 text; restore the file") from None
     try:
         content = parse_json(text)
     except json.JSONDecodeError as error:
@@ -65,9 +68,25 @@ def as_number(value: Any) -> float | None:
 
 
 def as_array(value: Any, *shapes: tuple[int, ...]) -> np.ndarray | None:
-    """Return a finite float64 array of one of ``shapes``, and None for anything else."""
-    try:
-        array = np.array(value, np.float64)
-    except (ValueError, TypeError, OverflowError):
+    """Return a finite float64 array of one of ``shapes``, and None for anything else, as :func:`numbers` does."""
+    array = numbers(value)
+    return array if array is not None and array.shape in shapes and np.isfinite(array).all() else None
+
+
+def numbers(value: Any) -> np.ndarray | None:
+    """Return nested lists of numbers as a float64 array of their shape, which may hold NaN and infinity.
+
+    None stands for anything else: rows of different lengths, and bool and strings, which NumPy would convert.
+    """
+    if not _only_numbers(value):
         return None
-    return array if array.shape in shapes and np.isfinite(array).all() else None
+    try:
+        return np.array(value, np.float64)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _only_numbers(value: Any, depth: int = 4) -> bool:
+    if isinstance(value, (list, tuple)):
+        return depth > 0 and all(_only_numbers(item, depth - 1) for item in value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool)

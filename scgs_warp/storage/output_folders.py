@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
 from pathlib import Path
 
 from ..errors import UserError
+
+ATTEMPTS = 5
+"""Number of attempts to replace a folder that other processes replace at the same time."""
 
 
 def make_parent(path: Path) -> None:
@@ -32,17 +36,30 @@ def holds_only(folder: Path, pattern: str) -> bool:
 def replace_folder(path: Path, new: Path) -> None:
     """Replace the folder ``path`` by the folder ``new``, and remove the earlier one afterwards.
 
+    If several processes replace one folder, the last one wins.
+
     Raises:
         OSError: replacing failed; the earlier folder is back in its place.
     """
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            return _replace(path, new, path.with_name(f".{path.name}.{os.getpid()}.old"))
+        except OSError as error:  # Another process put its folder there, or took the earlier one away.
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT) or attempt == ATTEMPTS:
+                raise
+
+
+def _replace(path: Path, new: Path, old: Path) -> None:
     if not path.is_dir():
         os.replace(new, path)
         return
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
     os.replace(path, old)
     try:
         os.replace(new, path)
     except BaseException:
-        os.replace(old, path)
+        if path.is_dir():
+            shutil.rmtree(old, ignore_errors=True)  # What another process put there has replaced it.
+        else:
+            os.replace(old, path)
         raise
     shutil.rmtree(old, ignore_errors=True)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
-from ..storage.files import write_atomically
+from ..storage.files import read_text, write_atomically
 from ..storage.json_files import as_number, parse_json
 
 AXIS_FIELDS, MAX_AXIS_VALUE = ("step", "seconds"), 1e9
@@ -131,7 +131,7 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
         UserError: the file cannot be read.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8", errors="replace")
+        text = read_text(path, errors="replace")
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give the folder of a run") from None
     lines = []

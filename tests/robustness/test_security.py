@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import re
+import secrets
 import struct
 import threading
 from pathlib import Path
@@ -313,10 +314,11 @@ def test_messages_cannot_command_a_terminal():
     assert text.isprintable() and len(text) <= 1100 and "\\x1b[2Jb c\\u202ed\\ud800" in text
 
 
-def test_a_link_in_the_place_of_a_temporary_file_is_not_written_through(tmp_path):
+def test_a_link_in_the_place_of_a_temporary_file_is_not_written_through(tmp_path, monkeypatch):
     victim = tmp_path / "victim"
     victim.write_text("mine")
-    (tmp_path / ".a.json.tmp").symlink_to(victim)
+    (tmp_path / ".a.json.0123abcd.tmp").symlink_to(victim)
+    monkeypatch.setattr(secrets, "token_hex", lambda _: "0123abcd")  # an attacker who guesses right
     write_atomically(tmp_path / "a.json", b"{}")
     assert victim.read_text() == "mine" and (tmp_path / "a.json").read_bytes() == b"{}"
 

@@ -31,6 +31,12 @@ ENDINGS = {
     "os.system", "os.popen", "np.load", "numpy.load", "torch.save", "torch.hub.load", "tempfile.mktemp", "json.load",
     "extractall", "joblib.load", "shutil.unpack_archive", "yaml.load", "pickle.loads", "os.execv", "os.spawnv",
 }  # fmt: skip
+ENDINGS_ONLY_IN = {
+    ".read_text": {"environment.py", "memory.py", "page.py", "viewer.py", "provenance.py", "__init__.py"},
+    ".read_bytes": {"files.py", "run.py", "ray_worker.py"},
+}
+"""Methods of paths that wait for a pipe and never end on ``/dev/zero``, and the files in which they read our own
+files or the system's."""
 ONLY_IN = {"json.loads": {"json_files.py", "page_data.py", "edit_file.py", "from_mesh.py"}}
 """Functions unsafe for untrusted text, and the files in which they read our own."""
 
@@ -39,7 +45,7 @@ def forbidden(tree: ast.AST, name: str) -> Iterator[str]:
     """Yield the unsafe calls and imports of a source file of this name."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found = {alias.name.partition(".")[0] for alias in node.names} & MODULES
+            found = {alias.name.partition(".")[0] for alias in node.names} & (MODULES | {"pycolmap"})
         elif isinstance(node, ast.ImportFrom):
             found = {(node.module or "").partition(".")[0]} & MODULES if node.level == 0 else set()
         elif isinstance(node, ast.Call):
@@ -62,6 +68,8 @@ def _of_call(node: ast.Call, name: str) -> Iterator[str]:
         yield "torch.load without weights_only"
     if name not in ONLY_IN.get(called, {name}):
         yield f"{called} where parse_json belongs"
+    if any(called.endswith(end) and name not in files for end, files in ENDINGS_ONLY_IN.items()):
+        yield f"{called} where storage/files.py belongs"
 
 
 def test_nothing_runs_what_a_file_says():
@@ -76,7 +84,8 @@ def test_nothing_runs_what_a_file_says():
         "import pickle", "from yaml import load", "eval('1')", "exec(x)", "np.load(path)", "torch.load(path)",
         "np.fromfile(p, allow_pickle=True)", "subprocess.run('ls', shell=True)", "subprocess.Popen(command)",
         "torch.load(p, weights_only=False)", "archive.extractall()", "os.system('x')", "json.loads(text)",
-        "tempfile.mktemp()", "import dill.source",
+        "tempfile.mktemp()", "import dill.source", "path.read_text()", "(folder / name).read_bytes()",
+        "import pycolmap",
     ],
 )  # fmt: skip
 def test_the_audit_sees_what_it_looks_for(code):

@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 
 from ...errors import UserError
-from ...storage.files import read_bytes
+from ...storage.files import open_regular, read_bytes
 from ...storage.json_files import parse_json
-from ...storage.safe_paths import inside, is_regular
+from ...storage.safe_paths import inside
 from ..images import is_complete, oversized_claim
 from .schema import find_problem
 
@@ -58,7 +58,7 @@ class GltfFile:
         self._json = _checked(self.path)
         self.document = _parse(self.path)
         self._buffers: dict[int, bytes] = {}
-        self._digest = hashlib.sha256(self.path.read_bytes())
+        self._digest = hashlib.sha256(read_bytes(self.path, "restore it"))
         version = str(getattr(self.document.asset, "version", "") or "")
         if not version.startswith("2."):
             raise self.error("asset.version", f"is {version or 'missing'}; export it again as glTF 2.0")
@@ -175,9 +175,8 @@ class GltfFile:
                 raise self.error(field, "is no valid base64; export the file again") from None
         path = inside(self.path.parent, unquote(uri), f"{self.path}: {field}")
         try:
-            if not is_regular(path):
-                raise OSError(None, "it is not a regular file")
-            data = path.read_bytes()
+            with open_regular(path) as file:
+                data = file.read()
             self._digest.update(data)
             return data
         except OSError as error:

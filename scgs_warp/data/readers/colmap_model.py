@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import UserError
+from ...runtime.pycolmap_import import import_pycolmap
+from ...storage.files import open_regular
 
 MAX_NAME_BYTES = 4096
 
@@ -90,7 +92,9 @@ def read_model(folder: Path) -> SparseModel:
 
 def _read(file: Path, reader: Callable[[bytes], Any]) -> Any:
     try:
-        return reader(file.read_bytes())
+        with open_regular(file) as opened:
+            content = opened.read()
+        return reader(content)
     except FileNotFoundError:
         raise UserError(f"{file}: no such file, though the rest of the model is here; export the model again") from None
     except OSError as error:
@@ -119,16 +123,13 @@ def _pose(quaternion: np.ndarray, translation: np.ndarray, name: str) -> np.ndar
 
 
 def _model_names() -> dict[int, str]:
-    import pycolmap
-
-    return {int(value): name for name, value in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    members = import_pycolmap().CameraModelId.__members__
+    return {int(value): name for name, value in members.items() if name != "INVALID"}
 
 
 @functools.cache
 def _parameter_count(model: str) -> int:
-    import pycolmap
-
-    return len(pycolmap.Camera(model=model, width=1, height=1).params_info.split(","))
+    return len(import_pycolmap().Camera(model=model, width=1, height=1).params_info.split(","))
 
 
 def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import UserError
+from ...storage.json_files import as_array, as_number
 from ...storage.safe_paths import inside
 from ...types import Camera
 from ..assemble import FrameRecord, assemble, video_border, with_points
@@ -138,12 +139,9 @@ def _applied(path: Path, content: dict[str, Any], points: np.ndarray) -> np.ndar
     """Apply ``applied_transform`` and ``applied_scale`` to the points; return None if the file has neither of them."""
     if "applied_transform" not in content and "applied_scale" not in content:
         return None
-    try:
-        matrix = np.array(content.get("applied_transform", np.eye(4)), np.float64)
-        scale = float(content.get("applied_scale", 1.0))
-    except (ValueError, TypeError, OverflowError):
-        matrix, scale = np.zeros(0), 0.0
-    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all() or not (np.isfinite(scale) and scale > 0):
+    matrix = as_array(content.get("applied_transform", np.eye(4).tolist()), (3, 4), (4, 4))
+    scale = as_number(content.get("applied_scale", 1.0))
+    if matrix is None or scale is None or scale <= 0.0:
         raise UserError(
             f"{path}: applied_transform must be 3 or 4 rows of 4 numbers, and applied_scale a positive number; "
             "correct them or leave them out"

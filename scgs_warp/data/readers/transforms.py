@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import UserError
 from ...geometry.rotation import is_rotation
-from ...storage.json_files import as_number, read_json
+from ...storage.json_files import as_number, numbers, read_json
 from ...storage.safe_paths import inside
 from ..images import size_text
 from ..lens import Lens, make_lens
@@ -49,10 +49,9 @@ def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
     where = f"{path}: frames[{index}].transform_matrix"
     if "transform_matrix" not in entry:
         raise UserError(f"{where} is missing; give the 4 x 4 camera-to-world matrix")
-    try:
-        matrix = np.array(entry["transform_matrix"], np.float64)
-    except (ValueError, TypeError, OverflowError):
-        raise UserError(f"{where} is not a matrix of numbers; give 4 rows of 4 numbers") from None
+    matrix = numbers(entry["transform_matrix"])
+    if matrix is None:
+        raise UserError(f"{where} is not a matrix of numbers; give 4 rows of 4 numbers")
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     if matrix.shape != (4, 4):

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import UserError
+from ...storage.files import read_text
 from ...storage.json_files import parse_json
 from .figure import build_figure
 from .figure_motion import bone_transforms
@@ -79,7 +80,7 @@ def make_synthetic(
 
 def _recipe_of(folder: Path) -> dict[str, Any] | None:
     try:
-        return parse_json((folder / MARKER).read_text())
+        return parse_json(read_text(folder / MARKER))
     except (OSError, ValueError):
         return None
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from ...errors import UserError
+from ...storage.files import read_text
 from ...storage.json_files import parse_json
 from ..gltf.scene import GltfScene, read_scene
 from .contact_sheet import ContactSheet
@@ -266,6 +267,6 @@ def _recipe(request: SynthesisRequest, identity: dict[str, Any]) -> dict[str, An
 
 def _recipe_of(folder: Path) -> dict[str, Any] | None:
     try:
-        return parse_json((folder / MARKER).read_text())
+        return parse_json(read_text(folder / MARKER))
     except (OSError, ValueError):
         return None

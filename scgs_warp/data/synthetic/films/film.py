@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....errors import UserError
+from ....storage.files import read_text
 from ....storage.json_files import parse_json
 from ..renderer import SURFACE_POINTS, write_folder_atomically
 from .request import FilmRequest, check
@@ -105,6 +106,6 @@ def _recipe(request: FilmRequest) -> dict[str, Any]:
 
 def _recipe_of(folder: Path) -> dict[str, Any] | None:
     try:
-        return parse_json((folder / MARKER).read_text())
+        return parse_json(read_text(folder / MARKER))
     except (OSError, ValueError):
         return None
