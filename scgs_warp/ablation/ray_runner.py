@@ -21,8 +21,8 @@ from ..runtime.environment import available_threads
 from ..runtime.progress import Progress, progress
 from ..runtime.stop_signals import stop_signals
 from ..storage.checkpoint import FILE as CHECKPOINT
-from ..storage.files import open_regular, read_text
-from ..storage.json_files import parse_json
+from ..storage.files import open_regular
+from ..storage.json_files import parse_json, read_json
 from . import ray_cluster
 from .cells import LOG, Cell, cell_to_json
 from .local_runner import CellEnded, CellRunner, ReportLine
@@ -367,10 +367,9 @@ def _changed(folder: Path) -> int:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        values = parse_json(read_text(path))
-    except (OSError, ValueError):
+        return read_json(path)
+    except UserError:
         return {}
-    return values if isinstance(values, dict) else {}
 
 
 def steps_done(folder: Path) -> int:
