@@ -1,14 +1,16 @@
 """The settings of a training run: frozen, nested dataclasses, one per component that uses them, with bounds and help
 for each field.
 
-Step counts that scale with the length of a run are declared with :func:`milestone`; ``presets.with_steps`` scales them
+Step counts that scale with the length of a run are declared with ``milestone``; ``presets.with_steps`` scales them
 all. ``config/presets.py`` makes, reads and writes presets; ``config/validation.py`` checks the bounds.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
+
+from .bounds import bounded, chosen, milestone, newer, rate
 
 MotionName = Literal["control-points", "per-gaussian", "hexplane", "static"]
 PresetName = Literal["quick", "cpu", "best", "paper"]
@@ -16,39 +18,6 @@ IMAGE_SETTINGS = ("downscale", "resample", "background", "frames", "only_cameras
 """Fields of ``DataConfig`` that say which images a run sees, and how: arguments of ``data.load``."""
 CACHE_MIB = 2048
 """Default size of the cache of decoded images: 200 images of 800 x 800 pixels with alpha."""
-
-
-MAGNITUDE = 1e9
-"""Largest value of a number without a limit of its own."""
-
-
-def bounded(default: float, least: float, most: float = MAGNITUDE, **more: Any) -> Any:
-    """Declare a number with inclusive bounds. ``most`` also limits sizes that take memory, because a configuration may
-    come from an untrusted file."""
-    return field(default=default, metadata={"least": least, "most": most, **more})
-
-
-def rate(default: float, **more: Any) -> Any:
-    """Declare a learning rate of Adam: at a rate of 1, every step moves a parameter by about 1."""
-    return bounded(default, 0, 1, **more)
-
-
-def chosen(default: int, least: int, most: int) -> Any:
-    """Declare a whole number with inclusive bounds, few enough that the error message offers all values as choices."""
-    return field(default=default, metadata={"choices": (least, most)})
-
-
-def newer(default: Any, before: Any, **bounds: Any) -> Any:
-    """Declare a field that older versions did not have; ``before`` is the value that does what they did. Numbers need
-    bounds as in :func:`bounded`."""
-    if "least" in bounds:
-        return bounded(default, before=before, **bounds)
-    return field(default=default, metadata={"before": before})
-
-
-def milestone(steps: int, least: int = 0) -> Any:
-    """Declare a step count that scales with the length of the run."""
-    return bounded(steps, least, milestone=True)
 
 
 @dataclass(frozen=True)

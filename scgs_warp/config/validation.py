@@ -1,4 +1,4 @@
-"""Validation of a configuration: the bounds declared in ``fields.py``, and rules between fields."""
+"""Validation of a configuration: the bounds declared in ``fields.py`` with ``bounds.py``, and rules between fields."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from ..errors import UserError
-from .fields import MAGNITUDE
+from .bounds import MAGNITUDE
 from .presets import TrainConfig
 
 
