@@ -1,4 +1,4 @@
-"""Declarations of numbers with bounds, for the fields of a configuration; ``config/validation.py`` checks the bounds."""
+"""Declarations of numbers with bounds, for the fields of a configuration; ``validation.py`` checks the bounds."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from scgs_warp.config import presets as C
-from scgs_warp.config.fields import bounded, chosen, milestone
+from scgs_warp.config.bounds import bounded, chosen, milestone
 
 
 def test_interval_of_densification_rounds():

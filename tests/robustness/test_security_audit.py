@@ -37,7 +37,7 @@ ENDINGS_ONLY_IN = {
 }
 """Methods of paths that wait for a pipe and never end on ``/dev/zero``, and the files in which they read our own
 files or the system's."""
-ONLY_IN = {"json.loads": {"json_files.py", "page_data.py", "edit_file.py", "from_mesh.py"}}
+ONLY_IN = {"json.loads": {"json_files.py", "page_data.py", "edit_file.py", "from_mesh.py", "film.py"}}
 """Functions unsafe for untrusted text, and the files in which they read our own."""
 
 
