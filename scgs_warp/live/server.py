@@ -11,6 +11,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ..errors import UserError
+from ..storage.json_files import parse_json
 from .access import Access, Request, cookies
 
 if TYPE_CHECKING:
@@ -229,8 +230,8 @@ class PageServer:
     def _hear(self, client: Client, text: str) -> None:
         """Pass a message on if it is a JSON object; ignore anything else."""
         try:
-            message = json.loads(text)
-        except (ValueError, RecursionError):
+            message = parse_json(text)
+        except ValueError:
             return
         if isinstance(message, dict):
             self._received(client, message)
