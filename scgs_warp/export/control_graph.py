@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..visualization.overlay import position_colors
-from .glb import point_colors
-from .gltf import INDICES, VERTICES, GltfDocument, add_skeleton
+from .gltf import INDICES, VERTICES, GltfDocument, add_skeleton, linear_colors
 from .skeleton import Skeleton
 
 POINT, EDGE = 0.12, 0.02
@@ -52,7 +51,7 @@ def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[flo
     attributes = {
         "POSITION": document.accessor(vertices, target=VERTICES, bounds=True),
         "NORMAL": document.accessor(normals, target=VERTICES),
-        "COLOR_0": document.accessor(_linear(colors), target=VERTICES, normalized=True),
+        "COLOR_0": document.accessor(linear_colors(colors), target=VERTICES, normalized=True),
         "JOINTS_0": document.accessor(bound, target=VERTICES),
         "WEIGHTS_0": document.accessor(weights, target=VERTICES),
     }
@@ -88,10 +87,3 @@ def _away(bars: np.ndarray) -> np.ndarray:
     ends = bars.reshape(-1, 3, 3)
     out = ends - ends.mean(axis=1, keepdims=True)
     return (out / np.linalg.norm(out, axis=2, keepdims=True)).reshape(-1, 3)
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Convert sRGB colours to opaque linear ones, [V, 4] uint16."""
-    from ..gaussians import SH_C0
-
-    return point_colors((srgb - 0.5) / SH_C0, np.ones(len(srgb)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..gaussians import SH_C0
 from ..types import Gaussians
-from .gltf import VERTICES, GltfDocument, add_skeleton, influences, upright, xyzw
+from .gltf import VERTICES, GltfDocument, add_skeleton, influences, linear_colors, upright, xyzw
 from .skeleton import Skeleton
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -73,6 +73,4 @@ def _attributes(document: GltfDocument, gaussians: Gaussians) -> dict[str, int]:
 
 def point_colors(sh_dc: np.ndarray, opacities: np.ndarray) -> np.ndarray:
     """Return linear RGB and opacity [N, 4] uint16, for programs that show points; Gaussians hold sRGB."""
-    srgb = (0.5 + SH_C0 * sh_dc.astype(np.float64)).clip(0.0, 1.0)
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return np.rint(65535 * np.column_stack([linear, opacities.clip(0.0, 1.0)])).astype("<u2")
+    return linear_colors(0.5 + SH_C0 * sh_dc.astype(np.float64), opacities)

@@ -108,6 +108,14 @@ class GltfDocument:
         write_atomically(path, self.content())
 
 
+def linear_colors(srgb: np.ndarray, opacities: np.ndarray | None = None) -> np.ndarray:
+    """Convert sRGB colours [N, 3] to linear ones with opacity (1 by default), [N, 4] uint16."""
+    srgb = srgb.clip(0.0, 1.0)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    alpha = np.ones(len(srgb)) if opacities is None else opacities.clip(0.0, 1.0)
+    return np.rint(65535 * np.column_stack([linear, alpha])).astype("<u2")
+
+
 def upright(up: tuple[float, float, float]) -> list[float]:
     """Return the shortest turn from ``up`` to +y as xyzw. If ``up`` is -y, as in OpenCV's convention, it is half a turn
     about x."""

@@ -19,7 +19,15 @@ from ..edit.rotations import from_matrix, rotate
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
 from ..types import Gaussians
-from .skeleton import AnimationMoment, Skeleton, continuous, finite_rows, posed_gaussians, select_gaussians
+from .skeleton import (
+    AnimationMoment,
+    Skeleton,
+    continuous,
+    extent_of,
+    finite_rows,
+    posed_gaussians,
+    select_gaussians,
+)
 
 WIDTH = 4
 """Number of parts per Gaussian: what every player of glTF supports."""
@@ -30,7 +38,7 @@ such as the twist of a line."""
 
 class RigLoss(NamedTuple):
     """Distances between Gaussians that follow the parts and those that follow the whole motion, at all moments,
-    relative to the scene's extent: the diagonal of the box around 98 % of the Gaussians along each axis."""
+    relative to the scene's extent (:func:`~scgs_warp.export.skeleton.extent_of`)."""
 
     mean: float
     most: float
@@ -151,9 +159,7 @@ def _rigid_motions(
 
 
 def _loss(tracks: list[np.ndarray], rest: np.ndarray, skeleton: Skeleton) -> RigLoss:
-    low, high = np.quantile(rest, [0.01, 0.99], axis=0)
-    extent = max(float(np.linalg.norm(high - low)), 1e-12)
-    off = []
+    extent, off = extent_of(rest), []
     for frame, track in enumerate(tracks):
         arms = rest[:, None] - skeleton.rest[skeleton.indices]
         moved = rotate(skeleton.rotations[frame][skeleton.indices], arms) + skeleton.positions[frame][skeleton.indices]

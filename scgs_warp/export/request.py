@@ -11,7 +11,9 @@ from ..errors import UserError
 from ..storage.output_folders import make_parent
 from ..storage.suffixes import longest_suffix
 
-Format = Literal["ply", "ply-sequence", "compressed.ply", "splat", "spz", "glb", "graph", "npz", "cameras", "html"]
+Format = Literal[
+    "ply", "ply-sequence", "compressed.ply", "splat", "spz", "glb", "graph", "npz", "tracks", "4dgs", "cameras", "html"
+]
 SUFFIXES: dict[Format, str] = {
     "ply": ".ply",
     "compressed.ply": ".compressed.ply",
@@ -19,6 +21,8 @@ SUFFIXES: dict[Format, str] = {
     "spz": ".spz",
     "glb": ".glb",
     "npz": ".npz",
+    "tracks": ".csv",
+    "4dgs": ".4dgs",
     "cameras": ".json",
     "html": ".html",
     "graph": ".glb",
@@ -26,11 +30,16 @@ SUFFIXES: dict[Format, str] = {
 }
 """Suffix of each format's output. Formats may share a suffix, which then selects the first of them. If a name ends in
 several suffixes, the longest of them counts."""
+TRACK_SUFFIXES = (".csv", ".npz", ".glb")
+"""Suffixes of tracks. The last two select other formats unless ``--format tracks`` is given."""
 OTHER_SUFFIXES = {".htm": ".html"}
 """Alternative suffixes."""
 STILL_FORMATS = ("ply", "compressed.ply", "splat", "spz", "glb")
 """Formats of Gaussians at one instant; ``glb`` holds the motion if no instant is given."""
+FRAME_FORMATS = ("ply-sequence", "tracks", "4dgs")
+"""Formats of many moments, which hold the motion of every motion model."""
 MAX_FRAMES = 100_000
+MAX_POINTS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,9 @@ class ExportRequest:
     """ply, compressed.ply, splat, spz: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF with
     Gaussians, moved by control points as an animated skeleton; still with --time. graph: the control points and their
     edges as an animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras as
-    nerfstudio's transforms.json. html: a page that plays the scene. By default the output's suffix decides."""
+    nerfstudio's transforms.json. html: a page that plays the scene. tracks: paths of surface points, in
+    .npz, .csv or .glb. 4dgs: Gaussians in linear segments, for players of that format. By default the output's suffix
+    decides."""
     time: float | None = None
     """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion."""
     edit: Path | None = None
@@ -64,6 +75,9 @@ class ExportRequest:
     """Version of a .spz; 4 by default, 3 for readers that know no newer one."""
     url: str = ""
     """Address at which a page will be published, for links to it: a picture (.jpg) is then written beside the page."""
+    points: str | None = None
+    """Of tracks: a number of points, spread over the surface, or a .csv of points at time 0 (x,y,z) to follow. All
+    Gaussians of the surface by default."""
     skeleton: Literal["control-points", "parts"] = "control-points"
     """Joints of a moving glb: the control points, which hold the motion exactly, or the parts found in it, a rig of a
     dozen named joints that comes close to it."""
@@ -160,6 +174,10 @@ def _check_unused(request: ExportRequest) -> None:
         raise UserError(f"{name}: --output {request.output} is to hold one instant; leave {name} out, or {remedy}")
     if name is not None and kind in ("html", "cameras"):
         raise UserError(f"{name}: --format {kind} has no frames; leave it out")
+    if request.points is not None and kind != "tracks":
+        raise UserError(f"--points {request.points}: belongs to tracks; leave it out, or give --format tracks")
+    if request.points is not None and request.points.isdecimal() and not 1 <= int(request.points) <= MAX_POINTS:
+        raise UserError(f"--points {request.points}: give 1 to {MAX_POINTS:,}, or a .csv of points")
     if request.skeleton == "parts" and (kind != "glb" or request.still):
         remedy = "leave out --time" if kind == "glb" and request.time is not None else "give --format glb and --run"
         raise UserError(f"--skeleton parts: --output {request.output} is to hold no skeleton; {remedy}")
@@ -174,6 +192,8 @@ def check_output(path: Path, kind: Format) -> None:
         UserError: the suffix is wrong, a file or folder is in the way, or the folder cannot be written.
     """
     ending, suffix = SUFFIXES[kind], output_suffix(path)
+    if kind == "tracks" and suffix in TRACK_SUFFIXES:
+        ending = suffix
     if ending and suffix != ending:
         longer = f", not in {suffix}," if suffix.endswith(ending) else ""
         raise UserError(f"--output {path}: end the name in {ending}{longer} for --format {kind}")

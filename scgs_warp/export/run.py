@@ -24,10 +24,11 @@ from ..types import Gaussians
 from .cameras import write_cameras
 from .control_graph import write_graph
 from .glb import write_glb
+from .moving import export_fourdgs, export_tracks
 from .npz import write_npz
 from .part_rig import build_rig
 from .plain import plain_scene
-from .request import ExportRequest, check_request, output_suffix
+from .request import FRAME_FORMATS, ExportRequest, check_request, output_suffix
 from .sequence import check_folder, write_sequence
 from .skeleton import (
     AnimationMoment,
@@ -141,21 +142,25 @@ def write_still(
 
 def _export_moving(request: ExportRequest, device: str) -> str:
     scene = opened = _open(request, device)
-    if request.kind != "graph":
+    if request.kind not in ("graph", "tracks"):
         scene = plain_scene(scene)
     session = None
-    if request.edit is not None or (request.kind != "ply-sequence" and scene.motion.moves):
+    if request.edit is not None or (request.kind not in FRAME_FORMATS and scene.motion.moves):
         session = _open_session(request, scene)
     if session is None and request.kind == "glb":
         gaussians = keep_finite(at_rest(scene))
         write_glb(request.output, gaussians, scene.overview.up)
         return f"{len(gaussians.means):,} Gaussians that stand still"
-    if session is None and request.kind != "ply-sequence":
+    if request.edit is None and not scene.motion.moves and request.kind != "ply-sequence":
         raise UserError(f"--format {request.kind}: {request.run} stands still; write its Gaussians as ply or glb")
     frames = even_moments(request.frames or FRAMES, request.fps or FPS)
     moments = film_moments(session) if session is not None and request.edit is not None else frames
     if request.kind == "ply-sequence":
         return _write_frames(request, scene, session, moments)
+    if request.kind == "tracks":
+        return export_tracks(request.output, scene, session, moments, request.points)
+    if request.kind == "4dgs":
+        return export_fourdgs(request.output, scene, session, moments, _usable(scene))
     assert session is not None
     if request.skeleton == "parts":
         parts = session.edit.skeleton or EditSession(opened).skeleton  # that of the run, not of its plain Gaussians

@@ -121,6 +121,12 @@ def keep_finite(gaussians: Gaussians) -> Gaussians:
     return select_gaussians(gaussians, rows)
 
 
+def extent_of(points: np.ndarray) -> float:
+    """Return the diagonal of the box around 98 % of points [N, 3] along each axis."""
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    return max(float(np.linalg.norm(high - low)), 1e-12)
+
+
 @torch.no_grad()
 def build_skeleton(
     session: EditSession, moments: list[AnimationMoment], advance: Callable[[], None] | None = None

@@ -23,6 +23,7 @@ from scgs_warp.export.gltf import upright
 from scgs_warp.export.part_rig import build_rig
 from scgs_warp.export.run import write_still
 from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
+from scgs_warp.export.tracks import build_tracks, write_tracks
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.types import Gaussians
 
@@ -60,6 +61,35 @@ window.play = async (url, times) => {
     frames.push({ joints, vertices });
   }
   return { frames, duration: gltf.animations[0].duration };
+};
+
+// World positions of a cloud of points while its animation plays.
+window.cloud = async (url, times) => {
+  const gltf = await new GLTFLoader().loadAsync(url);
+  let cloud = null;
+  gltf.scene.traverse((item) => { if (item.isPoints) cloud = item; });
+  const mixer = new THREE.AnimationMixer(gltf.scene);
+  const action = mixer.clipAction(gltf.animations[0]);
+  action.setLoop(THREE.LoopOnce);
+  action.clampWhenFinished = true;
+  action.play();
+  const { position } = cloud.geometry.attributes, moves = cloud.geometry.morphAttributes.position;
+  return times.map((time) => {
+    mixer.setTime(time);
+    gltf.scene.updateMatrixWorld(true);
+    const points = [];
+    for (let i = 0; i < position.count; i++) {
+      point.fromBufferAttribute(position, i);
+      const base = point.clone(), away = new THREE.Vector3();
+      moves.forEach((move, k) => {
+        away.fromBufferAttribute(move, i);
+        point.addScaledVector(cloud.geometry.morphTargetsRelative ? away : away.sub(base),
+          cloud.morphTargetInfluences[k]);
+      });
+      points.push(point.applyMatrix4(cloud.matrixWorld).toArray());
+    }
+    return points;
+  });
 };
 
 // The Gaussians as three.js's own reader of the extension makes them.
@@ -157,6 +187,16 @@ def test_the_rig_plays_in_three(page):
         means = turned(scene.gaussians_at(place / 8).means.double().numpy(), up)
         off = np.linalg.norm(np.array(frame["vertices"]) - means, axis=1) / np.linalg.norm(high - low)
         assert off.mean() < 2 * rig.loss.mean
+
+
+def test_tracks_play_in_three(page):
+    window, folder = page
+    scene = bar_scene()
+    up, tracks = scene.overview.up, build_tracks(scene, None, even_moments(FRAMES, FPS), 40)
+    write_tracks(folder / "t.glb", tracks, up)
+    found = window.evaluate("([url, times]) => window.cloud(url, times)", ["/t.glb", [0.0, 0.75, 2.0]])
+    for frame, place in zip(found, (0, 3, 8)):
+        assert np.abs(np.array(frame) - turned(tracks.points[place].astype(float), up)).max() < 2e-6
 
 
 def test_the_graph_plays_in_three(page):

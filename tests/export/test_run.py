@@ -147,6 +147,32 @@ def test_a_rig_of_the_parts_of_the_run(run, tmp_path, capsys):
     (run / "skeleton.json").unlink()
 
 
+def test_tracks_and_segments_of_a_run(run, tmp_path, capsys):
+    scene = Scene.load(run)
+    (tmp_path / "p.csv").write_text("x,y,z\n0.5,-1,0.25\n")
+    for arguments, words in (
+        (["--output", tmp_path / "a.csv", "--points", 5], "tracks of 5 points at 3 instants"),
+        (["--output", tmp_path / "b.npz", "--format", "tracks"], "tracks of 120 points at 3 instants"),
+        (["--output", tmp_path / "c.glb", "--format", "tracks", "--points", tmp_path / "p.csv"], "tracks of 1 points"),
+        (["--output", tmp_path / "d.4dgs"], "120 Gaussians in "),
+    ):
+        export("--run", run, *arguments, "--frames", 3)
+        assert words in capsys.readouterr().out
+    with np.load(tmp_path / "b.npz", allow_pickle=False) as found:
+        np.testing.assert_array_equal(found["points"][2], scene.gaussians_at(1.0).means[found["gaussians"]])
+    edit = tmp_path / "edit.json"
+    session = bent(scene)
+    session.save(edit)
+    written = json.loads(edit.read_text())
+    written["film"] |= {"seconds": 0.2, "fps": 20}
+    edit.write_text(json.dumps(written))
+    session.load(edit)
+    export("--run", run, "--edit", edit, "--format", "tracks", "--output", tmp_path / "e.npz")
+    with np.load(tmp_path / "e.npz", allow_pickle=False) as found:
+        truth = session.gaussians_at(session.scene_time(0.1), 0.1).means
+        np.testing.assert_array_equal(found["points"][2], truth[found["gaussians"]])
+
+
 def test_graph_is_valid(run, tmp_path):
     export("--run", run, "--format", "graph", "--output", tmp_path / "g.glb", "--frames", 4)
     assert gltf_errors(tmp_path / "g.glb") == []
@@ -261,6 +287,12 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         (["--run", run, "--output", "b", "--format", "ply-sequence", "--fps", 9], "--fps: a ply-sequence"),
         (["--run", run, "--output", "b.npz", "--skeleton", "parts"], "--skeleton parts: "),
         (["--run", run, "--output", "b.glb", "--skeleton", "parts", "--time", 0.1], "leave out --time"),
+        (["--run", run, "--output", "b.npz", "--points", 3], "--points 3: belongs to tracks"),
+        (["--run", run, "--output", "b.csv", "--points", 0], "--points 0: give 1 to"),
+        (["--run", run, "--output", "b.csv", "--points", tmp_path / "none.csv"], "none.csv"),
+        (["--run", run, "--output", "b.obj", "--format", "tracks"], "--format tracks"),
+        (["--run", run, "--output", "b.4dgs", "--frames", 1], "--frames 2"),
+        (["--run", still, "--output", "b.4dgs"], "stands still"),
         (["--run", run, "--output", "b.npz", "--title", "x"], "--title: belongs to a page"),
         (["--run", run, "--output", "b.glb", "--max-mib", 3], "--max-mib: belongs to a page"),
         (["--run", run, "--output", "b.html", "--max-mib", 0.001], "0.001 MiB of --max-mib"),

@@ -17,6 +17,7 @@ from helpers.tiny import write_dnerf
 from scgs_warp.data import load
 from scgs_warp.evaluation.motion_metrics import load_ground_truth, score_motion
 from scgs_warp.evaluation.thin_structures import RodCheck, load_rods
+from scgs_warp.export.tracks import read_points
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.types import Camera, Frame
 
@@ -116,6 +117,17 @@ def load_rod_ratios(folder: Path) -> None:
     expect(check.summary()["rods_segments"] == len(check.rows), "number of tenths")
 
 
+def write_points(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "points.csv").write_text("x,y,z\n0.5,-1,0.25\n1e-3,2,-7.5\n", encoding="utf-8")
+
+
+def load_points(folder: Path) -> None:
+    points = read_points(folder / "points.csv")
+    expect(points.ndim == 2 and points.shape[1] == 3 and len(points) > 0, "shape of points")
+    within("points", points, -1e9, 1e9)
+
+
 NOT_PICTURES = suffixed(".json", ".npy", ".npz", ".ply", ".bin", ".txt")
 
 FORMATS = (
@@ -130,4 +142,5 @@ FORMATS = (
     Format("colmap-text", lambda folder: write_colmap(folder, 6, "OPENCV", True), load_train, NOT_PICTURES),
     Format("ground-truth", write_truth, load_truth),
     Format("rods", write_rods, load_rod_ratios),
+    Format("points", write_points, load_points, share=0.5),
 )
