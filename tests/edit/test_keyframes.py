@@ -83,3 +83,15 @@ def test_handles_without_a_keyframe_stay_where_they_are():
 def test_a_keyframe_refuses_fields_that_no_file_may_hold(at, easing, words):
     with pytest.raises(UserError, match=words):
         Keyframe(at, {}, easing)
+
+
+def test_smooth_rotation_at_constant_speed_stays_constant():
+    """Between equal steps of rotation and of translation, the curve is a straight line in time."""
+    frames = [
+        Keyframe(float(k), {"a": Target((1.0 * k, 0.0, 0.0), tuple(from_axis([0, 0, 1], 30 * k).tolist()))})
+        for k in range(4)
+    ]
+    for moment in (1.0, 1.25, 1.5, 1.9):
+        found = at(frames, moment)
+        assert np.degrees(angle(np.array(found.rotation))) == pytest.approx(30 * moment, abs=1e-9)
+        assert found.translation[0] == pytest.approx(moment, abs=1e-12)

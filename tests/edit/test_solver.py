@@ -210,3 +210,26 @@ def test_a_pair_tied_by_one_edge_is_turned_no_further_than_it_has_to_be():
     posed[41] = rest[40] - edge
     turned = solver.turns(rest, posed)[40:]
     np.testing.assert_allclose(np.linalg.det(turned), 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("other", ["turned", "soft", "hard"])
+def test_a_solver_that_is_used_again_remembers_what_its_systems_depend_on(other):
+    """Which nodes have a rotation of their own is part of the system, as much as which are held and how softly."""
+    rest = cloud(4, 40)
+    graph = graph_of(rest)
+    held, none = np.arange(40) < 10, np.zeros(40)
+    turns = np.tile(from_axis([0, 0, 1], 70), (40, 1))
+    rotations = np.stack([rotate(turns, np.tile(axis, (40, 1))) for axis in np.eye(3)], axis=2)
+    free = RigidGroups.none(40)
+    posed = rest + 0.3 * np.random.default_rng(4).normal(size=rest.shape)
+    first = Anchors(held, none, np.zeros(40, bool), posed, rotations, none, free)
+    changes = {"turned": held, "soft": np.where(np.arange(40) == 30, 0.5, 0.0), "hard": np.arange(40) < 12}
+    second = first._replace(**{other: changes[other]})
+    used = ArapSolver(graph)
+    used.relax(rest, first, Shape.at_rest(rest), 2)
+    again = used.relax(rest, second, Shape.at_rest(rest), 2)
+    fresh = ArapSolver(graph).relax(rest, second, Shape.at_rest(rest), 2)
+    np.testing.assert_array_equal(again.positions, fresh.positions)
+    np.testing.assert_array_equal(again.rotations, fresh.rotations)
+    before = ArapSolver(graph).relax(rest, first, Shape.at_rest(rest), 2)
+    assert np.abs(before.rotations - fresh.rotations).max() > 1e-3

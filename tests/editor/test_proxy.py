@@ -16,6 +16,7 @@ import pytest
 from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession
 from scgs_warp.editor import Editor, Proxy
+from scgs_warp.editor import proxy as proxy_module
 from scgs_warp.editor.proxy import KEY_HEADER, MAX_PENDING, cookies, guarded, is_local, parse_head, same_origin
 from scgs_warp.errors import UserError
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
@@ -261,3 +262,12 @@ def test_the_app_serves_until_it_is_interrupted(tmp_path, share):
     finally:
         process.kill()
         process.wait()
+
+
+def test_a_request_that_is_never_finished_ends(shared, monkeypatch):
+    """A client that sends a head byte by byte would hold its connection for ever."""
+    monkeypatch.setattr(proxy_module, "PATIENCE", 0.3)
+    with socket.create_connection(("127.0.0.1", shared.public), 20) as slow:
+        slow.sendall(b"GET / HTTP/1.1\r\nHost: a\r\n")
+        slow.settimeout(20)
+        assert slow.recv(1) == b""

@@ -7,7 +7,8 @@ import pytest
 
 from scgs_warp.edit.rotations import rotate
 from scgs_warp.errors import UserError
-from scgs_warp.export.gltf import GltfDocument, influences, upright
+from scgs_warp.export.gltf import GltfDocument, add_skeleton, influences, upright
+from scgs_warp.export.skeleton import Skeleton
 
 UPS = [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8)]
 
@@ -39,3 +40,25 @@ def test_glb_is_never_json_that_is_not_json():
     document.append("nodes", {"translation": [0.0, float("nan"), 0.0]})
     with pytest.raises(UserError, match="not finite"):
         document.content()
+
+
+def test_vertices_at_rest_stay_where_they_are():
+    """Each joint at rest, after its inverse bind matrix, is the identity; a joint that moved carries its vertices."""
+    rest = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 0.0]])
+    still = np.tile(np.array([1.0, 0, 0, 0]), (2, 2, 1))
+    times, positions = np.array([0.0, 1.0]), np.stack([rest, rest + np.array([0.0, 0.0, 1.0])])
+    binding = np.array([[0], [1]]), np.ones((2, 1))
+    skeleton = Skeleton(times, times, rest, positions, still, None, None, None, *binding)
+    document = GltfDocument()
+    index = add_skeleton(document, skeleton, (0.0, 1.0, 0.0), "motion")
+    skin = document.json["skins"][index]
+    accessor = document.json["accessors"][skin["inverseBindMatrices"]]
+    view = document.json["bufferViews"][accessor["bufferView"]]
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    blob = document.content()
+    binary = blob[20 + int.from_bytes(blob[12:16], "little") + 8 :]
+    inverse = np.frombuffer(binary, "<f4", 32, start).reshape(2, 4, 4).transpose(0, 2, 1)
+    for k, joint in enumerate(skin["joints"]):
+        place = np.eye(4)
+        place[:3, 3] = document.json["nodes"][joint]["translation"]
+        np.testing.assert_allclose(place @ inverse[k], np.eye(4), atol=1e-6)

@@ -260,3 +260,17 @@ def test_far_tiny_and_poisoned_rows(device):
     torch.testing.assert_close(weights.sum(1), torch.ones(4, device=device))
     assert weights[2].tolist() == [1.0, 0.0] and weights[3].tolist() == [1.0, 0.0]
     assert all(g.isfinite().all() for g in grads)
+
+
+def test_strengths_that_underflow_leave_distances_to_decide(device):
+    """A row whose control points all have strength 0 is shared by distance, not given to the first one."""
+    points = torch.tensor([[0.6, 0.0, 0.0]], device=device)
+    nodes = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], device=device)
+    indices = torch.tensor([[0, 1]], dtype=torch.int32, device=device)
+    v = torch.tensor([[1.0, 0.0]])
+    plain = rbf_weights(points, nodes, torch.ones(2, device=device), indices)
+    for strengths in (torch.zeros(2), torch.full((2,), 1e-38), torch.full((2,), 1e-20)):
+        tensors = [points, nodes, torch.ones(2, device=device), strengths.to(device)]
+        weights, grads = gradients(rbf_weights, tensors, indices, v)
+        torch.testing.assert_close(weights, plain)
+        assert all(g.isfinite().all() for g in grads) and float(grads[0].abs().max()) > 0.1

@@ -23,8 +23,11 @@ from scgs_warp.rendering.render import render
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage.checkpoint import read
 from scgs_warp.training.camera_refinement import CameraRefinement, camera_rate, refined
+from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
 from scgs_warp.training.run import train_and_evaluate
+from scgs_warp.training.state import TrainState
+from scgs_warp.training.step import training_step
 from scgs_warp.types import Camera, Frame
 
 COUNT, SIZE = 24, 48
@@ -186,3 +189,17 @@ def test_resumed_to_the_same_bits(tmp_path, device, monkeypatch):
     whole, parts = (read(tmp_path / name)[0] for name in ("whole", "parts"))
     assert whole["cameras.twists"].any() and "adam.cameras.twists.exp_avg" in whole
     assert whole.keys() == parts.keys() and all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_a_training_step_takes_the_mean_out():
+    """A step sees one camera; what it moves in common with the others is not determined by the images."""
+    config = tiny_config(60, motion={"model": "static"}, coarse=0, optim={"cameras": 5e-3})
+    data = still_dataset(count=4)
+    state = TrainState.begin(config, data, "cpu")
+    frames = Frames(data, state.normalisation, config, "cpu")
+    assert state.refines_cameras
+    for _ in range(2):
+        assert training_step(state, frames).failed is None
+        state.step += 1
+    twists = state.cameras.twists.detach()
+    assert float(twists.abs().max()) > 1e-3 and float(twists.mean(0).abs().max()) < 1e-8

@@ -15,6 +15,7 @@ from scgs_warp.training import density_control
 from scgs_warp.training.density_control import (
     control_density,
     control_points_due,
+    density_due,
     gradient_threshold,
     grow_and_prune,
     opacity_reset_due,
@@ -235,3 +236,22 @@ def test_when_the_presets_look(name, steps, looks, monkeypatch):
             state.step = step + state.config.pretrain_steps
             due += [(step + 1) / 1000] if visible_gaussians(state, [0] * 150) is not None else []
     assert tuple(due) == looks
+
+
+@pytest.mark.parametrize("when", ["always", "never"])
+def test_large_gaussians_stay_until_the_first_reset(when, monkeypatch):
+    """Before it, opacities have not separated the Gaussians that are needed from those that are not."""
+    state, _ = state_with_hidden_gaussian(every=5, start=5, rounds=0, prune_large=when)
+    state.stage, seen = "main", {}
+    monkeypatch.setattr(
+        density_control,
+        "grow_and_prune",
+        lambda *_, prune_large, **more: seen.setdefault(state.stage_step + 1, prune_large),
+    )
+    for step in range(50):
+        state.step = step + state.config.pretrain_steps
+        if density_due(state):
+            control_density(state, (48, 48))
+    later = {done: when == "always" for done in range(25, 41, 5)}
+    assert state.config.densify.opacity_reset_every == 20
+    assert seen == {**dict.fromkeys(range(5, 21, 5), False), **later}, "nothing after densification ends at 40"

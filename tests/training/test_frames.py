@@ -80,3 +80,16 @@ def test_small_images_and_masks_at_half_size():
     made.frames = Dataset(masked, folder=made.frames.folder, split="train")
     half = made.view(1, 0, False, False).mask
     assert half is not None and not half[5, 5] and int((~half).sum()) == 1
+
+
+def test_random_backgrounds_over_data_on_white():
+    """The images are read on white: a random colour must take the place of white, not be added to it."""
+    given = tiny_dataset(3, 64)
+    on_white = [dataclasses.replace(f, image=f.image + (1 - f.alpha)[..., None]) for f in given]
+    data = Dataset(on_white, folder=given.folder, split="train", background="white")
+    made = Frames(data, Normalisation.identity(), tiny_config(100), "cpu")
+    _, background, truth, _, _ = made.view(1, 7, True, False)
+    alone = given[1].image.permute(2, 0, 1)
+    expected = alone + (1 - given[1].alpha) * background[:, None, None]
+    assert torch.allclose(truth, expected, atol=1e-6) and not torch.allclose(background, torch.ones(3))
+    assert torch.equal(made.view(1, 7, False, False).background, torch.ones(3))

@@ -3,10 +3,9 @@ code."""
 
 from __future__ import annotations
 
-from functools import cache
-
 import pytest
 
+from helpers.schedules import SMALL, at_step, rates_at
 from helpers.tiny import tiny_dataset
 from scgs_warp.config.presets import from_dict, preset, with_steps
 from scgs_warp.motion.rigidity import arap_weight
@@ -20,31 +19,10 @@ from scgs_warp.training.density_control import (
     visibility_pruning_due,
 )
 from scgs_warp.training.loop import fit
-from scgs_warp.training.state import TrainState
-from scgs_warp.training.step import motion_frozen, set_rates
+from scgs_warp.training.step import motion_frozen
 from scgs_warp.training.view import sh_degree
 
 PAPER = preset("paper")
-SMALL = {"init_points": 300, "motion": {"nodes": 16, "layers": 3, "width": 32, "skip": 2}}
-
-
-@cache
-def begun(stage: str) -> TrainState:
-    """A state with the schedule of ``paper`` and few Gaussians, at the beginning of a stage."""
-    state = TrainState.begin(from_dict(SMALL, "test", PAPER), tiny_dataset(3), "cpu")
-    if stage == "main":
-        state.begin_main()
-    return state
-
-
-def rates_at(stage: str, step: int) -> dict[str, float]:
-    """The learning rates at a step of a stage."""
-    state = begun(stage)
-    state.step = step + (10_000 if stage == "main" else 0)
-    set_rates(state)
-    assert state.motion_optimizer is not None
-    groups = {**state.gaussian_optimizer.groups, **state.motion_optimizer.groups}
-    return {name: group.rate for name, group in groups.items()}
 
 
 @pytest.mark.parametrize(
@@ -72,7 +50,7 @@ def test_arap(step, weight):
     ],
 )
 def test_rates_of_stage_2(step, means, network, positions):
-    rates = rates_at("main", step)
+    rates = rates_at("paper", "main", step)
     assert rates["means"] == pytest.approx(means, rel=1e-4)
     assert rates["network.head.weight"] == pytest.approx(network, rel=1e-4)
     assert rates["positions"] == pytest.approx(positions, rel=1e-4)
@@ -87,7 +65,7 @@ def test_rates_of_stage_2(step, means, network, positions):
 )
 def test_rates_of_stage_1(step, means, network):
     """Spheres learn like Gaussians; the count of the network's rate begins with the stage, not after the warm-up."""
-    rates = rates_at("pretrain", step)
+    rates = rates_at("paper", "pretrain", step)
     assert rates["means"] == pytest.approx(means, rel=1e-4)
     assert rates["network.head.weight"] == pytest.approx(network, rel=1e-4)
     assert (rates["opacity_logits"], rates["sh_dc"], rates["log_radius"]) == (0.05, 2.5e-3, 5e-3)
@@ -98,8 +76,7 @@ def test_rates_of_stage_1(step, means, network):
     [(0, 0, True), (999, 0, True), (1_000, 1, True), (2_000, 2, True), (2_999, 2, True), (3_000, 3, False)],
 )
 def test_harmonics_and_freeze(step, degree, frozen):
-    state = begun("main")
-    state.step = 10_000 + step
+    state = at_step("paper", "main", step)
     assert sh_degree(state, step) == degree and motion_frozen(state) is frozen
     assert sh_degree(state, 69_999) == 3
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -77,3 +78,22 @@ def test_a_run_is_not_overwritten(tmp_path):
     refuse_existing(tmp_path, resume=True)
     with pytest.raises(UserError, match="holds a run already"):
         refuse_existing(tmp_path, resume=False)
+
+
+def test_the_curve_is_the_mean_of_images_from_the_whole_split(tmp_path):
+    """Every second of eight images; each is rendered with an error of its own."""
+    data, rendered = tiny_dataset(8), []
+
+    def render(camera, time):
+        rendered.append(round(7 * time))
+        image = next(frame.image for frame in data if frame.time == time)
+        return SimpleNamespace(rgb=image + 0.1 * (1.0 + time))
+
+    modes = []
+    motion = SimpleNamespace(eval=lambda: modes.append("eval"), train=lambda: modes.append("train"))
+    with RunFolder(tmp_path / "run", tiny_config(50), None, resume=False) as folder:
+        folder.log_test_psnr(SimpleNamespace(render=render, motion=motion), data, 30)
+    assert rendered == [0, 2, 4, 6] and modes == ["eval", "train"]
+    logged = json.loads((tmp_path / "run/log.jsonl").read_text())
+    expected = sum(-20 * math.log10(0.1 * (1 + k / 7)) for k in rendered) / 4
+    assert logged["step"] == 30 and logged["test_psnr"] == pytest.approx(expected, abs=0.01)  # colours end at 1

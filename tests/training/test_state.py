@@ -121,3 +121,12 @@ def test_random_points_of_the_official_code_are_grey_in_a_cube():
         for way in ("cube", "covered")
     ]
     assert counts[0] == 40 < counts[1]
+
+
+def test_resume_counts_dropped_steps_on(tmp_path):
+    """Otherwise a run that is killed and resumed would never reach the number of dropped steps at which it ends."""
+    config, data = tiny_config(20, motion={"model": "static"}), tiny_dataset(3)
+    state = TrainState.begin(config, data, "cpu")
+    state.failures = 7
+    state.save(tmp_path)
+    assert TrainState.resume(tmp_path, config, data, "cpu").failures == 7
