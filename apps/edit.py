@@ -22,7 +22,8 @@ class Options:
     run: Path | None = None
     """Run folder, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: a file of Gaussians (.ply, .compressed.ply, .splat or .spz), which does not move by itself."""
+    """Instead of a run: a file of Gaussians, which does not move by itself: .ply, .compressed.ply, .splat, .spz, .sog
+    or a SOG's meta.json."""
     script: Path | None = None
     """Edit to load, as JSON (docs/editing.md). Without an output, the editor opens with it."""
     output: Path | None = None

@@ -24,7 +24,8 @@ class Options:
     run: Path | None = None
     """Run folder, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: a file of Gaussians (.ply, .compressed.ply, .splat or .spz), which does not move."""
+    """Instead of a run: a file of Gaussians, which does not move: .ply, .compressed.ply, .splat, .spz, .sog or a SOG's
+    meta.json."""
     mode: Literal["turntable", "time", "both"] = "both"
     """turntable: the camera moves round a still scene; time: the scene moves; both: both at once. If the training
     cameras saw the scene from one side only, the camera swings within that range."""

@@ -17,6 +17,8 @@ import re
 import sys
 from pathlib import Path
 
+from format_tables import NAMES as FORMATS
+from format_tables import format_table
 from kernel_tables import WRITERS as KERNELS
 from kernel_tables import kernel_table
 from provenance import ROOT, without_older_marks
@@ -35,6 +37,7 @@ def table_names(results: Path) -> list[str]:
         *BENCHMARKS,
         "speed-overview",
         *KERNELS,
+        *FORMATS,
         *(f"quality-{name}" for name in WRITERS),
         *sorted(reported | set(REPEATABLE)),
     ]
@@ -52,6 +55,8 @@ def section(name: str, results: Path) -> str:
         return speed_overview(results)
     if name in KERNELS:
         return kernel_table(name, results)
+    if name in FORMATS:
+        return format_table(name, results)
     if name.startswith("quality-") and name[len("quality-") :] in WRITERS:
         return quality_table(name[len("quality-") :], results)
     measured = repeatable_table(name, results) if name in REPEATABLE else None

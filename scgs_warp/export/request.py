@@ -8,17 +8,31 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ..errors import UserError
+from ..formats.sog_files import META, check_folder
 from ..storage.output_folders import make_parent
 from ..storage.suffixes import longest_suffix
 
 Format = Literal[
-    "ply", "ply-sequence", "compressed.ply", "splat", "spz", "glb", "graph", "npz", "tracks", "4dgs", "cameras", "html"
+    "ply",
+    "ply-sequence",
+    "compressed.ply",
+    "splat",
+    "spz",
+    "sog",
+    "glb",
+    "graph",
+    "npz",
+    "tracks",
+    "4dgs",
+    "cameras",
+    "html",
 ]
 SUFFIXES: dict[Format, str] = {
     "ply": ".ply",
     "compressed.ply": ".compressed.ply",
     "splat": ".splat",
     "spz": ".spz",
+    "sog": ".sog",
     "glb": ".glb",
     "npz": ".npz",
     "tracks": ".csv",
@@ -32,9 +46,9 @@ SUFFIXES: dict[Format, str] = {
 several suffixes, the longest of them counts."""
 TRACK_SUFFIXES = (".csv", ".npz", ".glb")
 """Suffixes of tracks. The last two select other formats unless ``--format tracks`` is given."""
-OTHER_SUFFIXES = {".htm": ".html"}
-"""Alternative suffixes."""
-STILL_FORMATS = ("ply", "compressed.ply", "splat", "spz", "glb")
+OTHER_SUFFIXES = {".htm": ".html", "meta.json": ".sog"}
+"""Alternative suffixes, and a whole name: a SOG that is not bundled."""
+STILL_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb")
 """Formats of Gaussians at one instant; ``glb`` holds the motion if no instant is given."""
 FRAME_FORMATS = ("ply-sequence", "tracks", "4dgs")
 """Formats of many moments, which hold the motion of every motion model."""
@@ -47,19 +61,19 @@ class ExportRequest:
     """Write a scene as a file that other programs open (docs/formats.md)."""
 
     output: Path
-    """File to write, or the folder of a ply-sequence. An existing one is replaced when the new one is complete."""
+    """File to write, or the folder of a ply-sequence. An existing one is replaced when the new one is complete. A SOG
+    named FOLDER/meta.json is not bundled: its images lie beside it."""
     run: Path | None = None
     """Folder of a run, as apps/train.py writes it."""
     ply: Path | None = None
-    """Instead of a run: Gaussians to convert, in a .ply of 3D Gaussian splatting, a .compressed.ply, a .splat or a
-    .spz."""
+    """Instead of a run: Gaussians to convert, in a .ply of 3D Gaussian splatting, a .compressed.ply, a .splat, a .spz,
+    a .sog or a SOG's meta.json."""
     format: Format | None = None
-    """ply, compressed.ply, splat, spz: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF with
-    Gaussians, moved by control points as an animated skeleton; still with --time. graph: the control points and their
-    edges as an animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras as
-    nerfstudio's transforms.json. html: a page that plays the scene. tracks: paths of surface points, in
-    .npz, .csv or .glb. 4dgs: Gaussians in linear segments, for players of that format. By default the output's suffix
-    decides."""
+    """ply, compressed.ply, splat, spz, sog: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF
+    with Gaussians, moved by control points as an animated skeleton; still with --time. graph: the control points and
+    their edges as an animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras
+    as nerfstudio's transforms.json. html: a page that plays the scene. tracks: paths of surface points, in .npz, .csv
+    or .glb. 4dgs: Gaussians in linear segments, for players of that format. By default the output's suffix decides."""
     time: float | None = None
     """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion."""
     edit: Path | None = None
@@ -127,9 +141,9 @@ def check_request(request: ExportRequest) -> None:
     kind = request.kind
     if (request.run is None) == (request.ply is None):
         raise UserError("export.py: give one of --run and --ply")
-    if request.run is None and kind in ("cameras", "html"):
-        raise UserError(f"--format {kind}: needs --run; a file of Gaussians has no cameras and no motion")
-    if request.run is None and request.edit is None and kind not in STILL_FORMATS:
+    if request.run is None and kind == "cameras":
+        raise UserError("--format cameras: needs --run; a file of Gaussians has no cameras")
+    if request.run is None and request.edit is None and kind not in (*STILL_FORMATS, "html"):
         raise UserError(f"--format {kind}: needs --run, or an --edit that moves the Gaussians of {request.ply}")
     if request.time is not None and not 0 <= request.time <= 1:
         raise UserError(f"--time {request.time:g}: give a time from 0 to 1")
@@ -195,10 +209,12 @@ def check_output(path: Path, kind: Format) -> None:
     if kind == "tracks" and suffix in TRACK_SUFFIXES:
         ending = suffix
     if ending and suffix != ending:
-        longer = f", not in {suffix}," if suffix.endswith(ending) else ""
+        longer = f", not in {suffix}," if suffix.endswith(ending) else f" (not {META})" if path.name == META else ""
         raise UserError(f"--output {path}: end the name in {ending}{longer} for --format {kind}")
     if ending and path.is_dir():
         raise UserError(f"--output {path}: is a folder; give another name")
     if not ending and path.exists() and not path.is_dir():
         raise UserError(f"--output {path}: is a file; name a folder for --format {kind}")
+    if path.name.lower() == META:
+        check_folder(path)
     make_parent(path)

@@ -16,6 +16,7 @@ from ..edit import EditSession
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
 from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
+from ..formats.sog_files import META
 from ..motion.control_points import ControlPoints
 from ..runtime.progress import progress
 from ..scene.from_gaussians import open_gaussians
@@ -69,7 +70,8 @@ def export(request: ExportRequest, device: str = "cpu") -> str:
 
 
 def _size(path: Path) -> str:
-    files = path.iterdir() if path.is_dir() else [path]
+    folder = path.parent if path.name.lower() == META else path
+    files = folder.iterdir() if folder.is_dir() else [path]
     return f"{sum(file.stat().st_size for file in files) / 2**20:.1f} MiB"
 
 
@@ -263,8 +265,8 @@ def _export_page(request: ExportRequest, device: str) -> str:
         from .page import write_page
     except ImportError as error:
         raise UserError(f"--format html: {error}; install the package again") from None
-    assert request.run is not None
-    scene = Scene.load(request.run, device=device)
-    title = request.title or request.run.resolve().name
+    scene, source = _open(request, device), request.run or request.ply
+    assert source is not None
+    title = request.title or source.resolve().name
     count = write_page(scene, request.output, title=title, max_mib=request.max_mib, url=request.url)
     return f"{count:,} Gaussians {'and their motion' if scene.motion.moves else 'that stand still'}"

@@ -15,26 +15,31 @@ from ..storage.suffixes import longest_suffix
 from ..types import Gaussians
 from .gaussian_compressed_ply import SUFFIX, write_compressed_ply
 from .gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from .gaussian_sog import read_antialiased_model, read_sog, write_sog
 from .gaussian_splat import read_splat, write_splat
 from .gaussian_spz import VERSION, read_antialiased_flag, read_spz, write_spz
 from .ply_header import has_antialiased_comment
+from .sog_files import META
 
 READERS: dict[str, Callable[[Path], GaussianParameters]] = {
     ".ply": read_gaussian_ply,
     SUFFIX: read_gaussian_ply,
     ".splat": read_splat,
     ".spz": read_spz,
+    ".sog": read_sog,
+    META: read_sog,
 }
+"""Readers by suffix; the folder of a SOG can be given for its ``meta.json``."""
 
 
 def read_gaussians(path: str | Path) -> GaussianParameters:
-    """Read raw parameters, world units, from a ``.ply`` of 3D Gaussian splatting, a ``.compressed.ply``, a ``.splat``
-    or a ``.spz``.
+    """Read raw parameters, world units, from a ``.ply`` of 3D Gaussian splatting, a ``.compressed.ply``, a ``.splat``,
+    a ``.spz``, or a SOG: a ``.sog``, a ``meta.json`` or the folder that holds one.
 
     Raises:
         UserError: the file is of another kind, missing, damaged or too large for memory, or it has no finite Gaussian.
     """
-    path = Path(path)
+    path = _file(path)
     reader = READERS.get(longest_suffix(path, READERS))
     if reader is None:
         raise UserError(f"{path}: Gaussians are read from {', '.join(READERS)}; give one of these or convert it")
@@ -42,12 +47,20 @@ def read_gaussians(path: str | Path) -> GaussianParameters:
         return reader(path)
 
 
+def _file(path: str | Path) -> Path:
+    """Return the path itself, or the ``meta.json`` in a folder."""
+    path = Path(path)
+    return path / META if (path / META).is_file() else path
+
+
 def read_antialiased(path: str | Path) -> bool:
     """Return whether a file is marked as trained with the antialiasing compensation; False for what cannot be read."""
-    path = Path(path)
+    path = _file(path)
     suffix = longest_suffix(path, READERS)
     if suffix in (".ply", SUFFIX):
         return has_antialiased_comment(path)
+    if suffix in (".sog", META):
+        return read_antialiased_model(path)
     return suffix == ".spz" and read_antialiased_flag(path)
 
 
@@ -77,6 +90,8 @@ def write_gaussians(
         write_gaussian_ply(path, gaussians, antialiased=antialiased)
     elif suffix == ".splat":
         write_splat(path, gaussians)
+    elif suffix in (".sog", META):
+        write_sog(path, gaussians, antialiased=antialiased)
     else:
         raise UserError(f"{path}: Gaussians are written as {', '.join(READERS)} or .glb; end the name in one of these")
     return 0

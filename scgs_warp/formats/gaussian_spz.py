@@ -19,7 +19,7 @@ import torch
 
 from ..errors import UserError
 from ..gaussians import GaussianParameters
-from ..storage.files import read_bytes, write_atomically
+from ..storage.files import open_regular, read_bytes, write_atomically
 from ..types import Gaussians
 from .gaussian_parameters import to_parameters
 from .spz_axes import NAMES, STANDARD, turn_axes
@@ -196,7 +196,7 @@ def read_spz(path: str | Path) -> GaussianParameters:
 def read_antialiased_flag(path: Path) -> bool:
     """Return whether a ``.spz`` is marked as trained with the antialiasing compensation; False if it is damaged."""
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             start = file.read(4096)
         if start[:4] != struct.pack("<I", MAGIC):
             start = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(start, 16)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..storage.files import open_regular
+
 ANTIALIASED_COMMENT = "SplatRenderMode: mip"
 """Comment that marks Gaussians trained with the antialiasing compensation, as Brush writes it."""
 ANTIALIASED_WORDS = ([b"SplatRenderMode:", b"mip"], [b"antialiased", b"1"])
@@ -20,7 +22,7 @@ def check_ply_counts(path: Path) -> None:
         OSError: the file cannot be read.
     """
     size = path.stat().st_size
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         head = file.read(HEAD_BYTES).split(b"end_header")[0]
     for line in head.splitlines():
         words = line.split()
@@ -32,7 +34,7 @@ def has_antialiased_comment(path: Path) -> bool:
     """Return whether a comment marks the Gaussians of a PLY file as trained with the antialiasing compensation; False
     if the file cannot be read."""
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             lines = file.read(HEAD_BYTES).split(b"end_header")[0].splitlines()
     except OSError:
         return False  # The reader of the Gaussians reports this.

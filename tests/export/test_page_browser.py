@@ -19,9 +19,11 @@ from PIL import Image
 from helpers.chromium import chromium
 from helpers.edit_scenes import bar_scene, rich_scene, tinted_scene
 from scgs_warp.export.page import write_page
+from scgs_warp.export.request import ExportRequest
+from scgs_warp.export.run import export, write_still
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.motion import build_motion
-from scgs_warp.scene.from_gaussians import with_control_points
+from scgs_warp.scene.from_gaussians import open_gaussians, with_control_points
 from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Camera
 
@@ -143,6 +145,18 @@ def test_frames_are_those_of_our_renderer(browser, name, tmp_path):
             assert psnr(pictures[-1], ours) > 45
     if scene.motion.moves:
         assert changed(pictures[0], pictures[2]) > 0.01, "it moves"
+    assert not visit.problems
+    visit.context.close()
+
+
+def test_a_file_of_gaussians_is_shown(browser, tmp_path):
+    write_still(tmp_path / "a.sog", bar_scene(shaded=True).gaussians_at(0.2))
+    export(ExportRequest(tmp_path / "a.html", ply=tmp_path / "a.sog"))
+    scene, visit = open_gaussians(tmp_path / "a.sog"), Visit(browser, tmp_path / "a.html")
+    for azimuth in (30.0, 200.0):
+        camera = orbit_camera(scene.overview, azimuth, 120)
+        ours = scene.render(camera, 0.0, (0, 0, 0)).rgb.clamp(0, 1).numpy()
+        assert (ours > 0.1).mean() > 0.02 and psnr(visit.render(camera, 0.0), ours) > 45
     assert not visit.problems
     visit.context.close()
 

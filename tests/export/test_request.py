@@ -22,6 +22,8 @@ from scgs_warp.export.request import ExportRequest, check_request
         ("frames", "ply-sequence"),
         ("a.compressed.ply", "compressed.ply"),
         ("compressed.ply", "ply"),
+        ("a.sog", "sog"),
+        ("new/meta.json", "sog"),
     ],
 )
 def test_the_suffix_decides_the_format(name, kind):
@@ -54,6 +56,8 @@ def test_a_glb_is_still_where_an_instant_is_given():
         ("a.html", {"edit": Path("e.json")}, "--format html"),
         ("a.ply", {"format": "glb"}, "end the name in .glb"),
         ("a.ply", {"format": "compressed.ply"}, "end the name in .compressed.ply"),
+        ("meta.json", {"format": "cameras"}, r"end the name in .json \(not meta.json\) for"),
+        ("a.ply", {"spz_version": 3}, "--spz-version: --format ply has no such versions"),
         ("a.compressed.ply", {"format": "ply"}, "end the name in .ply, not in .compressed.ply"),
     ],
 )

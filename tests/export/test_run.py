@@ -253,15 +253,21 @@ def test_an_edit_is_exported(run, tmp_path):
         np.testing.assert_allclose(sh_dc, truth.sh_dc, atol=2e-5)
 
 
-def test_files_are_filmed_and_edited(run, tmp_path):
-    write_still(tmp_path / "a.spz", Scene.load(run).gaussians_at(0.0))
+@pytest.mark.parametrize("name", ["a.spz", "a.compressed.ply", "a.sog", "loose/meta.json", "loose"])
+def test_files_are_filmed_edited_and_put_on_a_page(run, tmp_path, name, capsys):
+    source = tmp_path / name
+    write_still(source / "meta.json" if name == "loose" else source, Scene.load(run).gaussians_at(0.0))
     film = tmp_path / "film"
-    arguments = ["--ply", tmp_path / "a.spz", "--frames", 1, "--size", 32, "--mode", "turntable", "--output", film]
+    arguments = ["--ply", source, "--frames", 1, "--size", 32, "--mode", "turntable", "--output", film]
     assert view_app.cli([*map(str, arguments), "--device", "cpu"]) == 0
     assert len(list(film.iterdir())) == 1
-    arguments = ["--ply", tmp_path / "a.spz", "--nodes", 10, "--export", tmp_path / "b.ply", "--device", "cpu"]
+    arguments = ["--ply", source, "--nodes", 10, "--export", tmp_path / "b.ply", "--device", "cpu"]
     assert edit_app.cli([*map(str, arguments)]) == 0
     assert len(PlyData.read(str(tmp_path / "b.ply"))["vertex"].data) == 120
+    export("--ply", source, "--output", tmp_path / "b.html")
+    assert "b.html: 120 Gaussians that stand still," in capsys.readouterr().out
+    facts, _ = read_page(tmp_path / "b.html")
+    assert facts["gaussians"] == 120 and f"<title>{source.name}</title>" in (tmp_path / "b.html").read_text()
 
 
 def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
@@ -300,6 +306,8 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         (["--run", tmp_path / "nowhere", "--output", "a.ply"], "nowhere"),
         (["--ply", "a.ply", "--output", "b.spz"], "no such file"),
         (["--ply", "a.ply", "--output", "b.npz"], "--run"),
+        (["--ply", "a.ply", "--output", "b.html", "--edit", "e.json"], "leave --edit out"),
+        (["--ply", "a.ply", "--output", "b.json"], "a file of Gaussians has no cameras"),
         (["--run", still, "--output", "b.npz"], "stands still"),
         (["--run", run, "--format", "cameras", "--output", "b.json"], "data.folder"),
     ]

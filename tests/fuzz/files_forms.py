@@ -223,6 +223,32 @@ def _spz_streams(data: bytes, random: Random) -> bytes:
     return bytes(changed)
 
 
+def sog_member(data: bytes, random: Random) -> bytes:
+    """Damage, remove, rename or inflate a member of a bundle, with valid check sums."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    names = list(members)
+    name = names[random.integers(len(names))] if random.random() < 0.5 else "meta.json"
+    kind = int(random.integers(7))
+    if kind < 3:
+        members[name] = (
+            json_value(members["meta.json"], random) if name == "meta.json" else set_word(members[name], random)
+        )
+    elif kind == 3:
+        members[name] = BYTES[random.integers(len(BYTES))](members[name], random)
+    elif kind == 4:
+        members[f"../../{name}" if random.random() < 0.5 else name.upper()] = members.pop(name)
+    elif kind == 5:
+        members[name] = members[names[random.integers(len(names))]]
+    else:  # 80 MiB of zeros in as many KiB
+        members[name] = bytes(80 << 20)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED if random.random() < 0.5 or kind == 6 else 0) as archive:
+        for key, value in members.items():
+            archive.writestr(key, value)
+    return stream.getvalue()
+
+
 def png_size(data: bytes, random: Random) -> bytes:
     """Change the width or height with a valid checksum: data are missing, or the picture is a bomb."""
     if data[:4] != b"\x89PNG":
@@ -371,6 +397,7 @@ STRUCTURED: dict[str, tuple[Mutator, ...]] = {
     ".ply": (ply_header, ply_header, ply_values, ply_values, TEXT[0]),
     ".splat": (splat_values,),
     ".spz": (spz_inside,),
+    ".sog": (sog_member,),
     ".bin": (colmap_count, colmap_doubles, colmap_doubles),
     ".txt": TEXT,
     ".safetensors": (safetensors_head, safetensors_head, safetensors_values, safetensors_values),

@@ -1,4 +1,4 @@
-"""Files of Gaussians: PLY in text, binary and packed, .splat, .spz of versions 1 to 4; and glTF."""
+"""Files of Gaussians: PLY in text, binary and packed, .splat, .spz of versions 1 to 4, SOG; and glTF."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from scgs_warp.data.synthetic.from_mesh import SynthesisRequest, load_subject
 from scgs_warp.formats.gaussian_compressed_ply import write_compressed_ply
 from scgs_warp.formats.gaussian_files import gaussian_points
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
+from scgs_warp.formats.gaussian_sog import write_sog
 from scgs_warp.formats.gaussian_splat import write_splat
 from scgs_warp.formats.gaussian_spz import write_spz
 from scgs_warp.scene.from_gaussians import open_gaussians
@@ -109,6 +110,22 @@ def _mesh(name: str, write: Any, share: float = 1.0) -> Format:
     return Format(name, maker("scene.glb", write), functools.partial(load_mesh, "scene.glb"), share=share)
 
 
+def write_loose_sog(folder: Path) -> None:
+    write_sog(folder / "meta.json", cloud())
+
+
+def write_old_sog(folder: Path) -> None:
+    """Write version 1, with ranges in place of codebooks."""
+    write_loose_sog(folder)
+    meta = json.loads((folder / "meta.json").read_text())
+    del meta["version"], meta["shN"]["bands"], meta["shN"]["count"]
+    meta["means"]["shape"] = [meta.pop("count"), 3]
+    for name, low, high in (("scales", [-6.0] * 3, [0.0] * 3), ("sh0", [-2.0] * 4, [2.0] * 4), ("shN", -1.0, 1.0)):
+        del meta[name]["codebook"]
+        meta[name] |= {"mins": low, "maxs": high}
+    (folder / "meta.json").write_text(json.dumps(meta))
+
+
 FORMATS = (
     _gaussians("ply", ".ply", lambda path: write_gaussian_ply(path, cloud()), 2.0),
     _gaussians("ply-text", ".ply", write_text_ply),
@@ -119,6 +136,9 @@ FORMATS = (
     _gaussians("spz-3", ".spz", lambda path: write_spz(path, cloud(), version=3)),
     _gaussians("spz-4", ".spz", lambda path: write_spz(path, cloud())),
     _gaussians("spz-axes", ".spz", write_extended_spz, 0.5),
+    _gaussians("sog", ".sog", lambda path: write_sog(path, cloud()), 2.0),
+    Format("sog-loose", write_loose_sog, functools.partial(load_gaussians, "meta.json"), share=2.0),
+    Format("sog-1", write_old_sog, functools.partial(load_gaussians, "meta.json")),
     _mesh("glb-moving", lambda path: box().save(path)),
     _mesh("glb-skinned", lambda path: bar(4)[0].save(path), 1.5),
     _mesh("glb-textured", write_textured),
