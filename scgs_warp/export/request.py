@@ -15,6 +15,7 @@ from ..storage.suffixes import longest_suffix
 Format = Literal[
     "ply",
     "ply-sequence",
+    "sog-sequence",
     "compressed.ply",
     "splat",
     "spz",
@@ -41,6 +42,7 @@ SUFFIXES: dict[Format, str] = {
     "html": ".html",
     "graph": ".glb",
     "ply-sequence": "",
+    "sog-sequence": "",
 }
 """Suffix of each format's output. Formats may share a suffix, which then selects the first of them. If a name ends in
 several suffixes, the longest of them counts."""
@@ -50,7 +52,8 @@ OTHER_SUFFIXES = {".htm": ".html", "meta.json": ".sog"}
 """Alternative suffixes, and a whole name: a SOG that is not bundled."""
 STILL_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb")
 """Formats of Gaussians at one instant; ``glb`` holds the motion if no instant is given."""
-FRAME_FORMATS = ("ply-sequence", "tracks", "4dgs")
+SEQUENCES = ("ply-sequence", "sog-sequence")
+FRAME_FORMATS = (*SEQUENCES, "tracks", "4dgs")
 """Formats of many moments, which hold the motion of every motion model."""
 MAX_FRAMES = 100_000
 MAX_POINTS = 1_000_000
@@ -61,7 +64,7 @@ class ExportRequest:
     """Write a scene as a file that other programs open (docs/formats.md)."""
 
     output: Path
-    """File to write, or the folder of a ply-sequence. An existing one is replaced when the new one is complete. A SOG
+    """File to write, or the folder of a sequence. An existing one is replaced when the new one is complete. A SOG
     named FOLDER/meta.json is not bundled: its images lie beside it."""
     run: Path | None = None
     """Folder of a run, as apps/train.py writes it."""
@@ -69,11 +72,12 @@ class ExportRequest:
     """Instead of a run: Gaussians to convert, in a .ply of 3D Gaussian splatting, a .compressed.ply, a .splat, a .spz,
     a .sog or a SOG's meta.json."""
     format: Format | None = None
-    """ply, compressed.ply, splat, spz, sog: Gaussians at one instant. ply-sequence: a .ply for every frame. glb: glTF
-    with Gaussians, moved by control points as an animated skeleton; still with --time. graph: the control points and
-    their edges as an animated glTF mesh. npz: Gaussians, weights and trajectories as arrays. cameras: the run's cameras
-    as nerfstudio's transforms.json. html: a page that plays the scene. tracks: paths of surface points, in .npz, .csv
-    or .glb. 4dgs: Gaussians in linear segments, for players of that format. By default the output's suffix decides."""
+    """ply, compressed.ply, splat, spz, sog: Gaussians at one instant. ply-sequence, sog-sequence: a file for every
+    frame. glb: glTF with Gaussians, moved by control points as an animated skeleton; still with --time. graph: the
+    control points and their edges as an animated glTF mesh. npz: Gaussians, weights and trajectories as arrays.
+    cameras: the run's cameras as nerfstudio's transforms.json. html: a page that plays the scene. tracks: paths of
+    surface points, in .npz, .csv or .glb. 4dgs: Gaussians in linear segments, for players of that format. By default
+    the output's suffix decides."""
     time: float | None = None
     """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion."""
     edit: Path | None = None
@@ -195,8 +199,8 @@ def _check_unused(request: ExportRequest) -> None:
     if request.skeleton == "parts" and (kind != "glb" or request.still):
         remedy = "leave out --time" if kind == "glb" and request.time is not None else "give --format glb and --run"
         raise UserError(f"--skeleton parts: --output {request.output} is to hold no skeleton; {remedy}")
-    if request.fps is not None and kind == "ply-sequence":
-        raise UserError("--fps: a ply-sequence does not say how fast it is; leave it out, and give --frames")
+    if request.fps is not None and kind in SEQUENCES:
+        raise UserError(f"--fps: a {kind} does not say how fast it is; leave it out, and give --frames")
 
 
 def check_output(path: Path, kind: Format) -> None:

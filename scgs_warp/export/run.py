@@ -29,8 +29,8 @@ from .moving import export_fourdgs, export_tracks
 from .npz import write_npz
 from .part_rig import build_rig
 from .plain import plain_scene
-from .request import FRAME_FORMATS, ExportRequest, check_request, output_suffix
-from .sequence import check_folder, write_sequence
+from .request import FRAME_FORMATS, SEQUENCES, ExportRequest, check_request, output_suffix
+from .sequence import ENDINGS, check_folder, write_sequence
 from .skeleton import (
     AnimationMoment,
     Skeleton,
@@ -56,7 +56,7 @@ def export(request: ExportRequest, device: str = "cpu") -> str:
         UserError: the request cannot be met; an existing file stays unchanged.
     """
     check_request(request)
-    if request.kind == "ply-sequence":
+    if request.kind in SEQUENCES:
         check_folder(request.output)
     if request.still:
         held = _export_still(request, device)
@@ -153,11 +153,11 @@ def _export_moving(request: ExportRequest, device: str) -> str:
         gaussians = keep_finite(at_rest(scene))
         write_glb(request.output, gaussians, scene.overview.up)
         return f"{len(gaussians.means):,} Gaussians that stand still"
-    if request.edit is None and not scene.motion.moves and request.kind != "ply-sequence":
+    if request.edit is None and not scene.motion.moves and request.kind not in SEQUENCES:
         raise UserError(f"--format {request.kind}: {request.run} stands still; write its Gaussians as ply or glb")
     frames = even_moments(request.frames or FRAMES, request.fps or FPS)
     moments = film_moments(session) if session is not None and request.edit is not None else frames
-    if request.kind == "ply-sequence":
+    if request.kind in SEQUENCES:
         return _write_frames(request, scene, session, moments)
     if request.kind == "tracks":
         return export_tracks(request.output, scene, session, moments, request.points)
@@ -182,7 +182,8 @@ def _write_frames(
             yield finite
 
     with progress(len(moments), "export") as shown:
-        count = write_sequence(request.output, frames(), shown.advance)
+        how = {"ending": ENDINGS[request.kind], "antialiased": scene.config.antialiased}
+        count = write_sequence(request.output, frames(), shown.advance, **how)
     least, most = min(counts), max(counts)
     held = f"{most:,}" if least == most else f"{least:,} to {most:,}"
     return f"{count} frames of {held} Gaussians"

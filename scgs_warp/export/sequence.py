@@ -1,4 +1,4 @@
-"""A moving scene as a folder of 3D-GS files, one per frame."""
+"""A moving scene as a folder of files of Gaussians, one per frame."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ..errors import UserError
-from ..formats.gaussian_ply import write_gaussian_ply
+from ..formats.gaussian_files import write_gaussians
 from ..storage.output_folders import holds_only, replace_folder
 from ..types import Gaussians
 
-NAME = "frame_{:05d}.ply"
+NAME = "frame_{:05d}"
+ENDINGS = {"ply-sequence": ".ply", "sog-sequence": ".sog"}
+"""Suffix of the frames of each format."""
 
 
 def check_folder(path: Path) -> None:
@@ -24,13 +26,25 @@ def check_folder(path: Path) -> None:
     path = path.resolve()
     if Path.cwd().is_relative_to(path):
         raise UserError(f"--output {path}: is the current folder or contains it; name a new folder")
-    if path.is_dir() and not holds_only(path, r"frame_\d{5,}\.ply"):
+    if path.is_dir() and not holds_only(path, r"frame_\d{5,}\.(ply|sog)"):
         raise UserError(f"{path}: holds other files than a sequence's frames; name a new folder")
 
 
-def write_sequence(path: Path, frames: Iterable[Gaussians], advance: Callable[[], None] | None = None) -> int:
+def write_sequence(
+    path: Path,
+    frames: Iterable[Gaussians],
+    advance: Callable[[], None] | None = None,
+    *,
+    ending: str = ".ply",
+    antialiased: bool = False,
+) -> int:
     """Write activated Gaussians, world units, as ``frame_00000.ply`` and so on. An earlier sequence in the same folder
     is replaced as a whole once the new one is complete.
+
+    Args:
+        advance: called after each frame.
+        ending: suffix of the frames, one of ``ENDINGS``.
+        antialiased: whether the Gaussians were trained with the antialiasing compensation.
 
     Returns:
         Frame count.
@@ -45,7 +59,7 @@ def write_sequence(path: Path, frames: Iterable[Gaussians], advance: Callable[[]
     count = 0
     try:
         for gaussians in frames:
-            write_gaussian_ply(temporary / NAME.format(count), gaussians)
+            write_gaussians(temporary / f"{NAME.format(count)}{ending}", gaussians, antialiased=antialiased)
             count += 1
             if advance is not None:
                 advance()

@@ -13,7 +13,7 @@ from plyfile import PlyData
 
 from helpers.edit_scenes import bar_scene
 from helpers.export_files import columns, gltf_arrays, picture, ply_columns
-from helpers.node_packages import gltf_errors
+from helpers.node_packages import gltf_errors, splat_transform
 from helpers.page_reader import read_page
 from helpers.paths import ROOT
 from scgs_warp.apps import edit as edit_app
@@ -201,6 +201,21 @@ def test_a_sequence_has_a_frame_an_instant(run, tmp_path):
     (folder / "mine.txt").write_text("keep me")
     assert app.cli(["--run", str(run), "--output", str(folder), "--frames", "2"]) == 2
     assert len(list(folder.iterdir())) == 4 and sorted(p.name for p in tmp_path.iterdir()) == ["frames"]
+
+
+def test_a_sequence_of_sog_is_read_by_splat_transform(run, tmp_path):
+    folder = tmp_path / "frames"
+    export("--run", run, "--output", folder, "--format", "sog-sequence", "--frames", 3)
+    assert sorted(path.name for path in folder.iterdir()) == [f"frame_{i:05d}.sog" for i in range(3)]
+    scene = Scene.load(run)
+    for frame in (0, 2):
+        found = ply_columns(splat_transform(folder / f"frame_{frame:05d}.sog", tmp_path / f"{frame}.ply"))
+        means = np.stack([found[axis] for axis in "xyz"], 1)
+        truth = scene.gaussians_at(frame / 2).means.double().numpy()
+        away = np.linalg.norm(means[:, None] - truth[None], axis=2)
+        assert len(means) == 120 and away.min(axis=0).max() < 1e-3 and away.min(axis=1).max() < 1e-3
+    export("--run", run, "--output", folder, "--frames", 2, "--format", "ply-sequence")
+    assert len(list(folder.iterdir())) == 2
 
 
 def test_stills_and_conversions(run, tmp_path):
