@@ -12,6 +12,7 @@ import numpy as np
 
 from .handles import ONE_FRAME, Handle, Target, Vector3
 from .keyframes import Keyframe
+from .part_skin import SkinName
 from .playback import Exaggerate, Hold, Playback
 from .skeleton import Skeleton
 
@@ -92,6 +93,11 @@ class Edit:
     film: Film = Film()
     skeleton: Skeleton | None = None
     """Parts to which handles refer; None: no handle poses a part, and the run's skeleton is unchanged."""
+
+    skin: SkinName = "parts"
+    """How Gaussians follow posed parts. parts: they follow the part to which they belong and those that it meets at a
+    joint, and widen where the surface stretches; dual: the same, and motions blend as dual quaternions; nodes: by their
+    trained weights, as they follow handles of control points."""
 
     @property
     def reach(self) -> float:

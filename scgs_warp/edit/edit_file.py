@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from .engine import Engine
 from .field_reader import FieldReader, one_line, read_object, show_value
 from .handles import Handle, Target, handle_fields
 from .keyframes import MAX_SECONDS, Keyframe, keyframe_fields
+from .part_skin import SkinName
 from .playback import Exaggerate, Hold, Playback
 from .rotations import from_axis
 from .skeleton import Skeleton
@@ -49,6 +50,7 @@ def to_json(edit: Edit, engine: Engine) -> str:
         "version": VERSION,
         "scene": scene_of(engine),
         "skeleton": None if edit.skeleton is None else skeleton_file.to_plain(edit.skeleton),
+        "skin": None if edit.skeleton is None else edit.skin,
         "handles": [_handle_entry(handle) for handle in edit.handles],
         "pins": list(edit.pins),
         "targets": {name: _plain(target) for name, target in edit.targets.items()},
@@ -141,6 +143,7 @@ def parse(content: Any, source: str, engine: Engine, default: Callable[[], Skele
         exaggerate=_exaggerate(root.child("exaggerate"), engine),
         film=film_of(root.child("film")),
         skeleton=skeleton,
+        skin=root.choice("skin", get_args(SkinName), "parts"),
     )
     root.done("comment")
     return edit

@@ -24,6 +24,7 @@ from .graph import ControlGraph, build_graph, sample_times
 from .handles import ONE_FRAME, STAY, Goal, Target, anchors_at, carried_goal
 from .keyframes import targets_at
 from .part_pose import PartMove, PartPoser
+from .part_skin import PartSkin, part_skin
 from .player import Player
 from .pose import MotionPose, NodePose, Rig, motion_pose, pose_gaussians
 from .rotations import from_matrix, slerp, unit
@@ -54,6 +55,7 @@ class _Problem(NamedTuple):
     """[M] bool: strays that do not follow their leader, because they are pinned or a handle acts on their component."""
     graph: ControlGraph
     solver: ArapSolver
+    skin: PartSkin | None
 
 
 class _Live(NamedTuple):
@@ -98,6 +100,7 @@ class Engine:
         self._bases: OrderedDict[Any, NodePose] = OrderedDict()
         self._bent: OrderedDict[Any, NodePose | None] = OrderedDict()
         self._posers: OrderedDict[Any, PartPoser] = OrderedDict()
+        self._skins: OrderedDict[Any, PartSkin] = OrderedDict()
         self._live: _Live | None = None
 
     def _shared(self) -> np.ndarray:
@@ -136,7 +139,7 @@ class Engine:
         targets = self.targets(edit, at)
         said = tuple((name, target.translation, target.rotation) for name, target in targets.items())
         turned = tuple(edit.turned(handle.name) for handle in edit.handles)
-        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, said, turned, frame, edit.skeleton
+        key = time, edit.handles, edit.pins, edit.holds, edit.exaggerate, said, turned, frame, edit.skeleton, edit.skin
 
         def solve() -> NodePose | None:
             problem = self._problem(edit, time, targets, frame)
@@ -226,11 +229,11 @@ class Engine:
                 continue
             arguments = self.graph, then.positions, base.positions, self.units, edit.turned(handle.name)
             goals.append(carried_goal(handle, target, share, *arguments))
-        graph, solver = self.graph, self.solver
+        graph, solver, skin = self.graph, self.solver, None
         posed = self._part_goals(edit, moves, goals, base.positions)
         if posed:
             assert edit.skeleton is not None
-            poser = self.poser(edit.skeleton)
+            poser, skin = self.poser(edit.skeleton), self._skin(edit)
             graph, solver, goals = poser.graph, poser.solver, [*posed, *goals]
         component = graph.component
         moved = [component[goal.nodes] for goal in goals if not goal.is_identity]
@@ -241,7 +244,7 @@ class Engine:
         pins = np.array(edit.pins, np.int64)
         stay = np.isin(component, np.concatenate([component[goal.nodes] for goal in goals]))
         stay[pins] = True
-        return _Problem(base, used, pins[alive[pins]], stay, graph, solver)
+        return _Problem(base, used, pins[alive[pins]], stay, graph, solver, skin)
 
     def poser(self, skeleton: Skeleton) -> PartPoser:
         """Return the poser of a skeleton's parts."""
@@ -250,6 +253,14 @@ class Engine:
             return PartPoser(skeleton, self.graph, self.motion_at(0.0).positions, self.units)
 
         return _remember(self._posers, skeleton, make, CACHED_POSERS)
+
+    def _skin(self, edit: Edit) -> PartSkin | None:
+        """Return the skin of the edit's parts; None: Gaussians follow by their own binding."""
+        if edit.skeleton is None or edit.skin == "nodes":
+            return None
+        poser, dual = self.poser(edit.skeleton), edit.skin == "dual"
+        make = lambda: part_skin(self.binding, poser.owner, poser.graph, dual)  # noqa: E731
+        return _remember(self._skins, (edit.skeleton, dual), make, CACHED_POSERS)
 
     def _part_goals(self, edit: Edit, moves: list[PartMove], others: list[Goal], now: np.ndarray) -> list[Goal]:
         """Return the goals of posed parts, none if no target moves a part. Control points near other handles are left
@@ -267,7 +278,7 @@ class Engine:
         base = problem.base
         turns = from_matrix(shape.rotations)
         positions, turns = problem.graph.follow(base.positions, shape.positions, turns, problem.stay)
-        return dataclasses.replace(base.then(positions, turns), base=base)
+        return dataclasses.replace(base.then(positions, turns), base=base, skin=problem.skin)
 
     def _distance(self, before: Mapping[str, Target], after: Mapping[str, Target]) -> int:
         """Return the number of sub-steps from one set of targets to another."""

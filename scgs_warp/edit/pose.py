@@ -14,6 +14,7 @@ from ..ops.harmonics_rotation import rotate_harmonics
 from ..ops.skinning import skin
 from ..runtime.environment import one_piece
 from ..types import Gaussians, Pose
+from .part_skin import PartSkin
 from .rotations import IDENTITY, conjugate, multiply
 
 
@@ -55,6 +56,8 @@ class NodePose:
     base: NodePose | None = None
     """Pose under holds and exaggeration alone, before any handle; a mask weakens this part only. None: there is no
     handle."""
+    skin: PartSkin | None = None
+    """Binding by which Gaussians follow from ``base`` on where parts are posed; None: their own."""
 
     @staticmethod
     def of(positions: np.ndarray) -> NodePose:
@@ -128,8 +131,10 @@ def pose_gaussians(
         masked: the last hyper-coordinate is the logit of a Gaussian's share in the motion. The share applies to holds
             and exaggeration, which change the motion, but not to handles, which must also move static Gaussians.
     """
-    if masked and bent.base is not None:
+    if bent.base is not None and (masked or bent.skin is not None):
         posed = pose_gaussians(rig, gaussians, motion, bent.base, binding, masked)
+        if bent.skin is not None:
+            return _with_parts(posed, bent, bent.base, bent.skin)
         return _on_top(posed, gaussians, bent, bent.base, binding)
     learnt = gaussians.shading.shape[1] or gaussians.correctives.shape[1]
     own = own_pose(motion, bent) if learnt else None
@@ -153,6 +158,17 @@ def _share_of(turns: Tensor, gaussians: GaussianParameters) -> Tensor:
     none[:, 0] = 1.0
     turns = torch.where(turns[:, :1] < 0, -turns, turns)
     return none + share * (turns - none)
+
+
+def _with_parts(posed: Gaussians, bent: NodePose, base: NodePose, skin: PartSkin) -> Gaussians:
+    """Move posed Gaussians with their parts from ``base`` to ``bent``."""
+    further = multiply(bent.turns, conjugate(base.turns))
+    further[(bent.turns == base.turns).all(1)] = IDENTITY
+    found = skin.moved(posed, base.positions, bent.positions, further)
+    sh_rest = posed.sh_rest
+    if sh_rest.shape[1]:
+        sh_rest = rotate_harmonics(sh_rest, found.blends)
+    return replace(posed, means=found.means, quats=found.quats, scales=found.scales, sh_rest=sh_rest)
 
 
 def _on_top(

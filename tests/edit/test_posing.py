@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import minimize
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from helpers.edit_scenes import bar_scene, figure_scene
-from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
+from helpers.edit_scenes import bar_scene, bone_skeleton, figure_scene
+from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.part_pose import FREE_RINGS, INNER_STIFFNESS, PartMove, Rigid, _rings_to_others
@@ -21,20 +21,6 @@ from scgs_warp.edit.skeleton import Part, Skeleton, strongest
 from scgs_warp.errors import UserError
 
 ARM = ("shoulder_left", "elbow_left")
-
-
-def bone_skeleton(bones: list[str]) -> Skeleton:
-    """The figure's true bones as parts, of those that hold control points."""
-    there, joints = set(bones), bone_transforms(0.0)
-    parts = []
-    for name, bone in BONES.items():
-        if name in there:
-            parent = bone.parent
-            while parent is not None and parent not in there:
-                parent = BONES[parent].parent
-            nodes = tuple(np.flatnonzero(np.array(bones) == name).tolist())
-            parts.append(Part(name, nodes, parent, tuple(joints[name][:3, 3].tolist())))
-    return Skeleton(tuple(parts))
 
 
 @pytest.fixture(scope="module")

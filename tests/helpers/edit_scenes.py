@@ -12,8 +12,9 @@ import torch
 from scgs_warp.config.presets import from_dict
 from scgs_warp.data.synthetic.builtin import sample_surface
 from scgs_warp.data.synthetic.figure import PARTS, build_figure
-from scgs_warp.data.synthetic.figure_motion import bone_transforms
+from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
 from scgs_warp.edit.rotations import from_matrix
+from scgs_warp.edit.skeleton import Part, Skeleton
 from scgs_warp.gaussians import GaussianParameters, gaussians_from_points
 from scgs_warp.geometry.cameras import Overview
 from scgs_warp.geometry.normalisation import Normalisation
@@ -201,3 +202,17 @@ def tinted_scene(**options: Any) -> Scene:
     scene.motion.poses = poses  # type: ignore[method-assign]
     scene.freeze_binding()
     return scene
+
+
+def bone_skeleton(bones: list[str]) -> Skeleton:
+    """The figure's true bones as parts, of those that hold control points."""
+    there, joints = set(bones), bone_transforms(0.0)
+    parts = []
+    for name, bone in BONES.items():
+        if name in there:
+            parent = bone.parent
+            while parent is not None and parent not in there:
+                parent = BONES[parent].parent
+            nodes = tuple(np.flatnonzero(np.array(bones) == name).tolist())
+            parts.append(Part(name, nodes, parent, tuple(joints[name][:3, 3].tolist())))
+    return Skeleton(tuple(parts))
