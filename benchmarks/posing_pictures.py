@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-import torch
 from provenance import ROOT
 
 sys.path.insert(0, str(ROOT / "tests"))

@@ -108,6 +108,6 @@ def bend(
         wide, largest = widening(stretch, widest)
         if largest > 1.0 + NEGLIGIBLE:
             axes = quat_matrix(quat_normalise(quats_in[i])) * wp.diag(scales_in[i])
-            U, sigma, V = wp.svd3(quat_matrix(turn) * wide * axes)
+            U, sigma, _V = wp.svd3(quat_matrix(turn) * wide * axes)
             quats_out[i] = quat_of(U)
             scales_out[i] = sigma

@@ -24,8 +24,8 @@ SkinName = Literal["parts", "dual", "nodes"]
 WIDEST = 2.0
 """Largest factor by which a Gaussian widens. Beyond it, a surface that tears open shows."""
 LITTLE = 1e-2
-"""Weight of a control point's own rotation in the fit of its surroundings, relative to the sum of its squared edges: the
-edges of a thin limb lie almost on a line."""
+"""Weight of a control point's own rotation in the fit of its surroundings, relative to the sum of its squared edges:
+the edges of a thin limb lie almost on a line."""
 
 
 class PartSkin(NamedTuple):
@@ -49,10 +49,13 @@ class PartSkin(NamedTuple):
         """
         device = posed.means.device
         still = (positions == rest).all(1) & ~turns[:, 1:].any(1)
-        stretches = stretches_of(self.graph, rest, positions, turns)
-        arrays = rest, positions - rest, turns, stretches
-        tensors = [torch.from_numpy(np.ascontiguousarray(x)).float().to(device) for x in arrays]
-        by = NodeBend(*tensors, torch.from_numpy((~still).astype(np.int32)).to(device))
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values)).float().to(device)
+
+        stretches = tensor(stretches_of(self.graph, rest, positions, turns))
+        moved = torch.from_numpy((~still).astype(np.int32)).to(device)
+        by = NodeBend(tensor(rest), tensor(positions - rest), tensor(turns), stretches, moved)
         return bend(
             posed.means, posed.quats, posed.scales, by, self.indices, self.weights, dual=self.dual, widest=WIDEST
         )

@@ -72,12 +72,9 @@ def test_dual_quaternions_keep_the_distance_from_a_common_axis(device):
     """Half way between a control point that stays and one that turns by 150 degrees about the same axis, the linear
     blend collapses to the axis."""
     means = torch.tensor([[0.0, 1.0, 0.0]])
-    turns = torch.tensor(
-        [[1.0, 0, 0, 0], np.cos(np.radians(75)) * np.eye(4)[0] + np.sin(np.radians(75)) * np.eye(4)[1]]
-    )
-    by = NodeBend(
-        torch.zeros(2, 3), torch.zeros(2, 3), turns.float(), torch.eye(3).repeat(2, 1, 1), torch.ones(2).int()
-    )
+    turns = torch.from_numpy(np.stack([from_axis((1, 0, 0), degrees) for degrees in (0, 150)])).float()
+    none, still = torch.zeros(2, 3), torch.eye(3).repeat(2, 1, 1)
+    by = NodeBend(none, none, turns, still, torch.ones(2, dtype=torch.int32))
     rest = [means, torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3)]
     moved, of_nodes, bound = on(device, rest, by, [torch.tensor([[0, 1]]).int(), torch.tensor([[0.5, 0.5]])])
     away = [float(bend(*moved, of_nodes, *bound, dual=dual).means.norm()) for dual in (False, True)]
