@@ -46,7 +46,9 @@ class Options:
     """Serve the editor to other machines: on all interfaces, behind a proxy that asks for a token."""
     folder: Path | None = None
     """Folder for the editor's edits, films and exports; by default edits/ in the run folder, or beside the file
-    that --ply names."""
+    that --ply names. The editor keeps its edit there after every change and restores it when it starts again."""
+    new: bool = False
+    """Begin with an empty edit instead of the one that the editor has kept."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
@@ -121,16 +123,20 @@ def open_browser(session: EditSession, options: Options) -> None:
     import secrets
 
     from scgs_warp.editor import Editor, Proxy
+    from scgs_warp.editor.autosave import Autosave, folder_for
     from scgs_warp.runtime.stop_signals import stop_signals
 
-    source = options.run if options.ply is None else options.ply.parent
+    source = options.run or options.ply
     assert source is not None
-    folder = options.folder or source / "edits"
+    folder = folder_for(source, options.folder)
+    autosave = Autosave(session, folder, "" if options.ply is None else options.ply.name)
+    autosave.start(restore=options.script is None and not options.new)
     key = secrets.token_urlsafe(24) if options.share else None
     with stop_signals() as stop:  # Shells may make background processes ignore Ctrl-C.
-        editor = Editor(session, folder, 0 if options.share else options.port, key=key)
+        editor = Editor(session, folder, 0 if options.share else options.port, key=key, autosave=autosave)
         proxy = None
         try:
+            print(autosave.said or f"the edit is kept in {autosave.path}", flush=True)
             if key is None:
                 print(f"open {editor.url} in a browser; Ctrl-C ends", flush=True)
             else:
@@ -140,7 +146,7 @@ def open_browser(session: EditSession, options: Options) -> None:
                 print("what is sent is not encrypted: outside a network that you trust, forward the port over SSH")
                 sys.stdout.flush()
             stop.wait()
-            print("the editor has ended", flush=True)
+            print(f"the editor has ended; the edit is in {autosave.path}", flush=True)
         finally:
             if proxy is not None:
                 proxy.stop()

@@ -21,6 +21,7 @@ from ..edit.rotations import IDENTITY
 from ..errors import UserError
 from ..geometry.cameras import orbit_camera
 from . import gizmo_pose
+from .autosave import Autosave
 from .display import RADIUS, Display
 from .frame_image import FINE_QUALITY, QUALITY, Picture, take_picture
 from .model import Combine, EditorModel, Moment
@@ -65,6 +66,7 @@ class Editor:
         port: port on 127.0.0.1; if it is taken, the next free one is used. 0: any.
         size: upper limit for the longer side of a picture in pixels.
         key: secret of the proxy in front of the editor, if there is one.
+        autosave: keeper of the session's edit; None: it is saved on request alone.
 
     Attributes: ``server`` (viser's), ``model``, ``parts`` (what clicks and drags do with parts), ``worker``, ``port``,
     ``gizmo_frame`` (a pair, or None if no gizmo is shown: the gizmo's frame, of a handle or of a part, and the handle's
@@ -76,14 +78,22 @@ class Editor:
     """
 
     def __init__(
-        self, session: EditSession, folder: Path, port: int = 8080, size: int = 1024, key: str | None = None
+        self,
+        session: EditSession,
+        folder: Path,
+        port: int = 8080,
+        size: int = 1024,
+        key: str | None = None,
+        autosave: Autosave | None = None,
     ) -> None:
         viser = import_viser()
         self.session, self.folder = session, folder
         self.schedule = PictureSchedule()
         self.quick, self.full = Pace(MOVING_SECONDS, 256, 512), Pace(STILL_SECONDS, min(640, size), size)
         self.worker = Worker(self.schedule, self._draw, lambda: self.model.busy, failed=self.picture_failed)
-        self.model = EditorModel(session, self.refresh)
+        self.autosave = autosave
+        self._autosave_problem: str | None = None
+        self.model = EditorModel(session, self._changed)
         self.parts = PartsTool(self.model)
         self.latency: list[float] = []
         self._notified: dict[str, float] = {}
@@ -111,6 +121,8 @@ class Editor:
     def stop(self) -> None:
         self.panel.jobs.stop()
         self.worker.stop()
+        if self.autosave is not None:
+            self.autosave.stop()
         self.server.stop()
 
     def _set_up_page(self) -> None:
@@ -138,6 +150,8 @@ class Editor:
     # Clients
 
     def _connect(self, client: viser.ClientHandle) -> None:
+        if self.autosave is not None and self.autosave.said:
+            client.add_notification("Your edit", self.autosave.said, auto_close_seconds=10.0)
         if self._first:
             text = "Kernels are compiled on first use, which may take a minute."
             self._waiting[client.client_id] = client.add_notification("Drawing the scene", text, loading=True)
@@ -157,6 +171,17 @@ class Editor:
             return
         with self.worker.changing() as schedule:
             schedule.move(client.client_id, self.camera(client), time.monotonic())
+
+    def _changed(self) -> None:
+        """Keep the edit, unless it is in the middle of a drag, and show it."""
+        self.refresh()
+        if self.autosave is None or self.model.dragging:
+            return
+        self.autosave.note(self.session.edit)
+        problem, before = self.autosave.problem, self._autosave_problem
+        self._autosave_problem = problem
+        if problem is not None and problem != before:
+            self.say(None, "The edit is not saved", problem)
 
     def refresh(self) -> None:
         """Request new pictures for all clients."""

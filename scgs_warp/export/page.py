@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import html
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from ..errors import UserError
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
 from .page_data import pack
-from .page_scene import page_scene
-from .poster import CARD_SIZE, poster
+from .page_scene import PageMotion, page_scene
+from .poster import CARD_SIZE, POSTER_SIZE, poster
 
 SCRIPTS = ("loading", "data", "camera", "renderer", "player", "controls", "page")
+POSE_SCRIPTS = ("rotations", "solver", "reach", "figure", "hand")
 SHADERS = ("shared", "splat.frag", "draw.vert", "draw.frag", "screen.vert", "screen.frag")
 MAX_DEGREE = 3
 WEB = Path(__file__).parent / "web"
@@ -51,16 +54,32 @@ class Card:
         return re.sub(r"\.html?$", "", self.url, flags=re.IGNORECASE) + ".jpg"
 
 
-def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | None = None, url: str = "") -> int:
+@dataclass(frozen=True)
+class PageOptions:
+    """What a page holds beside the scene."""
+
+    title: str = ""
+    """Text shown on the page."""
+    max_mib: float | None = None
+    """Largest size of the file in MiB. Colours lose their highest degrees of spherical harmonics, one by one, until it
+    fits."""
+    url: str = ""
+    """Address at which the page will be published. A picture for links to it is then written beside the page."""
+    motion: PageMotion | None = None
+    """Motion that replaces the scene's, such as an edit's film or one with parts to pull."""
+    captions: Sequence[Mapping[str, Any]] = ()
+    """Cues with ``from`` and ``to`` in seconds, and ``text``."""
+    picture: Callable[[int], bytes] | None = None
+    """Returns a JPEG of the page's first view with the given longer side; None: of the scene at time 0."""
+
+
+def write_page(scene: Scene, path: Path, options: PageOptions | None = None, **fields: Any) -> int:
     """Write one HTML file that plays ``scene``; an existing file is replaced once the new one is complete.
 
     Args:
         scene: scene with control points, or a static one.
         path: name that ends in .html or .htm; missing folders are made.
-        title: text shown on the page.
-        max_mib: largest size of the file in MiB. Colours lose their highest degrees of spherical harmonics, one by one,
-            until it fits.
-        url: address at which the page will be published. A picture for links to it is then written beside the page.
+        options: what the page holds; ``fields`` of :class:`PageOptions` may be given instead.
 
     Returns:
         Number of Gaussians on the page, which holds the visible ones only.
@@ -69,53 +88,57 @@ def write_page(scene: Scene, path: Path, *, title: str = "", max_mib: float | No
         UserError: the name does not end in .html, the motion model has no control points, the page does not fit, or the
             file cannot be written.
     """
-    path = Path(path)
+    path, options = Path(path), options or PageOptions(**fields)
     if path.suffix.lower() not in (".html", ".htm"):
         raise UserError(f"{path}: end the name of a page in .html")
     if path.is_dir():
         raise UserError(f"{path}: is a folder; give the page another name")
-    if max_mib is not None and not max_mib > 0:
-        raise UserError(f"--max-mib (max_mib) is {max_mib:g}; give a size in MiB above 0, or none")
-    page, count = _fitting(scene, path, title, max_mib, Card(url=url))
+    if options.max_mib is not None and not options.max_mib > 0:
+        raise UserError(f"--max-mib (max_mib) is {options.max_mib:g}; give a size in MiB above 0, or none")
+    picture = options.picture or functools.partial(poster, scene)
+    page, count = _fitting(scene, path, options, picture(POSTER_SIZE))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{path.parent}: cannot be made ({error.strerror}); give another folder") from None
-    if url:
-        write_atomically(path.with_suffix(".jpg"), poster(scene, CARD_SIZE))
+    if options.url:
+        write_atomically(path.with_suffix(".jpg"), picture(CARD_SIZE))
     write_atomically(path, page)
     return count
 
 
-def _fitting(scene: Scene, path: Path, title: str, max_mib: float | None, card: Card) -> tuple[bytes, int]:
+def _fitting(scene: Scene, path: Path, options: PageOptions, picture: bytes) -> tuple[bytes, int]:
     """Return the page with the highest degree of spherical harmonics that fits, and its number of Gaussians."""
-    page = b""
+    page, most = b"", options.max_mib
     for degree in range(min(scene.gaussians.sh_degree, MAX_DEGREE), -1, -1):
-        content = page_scene(scene, degree)
-        page = assemble(pack(content.facts, content.columns), title, poster(scene), card)
-        if max_mib is None or len(page) <= max_mib * MIB:
+        content = page_scene(scene, degree, motion_of=options.motion)
+        facts = {**content.facts, "captions": list(options.captions)}
+        page = assemble(pack(facts, content.columns), options.title, picture, Card(url=options.url), "pose" in facts)
+        if most is None or len(page) <= most * MIB:
             return page, content.facts["gaussians"]
     least = len(page) / MIB
     raise UserError(
         f"{path}: takes {least:.2f} MiB even with colours that do not depend on the view, more than the "
-        f"{max_mib:g} MiB of --max-mib (max_mib); allow that much, or train with a smaller --max-gaussians"
+        f"{most:g} MiB of --max-mib (max_mib); allow that much, or train with a smaller --max-gaussians"
     )
 
 
-def assemble(data: bytes, title: str = "", picture: bytes = b"", card: Card | None = None) -> bytes:
+def assemble(
+    data: bytes, title: str = "", picture: bytes = b"", card: Card | None = None, posed: bool = False
+) -> bytes:
     """Assemble the page from packed data, program and style, as UTF-8.
 
     Args:
         data: result of ``pack``.
         picture: JPEG that is shown while the page loads.
         card: what a link to the page shows; None: the title alone.
+        posed: whether the page holds parts to pull.
     """
     parts = [base64.b64encode(data[i : i + PART]).decode("ascii") for i in range(0, len(data), PART)]
     scripts = "".join(f'<script class="data" type="text/plain">{part}</script>\n' for part in parts)
-    return document(
-        program_text((*SCRIPTS, "main")), title, data=scripts, parts=f' data-parts="{len(parts)}"', picture=picture,
-        card=card,
-    )  # fmt: skip
+    names = (*SCRIPTS, *POSE_SCRIPTS, "main_posed") if posed else (*SCRIPTS, "main")
+    count = f' data-parts="{len(parts)}"'
+    return document(program_text(names), title, data=scripts, parts=count, picture=picture, card=card)
 
 
 def document(

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..edit.pose import Rig
 from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..geometry.morton import morton_order
@@ -106,7 +107,7 @@ def page_scene(
         columns = gaussian_columns(gaussians, kept, sh_degree)
         facts = scene_facts(scene, len(kept), sh_degree)
         if motion_of is None and isinstance(motion, ControlPoints):
-            poses = sample_poses(motion) if samples is None else one_sided(_poses_at(motion, even_times(samples)))
+            poses = sample_poses(motion) if samples is None else one_sided(poses_at(motion, even_times(samples)))
             parts, owners = part_columns(scene) if samples is None else ([], [])  # not while the scene trains
             rest, binding = to_array(motion.positions), motion.binding(gaussians)
             motion_of = PageMotion(rest, binding, poses, {"parts": parts}, owners)
@@ -161,6 +162,7 @@ def scene_facts(scene: Scene, count: int, sh_degree: int) -> dict[str, Any]:
         "scaled": False,
         "tinted": False,
         "edited": False,
+        "turned": False,
     }
 
 
@@ -214,7 +216,8 @@ def _binding_columns(
 def pose_columns(rest: np.ndarray, poses: dict[str, np.ndarray], facts: dict[str, Any]) -> list[Column]:
     """Store rest positions [M, 3], and poses [T, M, ...] at evenly spaced times, node by node."""
     facts.update(samples=len(poses["translation"]), shapes="shape" in poses)
-    facts.update(scaled="log_scale" in poses, tinted="tint" in poses, edited="turn" in poses)
+    facts.update(scaled="log_scale" in poses, tinted="tint" in poses, turned="turn" in poses)
+    facts["edited"] |= facts["turned"]
     columns = [quantise(f"rest{a}", rest[:, a], STEPS["rest"]) for a in range(3)]
     for name, values in poses.items():
         for a in range(values.shape[2]):
@@ -234,9 +237,9 @@ def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
         UserError: a pose is not finite.
     """
     count = MIN_SAMPLES
-    poses = _poses_at(motion, even_times(count))
+    poses = poses_at(motion, even_times(count))
     while count < MAX_SAMPLES:
-        between = _poses_at(motion, (torch.arange(count - 1) + 0.5) / (count - 1))
+        between = poses_at(motion, (torch.arange(count - 1) + 0.5) / (count - 1))
         errors = [(2.0 if name in QUATERNIONS else 1.0) * _error(poses[name], between[name]) for name in poses]
         poses = {name: _interleaved(poses[name], between[name]) for name in poses}
         count = 2 * count - 1
@@ -266,7 +269,12 @@ def _error(values: np.ndarray, between: np.ndarray) -> float:
     return float(((0.5 * (before + after) - between) ** 2).sum(axis=2).mean() ** 0.5)
 
 
-def _poses_at(motion: ControlPoints, times: Tensor) -> dict[str, np.ndarray]:
+def poses_at(motion: Rig, times: Tensor) -> dict[str, np.ndarray]:
+    """Return the poses of control points at some times, as :func:`sample_poses`.
+
+    Raises:
+        UserError: a pose is not finite.
+    """
     samples: dict[str, list[np.ndarray]] = {}
     for part in times.split(TIMES_AT_ONCE):
         for pose in motion.poses(part):

@@ -6,9 +6,12 @@ import io
 
 from PIL import Image
 
+from ..edit import EditSession
+from ..edit.filming import film_camera
 from ..geometry.cameras import orbit_camera
 from ..scene.scene import Scene
 from ..types import Camera
+from ..types import Image as Picture
 from ..visualization.figures import to_bytes
 
 POSTER_SIZE, CARD_SIZE = 480, 1200
@@ -23,7 +26,16 @@ def opening_camera(scene: Scene, size: int) -> Camera:
 
 def poster(scene: Scene, size: int = POSTER_SIZE) -> bytes:
     """Return a JPEG of the scene at time 0 with the given longer side."""
-    image = scene.render(opening_camera(scene, size).to(scene.device), 0.0)
+    return _jpeg(scene.render(opening_camera(scene, size).to(scene.device), 0.0))
+
+
+def edited_poster(session: EditSession, size: int = POSTER_SIZE) -> bytes:
+    """Return a JPEG of the first frame of an edit's film."""
+    camera = film_camera(session, 0.0, size).to(session.scene.device)
+    return _jpeg(session.render(camera, session.scene_time(0.0), 0.0, session.edit.film.background))
+
+
+def _jpeg(image: Picture) -> bytes:
     file = io.BytesIO()
     Image.fromarray(to_bytes(image.rgb)).save(file, "JPEG", quality=QUALITY, optimize=True)
     return file.getvalue()

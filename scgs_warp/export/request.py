@@ -91,6 +91,10 @@ class ExportRequest:
     """Frames per second of an animation; 30 by default."""
     spz_version: Literal[3, 4] | None = None
     """Version of a .spz; 4 by default, 3 for readers that know no newer one."""
+    pose: bool = False
+    """Let visitors of a page take parts of the scene and pull them (docs/page.md)."""
+    captions: Path | None = None
+    """Captions of a page, as WebVTT (.vtt)."""
     url: str = ""
     """Address at which a page will be published, for links to it: a picture (.jpg) is then written beside the page."""
     points: str | None = None
@@ -146,7 +150,7 @@ def check_request(request: ExportRequest) -> None:
     if (request.run is None) == (request.ply is None):
         raise UserError("export.py: give one of --run and --ply")
     if request.run is None and kind == "cameras":
-        raise UserError("--format cameras: needs --run; a file of Gaussians has no cameras")
+        raise UserError(f"--format {kind}: needs --run; a file of Gaussians has no cameras")
     if request.run is None and request.edit is None and kind not in (*STILL_FORMATS, "html"):
         raise UserError(f"--format {kind}: needs --run, or an --edit that moves the Gaussians of {request.ply}")
     if request.time is not None and not 0 <= request.time <= 1:
@@ -156,8 +160,8 @@ def check_request(request: ExportRequest) -> None:
             "an edit's film is shown at --at SECONDS" if request.edit else "leave it out: the format holds all times"
         )
         raise UserError(f"--time {request.time:g}: {other}")
-    if request.edit is not None and kind in ("cameras", "html"):
-        raise UserError(f"--format {kind}: shows the scene as it was trained; leave --edit out, or write a glb")
+    if request.edit is not None and kind == "cameras":
+        raise UserError(f"--format {kind}: holds the cameras of the training; leave --edit out")
     if request.at is not None and (request.edit is None or kind not in STILL_FORMATS):
         raise UserError(f"--at {request.at:g}: is a second of an edit's film; give it with --edit and a still format")
     if request.at is not None and not 0 <= request.at <= 3600:
@@ -181,8 +185,9 @@ def _check_unused(request: ExportRequest) -> None:
     kind = request.kind
     if request.time is not None and request.run is None:
         raise UserError(f"--time {request.time:g}: a file of Gaussians has no times; leave it out")
-    if kind != "html" and (request.title or request.url or request.max_mib is not None):
-        name = "--title" if request.title else "--url" if request.url else "--max-mib"
+    given = {"--title": request.title, "--url": request.url, "--pose": request.pose, "--captions": request.captions}
+    name = next((name for name, value in given.items() if value), None if request.max_mib is None else "--max-mib")
+    if kind != "html" and name is not None:
         raise UserError(f"{name}: belongs to a page; leave it out, or give --format html")
     if kind != "spz" and request.spz_version is not None:
         raise UserError(f"--spz-version: --format {kind} has no such versions; leave it out")

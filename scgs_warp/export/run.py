@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from .moving import export_fourdgs, export_tracks
 from .npz import write_npz
 from .part_rig import build_rig
 from .plain import plain_scene
+from .poster import edited_poster
 from .request import FRAME_FORMATS, SEQUENCES, ExportRequest, check_request, output_suffix
 from .sequence import ENDINGS, check_folder, write_sequence
 from .skeleton import (
@@ -43,6 +45,9 @@ from .skeleton import (
     posed_gaussians,
     select_gaussians,
 )
+
+if TYPE_CHECKING:
+    from .page import PageOptions
 
 FILE_UP = (0.0, -1.0, 0.0)
 """Up direction of Gaussians from files, which do not state it."""
@@ -262,12 +267,34 @@ def _export_cameras(request: ExportRequest, device: str) -> str:
 
 
 def _export_page(request: ExportRequest, device: str) -> str:
-    try:
-        from .page import write_page
-    except ImportError as error:
-        raise UserError(f"--format html: {error}; install the package again") from None
-    scene, source = _open(request, device), request.run or request.ply
+    from .captions import read_captions
+    from .page import PageOptions, write_page
+
+    captions = [] if request.captions is None else read_captions(request.captions)
+    scene = _open(request, device)
+    source = request.run or request.ply
     assert source is not None
     title = request.title or source.resolve().name
-    count = write_page(scene, request.output, title=title, max_mib=request.max_mib, url=request.url)
-    return f"{count:,} Gaussians {'and their motion' if scene.motion.moves else 'that stand still'}"
+    options = PageOptions(title, request.max_mib, request.url, captions=captions)
+    if request.edit is not None or request.pose:
+        scene, options = _with_session(request, scene, options)
+    count = write_page(scene, request.output, options)
+    moves = scene.motion.moves or request.edit is not None
+    parts = " and parts to pull" if request.pose else ""
+    return f"{count:,} Gaussians {'and their motion' if moves else 'that stand still'}{parts}"
+
+
+def _with_session(request: ExportRequest, scene: Scene, options: PageOptions) -> tuple[Scene, PageOptions]:
+    """Return the scene with control points, and the page's options with the edit's film and the parts."""
+    from .page_edit import edited_motion, film_times, own_motion
+    from .page_pose import with_parts
+
+    session = _open_session(request, scene)
+    if request.edit is None:
+        motion, picture = own_motion(session), None
+    else:
+        with progress(len(film_times(session)), "export") as shown:
+            motion = edited_motion(session, shown.advance)
+        picture = functools.partial(edited_poster, session)
+    motion = with_parts(session, motion) if request.pose else motion
+    return session.scene, replace(options, motion=motion, picture=picture)

@@ -22,6 +22,7 @@ from ..runtime.progress import Progress, say
 from ..scene.scene import Scene
 from ..storage.checkpoint import FILE, PREVIOUS
 from ..storage.files import write_atomically
+from ..storage.locks import AlreadyLocked, lock_file
 from ..visualization.figures import read_log
 from .state import StepResult, TrainState
 from .tensorboard import TensorBoard, check_installed
@@ -139,20 +140,12 @@ class RunFolder:
                 self.tell(f"warning: {what}: {one_line(error)}; training goes on without")
 
     def _lock(self) -> None:
-        self._lock_file = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            import fcntl
-        except ImportError:  # Windows has no fcntl: the user must not start a second trainer there
-            return
-        try:
-            fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(self._lock_file)
+            self._lock_file = lock_file(self.path / LOCK)
+        except AlreadyLocked:
             raise UserError(
                 f"{self.path}: another trainer is running here; wait for it or choose another --output"
-            ) from error
-        except OSError:
-            pass  # likewise on a file system without locks
+            ) from None
 
     @property
     def has_no_checkpoint(self) -> bool:

@@ -19,6 +19,7 @@ from scgs_warp.capture.source import open_source
 from scgs_warp.data.synthetic import builtin, from_mesh
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.filming import film_camera
+from scgs_warp.export.captions import read_captions
 from scgs_warp.scene.scene import Scene
 from scgs_warp.visualization.video import film, write_png
 
@@ -158,7 +159,33 @@ def load_source(folder: Path) -> None:
     expect(bool(source.digest()), "digest")
 
 
+CAPTIONS = """WEBVTT Title
+
+NOTE none
+
+1
+00:00.500 --> 00:01.250 align:start
+Hello <b>there</b> &amp; here
+
+01:00:00.000 --> 01:00:02.000
+second
+line
+"""
+
+
+def write_captions(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "film.vtt").write_text(CAPTIONS)
+
+
+def load_captions(folder: Path) -> None:
+    for cue in read_captions(folder / "film.vtt"):
+        finite("cue", cue["from"], cue["to"])
+        expect(cue["to"] > cue["from"] >= 0.0 and bool(cue["text"].strip()), "cue")
+
+
 FORMATS = (
+    Format("captions", write_captions, load_captions, share=0.5),
     Format("edit", write_edit, load_edit, share=2.5),
     Format("journal", write_journal, load_journal, named(("work/journal.json",))),
     Format("marker", write_markers, load_markers, share=0.3),

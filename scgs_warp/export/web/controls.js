@@ -23,8 +23,14 @@ class Clock {
     this.last = performance.now();
   }
 
+  // Stand still while a part is pulled.
+  hold(held) {
+    this.held = held;
+    this.last = performance.now();
+  }
+
   tick(now) {
-    if (!this.playing) return;
+    if (!this.playing || this.held) return;
     const { player } = this, ending = element("ending").value;
     const passed = Math.min(Math.max(now - this.last, 0), 250) / 1000; // a page that was hidden does not jump
     this.last = now;

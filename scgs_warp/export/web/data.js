@@ -109,10 +109,17 @@ function readNodes(facts, columns) {
     translation: read("translation", 3, rows),
     rotation: read("rotation", 4, rows),
     shape: facts.shapes ? read("shape", 4, rows) : null,
-    own: facts.edited ? read("own", 4, rows) : null,
-    turn: facts.edited ? read("turn", 4, rows) : null,
+    own: facts.turned ? read("own", 4, rows) : null,
+    turn: facts.turned ? read("turn", 4, rows) : null,
     extra: facts.scaled ? read("log_scale", 3, rows) : facts.tinted ? read("tint", 3, rows) : null,
   };
+}
+
+// The part of every control point, where it is at time 0, and the edges between them.
+function readParts(facts, columns) {
+  const start = new Float64Array(3 * facts.nodes), codes = (name) => columns.read(name).codes;
+  fill(start, 3, 0, columns, numbered("start", 3));
+  return { owner: codes("part"), start, first: codes("edge0"), second: codes("edge1") };
 }
 
 // raw: the inflated bytes.
@@ -148,9 +155,12 @@ async function readModel(raw) {
   if (facts.nodes) {
     readBinding(facts, columns, model);
     model.trajectories = readNodes(facts, columns);
+    if (facts.pose) model.pose = readParts(facts, columns);
   }
   return model;
 }
+
+const UNTURNED = [1, 0, 0, 0];
 
 // Control points at a time in [0, 1], nodeWidth(facts) numbers each.
 function poseAt(model, time, table) {
@@ -179,10 +189,10 @@ function poseAt(model, time, table) {
     if (trajectories.extra) blend(trajectories.extra, 3, m, extra);
     table.set(extra, row + 16);
     if (!facts.edited) continue;
-    unit(trajectories.own, m);
+    if (trajectories.own) unit(trajectories.own, m);
     table.set(quat, row + 20);
-    unit(trajectories.turn, m);
-    table.set(quat, row + 24);
+    if (trajectories.turn) unit(trajectories.turn, m);
+    table.set(trajectories.turn ? quat : UNTURNED, row + 24);
   }
   return table;
 }

@@ -3,7 +3,7 @@ uniform usampler2D u_place, u_color;
 uniform usampler2D u_order;
 uniform vec2 u_size;
 out vec2 v_corner;
-flat out vec4 v_color;  // rgb, opacity
+flat out vec4 v_color;  // rgb, or with DEPTH depth 0 0; opacity
 
 void main() {
   int index = int(texelFetch(u_order, at(gl_VertexID / 6), 0).x), which = gl_VertexID % 6;
@@ -17,6 +17,10 @@ void main() {
   vec2 corner = vec2(which & 1, which >> 1) * 2.0 - 1.0;
   vec2 pixel = uintBitsToFloat(place.xy) + corner.x * unpackHalf2x16(place.z) + corner.y * unpackHalf2x16(place.w);
   v_corner = corner * sqrt(extent_of(opacity));
+#ifdef DEPTH
+  v_color = vec4(uintBitsToFloat(color.w), 0.0, 0.0, opacity);
+#else
   v_color = vec4(unpackHalf2x16(color.x), unpackHalf2x16(color.y).x, opacity);
+#endif
   gl_Position = vec4(2.0 * pixel.x / u_size.x - 1.0, 1.0 - 2.0 * pixel.y / u_size.y, 0.0, 1.0);
 }

@@ -27,7 +27,7 @@ function showModel(player) {
   showTime(player);
 }
 
-// load(report): the scene's bytes. extend(player, clock): further keys of the page.
+// load(report): the scene's bytes. extend(player, clock): further abilities of the page; returns their keys.
 async function startPage(load, extend = () => ({})) {
   requireBrowser();
   document.body.classList.toggle("bare", asked.has("noui"));

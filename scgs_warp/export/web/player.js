@@ -37,6 +37,7 @@ class Player {
   // Show a model, in place of the present one if there is one.
   take(model) {
     this.model = model;
+    this.figure = this.hand = null; // of pages in which parts are pulled
     this.table = new Float32Array(nodeWidth(model.facts) * Math.max(model.nodes, 1));
     this.stale = this.unsorted = true; // the picture, the order
     this.order = new Uint32Array(model.count);
@@ -105,6 +106,7 @@ class Player {
 
   // Called for every frame of the screen.
   tick(now) {
+    this.hand?.tick();
     if (this.stale) {
       const passed = now - this.drawn;
       this.moving = passed < BREAK;
@@ -150,11 +152,22 @@ class Player {
     }
   }
 
+  // Poses of the control points at a time. exact: independent of what was shown before.
+  pose(time, table, exact) {
+    poseAt(this.model, time, table);
+    this.figure?.apply(table, exact);
+    if (this.hand) {
+      const { nodes, facts } = this.model, { owner } = this.figure, { lit } = this.hand;
+      for (let m = 0; m < nodes; m++) table[nodeWidth(facts) * m + 19] = !exact && owner[m] === lit ? 1 : 0;
+    }
+    return table;
+  }
+
   // Draw if something has changed. Gaussians are where they belong at once; their order follows within a frame or two.
   frame() {
     if (!this.renderer || !this.stale) return;
     const view = this.view();
-    poseAt(this.model, this.time, this.table);
+    this.pose(this.time, this.table, false);
     this.stale = false;
     if (this.unsorted) this.requestOrder(view);
     this.renderer.render(view, this.table, this.background, null);
@@ -164,7 +177,7 @@ class Player {
   // An exact frame in memory, sorted for this very view; what is on the screen stays.
   renderAt(time, viewmat, K, width, height, background) {
     const view = normalised({ viewmat, K, width, height }, this.model.facts.normalisation);
-    const table = poseAt(this.model, time, new Float32Array(this.table.length));
+    const table = this.pose(time, new Float32Array(this.table.length), true);
     const order = new Uint32Array(this.model.count);
     this.renderer.setOrder(order, this.sort(view.rows[2], view.shift[2], table, order));
     const pixels = this.renderer.read(view, table, background ?? this.background);

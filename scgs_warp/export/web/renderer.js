@@ -44,9 +44,11 @@ class Renderer {
     }
     this.splat = compile(gl, SHADERS["screen.vert"], SHADERS["splat.frag"], defines);
     this.draw = compile(gl, SHADERS["draw.vert"], SHADERS["draw.frag"], { SHARPNESS });
+    this.depth = compile(gl, SHADERS["draw.vert"], SHADERS["draw.frag"], { SHARPNESS, DEPTH: 1 });
     this.screen = compile(gl, SHADERS["screen.vert"], SHADERS["screen.frag"], { SHARPNESS });
     // Halves, where they can be drawn to: sums of many faint Gaussians lose what 8 bits round away.
     const precise = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    this.precise = Boolean(precise);
     this.sumFormat = precise ? gl.RGBA16F : gl.RGBA8;
     this.owned = []; // textures and framebuffers
     this.makeData();
@@ -55,12 +57,16 @@ class Renderer {
 
   dispose() {
     const { gl } = this;
-    for (const { program } of [this.splat, this.draw, this.screen]) gl.deleteProgram(program);
+    for (const { program } of [this.splat, this.draw, this.depth, this.screen]) gl.deleteProgram(program);
     for (const thing of this.owned) {
       if (thing instanceof WebGLTexture) gl.deleteTexture(thing);
       else gl.deleteFramebuffer(thing);
     }
     gl.deleteVertexArray(this.nothing);
+    if (this.probe) {
+      gl.deleteTexture(this.probe.texture);
+      gl.deleteFramebuffer(this.probe.target);
+    }
     this.dropSum();
   }
 
@@ -204,6 +210,32 @@ class Renderer {
     gl.uniform3fv(this.screen.place("u_background"), background);
     gl.bindVertexArray(this.nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // The point of the surface at a pixel of the picture that was drawn last, in the units of the page; null: background.
+  surface(view, x, y) {
+    const { gl } = this, { width, height } = view;
+    if (!this.precise || x < 0 || y < 0 || x >= width || y >= height) return null;
+    this.probe ??= { texture: this.texture(gl.RGBA16F, 1, 1) };
+    this.probe.target ??= this.target(this.probe.texture);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.probe.target);
+    gl.viewport(-Math.floor(x), -Math.floor(height - y - 1e-6), width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    this.use(this.depth, this.splats);
+    gl.uniform2f(this.depth.place("u_size"), width, height);
+    gl.bindVertexArray(this.nothing);
+    gl.drawArrays(gl.TRIANGLES, 0, 6 * this.amount);
+    gl.disable(gl.BLEND);
+    const found = new Float32Array(4);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.FLOAT, found);
+    const [sum, , , alpha] = found;
+    if (!(alpha >= 0.5)) return null;
+    const depth = sum / alpha, [fx, fy, cx, cy] = view.lens;
+    const seen = [((x - cx) / fx) * depth, ((y - cy) / fy) * depth, depth].map((v, k) => v - view.shift[k]);
+    return [0, 1, 2].map((c) => view.rows.reduce((total, row, r) => total + row[c] * seen[r], 0));
   }
 
   // As render, into memory: RGBA bytes, top row first.

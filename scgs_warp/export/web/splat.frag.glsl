@@ -20,7 +20,7 @@ uniform vec2 u_size;
 uniform vec3 u_light;           // of Gaussians that glow
 
 layout(location = 0) out uvec4 o_place;  // mean x, mean y (pixels, float bits), two half axes (pixels, half floats)
-layout(location = 1) out uvec4 o_color;  // red and green, blue (half floats), opacity (float bits)
+layout(location = 1) out uvec4 o_color;  // red and green, blue (half floats), opacity, depth (float bits)
 
 const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.3, GLOW = 0.4;
 
@@ -218,5 +218,6 @@ void main() {
   vec2 center = focal * point.xy / point.z + middle;
   o_place = uvec4(floatBitsToUint(center), packHalf2x16(longer * along),
     packHalf2x16(shorter * vec2(-along.y, along.x)));
-  o_color = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, 0.0)), floatBitsToUint(opacity), 0u);
+  o_color = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, 0.0)), floatBitsToUint(opacity),
+    floatBitsToUint(point.z));
 }

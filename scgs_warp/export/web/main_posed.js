@@ -1,0 +1,3 @@
+// As main.js, with parts that can be pulled.
+
+publish(startPage((report) => embeddedScene(Number(element("view").dataset.parts), report), posable));

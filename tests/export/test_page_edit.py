@@ -1,0 +1,104 @@
+"""Pages of edits: what they hold, and their pictures beside the session's."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers.chromium import chromium
+from helpers.edit_scenes import bar_scene
+from helpers.page_visits import Visit, psnr
+from scgs_warp.edit import EditSession
+from scgs_warp.edit.filming import film_camera
+from scgs_warp.errors import UserError
+from scgs_warp.export.page import write_page
+from scgs_warp.export.page_edit import edited_motion, film_times, own_motion
+from scgs_warp.export.page_pose import with_parts
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as started:
+        yield started
+
+
+def bent_session(**options: Any) -> EditSession:
+    """A session whose film lifts and turns one end of the bar, and whose motion swings."""
+    session = EditSession(bar_scene(**options))
+    end = session.within(session.node_positions(0.0)[session.node_positions(0.0)[:, 0].argmin()], 0.5, 0.0)
+    session.add_handle(end, 0.0, "end")
+    session.add_keyframe(0.0)
+    session.move("end", (0.0, 0.1, 0.3), (0.924, 0.0, 0.383, 0.0))
+    session.add_keyframe(1.0, "ease")
+    film = dataclasses.replace(session.edit.film, seconds=2.0, fps=10.0, background=(0.2, 0.3, 0.1))
+    playback = dataclasses.replace(session.edit.playback, repeat="swing", speed=2.0)
+    session.apply(dataclasses.replace(session.edit, film=film, playback=playback))
+    return session
+
+
+@pytest.mark.parametrize("options", [{"shaded": True, "corrected": True}, {}], ids=["learnt shading", "harmonics"])
+def test_frames_of_an_edit_are_those_of_the_session(browser, options, tmp_path):
+    """Colours turn with the edit, shading and correctives do not."""
+    session = bent_session(**options)
+    write_page(session.scene, tmp_path / "page.html", motion=edited_motion(session))
+    visit = Visit(browser, tmp_path / "page.html")
+    assert visit.ask("player.seconds") == 2.0 and visit.ask("player.follows")
+    for at in (0.0, 0.5, 1.3, 1.9):
+        camera = film_camera(session, at, 120)
+        background = session.edit.film.background
+        assert background is not None
+        ours = session.render(camera, session.scene_time(at), at, background).rgb.clamp(0, 1).numpy()
+        assert psnr(visit.render(camera, at / 2.0, background), ours) > 45, at
+        plain = session.scene.render(camera, session.scene_time(at), background).rgb.clamp(0, 1).numpy()
+        assert at == 0.0 or psnr(plain, ours) < 35, "the edit shows"
+    visit.ask("player.seek(0.65)")
+    visit.ask("player.frame()")
+    seen = visit.ask("player.orbit.camera(512, 512).viewmat")
+    assert np.allclose(seen, film_camera(session, 1.3, 512).viewmat, atol=1e-3), "the page looks as the film does"
+    visit.page.mouse.move(300, 200)
+    visit.page.mouse.down()
+    visit.page.mouse.move(340, 200)
+    visit.page.mouse.up()
+    assert not visit.ask("player.follows"), "until the visitor turns it"
+    assert visit.problems == []
+    visit.context.close()
+
+
+def test_what_jumps_is_not_interpolated(browser, tmp_path):
+    session = bent_session()
+    playback = dataclasses.replace(session.edit.playback, repeat="loop", speed=2.0)
+    session.apply(dataclasses.replace(session.edit, playback=playback))
+    motion = edited_motion(session)
+    times = film_times(session)
+    assert motion.facts["jumps"] == [10] and times[10] == pytest.approx(1.0) and times[-1] < 2.0
+    write_page(session.scene, tmp_path / "page.html", motion=motion)
+    visit = Visit(browser, tmp_path / "page.html")
+    camera = film_camera(session, 1.05, 100)
+    ours = session.render(camera, session.scene_time(times[10]), times[10], (0, 0, 0)).rgb.clamp(0, 1).numpy()
+    assert psnr(visit.render(camera, 1.05 / 2.0), ours) > 40
+    visit.context.close()
+
+
+def test_captions_are_shown_in_their_time(browser, tmp_path):
+    cues = [{"from": 0.5, "to": 1.0, "text": "<b>one</b>"}, {"from": 1.5, "to": 2.0, "text": "two"}]
+    write_page(bar_scene(gaussians=200), tmp_path / "page.html", captions=cues)
+    visit = Visit(browser, tmp_path / "page.html", "?paused&t=0.6")
+    assert visit.page.locator("#caption").inner_text() == "<b>one</b>"
+    slider = visit.page.get_by_role("slider", name="Time")
+    slider.fill("1.2")
+    assert visit.page.locator("#caption").is_hidden()
+    slider.fill("1.7")
+    assert visit.page.locator("#caption").inner_text() == "two"
+    visit.context.close()
+
+
+def test_masks_are_refused():
+    session = EditSession(bar_scene(share=0.5))
+    with pytest.raises(UserError, match=r"motion\.mask"):
+        edited_motion(session)
+    with pytest.raises(UserError, match=r"motion\.mask"):
+        with_parts(session, own_motion(session))
