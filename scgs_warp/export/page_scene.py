@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..edit.pose import Rig
 from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..geometry.morton import morton_order
@@ -17,6 +16,7 @@ from ..kernels.types import ALPHA_MIN
 from ..motion.control_points import ControlPoints
 from ..motion.static_nodes import StaticNodes
 from ..scene.scene import Scene
+from ..types import Pose
 from .page_data import Column, common_size, integers, quantise
 from .page_parts import part_columns
 from .skeleton import continuous
@@ -50,6 +50,12 @@ FAR = 200.0
 out if it is beyond this distance and more than twice as far as 99.9 % of all Gaussians."""
 BYTE = 8
 """Largest number of bits of ``sh_rest``, because the page unpacks bytes."""
+
+
+class HasPoses(Protocol):
+    """Motion of control points."""
+
+    def poses(self, times: Tensor) -> list[Pose]: ...
 
 
 @dataclass(frozen=True)
@@ -269,7 +275,7 @@ def _error(values: np.ndarray, between: np.ndarray) -> float:
     return float(((0.5 * (before + after) - between) ** 2).sum(axis=2).mean() ** 0.5)
 
 
-def poses_at(motion: Rig, times: Tensor) -> dict[str, np.ndarray]:
+def poses_at(motion: HasPoses, times: Tensor) -> dict[str, np.ndarray]:
     """Return the poses of control points at some times, as :func:`sample_poses`.
 
     Raises:
