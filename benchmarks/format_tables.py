@@ -1,4 +1,4 @@
-"""Tables of what file formats take and lose, from ``still_formats.py``."""
+"""Tables of what file formats take and lose, from ``still_formats.py`` and ``moving_formats.py``."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from typing import Any
 from markdown_table import number, percent, table
 from provenance import OLDER, changed_since, older_note
 
-CODE = ("scgs_warp/formats", "scgs_warp/export/glb.py", "benchmarks/still_formats.py")
-NAMES = ("still-formats",)
+CODE = {
+    "still-formats": ("scgs_warp/formats", "scgs_warp/export/glb.py", "benchmarks/still_formats.py"),
+    "moving-formats": ("scgs_warp/formats", "scgs_warp/export", "benchmarks/moving_formats.py"),
+}
+NAMES = tuple(CODE)
 EXACT = 1e-7
 """Largest error of a position, in diameters of the scene, that counts as none."""
 
@@ -31,17 +34,33 @@ def cells(row: dict[str, Any]) -> list[str]:
     ]
 
 
+def moving_cells(row: dict[str, Any]) -> list[str]:
+    losses = ["" if row.get(key) is None else percent(100 * row[key], 3) for key in MOVING]
+    return [f"`{row['format']}`", number(row["bytes"] / 2**20, 1), *losses, number(row.get("psnr"))]
+
+
+MOVING = {
+    "position": "position, mean",
+    "position_95": "95 % within",
+    "between": "between instants, mean",
+    "between_95": "95 % within",
+}
+
+
 def format_table(name: str, results: Path) -> str:
     """Write a table for each scene below the command that produced its result."""
     path = results / f"{name}.json"
     if not path.is_file():
         return "Not measured yet."
     report = json.loads(path.read_text(encoding="utf-8"))
-    older = changed_since(report.get("commit"), CODE)
+    older = changed_since(report.get("commit"), CODE[name])
     parts = [f"`{report['command']}`{f' {OLDER}' if older else ''}"]
     for scene in dict.fromkeys(row["scene"] for row in report["rows"]):
         rows = [row for row in report["rows"] if row["scene"] == scene]
         first = f"{scene}: {rows[0]['gaussians']:,} Gaussians of degree {rows[0]['degree']}"
+        if name == "moving-formats":
+            parts.append(table([first, "MiB", *MOVING.values(), "PSNR, dB"], [moving_cells(row) for row in rows]))
+            continue
         head = [
             first,
             "MiB",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,9 @@ import torch
 from plyfile import PlyData
 
 from helpers.edit_scenes import bar_scene
-from helpers.export_files import columns, gltf_arrays, picture, ply_columns
+from helpers.export_files import columns, documented_player, gltf_arrays, picture, ply_columns
 from helpers.node_packages import gltf_errors, splat_transform
 from helpers.page_reader import read_page
-from helpers.paths import ROOT
 from scgs_warp.apps import edit as edit_app
 from scgs_warp.apps import export as app
 from scgs_warp.apps import view as view_app
@@ -33,8 +31,6 @@ from scgs_warp.motion.control_points import ControlPoints
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
 from scgs_warp.types import Gaussians, Pose
-
-DOCS = ROOT / "docs" / "formats.md"
 
 
 def bent(scene: Scene) -> EditSession:
@@ -77,14 +73,6 @@ def export(*arguments: object) -> None:
     assert app.cli([*map(str, arguments), "--device", "cpu"]) == 0
 
 
-def player() -> dict:
-    """The functions of the script in the documentation."""
-    script = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)[0]
-    names: dict = {}
-    exec(script, names)
-    return names
-
-
 def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
     path = tmp_path / "a.npz"
     export("--run", run, "--output", path, "--frames", 5, "--fps", 4)
@@ -92,7 +80,7 @@ def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
     assert str(data["format"]) == "scgs-warp motion" and {"shading", "node_tints", "correctives"} <= data.keys()
     means, quats, scales, sh_dc = (None,) * 4
     for seconds, time in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
-        means, quats, scales, sh_dc = player()["play"](data, seconds)
+        means, quats, scales, sh_dc = documented_player()["play"](data, seconds)
         truth = scene.gaussians_at(time)
         np.testing.assert_allclose(means, truth.means, atol=2e-6)
         np.testing.assert_allclose(np.abs((unit(quats) * unit(truth.quats.numpy())).sum(1)), 1.0, atol=1e-6)
@@ -101,7 +89,7 @@ def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
         again = Gaussians(*(torch.from_numpy(np.asarray(part)).float() for part in parts))
         assert float((picture(again) - picture(truth)).abs().max()) < 2e-5
     assert np.abs(means - data["means"]).max() > 1e-2
-    between = player()["play"](data, 0.6)[0]
+    between = documented_player()["play"](data, 0.6)[0]
     assert np.isfinite(between).all() and not np.array_equal(between, means)
     before = path.read_bytes()
     export("--run", run, "--output", path, "--frames", 5, "--fps", 4)
@@ -263,7 +251,7 @@ def test_an_edit_is_exported(run, tmp_path):
     assert len(played["seconds"]) == 4 and {"shading", "correctives", "node_own_rotations"} <= played.keys()
     for second in (0.0, 0.1):
         truth = session.gaussians_at(session.scene_time(second), second)
-        means, _, _, sh_dc = player()["play"](played, second)
+        means, _, _, sh_dc = documented_player()["play"](played, second)
         np.testing.assert_allclose(means, truth.means, atol=2e-6)
         np.testing.assert_allclose(sh_dc, truth.sh_dc, atol=2e-5)
 

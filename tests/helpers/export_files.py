@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import re
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from plyfile import PlyData
 from scipy.spatial import KDTree
 
 from helpers.edit_scenes import dress
+from helpers.paths import ROOT
 from helpers.scenes import look_at
 from scgs_warp.edit.rotations import multiply
 from scgs_warp.gaussians import SH_C0
@@ -133,3 +136,50 @@ def zeros_spz(path: Path, count: int) -> Path:
     head = struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0)
     path.write_bytes(gzip.compress(head + bytes(65 * count)))
     return path
+
+
+def documented_player() -> dict:
+    """The functions of the script in docs/formats.md that plays a .npz."""
+    script = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "formats.md").read_text(encoding="utf-8"), re.DOTALL)[
+        0
+    ]
+    names: dict = {}
+    exec(script, names)
+    return names
+
+
+def npz_player(path: Path) -> Callable[[float], Gaussians]:
+    """Gaussians of a .npz at a second, by the script in docs/formats.md."""
+    play, scene = documented_player()["play"], dict(np.load(path, allow_pickle=False))
+
+    def at(seconds: float) -> Gaussians:
+        means, quats, scales, sh_dc = play(scene, seconds)
+        parts = means, quats, scales, scene["opacities"], sh_dc, scene["sh_rest"]
+        return Gaussians(*(torch.from_numpy(np.asarray(part)).float() for part in parts))
+
+    return at
+
+
+def fourdgs_player(path: Path) -> Callable[[float], Gaussians]:
+    """Gaussians of a .4dgs at a second, by the format's reference implementation; harmonics of the first keyframe."""
+    pytest.importorskip("fourdgs", reason="the package fourdgs is not installed")
+    from fourdgs import keyframe_delta_file, opcode, serialization
+
+    data, bands = path.read_bytes(), {}
+    decoded = keyframe_delta_file.decode_streamed(data)
+    for record in serialization.iter_records(data, 8):
+        if record.opcode == opcode.SH_BAND_STREAM:
+            cursor = serialization.Cursor(record.content)
+            band = cursor.u8()
+            codes = serialization.decode_stream(cursor)[1]
+            bands.setdefault(band, -4.0 + codes.reshape(-1, 3, 2 * band + 1).transpose(0, 2, 1) * 8.0 / 255.0)
+    count = int(decoded.header.gaussian_count)
+    rest = np.concatenate([bands[band] for band in sorted(bands)], 1) if bands else np.zeros((count, 0, 3))
+
+    def at(seconds: float) -> Gaussians:
+        found = keyframe_delta_file.render_at(decoded, seconds + 1e-9)
+        quats, sh_dc = found["rotations"][:, [3, 0, 1, 2]], (found["rgb"] - 0.5) / SH_C0
+        parts = found["centers"], quats, found["scales"], found["opacity"], sh_dc, rest
+        return Gaussians(*(torch.from_numpy(np.ascontiguousarray(part)).float() for part in parts))
+
+    return at
