@@ -21,6 +21,8 @@ from format_tables import NAMES as FORMATS
 from format_tables import format_table
 from kernel_tables import WRITERS as KERNELS
 from kernel_tables import kernel_table
+from mutation_table import NAME as MUTATION
+from mutation_table import mutation_table
 from provenance import ROOT, without_older_marks
 from quality_tables import WRITERS, quality_table, reported_table
 from repeatable_tables import REPEATABLE, repeatable_table
@@ -40,6 +42,7 @@ def table_names(results: Path) -> list[str]:
         *FORMATS,
         *(f"quality-{name}" for name in WRITERS),
         *sorted(reported | set(REPEATABLE)),
+        MUTATION,
     ]
 
 
@@ -51,6 +54,8 @@ def section(name: str, results: Path) -> str:
     """
     if name in BENCHMARKS:
         return timing_table(name, results)
+    if name == MUTATION:
+        return mutation_table(results)
     if name == "speed-overview":
         return speed_overview(results)
     if name in KERNELS:
