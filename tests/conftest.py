@@ -1,13 +1,15 @@
-"""Fixtures: devices that are present, thread counts, data sets at hand."""
+"""Fixtures: devices that are present, thread counts, data sets at hand; and the list of what was skipped."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
+from helpers import skipped
 
 import torch  # isort: skip
 
@@ -40,3 +42,27 @@ def data_root() -> Path:
     if not root or not Path(root).is_dir():
         pytest.skip("SCGS_DATA does not name a folder of data sets")
     return Path(root)
+
+
+def _reasons(config: pytest.Config) -> list[str]:
+    reporter: Any = config.pluginmanager.get_plugin("terminalreporter")
+    reports = reporter.stats.get("skipped", []) if reporter is not None else []
+    return [str(report.longrepr[2]) for report in reports if isinstance(report.longrepr, tuple)]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail where a test was skipped for want of something that this machine should have (``SCGS_NEEDS``)."""
+    if skipped.needed_here(_reasons(session.config)) and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say at the end what was not tested, and how to get what that needs."""
+    reasons = _reasons(terminalreporter.config)
+    for index, line in enumerate(skipped.lines(reasons)):
+        if index == 0:
+            terminalreporter.section("not tested here")
+        terminalreporter.write_line(line)
+    for name in skipped.needed_here(reasons):
+        terminalreporter.write_line(f"failed: this machine should have {name} ({skipped.VARIABLE})", red=True)
