@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import prepare, run
 from scgs_warp.apps.settings import Settings, builtin_scene, configuration
 from scgs_warp.config.presets import PresetName
@@ -202,7 +203,7 @@ def train(options: Options, cells: list[Cell]) -> dict[str, str]:
 
 
 def main(args: list[str] | None) -> None:
-    options = tyro.cli(Options, args=args, prog="ablate.py", description=__doc__)
+    options = parse(Options, "ablate", args, description=__doc__)
 
     from scgs_warp.ablation.markdown import markdown
     from scgs_warp.ablation.table import build, write

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from scgs_warp.apps.arguments import one_line_errors, program
 from scgs_warp.apps.cli import Device, prepare, run
 
 FIGURES = Path("docs/images")
@@ -202,7 +203,11 @@ def measure(options: Options, plan: Any) -> dict[str, Any]:
 def main(args: list[str] | None) -> None:
     import tyro
 
-    options: Common = tyro.extras.subcommand_cli_from_dict(COMMANDS, args=args, prog="bench.py", description=__doc__)
+    words = list(sys.argv[1:] if args is None else args)
+    with one_line_errors("bench", words, *COMMANDS.values()):
+        options: Common = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS, args=words, prog=program("bench"), description=__doc__
+        )
     check(options)
     device = prepare(options.device, options.threads, options.memory_gib)
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 import tyro
 
+from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 
 
@@ -54,7 +55,7 @@ class Options:
 
 
 def main(args: list[str] | None) -> None:
-    options = tyro.cli(Options, args=args, prog="capture.py")
+    options = parse(Options, "capture", args)
     device = prepare(options.device, options.threads)
 
     import cv2

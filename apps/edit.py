@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 
 if TYPE_CHECKING:
@@ -30,8 +31,8 @@ class Options:
     """Film to write of the script's edit: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     export: Path | None = None
     """File (.ply) to write the edited scene to, as it is at the moment --at of the film."""
-    at: float = 0.0
-    """Second of the film that --export writes."""
+    at: float | None = None
+    """Second of the film that --export writes; by default that of the last keyframe."""
     skeleton: bool = False
     """Print the parts that moved together, with their joints, and end (docs/editing.md)."""
     parts: int | None = None
@@ -86,7 +87,7 @@ def check(options: Options) -> None:
         raise UserError(f"--export {options.export}: end the name in .ply")
     if not 0 <= options.port <= 65535:
         raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
-    if not 0 <= options.at <= 3600:
+    if options.at is not None and not 0 <= options.at <= 3600:
         raise UserError(f"--at {options.at:g}: give a second of the film, from 0 to 3600")
 
 
@@ -109,9 +110,20 @@ def open_session(options: Options, device: str) -> EditSession:
         session.use_parts(options.parts)
     if options.script is not None:
         session.load(options.script)
+        warn_of_another_scene(options.script, session)
     if options.size is not None:
         session.resize_film(options.size)
     return session
+
+
+def warn_of_another_scene(script: Path, session: EditSession) -> None:
+    """Say so if the script names places outside the scene."""
+    from scgs_warp.edit.edit_file import read_object
+    from scgs_warp.edit.misplaced import misplaced
+
+    found = misplaced(read_object(script), session.engine)
+    if found is not None:
+        print(f"warning: {script}: made for another scene? {found}", file=sys.stderr)
 
 
 def open_browser(session: EditSession, options: Options) -> None:
@@ -168,9 +180,7 @@ def skeleton_lines(session: EditSession) -> list[str]:
 
 
 def main(args: list[str] | None) -> None:
-    import tyro
-
-    options = tyro.cli(Options, args=args, prog="edit.py")
+    options = parse(Options, "edit", args)
     check(options)
     browser = options.output is None and options.export is None and not options.skeleton
     if browser:
@@ -195,8 +205,11 @@ def main(args: list[str] | None) -> None:
         camera = film_camera(session, 0.0)
         print(f"{options.output}: {frames} frames of {camera.width} x {camera.height}")
     if options.export is not None:
-        session.export_ply(options.export, session.scene_time(options.at), options.at)
-        print(f"{options.export}: {session.scene.gaussian_count} Gaussians, {options.at:g} s into the film")
+        last = max((frame.at for frame in session.edit.keyframes), default=0.0)
+        at = last if options.at is None else options.at
+        which = ", the last keyframe" if options.at is None and session.edit.keyframes else ""
+        session.export_ply(options.export, session.scene_time(at), at)
+        print(f"{options.export}: {session.scene.gaussian_count:,} Gaussians, {at:g} s into the film{which}")
 
 
 def cli(args: list[str] | None = None) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 
 if TYPE_CHECKING:
@@ -57,25 +58,13 @@ def load_data(scene: Scene, options: Options) -> Dataset:
     return data.load(folder, options.split, **kept)
 
 
-def training_seconds(folder: Path) -> float | None:
-    """Return the training time in ``metrics.json`` of the run; None if it is missing."""
-    from scgs_warp.storage.files import read_text
-    from scgs_warp.storage.json_files import as_number, parse_json
-
-    try:
-        value = parse_json(read_text(folder / "metrics.json"))["seconds"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    seconds = as_number(value)
-    return None if seconds is None or seconds < 0 else seconds
-
-
-def show(metrics: dict[str, Any]) -> None:
+def show(metrics: dict[str, Any], unfinished: str | None) -> None:
     """Print the metrics as a table."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"{metrics['split']}, {metrics['images']} images, step {metrics['step']}")
+    where = unfinished or f"step {metrics['step']:,}"
+    table = Table(title=f"{metrics['split']}, {metrics['images']} images, {where}")
     columns = {
         "psnr": "PSNR [dB]",
         "psnr_median": "median",
@@ -96,15 +85,14 @@ def show(metrics: dict[str, Any]) -> None:
 
 
 def main(args: list[str] | None) -> None:
-    import tyro
-
-    options = tyro.cli(Options, args=args, prog="evaluate.py")
+    options = parse(Options, "evaluate", args)
     device = prepare(options.device, options.threads, options.memory_gib)
 
     from scgs_warp.evaluation.coverage import coverage_line
     from scgs_warp.evaluation.evaluate import metrics_of, write_metrics
     from scgs_warp.runtime.progress import progress
     from scgs_warp.scene.scene import Scene
+    from scgs_warp.training.run_folder import training_seconds
 
     scene = Scene.load(options.run, device=device)
     lpips = None
@@ -133,7 +121,7 @@ def main(args: list[str] | None) -> None:
     metrics["poses"] = poses
     target = options.json or folder / "metrics.json"
     write_metrics(metrics, target)
-    show(metrics)
+    show(metrics, scene.unfinished)
     uncovered = coverage_line(metrics)
     if uncovered is not None:
         print(uncovered)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
+from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 from scgs_warp.export.request import ExportRequest, check_request
 
@@ -23,9 +24,7 @@ class Options(ExportRequest):
 
 
 def main(args: list[str] | None) -> None:
-    import tyro
-
-    options = tyro.cli(Options, args=args, prog="export.py")
+    options = parse(Options, "export", args)
     check_request(options)
     device = prepare(options.device, options.threads, options.memory_gib)
 

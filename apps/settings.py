@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,21 +18,23 @@ BUILTIN = Path("data/figure")
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Settings of a training run."""
+class Schedule:
+    """What most runs need."""
 
     preset: PresetName | None = None
     """Schedule. quick: a few minutes on two cores; cpu: about a quarter of an hour; best: half an hour to an
     hour, a little better; paper: hours, the schedule of the SC-GS supplement. By default quick for the built-in scene
     and cpu for others."""
-    config: Path | None = None
-    """config.json of an earlier run, or a part of one; options override it."""
     downscale: int | None = None
     """Factor by which the images' width and height are divided."""
-    resample: Literal["area", "bicubic"] | None = None
-    """Filter that reduces images: area, or bicubic as in the official code."""
-    background: Literal["black", "white", "random"] | None = None
-    """Colour behind transparent pixels."""
+    steps: int | None = None
+    """Steps of both stages together; every milestone of the schedule scales with it, except with --resume."""
+
+
+@dataclass(frozen=True)
+class ImageChoice:
+    """Which images, and how they are read."""
+
     frames: str | None = None
     """Instants to use, as A:B:C (first, end, step): 0:300:2 takes every other one of the first 300."""
     only_cameras: str | None = None
@@ -40,10 +42,16 @@ class Settings:
     min_frames: int | None = None
     """Smallest number of frames whose images must exist; by default half of them. Frames without images are left
     out."""
-    batch: int | None = None
-    """Views per step; their gradients are averaged. With torchrun, the default is one per process (docs/scaling.md)."""
-    steps: int | None = None
-    """Steps of both stages together; every milestone of the schedule scales with it."""
+    resample: Literal["area", "bicubic"] | None = None
+    """Filter that reduces images: area, or bicubic as in the official code."""
+    background: Literal["black", "white", "random"] | None = None
+    """Colour behind transparent pixels."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """The model and its training."""
+
     nodes: int | None = None
     """Number of control points."""
     progressive: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -51,8 +59,19 @@ class Settings:
     pretrain.progressive=false turns it off for the preset quick."""
     max_gaussians: int | None = None
     """Largest number of Gaussians at any time, which bounds memory."""
+    batch: int | None = None
+    """Views per step; their gradients are averaged. With torchrun, the default is one per process (docs/scaling.md)."""
+    config: Path | None = None
+    """config.json of an earlier run, or a part of one; options override it."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Any other field of the configuration as NAME=VALUE; may be repeated: --set motion.hyper_dim=8 --set freeze=0."""
+    """Any other field of the configuration as NAME=VALUE (scgs-warp config lists them); may be repeated: --set
+    motion.hyper_dim=8 --set freeze=0."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where and how the computation runs."""
+
     device: Device = "auto"
     """Where to compute; auto takes a GPU if there is one."""
     threads: int | None = None
@@ -62,12 +81,18 @@ class Settings:
     in bands, and what does not fit is refused with an error that names its size."""
 
 
+@dataclass(frozen=True)
+class Settings(Machine, Method, ImageChoice, Schedule):
+    """Settings of a training run."""
+
+
 def configuration(
     options: Settings,
     file: Path | None,
     flags: dict[str, Any],
     usual: PresetName | None = None,
     usual_batch: int = 1,
+    resumed: bool = False,
 ) -> tuple[TrainConfig, str | None]:
     """Build the complete configuration, and return it with the data folder that ``file`` names.
 
@@ -77,6 +102,7 @@ def configuration(
         usual: Preset if neither the options nor ``file`` name one; None stands for cpu if ``file`` names a data folder,
             otherwise quick.
         usual_batch: Views per step if neither the options nor ``file`` set them.
+        resumed: whether ``file`` is that of a run that continues: ``--steps`` then moves its end alone.
 
     Raises:
         UserError: names the option, or the file and its field.
@@ -99,7 +125,7 @@ def configuration(
         steps = presets.whole_number(steps, f"{file}: steps")
     wanted_steps = steps if options.steps is None else options.steps
     if wanted_steps is not None and wanted_steps != made.steps:
-        made = presets.with_steps(made, wanted_steps)
+        made = replace(made, steps=wanted_steps) if resumed else presets.with_steps(made, wanted_steps)
     wanted = {
         "data.downscale": options.downscale,
         "data.resample": options.resample,

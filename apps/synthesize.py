@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 
 
@@ -107,9 +108,7 @@ class Options(FilmOptions, Output):
 
 
 def main(args: list[str] | None) -> None:
-    import tyro
-
-    options = tyro.cli(Options, args=args, prog="synthesize.py")
+    options = parse(Options, "synthesize", args)
     device = prepare(options.device, options.threads)
 
     from scgs_warp.errors import UserError

@@ -7,10 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import tyro
-
+from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import prepare, run
-from scgs_warp.apps.settings import BUILTIN, Settings, builtin_scene, configuration
+from scgs_warp.apps.settings import (
+    BUILTIN,
+    ImageChoice,
+    Machine,
+    Method,
+    Schedule,
+    Settings,
+    builtin_scene,
+    configuration,
+)
 from scgs_warp.config.presets import MotionName
 from scgs_warp.runtime.torchrun import process_rank
 
@@ -23,7 +31,7 @@ RUNS = Path("runs")
 
 @dataclass(frozen=True)
 class RunFolders:
-    """Options that --help lists before the settings."""
+    """Folders of a run."""
 
     data: Path | None = None
     """Folder of a data set: D-NeRF, nerfstudio, HyperNeRF, NeRF-DS, Panoptic, Neural 3D Video or COLMAP (docs/data.md).
@@ -33,21 +41,43 @@ class RunFolders:
 
 
 @dataclass(frozen=True)
-class Options(Settings, RunFolders):
-    """Reconstruct a moving scene from posed frames."""
+class Usual(Schedule, RunFolders):
+    """What most runs need."""
 
-    motion: MotionName | None = None
-    """Motion model: control points (SC-GS), one network query per Gaussian, feature planes, or no motion."""
-    seed: int | None = None
-    """Random seed; the same seed gives bit-identical results on the same machine."""
     resume: bool = False
-    """Continue the run in --output."""
+    """Continue the run in --output, with its settings; with --steps N until step N (docs/getting-started.md)."""
     live: bool = False
     """Show the scene in the browser while it trains (docs/page.md); the result stays bit-identical."""
-    port: int = 8080
-    """With --live: port on 127.0.0.1; if it is taken, one of the next."""
+
+
+@dataclass(frozen=True)
+class Model(Method):
+    """The model and its training."""
+
+    motion: MotionName | None = None
+    """Motion model: control points (SC-GS), one network query per Gaussian, feature planes, or no motion
+    (docs/static.md)."""
+    seed: int | None = None
+    """Random seed; the same seed gives bit-identical results on the same machine."""
+
+
+@dataclass(frozen=True)
+class Host(Machine):
+    """Where and how the computation runs."""
+
     tensorboard: bool = False
     """Also write curves and images for TensorBoard to the run folder: tensorboard --logdir runs."""
+    port: int = 8080
+    """With --live: port on 127.0.0.1; if it is taken, one of the next."""
+
+
+@dataclass(frozen=True)
+class Options(Host, Model, Usual, Settings):
+    """Reconstruct a moving scene from posed frames."""
+
+
+GROUPS = {"usual": Usual, "image": ImageChoice, "model": Model, "machine": Host}
+"""Groups of options in ``--help``: what people use first comes first."""
 
 
 def default_output(options: Options) -> Path:
@@ -75,7 +105,7 @@ def live_view(options: Options, output: Path, steps: int) -> TrainingView:
 
 
 def main(args: list[str] | None) -> None:
-    options = tyro.cli(Options, args=args, prog="train.py")
+    options = parse(Options, "train", args, groups=GROUPS)
     where = process_rank()
     threads = where.threads if where and options.threads is None else options.threads
     device = prepare(options.device, threads, options.memory_gib)
@@ -83,19 +113,21 @@ def main(args: list[str] | None) -> None:
     recorded = output / "config.json"
     file = options.config or (recorded if options.resume and recorded.is_file() else None)
     flags = {"motion.model": options.motion, "seed": options.seed}
-    config, named = configuration(options, file, flags, "cpu" if options.data else None, where.size if where else 1)
+    usual = "cpu" if options.data else None
+    resumed = options.resume and file is recorded
+    config, named = configuration(options, file, flags, usual, where.size if where else 1, resumed)
 
     from scgs_warp.runtime.progress import say
     from scgs_warp.runtime.provenance import command_line
     from scgs_warp.training.dataset_advice import advise, survey
+    from scgs_warp.training.preflight import refuse_early
     from scgs_warp.training.process_group import join_processes
     from scgs_warp.training.run import summary, train_and_evaluate
-    from scgs_warp.training.run_folder import refuse_existing
     from scgs_warp.training.tensorboard import check_installed
 
     if options.tensorboard:
         check_installed()
-    refuse_existing(output, options.resume)
+    refuse_early(config, output, options.resume)
     first = where is None or where.rank == 0
     watcher = live_view(options, output, config.steps) if options.live and first else None
 

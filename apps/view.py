@@ -7,12 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 
 if TYPE_CHECKING:
     from scgs_warp.scene.scene import Scene
+    from scgs_warp.types import Camera
 
 LARGEST_SIDE = 8192
+FRAMES = 120
+"""Default frame count of a film."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +35,24 @@ class Options:
     cameras saw the scene from one side only, the camera swings within that range."""
     show: Literal["rgb", "depth", "alpha", "nodes", "trajectories"] = "rgb"
     """Content of the film: colours, depth (near is warm), alpha, control points, or their trajectories."""
-    frames: int = 120
-    """Frame count of the film."""
+    frames: int | None = None
+    """Frame count of the film; 120 by default, with --path that of the path."""
     size: int = 512
     """Longer side of the film in pixels; the proportions are those of the training images."""
     fps: float = 30.0
     """Frames per second."""
     time: float = 0.5
     """Time that a turntable shows, from 0 to 1."""
+    frame: Literal["auto", "cameras", "subject"] = "auto"
+    """What the camera keeps in the picture. cameras: what the training cameras saw; subject: all of the opaque scene,
+    from all sides and at all times; auto: the subject if it is cut out, otherwise what the cameras saw."""
+    target: tuple[float, float, float] | None = None
+    """Point to look at, world units: --target X Y Z."""
+    zoom: float = 1.0
+    """Factor on the focal length: 2 shows half as much, twice as large."""
+    path: Path | None = None
+    """Camera path to follow instead: nerfstudio's camera_path.json, or a transforms.json. With --frames, as many
+    cameras are interpolated along it."""
     live: bool = False
     """Instead of a film, show the scene in the browser (docs/page.md), also while another process trains it."""
     port: int = 8080
@@ -72,11 +86,13 @@ def check(options: Options) -> None:
             raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
         return
     if options.output is None:
-        raise UserError("view.py: give --output for a film, or --live for the browser")
+        raise UserError("--output is missing: name a film (.mp4 or .gif) or a folder for PNGs, or give --live")
     if options.share:
         raise UserError("--share: belongs to --live; leave it out for a film")
-    if options.frames < 1:
+    if options.frames is not None and options.frames < 1:
         raise UserError(f"--frames {options.frames}: a film needs at least 1")
+    if options.path is not None and (options.target is not None or options.frame != "auto" or options.zoom != 1.0):
+        raise UserError(f"--path {options.path}: states the cameras; leave out --frame, --target and --zoom")
     if not 16 <= options.size <= LARGEST_SIDE:
         memory = f"; a frame of {options.size} x {options.size} would take {video.frame_gib(options.size):,.1f} GiB"
         needed = memory if options.size > LARGEST_SIDE else ""
@@ -124,10 +140,39 @@ def show_live(options: Options, device: str) -> None:
             watcher.stop()
 
 
-def main(args: list[str] | None) -> None:
-    import tyro
+def film_views(options: Options, scene: Scene) -> list[tuple[Camera, float]]:
+    """Return the camera and the time of each frame.
 
-    options = tyro.cli(Options, args=args, prog="view.py")
+    Raises:
+        UserError: the path cannot be read, or the scene cannot be framed as asked.
+    """
+    from scgs_warp.data.camera_path import read_camera_path
+    from scgs_warp.geometry.cameras import orbit_camera, turntable
+    from scgs_warp.visualization.framing import aim, frame_subject, is_cut_out
+
+    given: list[float | None]
+    if options.path is not None:
+        film = read_camera_path(options.path, scene.overview).film(options.frames, options.size)
+        path, given = [camera for camera, _ in film], [time for _, time in film]
+    else:
+        overview = scene.overview
+        if options.frame == "subject" or (options.frame == "auto" and options.target is None and is_cut_out(scene)):
+            overview = frame_subject(scene)
+        overview = aim(overview, options.target, options.zoom)
+        frames = FRAMES if options.frames is None else options.frames
+        if options.mode == "time":
+            path = [orbit_camera(overview, overview.azimuth, options.size)] * frames
+        else:
+            path = turntable(overview, frames, options.size)
+        given = [None] * frames
+    if options.mode == "turntable":
+        return [(camera, options.time) for camera in path]
+    last = max(len(path) - 1, 1)
+    return [(camera, index / last if time is None else time) for index, (camera, time) in enumerate(zip(path, given))]
+
+
+def main(args: list[str] | None) -> None:
+    options = parse(Options, "view", args)
     check(options)
     if options.live:
         from scgs_warp.live.server import import_aiohttp
@@ -139,27 +184,22 @@ def main(args: list[str] | None) -> None:
         return
     assert options.output is not None
 
-    from scgs_warp.geometry import cameras
     from scgs_warp.runtime.progress import progress
     from scgs_warp.visualization import video
     from scgs_warp.visualization.overlay import Painter
 
     scene = open_scene(options, device)
-    if options.mode == "time":
-        path = [cameras.orbit_camera(scene.overview, scene.overview.azimuth, options.size)] * options.frames
-    else:
-        path = cameras.turntable(scene.overview, options.frames, options.size)
-    times = [frame / max(options.frames - 1, 1) for frame in range(options.frames)]
-    if options.mode == "turntable":
-        times = [options.time] * options.frames
-    views = [(camera.to(device), time) for camera, time in zip(path, times)]
-    video.require_memory(options.output, path[0].width, path[0].height, options.frames, device)
+    if scene.unfinished is not None:
+        print(f"{options.run}: {scene.unfinished}")
+    views = [(camera.to(device), time) for camera, time in film_views(options, scene)]
+    first = views[0][0]
+    video.require_memory(options.output, first.width, first.height, len(views), device)
     painter = Painter(scene, options.show, views)
-    with video.film(options.output, options.fps) as writer, progress(options.frames, "view") as shown:
+    with video.film(options.output, options.fps) as writer, progress(len(views), "view") as shown:
         for camera, time in views:
             writer.write(painter.paint(camera, time))
             shown.advance()
-    print(f"{options.output}: {options.frames} frames of {path[0].width} x {path[0].height}")
+    print(f"{options.output}: {len(views)} frames of {first.width} x {first.height}")
 
 
 def cli(args: list[str] | None = None) -> int:

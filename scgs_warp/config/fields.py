@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from .bounds import bounded, chosen, milestone, newer, rate
+from .rates import OptimConfig
 
 MotionName = Literal["control-points", "per-gaussian", "hexplane", "static"]
 PresetName = Literal["quick", "cpu", "best", "paper"]
@@ -46,16 +47,21 @@ class MotionConfig:
     """Control points and the network that moves them (paper section 4.1)."""
 
     model: MotionName = "control-points"
+    """Motion model: control points (SC-GS), one network query per Gaussian, feature planes, or no motion."""
     nodes: int = bounded(512, 1, 1_000_000)
     """Number of control points, N_p."""
     neighbors: int = chosen(4, 1, 16)
     """Number of control points that move each Gaussian, K."""
     layers: int = bounded(8, 1, 64)
+    """Number of layers of the network."""
     width: int = bounded(256, 1, 2_048)
+    """Width of its layers."""
     skip: int = bounded(4, 0, 64)
     """Index of the layer whose output is concatenated with the network's input."""
     position_frequencies: int = bounded(10, 1, 32)
+    """Number of frequencies by which positions are encoded."""
     time_frequencies: int = bounded(6, 1, 32)
+    """Number of frequencies by which times are encoded."""
     train_positions: bool = True
     """Learn the rest positions of the control points in stage 2 (paper); the official code never moves them."""
     hyper_dim: int = bounded(8, 0, 64)
@@ -117,6 +123,7 @@ class PretrainConfig:
     """Stage 1: control points trained alone, rendered as same-sized spheres."""
 
     steps: int = milestone(5_000)
+    """Number of steps of stage 1."""
     with_points: bool = False
     """Keep stage 1 if the data has points. Otherwise control points start as a sample of these points and learn with
     the Gaussians from the first step."""
@@ -127,6 +134,7 @@ class PretrainConfig:
     """Number of steps before the network starts to move the spheres. After long at rest, only spheres of parts that
     hardly move are left."""
     densify_every: int = bounded(100, 1)
+    """Number of steps between two rounds of densification."""
     densify_by: Literal["share", "gradient"] = newer("share", before="share")
     """Choice of the spheres that are cloned. share: a fixed share of them. gradient: those whose gradient reaches
     ``grad_threshold``, and otherwise as Gaussians in stage 2: split if they are large, pruned below
@@ -145,10 +153,12 @@ class PretrainConfig:
     grey: bool = newer(False, before=False)
     """Start with grey spheres (official code), not with the colours of the points."""
     opacity_rate: float = rate(0.02)
-    """Learning rate of the spheres' opacities; ``color_rate`` is that of their colours. With the learning rates of the
-    Gaussians, spheres would turn transparent before they find their colour."""
+    """Learning rate of the spheres' opacities. With the learning rates of the Gaussians, spheres would turn transparent
+    before they find their colour."""
     color_rate: float = rate(1e-2)
+    """Learning rate of the spheres' colours."""
     arap_weight: float = bounded(1e-3, 0, 1e6)
+    """Weight of ARAP on the trajectories of the spheres."""
     random_background: bool = True
     """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
     space."""
@@ -165,6 +175,7 @@ class PretrainConfig:
     progressive: bool = False
     """Begin with the first 20 % of the frames and add 20 % every ``progressive_every`` steps."""
     progressive_every: int = milestone(500, 1)
+    """Number of steps from one fifth of the frames to the next."""
     progressive_by: Literal["frame", "fifth"] = newer("frame", before="frame")
     """How frames are added. frame: one by one at that pace, with every other step on one of the newest 20 %, and
     spheres that begin in the first pose. fifth: 20 % at a time, all frames equally often (supplement)."""
@@ -176,50 +187,13 @@ class PretrainConfig:
 
 
 @dataclass(frozen=True)
-class OptimConfig:
-    """Learning rates. ``NAME_end`` is the final rate of a log-linear decay (official values, normalised scene)."""
-
-    means: float = rate(8e-4)
-    means_end: float = rate(8e-6)
-    means_until: int = milestone(33_000, 1)
-    sh_dc: float = rate(2.5e-3)
-    sh_rest: float = rate(1.25e-4)
-    opacity: float = rate(0.05)
-    scales: float = rate(5e-3)
-    quats: float = rate(1e-3)
-    hyper: float = rate(2.5e-3)
-    shading: float = rate(2.5e-3)
-    correctives: float = rate(8e-4, before=2.5e-3)
-    """A step then moves a mean about as far as a step of the mean itself, at any rotation. At three times the rate,
-    bodies that spin were lost."""
-    network: float = rate(8e-4)
-    network_end: float = rate(1.6e-6)
-    network_until: int = milestone(33_000, 1)
-    network_from: Literal["motion", "stage"] = newer("motion", before="motion")
-    """Step from which ``network_until`` counts. motion: the first that trains the network. stage: the first of each
-    stage (official code)."""
-    nodes: float = rate(8e-4)
-    """Learning rate of the radii, weights and hyper-coordinates of the control points."""
-    node_positions: float = rate(8e-5)
-    nodes_decay: bool = newer(True, before=True)
-    """Let ``nodes`` decay like the network's rate; otherwise it is constant (official code). ``node_positions`` always
-    decays like it."""
-    settle: float = bounded(0.15, 0, 1)
-    """Share of the main stage, at its end, over which the otherwise constant rates of the Gaussians decay to a
-    twentieth."""
-    cameras: float = rate(0.0)
-    """Learning rate of the corrections to the training cameras' poses (radians, normalised units) after ``freeze``; 0:
-    no corrections."""
-    planes: float = rate(8e-3)
-    """Learning rate of the feature planes of the hexplane model."""
-
-
-@dataclass(frozen=True)
 class DensifyConfig:
     """Adaptive density control of Gaussians and control points, in main steps."""
 
     start: int = milestone(250)
+    """Main step of the first round."""
     until: int = milestone(20_000)
+    """Main step of the last round."""
     every: int = bounded(100, 1)
     """Smallest number of steps between two rounds: fewer steps see too few views to decide by."""
     rounds: int = bounded(132, 0)
@@ -236,10 +210,17 @@ class DensifyConfig:
     percent_dense: float = bounded(0.01, 0, 1e3)
     """Split Gaussians larger than this share of the extent, and clone smaller ones."""
     min_opacity: float = bounded(0.005, 0, 1)
+    """Prune Gaussians that are less opaque than this."""
     min_contribution: float = bounded(0.05, 0)
     """Visibility pruning, before each opacity reset and at the end of densification: remove Gaussians that contribute
     less than this many pixels to every sampled view (sum of blending weights, at the size of the training images). 0:
     off."""
+    least_views: int = newer(1, before=1, least=1, most=1_000)
+    """Visibility pruning without alpha: also remove Gaussians that contribute ``min_contribution`` to fewer views than
+    this, if all views are sampled: they explain one photo and hide the scene from others. 1: off."""
+    clear_distance: float = newer(0.0, before=0.0, least=0, most=1)
+    """Visibility pruning without alpha: also remove Gaussians that a view sees nearer than this share of the distance
+    at which its content begins: they become fog before the lens. 0: off."""
     prune_large: Literal["auto", "always", "never"] = "auto"
     """Apply max_screen and max_scale. auto: only if the images have alpha, because images without alpha show bare
     walls, which need large Gaussians."""
@@ -248,10 +229,13 @@ class DensifyConfig:
     max_scale: float = bounded(0.1, 0, 1e3)
     """Prune Gaussians larger than this share of the extent (after the first opacity reset)."""
     opacity_reset_every: int = milestone(5_000, 1)
+    """Number of main steps between two opacity resets."""
     sh_every: int = milestone(750, 1)
     """Number of main steps between two degrees of spherical harmonics."""
     nodes_every: int = milestone(2_500, 1)
+    """Number of main steps between two rounds in which control points are cloned and pruned."""
     nodes_until: int = milestone(12_500)
+    """Main step after which no control point is cloned or pruned."""
     node_grad_threshold: float = bounded(2e-4, 0)
     """Weighted mean gradient of the Gaussians that a control point moves above which it is cloned, in the units of
     ``grad_threshold`` and scaled likewise."""
@@ -260,6 +244,7 @@ class DensifyConfig:
     node_growth: float = newer(0.1, before=0.1, least=0, most=1)
     """Clone at most this share of the control points at a time, those with the largest gradients."""
     max_gaussians: int = bounded(300_000, 1, 100_000_000)
+    """Largest number of Gaussians at any time, which bounds memory."""
 
     @property
     def interval(self) -> int:
@@ -273,6 +258,7 @@ class LossConfig:
     Eq. 10)."""
 
     ssim: float = bounded(0.2, 0, 1)
+    """Weight of D-SSIM; L1 has the rest."""
     log_error: float = newer(0.002, before=0.0, least=0, most=1e3)
     """Weight of the logarithm of each view's mean squared error (not in the paper), which weighs views by their
     relative error, as PSNR does."""
@@ -283,7 +269,9 @@ class LossConfig:
     beside its true place then costs less than a missing one, so it is moved instead of turned transparent. auto: only
     for thin subjects; it lowers the scores of others."""
     arap: float = bounded(1e-4, 0, 1e6)
+    """Weight of ARAP at the first main step."""
     arap_end: float = bounded(1e-7, 0, 1e6)
+    """Weight of ARAP at ``arap_until``."""
     arap_until: int = milestone(5_000)
     """Main step until which the ARAP weight changes exponentially from ``arap`` to ``arap_end``; afterwards the term is
     off."""
@@ -295,12 +283,15 @@ class LossConfig:
     arap_times: int = bounded(8, 1, 10_000)
     """Number of sampled times, N_t; the trajectories over them define the neighbours."""
     arap_neighbors: int = chosen(8, 1, 15)
+    """Number of neighbours of each control point for ARAP."""
     arap_refresh: int = bounded(200, 1)
+    """Number of steps between two computations of the neighbours."""
     hexplane_tv: float = bounded(1e-4, 0, 1e6)
+    """Weight of the differences in space (feature planes, 4D-GS)."""
     hexplane_smooth: float = bounded(1e-2, 0, 1e6)
+    """Weight of the second differences in time (feature planes, 4D-GS)."""
     hexplane_rest: float = bounded(1e-4, 0, 1e6)
-    """Weight of the term that keeps the time planes near 1, the value at rest (feature planes, 4D-GS). ``hexplane_tv``
-    is the weight of differences in space, ``hexplane_smooth`` that of second differences in time."""
+    """Weight of the term that keeps the time planes near 1, the value at rest (feature planes, 4D-GS)."""
 
 
 @dataclass(frozen=True)
@@ -308,7 +299,9 @@ class TrainConfig:
     """A complete run. ``steps`` is the total of both stages; every milestone is a number of steps."""
 
     preset: PresetName = "best"
+    """Preset from which the other fields come."""
     steps: int = bounded(40_000, 1, 100_000_000)
+    """Steps of both stages together (``--steps``, which scales the milestones)."""
     freeze: int = milestone(1_500)
     """Number of main steps at the beginning in which control points and network stay as stage 1 left them."""
     coarse: int = milestone(3_000)
@@ -327,12 +320,15 @@ class TrainConfig:
     views overlap; where the data has points, behind them. cube: grey and uniformly in a cube around the scene, only if
     the data has no points (official code)."""
     sh_degree: int = chosen(3, 0, 3)
+    """Degree of the spherical harmonics of the colours."""
     antialiased: bool = False
+    """Dim Gaussians that are smaller than a pixel (Mip-Splatting)."""
     sharpness: float = newer(0.5, before=0.0, least=0, most=10)
     """Value s by which the splats fall off faster than a Gaussian (not in the paper): the opacity is multiplied by
     exp(-u - s u^2), where u is half the squared distance in units of the covariance. Opaque outlines become as sharp as
     in the images. 0: exact Gaussians, as other programs draw them; exports to their formats approximate others."""
     seed: int = bounded(0, 0)
+    """Random seed; the same seed gives bit-identical results on the same machine."""
     batch: int = bounded(1, 1, 100_000)
     """Number of views per step; their gradients are averaged. Several processes can share the views
     (docs/scaling.md)."""
@@ -342,6 +338,7 @@ class TrainConfig:
     """Number of steps between two evaluations on a few test images, for the curve only: they do not influence the
     training."""
     checkpoint_seconds: float = bounded(60.0, 0)
+    """Seconds between two checkpoints."""
     data: DataConfig = field(default_factory=DataConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)

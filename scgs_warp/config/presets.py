@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import types
 import typing
 from pathlib import Path
@@ -158,7 +159,9 @@ def from_dict(values: dict[str, Any], source: str = "config", base: Any = None, 
     for key, value in values.items():
         label = f"{prefix}{key}"
         if key not in known:
-            raise UserError(f"{source}: unknown field {label!r}; known here: {', '.join(sorted(known))}")
+            near = difflib.get_close_matches(key, known, 1)
+            hint = f"did you mean {prefix}{near[0]}?" if near else f"known here: {', '.join(sorted(known))}"
+            raise UserError(f"{source}: unknown field {label!r}; {hint} ('scgs-warp config' lists all)")
         current = getattr(base, key)
         if dataclasses.is_dataclass(current):
             if not isinstance(value, dict):
@@ -231,7 +234,9 @@ def read_config(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give a config.json of an earlier run") from error
     except ValueError as error:
-        raise UserError(f"{path}: not valid JSON ({error}); correct it or give another file") from None
+        raise UserError(
+            f"{path}: not valid JSON ({error}); correct it or give a config.json of an earlier run"
+        ) from None
     if not isinstance(values, dict):
         raise UserError(f"{path}: must hold a JSON object; give a config.json of an earlier run")
     return values

@@ -95,7 +95,10 @@ class Scene:
         check_settings(scene.settings, str(settings_path))
         scene.motion.eval()
         if metadata.get("stage") != "main":
-            raise UserError(f"{folder}: training stopped in stage 1; continue it with apps/train.py --resume")
+            raise UserError(
+                f"{folder}: step {scene.step:,} of {scene.config.steps:,} is in stage 1, which has no Gaussians to "
+                "show; continue it with apps/train.py --resume"
+            )
         scene.freeze_binding()
         check_motion(scene.gaussians_at, str(folder / checkpoint.FILE))
         return scene
@@ -115,6 +118,13 @@ class Scene:
     def motion_name(self) -> str:
         """``control-points``, ``per-gaussian``, ``hexplane`` or ``static``."""
         return self.motion.name
+
+    @property
+    def unfinished(self) -> str | None:
+        """``step 3,304 of 7,000, unfinished`` for the scene of a run that has not reached its last step, else None."""
+        if self.folder is None or self.step >= self.config.steps:
+            return None
+        return f"step {self.step:,} of {self.config.steps:,}, unfinished"
 
     @property
     def gaussian_count(self) -> int:

@@ -34,6 +34,11 @@ GAP = 5.0
 unknown."""
 UNSTEADY = 0.08
 """Relative change of brightness between neighbouring frames that indicates a change of exposure."""
+MOSTLY_BEHIND = 0.2
+"""Share of the points before the cameras, over all pairs of both, below which the cameras look away from them."""
+WIDE_ARC = 0.02
+"""Smallest eigenvalue of the mean of I - d d^T over the optical axes d from which the place where they meet is known;
+it corresponds to an arc of about 20 degrees."""
 FEW_VISITS = 20
 """Number of steps per frame below which frames are hardly learnt."""
 LARGE_IMAGE = 1_000_000
@@ -69,6 +74,8 @@ class Survey:
     moves."""
     points: int
     """Number of initial points in the data."""
+    look_away: bool = False
+    """True if the content lies behind most cameras."""
 
 
 def survey(data: Dataset) -> Survey:
@@ -98,7 +105,27 @@ def survey(data: Dataset) -> Survey:
         in_parts=is_in_parts(data),
         flicker=_flicker(data, [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(following < SAME_PLACE)]),
         points=0 if data.points is None else len(data.points),
+        look_away=looks_away(data),
     )
+
+
+def looks_away(data: Dataset) -> bool:
+    """Return whether the content lies behind most of the cameras: the sparse points or, without points, the place where
+    the optical axes meet, if they meet behind all cameras of a wide arc."""
+    cameras = [data.entries[index].camera for index in spread(len(data), 100)]
+    viewmats = torch.stack([camera.viewmat.double().cpu() for camera in cameras])
+    if data.points is not None and len(data.points) >= FEWEST_POINTS:
+        points = data.points[spread(len(data.points), 1000)].double()
+        depths = points @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]
+        return float((depths > 0).double().mean()) < MOSTLY_BEHIND
+    axes = viewmats[:, 2, :3]
+    positions = -torch.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    if float(torch.linalg.eigvalsh(across.mean(0))[0]) < WIDE_ARC:
+        return False
+    centre = torch.linalg.solve(across.sum(0), torch.einsum("vij,vj->i", across, positions))
+    depths = torch.einsum("vi,vi->v", centre - positions, axes)
+    return bool((depths < 0).all())
 
 
 def _directions(data: Dataset) -> np.ndarray:
@@ -157,6 +184,11 @@ def _content(facts: Survey) -> str:
 
 
 def _expectation(facts: Survey) -> str:
+    if facts.look_away:
+        return (
+            "nothing: the cameras look away from the content; poses in transforms.json are OpenGL's (y up, z backward),"
+            " not OpenCV's (y down, z forward)"
+        )
     if facts.instants < 2:
         return "a scene at rest: all frames are of one instant"
     if facts.arc < LITTLE_PARALLAX:

@@ -31,9 +31,10 @@ from ..seeding import generator
 from ..types import plain_scale
 from .densify import grow_and_prune, mean_gradient, prune, reset_opacities
 from .frames import Frames
+from .near_bound import nearest_content
 from .pretrain import densify_spheres, densify_spheres_by_gradient, thin_spheres
 from .state import TrainState
-from .visibility import contributions
+from .visibility import seen_by
 
 STEPS_PER_VIEW = 20
 """Visibility pruning renders at most one view per this many steps since the last pruning. A view takes about half as
@@ -129,7 +130,8 @@ def density_due(state: TrainState) -> bool:
 
 
 def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
-    """Find the Gaussians that contribute at least ``densify.min_contribution`` pixels to one of a few sampled views.
+    """Find the Gaussians that contribute at least ``densify.min_contribution`` pixels to one of a few sampled views, or
+    to ``densify.least_views`` of all views, and that none of them sees closer than ``densify.clear_distance``.
 
     The views are drawn at random, different ones each time.
 
@@ -146,7 +148,13 @@ def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
     if count < min(len(frames), FEWEST_VIEWS):
         return None
     order = torch.randperm(len(frames), generator=generator(state.config.seed, 52, state.step))
-    return contributions(state, frames, order[:count].tolist()) >= config.min_contribution
+    seen = seen_by(state, frames, order[:count].tolist(), config.min_contribution)
+    keep = seen.most >= config.min_contribution
+    if config.least_views > 1 and count == len(frames) >= config.least_views:
+        keep &= (seen.views >= config.least_views) | seen.most.isinf()
+    if config.clear_distance > 0.0:
+        keep &= seen.nearest >= config.clear_distance * nearest_content(frames.frames, state.normalisation)
+    return keep
 
 
 # After a step

@@ -26,7 +26,7 @@ from ..visualization.figures import curves
 from ..visualization.overlay import Painter
 from .loop import Watcher, fit
 from .process_group import ProcessGroup
-from .run_folder import read_seconds
+from .run_folder import training_seconds
 
 FILM_FRAMES = 120
 FILM_SIZE = 400
@@ -156,7 +156,7 @@ def write_results(
         metrics = metrics_of(
             scene,
             test,
-            seconds=read_seconds(folder),
+            seconds=training_seconds(folder),
             lpips=lpips,
             render_dir=renders,
             progress=lambda done, total: bar.advance(),

@@ -23,6 +23,7 @@ from ..scene.scene import Scene
 from ..storage.checkpoint import FILE, PREVIOUS
 from ..storage.files import write_atomically
 from ..storage.locks import AlreadyLocked, lock_file
+from ..storage.json_files import as_number, parse_json
 from ..visualization.figures import read_log
 from .state import StepResult, TrainState
 from .tensorboard import TensorBoard, check_installed
@@ -35,6 +36,19 @@ TEST_IMAGES = 4
 """Approximate number of held-out images on which the curve is measured."""
 BOARD_IMAGES = 20
 """Number of training pictures per run in TensorBoard."""
+
+
+def training_seconds(folder: Path) -> float | None:
+    """Return the seconds of training of a run, from its log or, without one, from its ``metrics.json``."""
+    seconds = read_seconds(folder)
+    if seconds is not None:
+        return seconds
+    try:
+        value = parse_json((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    seconds = as_number(value)
+    return None if seconds is None or seconds < 0 else seconds
 
 
 def read_seconds(folder: Path) -> float | None:

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ..config.presets import FREE_TO_CHANGE, TrainConfig, to_dict
+from ..config.presets import TrainConfig, to_dict
 from ..config.recorded import with_newer_fields
 from ..data.dataset import Dataset
 from ..errors import UserError
@@ -39,6 +39,7 @@ from .pretrain import (
     thin_spheres,
 )
 from .process_group import ProcessGroup
+from .resuming import check_same_configuration, check_steps
 from .silhouettes import half_thickness, is_in_parts, is_thin
 
 Stage = Literal["pretrain", "main"]
@@ -212,15 +213,14 @@ class TrainState:
         source = str(folder / checkpoint.FILE)
         check_metadata(metadata, source)
         saved, wanted = with_newer_fields(metadata["config"], recorded=True), to_dict(config)
-        _check_same_configuration({"data": saved.get("data")}, {"data": wanted["data"]}, source)
+        check_same_configuration({"data": saved.get("data")}, {"data": wanted["data"]}, source)
         # Settings that the data chooses differ with the frames, so the frames come before them.
         if metadata.get("frames") != data.fingerprint:
             raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
-        _check_same_configuration(saved, wanted, source)
+        check_same_configuration(saved, wanted, source)
         check_tensors(tensors, source)
         check_resumed(tensors, metadata, source)
-        if metadata["step"] > config.steps:
-            raise UserError(f"{source}: is at step {metadata['step']} of {config.steps}; train again without --resume")
+        check_steps(metadata["step"], config, source)
         tensors = checkpoint.to_device(tensors, device)
         scene = scene_from(tensors, metadata, device, source)
         nothing = torch.zeros(0, 3, device=device)
@@ -283,6 +283,8 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
         config = replace(config, motion=replace(motion, hyper_dim=hyper_dim))
     if growth.prune_large == "auto":
         config = replace(config, densify=replace(growth, prune_large="never" if filled else "always"))
+    if not filled:  # Beside a cut-out subject every Gaussian is contradicted by the background of some view.
+        config = replace(config, densify=replace(config.densify, least_views=1, clear_distance=0.0))
     thin = "auto" in (config.loss.pooled, config.pretrain.fade) and is_thin(data)
     if config.loss.pooled == "auto":
         config = replace(config, loss=replace(config.loss, pooled="always" if thin else "never"))
@@ -315,22 +317,3 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
         return points, colors
     behind = background_points(count - len(points), points, data, normalisation, config.seed, 35)
     return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]])
-
-
-def _check_same_configuration(saved: dict, wanted: dict, source: str, prefix: str = "") -> None:
-    """Refuse to resume with settings other than the checkpoint's."""
-    for name, value in wanted.items():
-        if f"{prefix}{name}" in FREE_TO_CHANGE:
-            continue
-        if isinstance(value, dict):
-            inner = saved.get(name, {})
-            _check_same_configuration(inner if isinstance(inner, dict) else {}, value, source, f"{prefix}{name}.")
-        elif name not in saved:  # no value of the field stands for that version's behaviour
-            raise UserError(
-                f"{source}: made by another version, which had no {prefix}{name}; train again with another --output"
-            )
-        elif saved[name] != value:
-            raise UserError(
-                f"{source}: made with {prefix}{name} = {saved[name]!r}, now {value!r}; "
-                "give the same options to --resume, or another --output"
-            )

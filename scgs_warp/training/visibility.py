@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -13,14 +15,27 @@ from .frames import Frames
 from .state import TrainState
 
 
-def contributions(state: TrainState, frames: Frames, indices: list[int]) -> Tensor:
-    """Measure each Gaussian's largest contribution to any of these frames.
+class Seen(NamedTuple):
+    """How sampled views see each Gaussian."""
 
-    Returns:
-        [N] pixels (:func:`view_contributions`); infinite for Gaussians outside all of the frames, which therefore
-        cannot judge them.
+    most: Tensor
+    """[N] pixels, the largest contribution to a view (:func:`view_contributions`); infinite for Gaussians outside all
+    of the views, which therefore cannot judge them."""
+    views: Tensor
+    """[N] int32, number of views to which it contributes at least the threshold."""
+    nearest: Tensor
+    """[N] least distance to a camera that has it in view; infinite outside all of the views."""
+
+
+def seen_by(state: TrainState, frames: Frames, indices: list[int], least: float) -> Seen:
+    """Measure how these frames see each Gaussian.
+
+    Args:
+        least: threshold of the contribution, in pixels.
     """
     most = torch.zeros(len(state.gaussians), device=state.device)
+    views = torch.zeros_like(most, dtype=torch.int32)
+    nearest = torch.full_like(most, torch.inf)
     ever = torch.zeros_like(most, dtype=torch.bool)
     for index in indices:
         camera = frames.views[index].to(state.device)
@@ -29,8 +44,11 @@ def contributions(state: TrainState, frames: Frames, indices: list[int]) -> Tens
             posed = state.motion.gaussians_at(state.gaussians, frames.frames.entries[index].time)
         weights, in_view = view_contributions(posed, camera, state.config.antialiased)
         torch.maximum(most, weights, out=most)
+        views += weights >= least
+        distance = (posed.means.detach() - camera.position).norm(dim=1)
+        torch.minimum(nearest, torch.where(in_view, distance, torch.inf), out=nearest)
         ever |= in_view
-    return torch.where(ever, most, torch.inf)
+    return Seen(torch.where(ever, most, torch.inf), views, nearest)
 
 
 def view_contributions(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> tuple[Tensor, Tensor]:

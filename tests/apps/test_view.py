@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
 
 import cv2
@@ -22,8 +24,8 @@ def read_frames(folder: Path) -> list[np.ndarray]:
 
 def film(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *more: str, points: int = 32) -> list[np.ndarray]:
     install(monkeypatch, FakeScene(points))
-    arguments = ["--run", str(tmp_path), "--output", str(tmp_path / "film"), "--size", "64", "--frames", "4", *more]
-    assert view.cli(arguments) == 0
+    arguments = ["--run", str(tmp_path), "--output", str(tmp_path / "film"), "--size", "64", "--frames", "4"]
+    assert view.cli([*arguments, "--frame", "cameras", *more]) == 0
     return read_frames(tmp_path / "film")
 
 
@@ -45,6 +47,34 @@ def test_turntable_moves_the_camera_round_a_standing_scene(monkeypatch, tmp_path
     for index, frame in enumerate(frames):
         camera = cameras.orbit_camera(FakeScene.overview, 90.0 * index, 64)
         assert same(frame, (FakeScene().render(camera, 0.25).rgb.numpy() * 255).round())
+
+
+def test_a_camera_path_and_its_times(monkeypatch, tmp_path) -> None:
+    poses = [cameras.orbit_camera(FakeScene.overview, azimuth, 64) for azimuth in (0.0, 40.0)]
+    flipped = np.diag([1.0, -1.0, -1.0, 1.0])
+    entries = [
+        {"transform_matrix": (np.linalg.inv(pose.viewmat.double().numpy()) @ flipped).tolist(), "time": time}
+        for pose, time in zip(poses, (0.25, 0.75))
+    ]
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"camera_angle_x": math.radians(FakeScene.overview.fov_x), "frames": entries}))
+    install(monkeypatch, FakeScene())
+    output = tmp_path / "film"
+    arguments = ["--run", str(tmp_path), "--output", str(output), "--size", "64", "--path", str(path)]
+    assert view.cli(arguments) == 0
+    frames = read_frames(output)
+    assert len(frames) == 2
+    for frame, camera, time in zip(frames, poses, (0.25, 0.75)):
+        assert same(frame, (FakeScene().render(camera, time).rgb.numpy() * 255).round())
+    assert view.cli([*arguments, "--frames", "5", "--output", str(tmp_path / "longer")]) == 0
+    assert len(read_frames(tmp_path / "longer")) == 5
+    assert view.cli([*arguments, "--zoom", "2"]) == 2
+
+
+def test_an_unfinished_run_is_shown_and_said_to_be_unfinished(monkeypatch, tmp_path, capsys) -> None:
+    monkeypatch.setattr(FakeScene, "unfinished", "step 3,304 of 7,000, unfinished")
+    film(monkeypatch, tmp_path)
+    assert "step 3,304 of 7,000, unfinished" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("show", ["depth", "alpha", "nodes", "trajectories"])
@@ -75,6 +105,8 @@ def test_trails_without_control_points_follow_gaussians(monkeypatch, tmp_path) -
         (["--output", "film.avi"], "film.avi"),
         (["--run", "missing"], "missing"),
         (["--threads", "0"], "--threads 0"),
+        (["--zoom", "0"], "--zoom 0"),
+        (["--path", "no.json"], "no.json: no such file"),
     ],
 )
 def test_mistakes_are_one_line_and_status_2(monkeypatch, tmp_path, capsys, arguments: list[str], words: str) -> None:

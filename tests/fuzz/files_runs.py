@@ -26,7 +26,7 @@ from helpers.edit_scenes import OVERVIEW, dress
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.ablation import table as ablate_table
 from scgs_warp.ablation.markdown import markdown
-from scgs_warp.apps.evaluate import Options, load_data, training_seconds
+from scgs_warp.apps.evaluate import Options, load_data
 from scgs_warp.apps.settings import Settings, configuration
 from scgs_warp.config.presets import TrainConfig, from_dict, preset, to_dict
 from scgs_warp.data import Dataset
@@ -37,7 +37,7 @@ from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
 from scgs_warp.training.camera_refinement import refined
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.run_folder import RunFolder, read_seconds
+from scgs_warp.training.run_folder import RunFolder, read_seconds, training_seconds
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step
 from scgs_warp.visualization import figures

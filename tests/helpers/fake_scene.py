@@ -23,6 +23,7 @@ class FakeScene:
     overview = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0, 40.0, 20.0)
     background_color = (0.0, 0.0, 0.0)
     step = 1234
+    unfinished: str | None = None
     motion_name = "control-points"
     gaussian_count = 2
     control_point_count = 32

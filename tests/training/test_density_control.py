@@ -25,7 +25,7 @@ from scgs_warp.training.density_control import (
     visible_gaussians,
 )
 from scgs_warp.training.loop import fit
-from scgs_warp.training.visibility import contributions
+from scgs_warp.training.visibility import Seen, seen_by
 from scgs_warp.types import Stats, plain_scale
 
 
@@ -140,12 +140,17 @@ def test_size_on_screen_may_be_of_no_account(max_screen, left):
     assert len(gaussians) == left
 
 
+def seen_by_all(count: int) -> Seen:
+    """Every Gaussian fills a pixel of many views, far away."""
+    return Seen(torch.ones(count), torch.full((count,), 99, dtype=torch.int32), torch.full((count,), 9.0))
+
+
 def test_the_look_takes_views_at_random_and_not_more_than_it_may(monkeypatch):
     """Of a rig whose cameras come in the same order at every instant, others each time."""
     state, frames = state_with_hidden_gaussian(opacity_reset_every=16)
     taken = []
     monkeypatch.setattr(
-        density_control, "contributions", lambda state, frames, indices: taken.append(indices) or torch.ones(1)
+        density_control, "seen_by", lambda state, frames, indices, least: taken.append(indices) or seen_by_all(1)
     )
     monkeypatch.setattr(density_control, "FEWEST_VIEWS", 3)
     for per_view, step in ((4, 15), (4, 32), (4, 39), (5, 15), (6, 15)):
@@ -167,7 +172,8 @@ def test_the_look_takes_views_at_random_and_not_more_than_it_may(monkeypatch):
 def test_the_unseen_go_before_a_reset_and_at_the_end_of_densification(step, due, monkeypatch):
     monkeypatch.setattr(density_control, "STEPS_PER_VIEW", 1)
     state, frames = state_with_hidden_gaussian()
-    kept = contributions(state, frames, list(range(6))) >= state.config.densify.min_contribution
+    least = state.config.densify.min_contribution
+    kept = seen_by(state, frames, list(range(6)), least).most >= least
     assert 0 < int(kept.sum()) < len(kept)
     before = state.gaussians.means.detach().clone()
     state.stats.count[:] = torch.arange(len(kept))
@@ -206,7 +212,7 @@ def test_memory_that_ends_at_the_look_costs_no_step(monkeypatch, tmp_path):
         raise NotEnoughMemory("there is none")
 
     with monkeypatch.context() as patch, pytest.raises(NotEnoughMemory):
-        patch.setattr(density_control, "contributions", full)
+        patch.setattr(density_control, "seen_by", full)
         fit(config, data, output=tmp_path / "cut")
     fit(config, data, output=tmp_path / "cut", resume=True)
     files = [(tmp_path / name / "checkpoint.safetensors").read_bytes() for name in ("whole", "cut")]
@@ -228,7 +234,7 @@ def test_when_the_presets_look(name, steps, looks, monkeypatch):
     """In thousands of main steps, with 150 frames; ``quick`` is too short for more than one."""
     state, _ = state_with_hidden_gaussian()
     state.config, state.stage = preset(name), "main"
-    monkeypatch.setattr(density_control, "contributions", lambda *_: torch.ones(1))
+    monkeypatch.setattr(density_control, "seen_by", lambda *_: seen_by_all(1))
     assert state.config.steps == steps
     due = []
     for step in range(0, state.config.main_steps):

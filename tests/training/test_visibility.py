@@ -12,7 +12,7 @@ from reference import render as reference
 from scgs_warp.ops.projection import project
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.visibility import contributions, view_contributions
+from scgs_warp.training.visibility import seen_by, view_contributions
 from scgs_warp.types import Gaussians
 
 
@@ -63,9 +63,9 @@ def test_the_most_over_the_views():
     posed = state.motion.gaussians_at(state.gaussians, 0.0)
     views = [view_contributions(posed, camera)[0] for camera in frames.views]
     views = [torch.where(torch.arange(len(view)) == 0, torch.inf, view) for view in views]
-    whole = contributions(state, frames, list(range(6)))
+    whole = seen_by(state, frames, list(range(6)), 0.05).most
     assert torch.equal(whole, torch.stack(views).amax(0)) and whole[-1] == 0.0
-    assert torch.equal(contributions(state, frames, [4, 1]), torch.maximum(views[4], views[1]))
+    assert torch.equal(seen_by(state, frames, [4, 1], 0.05).most, torch.maximum(views[4], views[1]))
 
 
 def test_views_from_where_the_cameras_were_found_to_stand():
@@ -73,11 +73,11 @@ def test_views_from_where_the_cameras_were_found_to_stand():
     data = tiny_dataset(3)
     state = TrainState.begin(config, data, "cpu")
     frames = Frames(data, state.normalisation, config, "cpu")
-    before = contributions(state, frames, [1])
+    before = seen_by(state, frames, [1], 0.05).most
     with torch.no_grad():
         state.cameras.twists[1, 3:] = 0.2
     corrected = state.cameras.apply(frames.views[1], 1)
     posed = state.motion.gaussians_at(state.gaussians, 0.0)
     weights, in_view = view_contributions(posed, corrected)
-    after = contributions(state, frames, [1])
+    after = seen_by(state, frames, [1], 0.05).most
     assert torch.equal(after, torch.where(in_view, weights, torch.inf)) and not torch.equal(after, before)

@@ -1,0 +1,44 @@
+"""The distance before every lens within which a capture shows nothing.
+
+A Gaussian close to a lens covers the whole picture of one view, and no other view contradicts it. Densification
+therefore fills the space before isolated cameras with fog, which hides the scene from views that were held out nearby.
+But a camera has moved through that space, and its lens was in focus beyond it.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from ..data.dataset import Dataset, spread
+from ..geometry.normalisation import COMMON_RADIUS, FEWEST_POINTS, Normalisation
+
+MOST_VIEWS = 200
+"""Largest number of cameras whose distances are measured."""
+NEAREST_POINTS = 0.01
+"""Share of the points in a view that may be nearer than its content: they are outliers of the reconstruction."""
+NEAREST_CAMERAS = 0.05
+"""Share of the cameras that may be nearer to the content than the bound assumes."""
+INSIDE = 0.1
+"""Distance to the content as a share of that to the centre, at least, for cameras without points: a camera may stand in
+the region that all cameras see."""
+
+
+def nearest_content(data: Dataset, normalisation: Normalisation) -> float:
+    """Return the distance, in normalised units, at which the content of a near view begins: that of the nearest sparse
+    points or, without points, of the region that all cameras see; 0 if no view sees enough points."""
+    cameras = [normalisation.apply_camera(data.entries[index].camera) for index in spread(len(data), MOST_VIEWS)]
+    if data.points is None or len(data.points) < FEWEST_POINTS:
+        reach = torch.stack([camera.position.double().norm() for camera in cameras])
+        distances = torch.maximum(reach - COMMON_RADIUS, INSIDE * reach)
+        return float(distances.quantile(NEAREST_CAMERAS))
+    points = normalisation.apply(data.points).double()
+    found = []
+    for camera in cameras:
+        local = points @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
+        local = local[local[:, 2] > 0]
+        pixels = local @ camera.K.double().T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
+        if int(inside.sum()) >= FEWEST_POINTS:
+            found.append(local[inside].norm(dim=1).quantile(NEAREST_POINTS))
+    return float(torch.stack(found).quantile(NEAREST_CAMERAS)) if found else 0.0

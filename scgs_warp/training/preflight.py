@@ -1,0 +1,75 @@
+"""Refusals of a run before any image is read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ..config.presets import TrainConfig, to_dict
+from ..config.recorded import with_newer_fields
+from ..config.validation import check
+from ..errors import UserError
+from ..storage import checkpoint
+from .resuming import check_same_configuration, check_steps
+from .run_folder import LOCK, refuse_existing
+
+CHOSEN_BY_THE_DATA = (
+    "init_from",
+    "motion.hyper_dim",
+    "densify.prune_large",
+    "densify.least_views",
+    "densify.clear_distance",
+    "loss.pooled",
+    "pretrain.fade",
+    "pretrain.steps",
+)
+"""Settings that ``state.resolve_auto`` may change, so that they can be compared only when the data is known."""
+
+
+def refuse_early(config: TrainConfig, output: Path, resume: bool) -> None:
+    """Refuse what can be refused without the data: impossible settings, an existing run, and other settings or fewer
+    steps than those of the run that is to continue.
+
+    Raises:
+        UserError: names the file or option, and the remedy. A damaged checkpoint is no error here.
+    """
+    check(config)
+    refuse_existing(output, resume)
+    if in_use(output):
+        raise UserError(f"{output}: another trainer is running here; wait for it or choose another --output")
+    if not resume:
+        return
+    if not output.is_dir():
+        raise UserError(f"{output}: no such run directory; give one that apps/train.py wrote, or no --resume")
+    if not (output / checkpoint.FILE).is_file():
+        return
+    try:
+        _, metadata = checkpoint.read(output, ())
+    except checkpoint.DamagedCheckpoint:
+        return
+    source = str(output / checkpoint.FILE)
+    saved, step = metadata.get("config"), metadata.get("step")
+    if isinstance(saved, dict):
+        saved = with_newer_fields(saved, recorded=True)
+        check_same_configuration(saved, to_dict(config), source, besides=CHOSEN_BY_THE_DATA)
+    if isinstance(step, int):
+        check_steps(step, config, source)
+
+
+def in_use(folder: Path) -> bool:
+    """Return whether a trainer holds the lock of a run folder; False where there are no locks."""
+    try:
+        import fcntl
+
+        file = os.open(folder / LOCK, os.O_RDWR)
+    except (ImportError, OSError):
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(file)  # gives the lock back
+    return False

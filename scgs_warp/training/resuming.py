@@ -1,0 +1,50 @@
+"""Comparison of a run that is to continue with its checkpoint."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..config.presets import FREE_TO_CHANGE, TrainConfig
+from ..errors import UserError
+
+
+def check_steps(step: int, config: TrainConfig, source: str) -> None:
+    """Refuse to continue a run until a step that it has passed.
+
+    Raises:
+        UserError: names the steps and the remedy.
+    """
+    if step > config.steps:
+        raise UserError(
+            f"{source}: is at step {step:,} already, beyond --steps {config.steps}; give at least {step}, or leave "
+            "--steps out"
+        )
+
+
+def check_same_configuration(
+    saved: dict[str, Any], wanted: dict[str, Any], source: str, prefix: str = "", besides: tuple[str, ...] = ()
+) -> None:
+    """Refuse to resume with settings other than the checkpoint's. The total of the steps may differ.
+
+    Args:
+        besides: dotted names of settings that are not compared.
+
+    Raises:
+        UserError: names the field, its two values and the remedy.
+    """
+    for name, value in wanted.items():
+        label = f"{prefix}{name}"
+        if label in FREE_TO_CHANGE or label in besides or label == "steps":
+            continue
+        if isinstance(value, dict):
+            inner = saved.get(name, {})
+            check_same_configuration(inner if isinstance(inner, dict) else {}, value, source, f"{label}.", besides)
+        elif name not in saved:  # no value of the field stands for that version's behaviour
+            raise UserError(
+                f"{source}: made by another version, which had no {label}; train again with another --output"
+            )
+        elif saved[name] != value:
+            raise UserError(
+                f"{source}: made with {label} = {saved[name]!r}, now {value!r}; "
+                "give the same options to --resume, or another --output"
+            )
