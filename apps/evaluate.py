@@ -90,9 +90,9 @@ def main(args: list[str] | None) -> None:
 
     from scgs_warp.evaluation.coverage import coverage_line
     from scgs_warp.evaluation.evaluate import metrics_of, write_metrics
+    from scgs_warp.evaluation.run_time import training_seconds
     from scgs_warp.runtime.progress import progress
     from scgs_warp.scene.scene import Scene
-    from scgs_warp.training.run_folder import training_seconds
 
     scene = Scene.load(options.run, device=device)
     lpips = None

@@ -148,7 +148,7 @@ def film_views(options: Options, scene: Scene) -> list[tuple[Camera, float]]:
     """
     from scgs_warp.data.camera_path import read_camera_path
     from scgs_warp.geometry.cameras import orbit_camera, turntable
-    from scgs_warp.visualization.framing import aim, frame_subject, is_cut_out
+    from scgs_warp.visualization.framing import aim, frame_subject, framed
 
     given: list[float | None]
     if options.path is not None:
@@ -156,8 +156,10 @@ def film_views(options: Options, scene: Scene) -> list[tuple[Camera, float]]:
         path, given = [camera for camera, _ in film], [time for _, time in film]
     else:
         overview = scene.overview
-        if options.frame == "subject" or (options.frame == "auto" and options.target is None and is_cut_out(scene)):
+        if options.frame == "subject":
             overview = frame_subject(scene)
+        elif options.frame == "auto" and options.target is None:
+            overview = framed(scene)
         overview = aim(overview, options.target, options.zoom)
         frames = FRAMES if options.frames is None else options.frames
         if options.mode == "time":

@@ -1,9 +1,10 @@
-"""MkDocs hook: add the pages that the repository keeps outside ``docs/`` (README, contributing, security, changelog,
-examples)."""
+"""MkDocs hook: add the pages that the repository keeps outside ``docs/`` (README, contributing, code of conduct,
+security, changelog, examples)."""
 
 from __future__ import annotations
 
 import ast
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages = {
         "index.md": from_docs((ROOT / "README.md").read_text(encoding="utf-8")),
         "contributing.md": from_docs((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")),
+        "code-of-conduct.md": from_docs((ROOT / "CODE_OF_CONDUCT.md").read_text(encoding="utf-8")),
         "security.md": from_docs((ROOT / "SECURITY.md").read_text(encoding="utf-8")),
         "changelog.md": from_docs((ROOT / "CHANGELOG.md").read_text(encoding="utf-8")),
         "examples.md": examples_page(),
@@ -42,7 +44,7 @@ def from_docs(text: str) -> str:
     """Rewrite links relative to the repository's root as links of the site; ``mkdocs build --strict`` checks them."""
     text = re.sub(r"(\]\()docs/", r"\1", text)
     text = text.replace("](SECURITY.md)", "](security.md)").replace("](CONTRIBUTING.md)", "](contributing.md)")
-    return re.sub(r"(\]\()examples/?(?=\))", r"\1examples.md", text)
+    return re.sub(r"(\]\()examples/?(?:tutorial\.ipynb)?(?=\))", r"\1examples.md", text)
 
 
 def examples_page() -> str:
@@ -60,4 +62,17 @@ def examples_page() -> str:
         heading = f"{path.stem[:2]} {name.rstrip('.')}"
         lead = f"{tail[:1].upper()}{tail[1:]}\n" if tail else ""
         parts.append(f"## {heading}\n\n{lead}{rest}\n\n`examples/{path.name}`:\n\n```python\n{body}\n```\n")
+    return "\n".join([*parts, notebook()])
+
+
+def notebook() -> str:
+    """Build a section of the tutorial notebook from its cells."""
+    content = json.loads((ROOT / "examples/tutorial.ipynb").read_text(encoding="utf-8"))
+    parts = ["## Notebook\n\n`examples/tutorial.ipynb` leads from images to an edit.\n"]
+    for cell in content["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            parts.append(f"```python\n{text}\n```\n")
+        else:
+            parts.append(re.sub(r"(?m)^#+ ", "### ", text).replace("](../docs/", "](") + "\n")
     return "\n".join(parts)

@@ -16,13 +16,14 @@ _prepare_environment()
 
 if TYPE_CHECKING:
     from .rendering.rasterize import rasterization as rasterization
-    from .scene.scene import Scene as Scene
     from .training.loop import fit as fit
+    from .training.one_call import train as train
     from .types import Camera as Camera
     from .types import Frame as Frame
     from .types import Gaussians as Gaussians
     from .types import Image as Image
     from .types import Pose as Pose
+    from .visualization.films import Scene as Scene
 
 _EXPORTS = {
     "Camera": "types",
@@ -30,11 +31,12 @@ _EXPORTS = {
     "Gaussians": "types",
     "Image": "types",
     "Pose": "types",
-    "Scene": "scene.scene",
+    "Scene": "visualization.films",
     "fit": "training.loop",
     "rasterization": "rendering.rasterize",
+    "train": "training.one_call",
 }
-__all__ = ["Camera", "Frame", "Gaussians", "Image", "Pose", "Scene", "__version__", "fit", "rasterization"]
+__all__ = ["Camera", "Frame", "Gaussians", "Image", "Pose", "Scene", "__version__", "fit", "rasterization", "train"]
 
 
 def __getattr__(name: str):

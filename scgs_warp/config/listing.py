@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
+from .bounds import MAGNITUDE
 from .presets import TrainConfig
 
 
@@ -49,11 +50,16 @@ def _allowed(hint: Any, metadata: Mapping[str, Any]) -> str:
         return "{} to {}".format(*metadata["choices"])
     kind = {bool: "true | false", int: "whole number", float: "number", str: "text"}.get(hint, "value")
     least, most = metadata.get("least"), metadata.get("most")
+    most = None if most == MAGNITUDE else most  # no limit of its own
     if least is not None and most is not None:
-        return f"{kind} from {least:,} to {most:,}"
+        return f"{kind} from {_number(least)} to {_number(most)}"
     if least is not None:
-        return f"{kind}, at least {least:,}"
-    return kind if most is None else f"{kind}, at most {most:,}"
+        return f"{kind}, at least {_number(least)}"
+    return kind if most is None else f"{kind}, at most {_number(most)}"
+
+
+def _number(value: float) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.10g}"
 
 
 @functools.cache

@@ -25,7 +25,7 @@ PAPER = TrainConfig(
     half_size=0,
     evaluate_every=5_000,
     checkpoint_seconds=60.0,
-    data=DataConfig(downscale=1, resample="bicubic", background="black"),
+    data=DataConfig(downscale=1, resample="bicubic", background="black", frames="", only_cameras="", min_frames=0),
     motion=MotionConfig(
         model="control-points",
         nodes=512,
@@ -108,6 +108,8 @@ PAPER = TrainConfig(
         percent_dense=0.01,
         min_opacity=0.005,
         min_contribution=0.0,
+        least_views=1,
+        clear_distance=0.0,
         prune_large="always",
         max_screen=0.0,
         max_scale=0.1,

@@ -62,6 +62,7 @@ class _Renders:
         self._rows: list[tuple[Any, Any]] = []
         self._titles: list[str] = []
         self._scores: list[float] = []
+        self._alphas: list[tuple[Tensor, Tensor] | None] = []
         self._names: set[str] = set()
         try:
             for name in ("renders", "truth"):
@@ -69,7 +70,7 @@ class _Renders:
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror}); make the folder writable") from None
 
-    def add(self, index: int, frame: Frame, image: Tensor, truth: Tensor, score: float) -> None:
+    def add(self, index: int, frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor, score: float) -> None:
         name = frame.name if frame.name and frame.name not in self._names else f"{index:05d}"
         self._names.add(name)
         pair = to_bytes(truth), to_bytes(image)
@@ -80,11 +81,13 @@ class _Renders:
                 pair = pair[0], to_bytes(torch.where(frame.mask.to(image.device)[..., None], image, truth))
             self._rows.append(pair)
             self._scores.append(score)
+            self._alphas.append(None if frame.alpha is None else (frame.alpha.cpu(), alpha.cpu()))
             self._titles.append(f"{name}   t = {frame.time:.3f}")
 
     def finish(self) -> None:
         if self._rows:
-            self._write(self.folder / "contact_sheet.png", contact_sheet(self._rows, self._titles, scores=self._scores))
+            more = {"scores": self._scores, "alphas": self._alphas}
+            self._write(self.folder / "contact_sheet.png", contact_sheet(self._rows, self._titles, **more))
 
     @staticmethod
     def _write(path: Path, image: Any) -> None:
@@ -133,7 +136,7 @@ def evaluate(
         truth = frame.image.to(image.device).clamp(0.0, 1.0)
         rows.append(_measure(frame, image, rendered.alpha, truth, lpips))
         if renders is not None:
-            renders.add(index, frame, image, truth, rows[-1]["psnr"])
+            renders.add(index, frame, image, rendered.alpha, truth, rows[-1]["psnr"])
         if watch is not None:
             watch(index, frame, rendered.alpha)
         if progress is not None:

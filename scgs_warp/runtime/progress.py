@@ -10,7 +10,8 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
+from contextvars import ContextVar
 from typing import Any, TextIO, TypeVar
 
 REDRAW_SECONDS = 0.2
@@ -26,6 +27,24 @@ RATE_SECONDS = 15.0
 
 
 Result = TypeVar("Result")
+Report = Callable[[str, int, int], Any]
+"""Function that is called with (work, done, total) after each step."""
+_report: ContextVar[Report | None] = ContextVar("report", default=None)
+
+
+@contextmanager
+def reported(report: Report) -> Iterator[None]:
+    """Call ``report`` with (work, done, total) after each step, instead of drawing progress and printing lines."""
+    token = _report.set(report)
+    try:
+        yield
+    finally:
+        _report.reset(token)
+
+
+def quiet() -> AbstractContextManager[None]:
+    """Draw no progress and print no line."""
+    return reported(lambda work, done, total: None)
 
 
 def mute(stream: TextIO) -> None:
@@ -38,6 +57,8 @@ def mute(stream: TextIO) -> None:
 
 def say(text: str) -> None:
     """Print a line on standard output. A closed terminal or pipe does not raise an error."""
+    if _report.get() is not None:
+        return
     try:
         print(text, flush=True)
     except OSError:
@@ -137,6 +158,22 @@ class Progress:
         return "  ".join(f"{name} {_text(value)}" for name, value in self.fields.items() if value is not None)
 
 
+class _Reported(Progress):
+    """Steps that a function is told of, and nothing printed."""
+
+    def advance(self, n: int = 1, **fields: Any) -> None:
+        self.done += n
+        report = _report.get()
+        if report is not None:
+            report(self.description, self.done, self.total)
+
+    def _print(self, text: str) -> None:
+        pass
+
+    def _finish(self, completed: bool) -> None:
+        pass
+
+
 class _LogLines(Progress):
     """Plain lines from time to time, for log files, to which rich would write only the final state."""
 
@@ -216,7 +253,11 @@ def progress(total: int, description: str, *, start: int = 0, stream: TextIO | N
         An object whose ``advance(n=1, **fields)`` the loop calls.
     """
     shown_on: TextIO = stream or sys.stdout or open(os.devnull, "w")  # a daemon may have no standard output
-    shown = (_TerminalBar if shown_on.isatty() else _LogLines)(total, description, shown_on, start)
+    report = _report.get()
+    if report is not None:
+        shown: Progress = _Reported(total, description, shown_on, start)
+    else:
+        shown = (_TerminalBar if shown_on.isatty() else _LogLines)(total, description, shown_on, start)
     try:
         yield shown
     except BaseException:

@@ -26,6 +26,7 @@ from ..storage import checkpoint
 from ..storage.files import read_text
 from ..storage.json_files import parse_json
 from ..types import Camera, Gaussians, Image
+from . import film_maker
 from .frame_graph import FrameGraph
 from .validation import check_metadata, check_motion, check_settings, check_tensors, reason
 
@@ -193,6 +194,26 @@ class Scene:
         posed = self.motion.gaussians_at(self.gaussians, time)
         image = render(posed, view.to(self.device), color.to(self.device), antialiased=self.config.antialiased)
         return Image(image.rgb, image.alpha, self.normalisation.undo_scale(image.depth))
+
+    def turntable(self, path: str | Path, **options: Any) -> Path:
+        """Write a film in which the camera goes round the moving scene.
+
+        If the subject is cut out, the camera stands where all of it stays in the picture at all times; otherwise the
+        film shows what the training cameras saw.
+
+        Args:
+            path: a name that ends in .mp4 or .gif, or a folder for numbered PNGs.
+            options: ``frames`` (120), ``size`` (512: longer side in pixels), ``fps`` (30), ``time`` (None: the scene
+                moves; else the time at which it stands), ``show`` (``rgb``, ``depth``, ``alpha``, ``nodes``,
+                ``trajectories``).
+
+        Returns:
+            The path.
+
+        Raises:
+            UserError: an option is out of range, or the film cannot be written.
+        """
+        return film_maker.film(self, path, **options)
 
     def frame_graph(self) -> FrameGraph:
         """Return the renderer of this scene's frames on CUDA, which takes cameras in normalised units. It is kept until

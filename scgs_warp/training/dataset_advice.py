@@ -39,6 +39,8 @@ MOSTLY_BEHIND = 0.2
 WIDE_ARC = 0.02
 """Smallest eigenvalue of the mean of I - d d^T over the optical axes d from which the place where they meet is known;
 it corresponds to an arc of about 20 degrees."""
+FEW_STEPS = 7_000
+"""Number of steps, those of the preset quick, below which thin or fast parts of a moving subject may be lost."""
 FEW_VISITS = 20
 """Number of steps per frame below which frames are hardly learnt."""
 LARGE_IMAGE = 1_000_000
@@ -232,6 +234,11 @@ def _help(facts: Survey, config: TrainConfig, device: str) -> str:
     if facts.width * facts.height > LARGE_IMAGE and device == "cpu":
         factor = math.ceil(math.sqrt(facts.width * facts.height / LARGE_IMAGE)) * config.data.downscale
         return f"on a CPU, --downscale {factor} makes it several times faster"
+    if facts.cut_out and config.motion.model != "static" and facts.instants > 1 and config.steps < FEW_STEPS:
+        return (
+            f"{config.steps:,} steps are few: thin or fast parts, such as legs, may be blurred or missing; look for "
+            f"them in contact_sheet.png, --steps {FEW_STEPS} usually shows them"
+        )
     if config.steps < FEW_VISITS * facts.frames:
         wanted = math.ceil(FEW_VISITS * facts.frames / 1000) * 1000
         return (

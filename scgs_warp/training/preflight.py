@@ -10,6 +10,7 @@ from ..config.recorded import with_newer_fields
 from ..config.validation import check
 from ..errors import UserError
 from ..storage import checkpoint
+from ..storage.locks import AlreadyLocked, lock_file
 from .resuming import check_same_configuration, check_steps
 from .run_folder import LOCK, refuse_existing
 
@@ -57,19 +58,13 @@ def refuse_early(config: TrainConfig, output: Path, resume: bool) -> None:
 
 
 def in_use(folder: Path) -> bool:
-    """Return whether a trainer holds the lock of a run folder; False where there are no locks."""
-    try:
-        import fcntl
-
-        file = os.open(folder / LOCK, os.O_RDWR)
-    except (ImportError, OSError):
+    """Return whether a trainer holds the lock of a run folder."""
+    if not (folder / LOCK).is_file():
         return False
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        os.close(lock_file(folder / LOCK))  # gives the lock back
+    except AlreadyLocked:
         return True
     except OSError:
         return False
-    finally:
-        os.close(file)  # gives the lock back
     return False

@@ -16,6 +16,7 @@ from ..data.dataset import Dataset
 from ..errors import UserError, one_line
 from ..evaluation.coverage import coverage_line
 from ..evaluation.evaluate import Lpips, metrics_of, write_metrics
+from ..evaluation.run_time import training_seconds
 from ..geometry import cameras
 from ..runtime.progress import progress, say
 from ..runtime.provenance import provenance
@@ -26,7 +27,6 @@ from ..visualization.figures import curves
 from ..visualization.overlay import Painter
 from .loop import Watcher, fit
 from .process_group import ProcessGroup
-from .run_folder import training_seconds
 
 FILM_FRAMES = 120
 FILM_SIZE = 400

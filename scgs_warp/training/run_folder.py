@@ -18,13 +18,13 @@ from ..config.presets import TrainConfig, to_dict
 from ..data.dataset import Dataset
 from ..errors import UserError, one_line
 from ..evaluation.image_metrics import psnr
+from ..evaluation.run_time import log_entries
 from ..runtime.progress import Progress, say
 from ..scene.scene import Scene
 from ..storage.checkpoint import FILE, PREVIOUS
 from ..storage.files import write_atomically
 from ..storage.locks import AlreadyLocked, lock_file
-from ..storage.json_files import as_number, parse_json
-from ..visualization.figures import read_log
+from .pace import Pace
 from .state import StepResult, TrainState
 from .tensorboard import TensorBoard, check_installed
 
@@ -36,33 +36,6 @@ TEST_IMAGES = 4
 """Approximate number of held-out images on which the curve is measured."""
 BOARD_IMAGES = 20
 """Number of training pictures per run in TensorBoard."""
-
-
-def training_seconds(folder: Path) -> float | None:
-    """Return the seconds of training of a run, from its log or, without one, from its ``metrics.json``."""
-    seconds = read_seconds(folder)
-    if seconds is not None:
-        return seconds
-    try:
-        value = parse_json((folder / "metrics.json").read_text(encoding="utf-8"))["seconds"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    seconds = as_number(value)
-    return None if seconds is None or seconds < 0 else seconds
-
-
-def read_seconds(folder: Path) -> float | None:
-    """Read the seconds of training from the log; None without a log."""
-    newest: float | None = None
-    for entry in _entries(folder):
-        with suppress(ValueError, KeyError, TypeError):  # skip a damaged line
-            newest = float(entry["seconds"])
-    return newest
-
-
-def _entries(folder: Path) -> list[dict[str, Any]]:
-    log = folder / "log.jsonl"
-    return read_log(log) if log.is_file() else []
 
 
 def refuse_existing(path: Path, resume: bool) -> None:
@@ -112,6 +85,7 @@ class RunFolder:
         """Last weighted regulariser since the previous log line; steps without the term do not count, because only one
         step in a few includes ARAP."""
         self._told: set[str] = set()
+        self._pace = Pace(config)
         self._torn = False
         """True if the log may end in the middle of a line."""
         self.tell: Callable[[str], None] = say
@@ -175,7 +149,7 @@ class RunFolder:
                 left.unlink()
         self._write_settings()
         entries: list[dict[str, Any]] = []
-        for entry in _entries(self.path) if self.resume else []:
+        for entry in log_entries(self.path) if self.resume else []:
             with suppress(ValueError, TypeError):  # skip a damaged line
                 if int(entry.get("step", 0)) <= step:
                     self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
@@ -255,6 +229,9 @@ class RunFolder:
             bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
         else:
             bar.advance(1)
+        pace = self._pace.note(done)
+        if pace is not None:
+            self.tell(pace)
         if done % self._between == 0 and result.failed is None:
             self._show("train", result.truth, result.render, done)
         if done == state.step and time.monotonic() - self._shown_at >= PREVIEW_SECONDS:

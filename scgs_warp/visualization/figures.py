@@ -50,6 +50,13 @@ def error_map(truth: Picture, render: Picture) -> np.ndarray:
     return cv2.applyColorMap(to_bytes(error), cv2.COLORMAP_INFERNO)[..., ::-1]
 
 
+def alpha_map(truth: Picture, render: Picture) -> np.ndarray:
+    """Show two alphas [H, W] as one picture [H, W, 3] uint8: white where both cover, red where the render misses the
+    truth, blue where it covers more."""
+    true, rendered = _floats(truth), _floats(render)
+    return to_bytes(np.stack([true, np.minimum(true, rendered), rendered], axis=-1))
+
+
 def psnr_of(truth: Picture, render: Picture) -> float:
     """Compute the peak signal-to-noise ratio of clamped floats, in dB; infinite for equal images."""
     error = float(np.square(_floats(truth).astype(np.float64) - _floats(render)).mean())
@@ -85,14 +92,16 @@ def contact_sheet(
     titles: Sequence[str] = (),
     *,
     scores: Sequence[float] = (),
+    alphas: Sequence[tuple[Picture, Picture] | None] = (),
     cell: int = 400,
 ) -> np.ndarray:
-    """Draw truth, render and error side by side, one row per pair.
+    """Draw truth, render and error side by side, one row per pair; beside them the alpha, if there is any.
 
     Args:
         rows: (truth, render), each [H, W, 3]: floats in [0, 1] or uint8; the two of a row have one size.
         titles: a caption for each row; may be shorter than ``rows``.
         scores: PSNR of each row, dB, if it differs from that of the two pictures because of masks.
+        alphas: (truth, render) of each row, each [H, W]; None for a row without alpha.
         cell: longest side of a picture on the sheet, pixels. Errors are computed before the reduction.
 
     Returns:
@@ -108,13 +117,20 @@ def contact_sheet(
             raise ValueError(f"truth {list(truth.shape)} and render {list(render.shape)} must both be [H, W, 3]")
     width = min(cell, max(truth.shape[1] for truth, _ in rows))
     height = min(cell, max(truth.shape[0] for truth, _ in rows))
-    sheet = np.full((CAPTION + len(rows) * (height + CAPTION + GAP), 3 * width + 4 * GAP, 3), PAPER, np.uint8)
-    columns = [GAP + column * (width + GAP) for column in range(3)]
-    for x, text in zip(columns, ("truth", "render", f"error (0 .. {ERROR_RANGE:g})")):
+    heads = ["truth", "render", f"error (0 .. {ERROR_RANGE:g})"]
+    if any(pair is not None for pair in alphas):
+        heads.append("alpha: red missing, blue extra")
+    size = CAPTION + len(rows) * (height + CAPTION + GAP), len(heads) * (width + GAP) + GAP
+    sheet = np.full((*size, 3), PAPER, np.uint8)
+    columns = [GAP + column * (width + GAP) for column in range(len(heads))]
+    for x, text in zip(columns, heads):
         _put_text(sheet, text, x, 0, width)
     for index, (truth, render) in enumerate(rows):
         y = CAPTION + index * (height + CAPTION + GAP)
-        pictures = (to_bytes(_floats(truth)), to_bytes(_floats(render)), error_map(truth, render))
+        pictures = [to_bytes(_floats(truth)), to_bytes(_floats(render)), error_map(truth, render)]
+        pair = alphas[index] if index < len(alphas) else None
+        if pair is not None:
+            pictures.append(alpha_map(*pair))
         for x, picture in zip(columns, pictures):
             sheet[y : y + height, x : x + width] = _fit(picture, width, height)
         score = scores[index] if index < len(scores) else psnr_of(truth, render)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -77,6 +78,15 @@ def frame_subject(scene: Scene) -> Overview:
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     aimed = replace(overview, centre=tuple(map(float, centre)), radius=max(overview.radius, 1e-6))
     return replace(aimed, radius=max(distance_to_fit(aimed, points, reach), 1e-6))
+
+
+def framed(scene: Scene) -> Overview:
+    """Return the overview from which films show a scene: aimed at the subject if it is cut out and opaque, otherwise
+    that of the training cameras."""
+    with suppress(UserError):
+        if is_cut_out(scene):
+            return frame_subject(scene)
+    return scene.overview
 
 
 def distance_to_fit(overview: Overview, points: np.ndarray, reach: float = 0.0) -> float:

@@ -36,7 +36,7 @@ def test_every_field_has_a_meaning_and_can_be_set():
 def test_the_command(capsys):
     assert app.cli(["--list"]) == 0
     said = capsys.readouterr().out
-    assert "motion.nodes = 256    (whole number, at most 1,000,000)" in said and said.count(" = ") > 90
+    assert "motion.nodes = 256    (whole number from 1 to 1,000,000)" in said and said.count(" = ") > 90
     assert app.cli(["pruning", "--preset", "paper"]) == 0
     few = capsys.readouterr().out
     assert "densify.min_contribution" in few and "motion.width" not in few

@@ -76,7 +76,7 @@ def test_the_sheet_shows_no_error_where_nothing_is_known(tmp_path: Path, monkeyp
     masked = type(frame)(frame.camera, frame.time, spoilt, frame.alpha, mask, "a")
     monkeypatch.setattr(
         "scgs_warp.evaluation.evaluate.contact_sheet",
-        lambda rows, titles, scores: seen.append((rows, scores)) or figures.contact_sheet(rows, titles, scores=scores),
+        lambda rows, titles, **more: seen.append((rows, more["scores"])) or figures.contact_sheet(rows, titles, **more),
     )
     found = evaluate(scene, Dataset([masked], folder=Path("x"), split="test"), render_dir=tmp_path)
     (((truth, shown),), scores) = seen[0]
@@ -95,7 +95,7 @@ def test_renders_lie_beside_the_truth(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found, figures.to_bytes(scene.render(first[1].camera, first[1].time).rgb))
     truth = cv2.imread(str(tmp_path / "made" / "truth" / "r_001.png"))[..., ::-1]
     np.testing.assert_array_equal(truth, figures.to_bytes(first[1].image))
-    assert cv2.imread(str(tmp_path / "made" / "contact_sheet.png")).shape[1] == 3 * 40 + 16
+    assert cv2.imread(str(tmp_path / "made" / "contact_sheet.png")).shape[1] == 4 * 44 + 4
 
 
 def test_nowhere_to_write_is_told(tmp_path: Path) -> None:

@@ -31,13 +31,14 @@ from scgs_warp.apps.settings import Settings, configuration
 from scgs_warp.config.presets import TrainConfig, from_dict, preset, to_dict
 from scgs_warp.data import Dataset
 from scgs_warp.errors import UserError
+from scgs_warp.evaluation.run_time import read_seconds, training_seconds
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.motion import ControlPoints, build_motion
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
 from scgs_warp.training.camera_refinement import refined
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.run_folder import RunFolder, read_seconds, training_seconds
+from scgs_warp.training.run_folder import RunFolder
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step
 from scgs_warp.visualization import figures

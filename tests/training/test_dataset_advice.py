@@ -15,7 +15,7 @@ from helpers.layouts import write_colmap, write_poses_bounds
 from helpers.tiny import tiny_dataset, write_dnerf
 from scgs_warp.config.presets import MOTIONS, PRESETS, preset
 from scgs_warp.data import Dataset, load
-from scgs_warp.training.dataset_advice import Survey, advise, survey
+from scgs_warp.training.dataset_advice import Survey, advise, looks_away, survey
 from scgs_warp.training.state import resolve_auto
 
 
@@ -194,3 +194,24 @@ def test_progressive_cannot_be_denied_in_vain():
     options = tyro.cli(Settings, args=["--preset", "quick", "--set", "pretrain.progressive=false"])
     assert not configuration(options, None, {})[0].pretrain.progressive
     assert configuration(tyro.cli(Settings, args=["--progressive"]), None, {})[0].pretrain.progressive
+
+
+def test_few_steps_for_a_moving_subject():
+    data = tiny_dataset()
+    assert "1,500 steps are few: thin or fast parts" in lines(data, steps=1_500)[1]
+    assert "are few" not in lines(data, steps=7_000)[1] and "are few" not in lines(handheld(30, 2.0), steps=1_500)[1]
+    still = dataclasses.replace(preset("cpu").motion, model="static")
+    assert "are few" not in lines(data, steps=1_500, motion=still)[1]
+
+
+@pytest.mark.parametrize("points", [True, False])
+def test_cameras_that_look_away(points):
+    """As when OpenCV's poses are given as OpenGL's."""
+    data = tiny_dataset(12)
+    if points:
+        data.points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)) * 0.3
+    assert not looks_away(data) and "look away" not in lines(data)[1]
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    turned = data.with_cameras([dataclasses.replace(c, viewmat=flip @ c.viewmat) for c in data.cameras])
+    assert looks_away(turned)
+    assert "the cameras look away from the content; poses in transforms.json are OpenGL's" in lines(turned)[1]

@@ -11,11 +11,12 @@ import pytest
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config.presets import to_dict, with_steps
 from scgs_warp.errors import UserError
+from scgs_warp.evaluation.run_time import read_seconds, training_seconds
 from scgs_warp.scene.scene import Scene
 from scgs_warp.training.loop import fit
 from scgs_warp.training.preflight import CHOSEN_BY_THE_DATA, in_use, refuse_early
 from scgs_warp.training.resuming import check_same_configuration
-from scgs_warp.training.run_folder import RunFolder, read_seconds, training_seconds
+from scgs_warp.training.run_folder import RunFolder
 from scgs_warp.training.state import resolve_auto
 
 

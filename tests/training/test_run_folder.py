@@ -14,8 +14,9 @@ import torch
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.errors import UserError
 from scgs_warp.evaluation.image_metrics import psnr
+from scgs_warp.evaluation.run_time import read_seconds
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.run_folder import ReadOnlyRunFolder, RunFolder, read_seconds, refuse_existing
+from scgs_warp.training.run_folder import ReadOnlyRunFolder, RunFolder, refuse_existing
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step
 

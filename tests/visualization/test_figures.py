@@ -103,3 +103,17 @@ def test_curves_of_next_to_nothing(tmp_path: Path, lines: list) -> None:
 def test_missing_log_is_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"log\.jsonl"):
         figures.curves(tmp_path / "log.jsonl", tmp_path / "curves.png")
+
+
+def test_contact_sheet_shows_alpha_where_there_is_any() -> None:
+    picture = torch.zeros(60, 80, 3)
+    true, rendered = torch.zeros(60, 80), torch.zeros(60, 80)
+    true[:, :40], rendered[:, 20:60] = 1.0, 1.0
+    sheet = figures.contact_sheet([(picture, picture)] * 2, alphas=[(true, rendered), None])
+    left, top = figures.GAP + 3 * 84, figures.CAPTION
+    assert sheet.shape[1] == 4 * 84 + 4
+    shown = sheet[top : top + 60, left : left + 80]
+    colors = [shown[30, x].tolist() for x in (10, 30, 50, 70)]
+    assert colors == [[255, 0, 0], [255, 255, 255], [0, 0, 255], [0, 0, 0]], "missing, both, extra, neither"
+    assert (sheet[top + 86 : top + 146, left : left + 80] == 255).all(), "the second row has none"
+    assert figures.contact_sheet([(picture, picture)], alphas=[None]).shape[1] == 3 * 84 + 4

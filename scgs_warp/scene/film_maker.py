@@ -1,0 +1,25 @@
+"""The place where a scene finds what films it. Films belong to a higher floor, which registers itself here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+_makers: list[Callable[..., Path]] = []
+
+
+def register(maker: Callable[..., Path]) -> None:
+    """Let ``maker(scene, path, **options)`` write the films of scenes."""
+    _makers[:] = [maker]
+
+
+def film(scene: Any, path: str | Path, **options: Any) -> Path:
+    """Write a film of a scene.
+
+    Raises:
+        RuntimeError: ``scgs_warp.visualization.films`` has not been imported.
+    """
+    if not _makers:
+        raise RuntimeError("import scgs_warp.visualization.films first, or take Scene from scgs_warp")
+    return _makers[0](scene, path, **options)

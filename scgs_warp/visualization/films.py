@@ -1,0 +1,49 @@
+"""Films of a scene in one call; importing this module gives scenes their method ``turntable``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from ..errors import UserError
+from ..geometry import cameras
+from ..runtime.progress import progress
+from ..scene import film_maker
+from ..scene.scene import Scene
+from . import video
+from .framing import framed
+from .overlay import Painter
+
+__all__ = ["Scene", "turntable"]
+
+
+def turntable(
+    scene: Scene,
+    path: str | Path,
+    *,
+    frames: int = 120,
+    size: int = 512,
+    fps: float = 30.0,
+    time: float | None = None,
+    show: Literal["rgb", "depth", "alpha", "nodes", "trajectories"] = "rgb",
+) -> Path:
+    """Write a film of a scene; see :meth:`Scene.turntable`."""
+    target = video.check_path(path)
+    if frames < 1 or not 16 <= size <= 8192 or not 0 < fps <= 1000:
+        raise UserError(f"frames {frames}, size {size}, fps {fps:g}: give at least 1, 16 to 8192, and 1 to 1000")
+    path_cameras = cameras.turntable(framed(scene), frames, size)
+    last = max(frames - 1, 1)
+    views = [
+        (camera.to(scene.device), index / last if time is None else time) for index, camera in enumerate(path_cameras)
+    ]
+    first = path_cameras[0]
+    video.require_memory(target, first.width, first.height, frames, scene.device.type)
+    painter = Painter(scene, show, views)
+    with video.film(target, fps) as writer, progress(frames, "turntable") as bar:
+        for camera, moment in views:
+            writer.write(painter.paint(camera, moment))
+            bar.advance()
+    return target
+
+
+film_maker.register(turntable)

@@ -1,0 +1,72 @@
+"""Training in one call: what it returns, what it prints, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import scgs_warp
+from helpers.tiny import tiny_dataset, write_dnerf
+from scgs_warp.errors import UserError
+
+TINY = {
+    "steps": 60,
+    "device": "cpu",
+    "motion__nodes": 16,
+    "motion__layers": 3,
+    "motion__width": 32,
+    "motion__skip": 2,
+    "init_points": 300,
+}
+
+
+def test_a_folder_becomes_a_scene_and_a_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    calls: list[tuple[str, int, int]] = []
+    write_dnerf(tmp_path / "blobs")
+    scene = scgs_warp.train("blobs", progress=lambda *call: calls.append(call), **TINY)
+    assert scene.step == 60 and scene.folder == Path("runs/blobs-cpu") and capsys.readouterr().out == ""
+    assert [call for call in calls if call[0] == "training"] == [("training", step, 60) for step in range(1, 61)]
+    metrics = json.loads((scene.folder / "metrics.json").read_text())
+    assert metrics["images"] == 3 and metrics["seconds"] > 0 and (scene.folder / "contact_sheet.png").is_file()
+    assert scgs_warp.Scene.load(scene.folder).gaussian_count == scene.gaussian_count
+    with pytest.raises(UserError, match="holds a run already"):
+        scgs_warp.train("blobs", **TINY)
+    longer = scgs_warp.train("blobs", resume=True, progress=False, **TINY)
+    assert longer.step == 60
+    film = scene.turntable("film.gif", frames=3, size=32)
+    assert film == Path("film.gif") and film.stat().st_size > 300
+    assert scene.turntable(tmp_path / "still", frames=2, size=32, time=0.5, show="alpha").is_dir()
+
+
+def test_frames_in_memory(tmp_path, capsys):
+    scene = scgs_warp.train(tiny_dataset(6), output=tmp_path / "run", **TINY)
+    assert scene.step == 60 and "data: 6 frames of 48 x 48" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"preset": "fast"}, "preset is 'fast'"),
+        ({"steps": 2.5}, "steps is 2.5"),
+        ({"motion__speed": 3}, "motion.speed"),
+        ({"device": "gpu"}, "device is 'gpu'"),
+        ({"data": "nowhere"}, "nowhere: no such folder"),
+    ],
+)
+def test_mistakes(arguments, expected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=expected):
+        scgs_warp.train(**{"data": tiny_dataset(2), "progress": False, **arguments})
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_film_of_impossible_size(tmp_path):
+    from helpers.fake_scene import FakeScene
+    from scgs_warp.visualization.films import turntable
+
+    for options in ({"frames": 0}, {"size": 5}, {"fps": 0}):
+        with pytest.raises(UserError, match="give at least 1"):
+            turntable(FakeScene(), tmp_path / "film.mp4", **options)  # type: ignore[arg-type]

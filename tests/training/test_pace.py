@@ -1,0 +1,41 @@
+"""The time that a run takes, estimated from its first steps."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from scgs_warp.config.presets import preset, with_steps
+from scgs_warp.training.pace import MEASURED, SKIPPED, Pace
+
+
+def notes(config, seconds: float, steps: int = 3_000, first: int = 0) -> dict[int, str]:
+    """Take steps of the same length, slow ones at the beginning."""
+    now = [0.0]
+    pace = Pace(config, lambda: now[0])
+    found = {}
+    for step in range(first + 1, first + steps + 1):
+        now[0] += 9.0 if step <= first + SKIPPED else seconds
+        note = pace.note(step)
+        if note is not None:
+            found[step] = note
+    return found
+
+
+def test_one_estimate_after_the_first_steps():
+    found = notes(preset("cpu"), 0.05)
+    assert list(found) == [MEASURED]
+    assert found[MEASURED] == (
+        "on this machine, 23,800 more steps (cpu) take 19:50 to 39:40: 50 ms each so far, more as Gaussians are added"
+    )
+
+
+@pytest.mark.parametrize("first", [0, 4_000])
+def test_steps_on_halved_images_do_not_count(first):
+    config = dataclasses.replace(preset("quick"), half_size=1_000)
+    assert list(notes(config, 0.01, first=first)) == [MEASURED + max(1_000, first)]
+
+
+def test_short_runs_get_none():
+    assert notes(with_steps(preset("cpu"), 900), 0.01) == {}
