@@ -309,7 +309,7 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         (["--run", tmp_path / "nowhere", "--output", "a.ply"], "nowhere"),
         (["--ply", "a.ply", "--output", "b.spz"], "no such file"),
         (["--ply", "a.ply", "--output", "b.npz"], "--run"),
-        (["--ply", "a.ply", "--output", "b.html", "--edit", "e.json"], "leave --edit out"),
+        (["--ply", "a.ply", "--output", "b.html", "--edit", "e.json"], "no such file"),
         (["--ply", "a.ply", "--output", "b.json"], "a file of Gaussians has no cameras"),
         (["--run", still, "--output", "b.npz"], "stands still"),
         (["--run", run, "--format", "cameras", "--output", "b.json"], "data.folder"),
