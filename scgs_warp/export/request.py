@@ -219,7 +219,8 @@ def check_output(path: Path, kind: Format) -> None:
         ending = suffix
     if ending and suffix != ending:
         longer = f", not in {suffix}," if suffix.endswith(ending) else f" (not {META})" if path.name == META else ""
-        raise UserError(f"--output {path}: end the name in {ending}{longer} for --format {kind}")
+        choice = " or ".join(TRACK_SUFFIXES) if kind == "tracks" else ending
+        raise UserError(f"--output {path}: end the name in {choice}{longer} for --format {kind}")
     if ending and path.is_dir():
         raise UserError(f"--output {path}: is a folder; give another name")
     if not ending and path.exists() and not path.is_dir():

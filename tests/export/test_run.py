@@ -299,7 +299,7 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         (["--run", run, "--output", "b.npz", "--points", 3], "--points 3: belongs to tracks"),
         (["--run", run, "--output", "b.csv", "--points", 0], "--points 0: give 1 to"),
         (["--run", run, "--output", "b.csv", "--points", tmp_path / "none.csv"], "none.csv"),
-        (["--run", run, "--output", "b.obj", "--format", "tracks"], "--format tracks"),
+        (["--run", run, "--output", "b.obj", "--format", "tracks"], ".csv or .npz or .glb for"),
         (["--run", run, "--output", "b.4dgs", "--frames", 1], "--frames 2"),
         (["--run", still, "--output", "b.4dgs"], "stands still"),
         (["--run", run, "--output", "b.npz", "--title", "x"], "--title: belongs to a page"),
