@@ -38,6 +38,8 @@ PALETTE_WIDTH = 64
 """Rows of the palette per line of pixels."""
 COUNTS = {1: 3, 2: 8, 3: 15}
 """Numbers of coefficients above degree 0, by degree."""
+MOST_VISIBLE, LEAST_AREA = 0.99, 1e-3
+"""Quantile of what Gaussians cover that counts as most; least share of it that a Gaussian counts for."""
 ORDER_BITS = 21
 """Cells along each axis, as a power of 2, for the order of Gaussians."""
 LOG_LIMIT = 40.0
@@ -103,7 +105,8 @@ def _pack(rows: dict[str, np.ndarray], size: tuple[int, int]) -> tuple[dict[str,
     }
     coefficients = rows["sh_rest"].shape[1]
     if coefficients:
-        palette, labels = make_palette(rows["sh_rest"].reshape(len(places), -1), _palette_size(len(places)))
+        rest, most = rows["sh_rest"].reshape(len(places), -1), _palette_size(len(places))
+        palette, labels = make_palette(rest, most, _importance(rows))
         book = make_codebook(palette)
         lines = -(-len(palette) // PALETTE_WIDTH)
         codes = encode(palette, book).reshape(-1, 3)
@@ -121,6 +124,14 @@ def _pack(rows: dict[str, np.ndarray], size: tuple[int, int]) -> tuple[dict[str,
 def _palette_size(count: int) -> int:
     """Return the number of palette rows for so many Gaussians: a power of 2, half of them or more, at most 65,536."""
     return min(PALETTE_LIMIT, 1 << (count.bit_length() - 1))
+
+
+def _importance(rows: dict[str, np.ndarray]) -> np.ndarray:
+    """Return how much each Gaussian matters, [N]: the square root of opacity times the area of its largest
+    cross-section, relative to that of the most visible, within bounds."""
+    area = np.exp(np.sort(rows["log_scales"], axis=1)[:, 1:].sum(axis=1)) * rows["opacities"]
+    most = max(float(np.quantile(area, MOST_VISIBLE)), 1e-30)
+    return np.sqrt((area / most).clip(LEAST_AREA, 1.0))
 
 
 def _numbers(book: np.ndarray) -> list[float]:

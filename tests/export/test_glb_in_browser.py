@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +10,7 @@ import pytest
 from helpers.chromium import chromium
 from helpers.edit_scenes import bar_scene, figure_scene
 from helpers.node_packages import package
+from helpers.web_server import served
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import rotate
 from scgs_warp.export.control_graph import write_graph
@@ -113,25 +109,6 @@ PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><s
 {"imports": {"three": "/three/build/three.module.js", "three/webgpu": "/three/build/three.webgpu.js",
  "three/tsl": "/three/build/three.tsl.js", "three/addons/": "/three/examples/jsm/"}}
 </script><script type="module" src="/play.js"></script>"""
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:
-        pass
-
-
-@contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """A folder on 127.0.0.1."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
 
 
 @pytest.fixture(scope="module")

@@ -65,3 +65,13 @@ def test_larger_palettes_are_nearer():
         assert len(palette) <= size
         errors.append(((palette[labels] - rows) ** 2).mean())
     assert errors[0] > errors[1] > errors[2] and errors[2] < 0.5 and errors[0] < 1.0
+
+
+def test_what_matters_is_nearer():
+    rows = np.random.default_rng(4).normal(size=(3000, 9)).astype(np.float32)
+    weights = np.where(np.arange(3000) % 10 == 0, 1.0, 0.03)
+    errors = []
+    for given in (None, weights):
+        palette, labels = make_palette(rows, 512, given)
+        errors.append(((palette[labels] - rows) ** 2).mean(axis=1))
+    assert errors[1][::10].mean() < 0.4 * errors[0][::10].mean() and errors[1].mean() < 1.5 * errors[0].mean()
