@@ -64,6 +64,12 @@ def test_masked_pixels_do_not_count() -> None:
     masked = type(frame)(frame.camera, frame.time, spoilt, frame.alpha, mask, "a")
     found = evaluate(scene, Dataset([masked], folder=Path("x"), split="test"))
     assert found["psnr"] == pytest.approx(20.0, abs=1e-3)
+    image, truth = (
+        x.permute(2, 0, 1).double() for x in (scene.render(frame.camera, frame.time).rgb, spoilt.clamp(0, 1))
+    )
+    expected = ssim_map(torch.where(mask, image, truth), truth)[:, mask].mean()
+    assert found["ssim"] == pytest.approx(float(expected), abs=1e-5)
+    assert abs(found["ssim"] - float(ssim_map(image, truth).mean())) > 1e-2
 
 
 def test_the_sheet_shows_no_error_where_nothing_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

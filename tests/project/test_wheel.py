@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import subprocess
@@ -17,7 +18,7 @@ from helpers.paths import ROOT
 
 PLACES = {"scgs_warp": "scgs_warp", "kernels": "scgs_warp/kernels", "apps": "scgs_warp/apps"}
 """Folders of the checkout, and where they are installed."""
-BUILD = "import sys; from setuptools import build_meta as b; print(getattr(b, 'build_' + sys.argv[1])(sys.argv[2]))"
+BUILD = "import sys; import build_backend as b; print(getattr(b, 'build_' + sys.argv[1])(sys.argv[2]))"
 
 
 def build(kind: str, source: Path, output: Path) -> Path:
@@ -67,6 +68,17 @@ def wheel(unpacked, tmp_path_factory) -> Path:
     return build("wheel", unpacked, tmp_path_factory.mktemp("wheel"))
 
 
+def test_the_same_sources_give_the_same_bytes(unpacked, wheel, tmp_path):
+    """Whenever and wherever they are built: in another folder, from files with other time stamps."""
+    again = tmp_path / "elsewhere"
+    shutil.copytree(unpacked, again, ignore=shutil.ignore_patterns("build", "*.egg-info"))
+    for path in again.rglob("*"):
+        os.utime(path, (1_000_000_000, 1_000_000_000))
+    second = build("wheel", again, tmp_path / "wheel")
+    sums = [hashlib.sha256(path.read_bytes()).hexdigest() for path in (wheel, second)]
+    assert wheel.name == second.name and sums[0] == sums[1]
+
+
 def test_the_source_distribution_has_everything(unpacked):
     for name in (*PLACES, "tests", "docs", "examples", "benchmarks"):
         missing = {n for n in files(ROOT / name) - files(unpacked / name) if not n.startswith("results/.")}
@@ -78,6 +90,7 @@ def test_the_source_distribution_has_everything(unpacked):
         "SECURITY.md",
         "LICENSE",
         "pyproject.toml",
+        "build_backend.py",
         "mkdocs.yml",
     ):
         assert (unpacked / name).is_file(), name

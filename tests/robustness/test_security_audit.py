@@ -101,6 +101,7 @@ def test_dependencies_are_bounded():
     listed = re.findall(r'"([^"]+)"', re.sub(r"#.*", "", needed[1] + extras[1]))
     assert len(listed) > 20
     assert [item for item in listed if not re.search(r"<|==", item)] == []
+    assert [item for item in listed if not re.search(r">=|==", item)] == [], ".ci/ends lowest tests the lower bounds"
 
 
 def test_secrets_are_compared_in_constant_time():

@@ -18,6 +18,7 @@ from scgs_warp.ablation.cells import read_metrics
 from scgs_warp.ablation.zoo import read_table
 from scgs_warp.apps import train
 from scgs_warp.data import load
+from scgs_warp.data.readers.transforms import read_transforms
 from scgs_warp.edit import EditSession
 from scgs_warp.errors import UserError
 from scgs_warp.scene.scene import Scene
@@ -36,7 +37,7 @@ def refusal(action: Callable[[], object], *words: str) -> None:
 JSON_READERS: dict[str, Any] = {
     "config.json": (lambda path: train.cli(["--config", str(path), "--output", str(path.parent / "out")]), "--config"),
     "edit.json": (lambda path: EditSession(bar_scene(nodes=12, gaussians=30)).load(path), "--script"),
-    "transforms.json": (lambda path: load(path.parent), "a data set"),
+    "transforms.json": (read_transforms, "a data set"),
     "zoo.json": (lambda path: read_table(path.parent), "--compare"),
     "metrics.json": (lambda path: read_metrics(path.parent), "a cell"),
     "log.jsonl": (read_log, "curves"),
@@ -48,10 +49,7 @@ JSON_READERS: dict[str, Any] = {
 def test_text_that_is_no_file_is_refused(tmp_path, capsys, name, kind):
     """A pipe without a writer would be waited for, and reading ``/dev/zero`` would exhaust the memory."""
     folder = tmp_path / "folder"
-    if name == "transforms.json":
-        write_nerfstudio(folder)
-        (folder / name).unlink()
-    folder.mkdir(exist_ok=True)
+    folder.mkdir()
     path = folder / name
     if kind == "pipe":
         os.mkfifo(path)
