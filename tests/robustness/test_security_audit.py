@@ -32,7 +32,15 @@ ENDINGS = {
     "extractall", "joblib.load", "shutil.unpack_archive", "yaml.load", "pickle.loads", "os.execv", "os.spawnv",
 }  # fmt: skip
 ENDINGS_ONLY_IN = {
-    ".read_text": {"environment.py", "memory.py", "page.py", "viewer.py", "provenance.py", "__init__.py"},
+    ".read_text": {
+        "environment.py",
+        "memory.py",
+        "page.py",
+        "viewer.py",
+        "completion.py",
+        "provenance.py",
+        "__init__.py",
+    },
     ".read_bytes": {"files.py", "run.py", "ray_worker.py"},
 }
 """Methods of paths that wait for a pipe and never end on ``/dev/zero``, and the files in which they read our own
