@@ -15,14 +15,14 @@ CODE = {
 }
 NAMES = tuple(CODE)
 EXACT = 1e-7
-"""Largest error of a position, in diameters of the scene, that counts as none."""
+"""Largest loss of position, colour and opacity that counts as none."""
 
 
 def cells(row: dict[str, Any]) -> list[str]:
     harmonics = "none" if row["harmonics"] is None else number(row["harmonics"], 3)
     losses = [f"{1e6 * row['position']:,.0f}", percent(100 * row["scale"], 1), number(row["color"], 4)]
     losses += [number(row["opacity"], 4), number(row["rotation"], 2), harmonics]
-    if row["position"] < EXACT and row["scale"] < 1e-5:
+    if max(row["position"], row["color"], row["opacity"]) < EXACT:
         losses = ["0"] * len(losses)
     shown = "> 90" if row["psnr"] > 90 else number(row["psnr"])
     return [

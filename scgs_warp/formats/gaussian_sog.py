@@ -1,4 +1,4 @@
-"""SOG files (PlayCanvas, "spatially ordered Gaussians"): images whose pixels are Gaussians, some 15 bytes for each.
+"""SOG files (PlayCanvas, "spatially ordered Gaussians"): images whose pixels are Gaussians.
 
 ``meta.json`` describes the images, which hold a Gaussian per pixel, row by row: ``means_l`` and ``means_u`` the low and
 high bytes of positions, as shares of the range of ``sign(x) log(1 + abs(x))``; ``scales`` bytes that index a codebook

@@ -84,6 +84,7 @@ def turned(found: dict[str, np.ndarray], signs: tuple[int, int, int]) -> dict[st
     half = torch.cat([torch.zeros(1, 1), half], 1).expand(len(found["x"]), 4).contiguous()
     found = found | {axis: sign * found[axis] for axis, sign in zip("xyz", signs)}
     quats = multiply(half.double().numpy(), columns(found, "rot", 4))
+    quats = multiply(quats, half.double().numpy())  # a Gaussian looks the same after half a turn about its own axis
     found |= {f"rot_{i}": quats[:, i] for i in range(4)}
     rest = len([name for name in found if name.startswith("f_rest_")])
     if rest:
