@@ -30,7 +30,8 @@ class Options:
     output: Path | None = None
     """Film to write of the script's edit: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     export: Path | None = None
-    """File (.ply) to write the edited scene to, as it is at the moment --at of the film."""
+    """File to write the edited scene to, as it is at the moment --at of the film: .ply, .compressed.ply, .splat, .spz,
+    .sog or .glb."""
     at: float | None = None
     """Second of the film that --export writes; by default that of the last keyframe."""
     skeleton: bool = False
@@ -66,7 +67,7 @@ def check(options: Options) -> None:
         UserError: names the option and the remedy.
     """
     from scgs_warp.errors import UserError
-    from scgs_warp.storage.suffixes import longest_suffix
+    from scgs_warp.export.request import STILL_FORMATS, SUFFIXES, output_suffix
     from scgs_warp.visualization import video
 
     if (options.run is None) == (options.ply is None):
@@ -83,8 +84,8 @@ def check(options: Options) -> None:
         if options.script is None:
             raise UserError(f"--output {options.output}: a film needs --script")
         video.check_path(options.output)
-    if options.export is not None and longest_suffix(options.export, (".ply", ".compressed.ply")) != ".ply":
-        raise UserError(f"--export {options.export}: end the name in .ply")
+    if options.export is not None and output_suffix(options.export) not in [SUFFIXES[kind] for kind in STILL_FORMATS]:
+        raise UserError(f"--export {options.export}: end the name in .ply, .compressed.ply, .splat, .spz, .sog or .glb")
     if not 0 <= options.port <= 65535:
         raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
     if options.at is not None and not 0 <= options.at <= 3600:
@@ -205,11 +206,15 @@ def main(args: list[str] | None) -> None:
         camera = film_camera(session, 0.0)
         print(f"{options.output}: {frames} frames of {camera.width} x {camera.height}")
     if options.export is not None:
+        from scgs_warp.export.run import write_still
+        from scgs_warp.export.skeleton import keep_finite
+
         last = max((frame.at for frame in session.edit.keyframes), default=0.0)
         at = last if options.at is None else options.at
         which = ", the last keyframe" if options.at is None and session.edit.keyframes else ""
-        session.export_ply(options.export, session.scene_time(at), at)
-        print(f"{options.export}: {session.scene.gaussian_count:,} Gaussians, {at:g} s into the film{which}")
+        scene, gaussians = session.scene, keep_finite(session.gaussians_at(session.scene_time(at), at))
+        write_still(options.export, gaussians, up=scene.overview.up, antialiased=scene.config.antialiased)
+        print(f"{options.export}: {len(gaussians.means):,} Gaussians, {at:g} s into the film{which}")
 
 
 def cli(args: list[str] | None = None) -> int:

@@ -12,6 +12,7 @@ import torch
 from helpers.edit_scenes import bar_scene, dress
 from helpers.edit_scripts import SCRIPT
 from scgs_warp.apps import edit as app
+from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from scgs_warp.scene.from_gaussians import open_gaussians
 
@@ -35,6 +36,11 @@ def test_the_app_films_and_exports(tmp_path, ply, capsys):
     assert "4 frames of 32 x 32" in capsys.readouterr().out and Path(output).stat().st_size > 500
     moved = (read_gaussian_ply(export).means - read_gaussian_ply(ply).means).norm(dim=1)
     assert float(moved.max()) == pytest.approx(1.0, abs=0.2)
+    for name in ("out.sog", "loose/meta.json", "out.compressed.ply", "out.spz"):
+        assert app.cli([*arguments, "--export", str(tmp_path / name), "--at", "0.5"]) == 0
+        assert "300 Gaussians, 0.5 s into the film" in capsys.readouterr().out
+        found = read_gaussians(tmp_path / name).means
+        assert float(torch.cdist(read_gaussian_ply(export).means, found).min(dim=1).values.max()) < 0.01
 
 
 @pytest.mark.parametrize(
