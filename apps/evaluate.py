@@ -27,6 +27,9 @@ class Options:
     """Folder of the data set, if it has moved since training."""
     lpips_weights: Path | None = None
     """File with VGG16 and LPIPS weights; without it LPIPS is not measured."""
+    fit_color: bool = False
+    """Also score each image with the affine colour (exposure, white balance) that fits it best. A run with
+    optim.frame_colors is always scored so, and with the colours of the training frames before and after."""
     json: Path | None = None
     """File for the metrics; RUN/evaluation/SPLIT/metrics.json by default."""
     device: Device = "auto"
@@ -69,6 +72,8 @@ def show(metrics: dict[str, Any], unfinished: str | None) -> None:
         "psnr": "PSNR [dB]",
         "psnr_median": "median",
         "psnr_worst": "worst",
+        "psnr_fitted": "fitted colour",
+        "psnr_interpolated": "interpolated",
         "ssim": "SSIM",
         "lpips": "LPIPS",
         "epe": "EPE [%]",
@@ -78,7 +83,17 @@ def show(metrics: dict[str, Any], unfinished: str | None) -> None:
     present = [key for key in columns if metrics.get(key) is not None]
     for key in present:
         table.add_column(columns[key], justify="right")
-    digits = {"psnr": 2, "psnr_median": 2, "psnr_worst": 2, "ssim": 4, "lpips": 4, "epe": 3, "jitter": 4}
+    digits = {
+        "psnr": 2,
+        "psnr_median": 2,
+        "psnr_worst": 2,
+        "psnr_fitted": 2,
+        "psnr_interpolated": 2,
+        "ssim": 4,
+        "lpips": 4,
+        "epe": 3,
+        "jitter": 4,
+    }
     cells = [f"{metrics[key]:.{digits[key]}f}" if key in digits else f"{metrics[key]:,}" for key in present]
     table.add_row(*cells)
     Console().print(table)
@@ -92,6 +107,7 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.evaluation.evaluate import metrics_of, write_metrics
     from scgs_warp.evaluation.run_time import training_seconds
     from scgs_warp.runtime.progress import progress
+    from scgs_warp.scene.frame_colors import FrameColors
     from scgs_warp.scene.scene import Scene
 
     scene = Scene.load(options.run, device=device)
@@ -117,6 +133,8 @@ def main(args: list[str] | None) -> None:
             lpips=lpips,
             render_dir=folder,
             progress=lambda done, total: shown.advance(),
+            colors=FrameColors.read(options.run),
+            fit_color=options.fit_color,
         )
     metrics["poses"] = poses
     target = options.json or folder / "metrics.json"

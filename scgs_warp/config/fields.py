@@ -286,6 +286,10 @@ class LossConfig:
     """Number of neighbours of each control point for ARAP."""
     arap_refresh: int = bounded(200, 1)
     """Number of steps between two computations of the neighbours."""
+    frame_colors: float = newer(1e-3, before=1e-3, least=0, most=1e6)
+    """Weight of the squared distance between a frame's affine colour (``optim.frame_colors``) and the identity."""
+    frame_colors_smooth: float = newer(1e-3, before=1e-3, least=0, most=1e6)
+    """Weight of the squared distance between a frame's affine colour and the mean of those before and after it."""
     hexplane_tv: float = bounded(1e-4, 0, 1e6)
     """Weight of the differences in space (feature planes, 4D-GS)."""
     hexplane_smooth: float = bounded(1e-2, 0, 1e6)

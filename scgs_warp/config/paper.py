@@ -96,6 +96,7 @@ PAPER = TrainConfig(
         settle=0.0,
         cameras=0.0,
         planes=8e-3,
+        frame_colors=0.0,
     ),
     densify=DensifyConfig(
         start=500,
@@ -135,6 +136,8 @@ PAPER = TrainConfig(
         arap_times=8,
         arap_neighbors=8,
         arap_refresh=200,
+        frame_colors=1e-3,
+        frame_colors_smooth=1e-3,
         hexplane_tv=1e-4,
         hexplane_smooth=1e-2,
         hexplane_rest=1e-4,

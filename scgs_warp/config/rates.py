@@ -59,3 +59,6 @@ class OptimConfig:
     no corrections."""
     planes: float = rate(8e-3)
     """Learning rate of the feature planes of the hexplane model."""
+    frame_colors: float = newer(0.0, before=0.0, least=0, most=1)
+    """Learning rate of an affine colour for each training frame, for films whose exposure or white balance changes (not
+    in the paper); 0: none. 2e-3 suits most."""

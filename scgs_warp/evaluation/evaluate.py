@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..data import Dataset
 from ..errors import UserError
+from ..scene.frame_colors import FrameColors, apply_color, fitted_color
 from ..scene.scene import Scene
 from ..types import Frame
 from ..visualization.figures import contact_sheet, to_bytes
@@ -34,6 +35,24 @@ Lpips = Callable[[Tensor, Tensor], Tensor | float]
 def _mean(values: list[float]) -> float | None:
     """Return the mean, summed exactly so that the order of the images does not matter; None for an empty list."""
     return math.fsum(values) / len(values) if values else None
+
+
+def _recolored(image: Tensor, color: Tensor) -> Tensor:
+    """Apply an affine colour [3, 4] to an image [H, W, 3]."""
+    return apply_color(color.to(image.device), image.permute(2, 0, 1)).permute(1, 2, 0).clamp(0.0, 1.0)
+
+
+def _color_scores(frame: Frame, image: Tensor, truth: Tensor, colors: FrameColors | None) -> dict[str, float]:
+    """Score an image with the colour that the frames before and after have, and with the colour that fits best."""
+    mask = None if frame.mask is None else frame.mask.to(image.device)
+    shown = {"fitted": _recolored(image, fitted_color(image, truth, mask))}
+    if colors is not None:
+        shown["interpolated"] = _recolored(image, colors.at(frame.time))
+    scores = {}
+    for name, picture in shown.items():
+        scores[f"psnr_{name}"] = float(psnr(picture, truth) if mask is None else psnr(picture[mask], truth[mask]))
+        scores[f"ssim_{name}"] = float(ssim(picture, truth, mask))
+    return scores
 
 
 def _measure(frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, Any]:
@@ -106,6 +125,8 @@ def evaluate(
     render_dir: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[int, Frame, Tensor], None] | None = None,
+    colors: FrameColors | None = None,
+    fit_color: bool = False,
 ) -> dict[str, Any]:
     """Render every frame of a split and compare it with the truth; a metric is the mean over the clamped images.
 
@@ -117,11 +138,15 @@ def evaluate(
         render_dir: folder for ``renders/NAME.png``, ``truth/NAME.png`` and ``contact_sheet.png``; None: not written.
         progress: called with (done, total) after each image.
         watch: called with (index, frame, rendered alpha [H, W]) after each image.
+        colors: affine colours of the training frames, if the run learnt them; scores with colours are added then.
+        fit_color: also score each image with the affine colour that fits it best.
 
     Returns:
         ``psnr`` [dB], ``ssim``, ``lpips`` (None if not measured), ``images``; ``psnr_median``; ``psnr_worst`` and
-        ``psnr_worst_time``, the lowest PSNR of an image and the image's time; the fields of ``coverage.summarise``; and
-        ``per_image``, a list of ``name``, ``time``, ``psnr``, ``ssim`` (``lpips``; ``missing``, ``extra``,
+        ``psnr_worst_time``, the lowest PSNR of an image and the image's time; with colours, ``psnr_fitted`` and
+        ``ssim_fitted`` with the affine colour that fits each image best, and ``psnr_interpolated`` and
+        ``ssim_interpolated`` with that of the training frames before and after; the fields of ``coverage.summarise``;
+        and ``per_image``, a list of ``name``, ``time``, ``psnr``, ``ssim`` (``lpips``; ``missing``, ``extra``,
         ``missing_region``, ``extra_region`` if the image has alpha). The metrics of an empty split are None.
 
     Raises:
@@ -135,6 +160,8 @@ def evaluate(
         image = rendered.rgb.clamp(0.0, 1.0)
         truth = frame.image.to(image.device).clamp(0.0, 1.0)
         rows.append(_measure(frame, image, rendered.alpha, truth, lpips))
+        if colors is not None or fit_color:
+            rows[-1].update(_color_scores(frame, image, truth, colors))
         if renders is not None:
             renders.add(index, frame, image, rendered.alpha, truth, rows[-1]["psnr"])
         if watch is not None:
@@ -144,7 +171,9 @@ def evaluate(
     if renders is not None:
         renders.finish()
     means = {name: _mean([row[name] for row in rows if name in row]) for name in ("psnr", "ssim", "lpips")}
-    return {**means, **_spread_of_psnr(rows), **summarise(rows), "images": len(rows), "per_image": rows}
+    names = [f"{score}_{way}" for way in ("fitted", "interpolated") for score in ("psnr", "ssim")]
+    colored = {name: _mean([row[name] for row in rows]) for name in names if rows and name in rows[0]}
+    return {**means, **_spread_of_psnr(rows), **colored, **summarise(rows), "images": len(rows), "per_image": rows}
 
 
 def _spread_of_psnr(rows: list[dict[str, Any]]) -> dict[str, float | None]:
@@ -161,6 +190,8 @@ def metrics_of(
     lpips: Lpips | None = None,
     render_dir: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    colors: FrameColors | None = None,
+    fit_color: bool = False,
 ) -> dict[str, Any]:
     """Make the content of ``metrics.json``: the metrics of ``evaluate``, and a description of scene and data.
 
@@ -169,6 +200,7 @@ def metrics_of(
 
     Args:
         seconds: duration of the training, if known.
+        colors, fit_color: as for ``evaluate``.
 
     Raises:
         UserError: ``render_dir`` cannot be written, or the ground truth cannot be read.
@@ -179,7 +211,16 @@ def metrics_of(
     rods = load_rods(dataset.folder, dataset.split, len(dataset)) if whole else None
     check = None if rods is None else RodCheck(rods)
     watch = None if check is None else check.add
-    measured = evaluate(scene, dataset, lpips=lpips, render_dir=render_dir, progress=progress, watch=watch)
+    measured = evaluate(
+        scene,
+        dataset,
+        lpips=lpips,
+        render_dir=render_dir,
+        progress=progress,
+        watch=watch,
+        colors=colors,
+        fit_color=fit_color,
+    )
     rows = measured.pop("per_image")
     metrics = {
         **measured,

@@ -239,6 +239,8 @@ def _help(facts: Survey, config: TrainConfig, device: str) -> str:
             f"{config.steps:,} steps are few: thin or fast parts, such as legs, may be blurred or missing; look for "
             f"them in contact_sheet.png, --steps {FEW_STEPS} usually shows them"
         )
+    if facts.flicker > UNSTEADY and config.optim.frame_colors == 0.0:
+        return "--set optim.frame_colors=2e-3 gives each frame its own exposure and white balance"
     if config.steps < FEW_VISITS * facts.frames:
         wanted = math.ceil(FEW_VISITS * facts.frames / 1000) * 1000
         return (

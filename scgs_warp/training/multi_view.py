@@ -127,7 +127,7 @@ def check_replicas(state: TrainState) -> None:
     if state.group is None:
         return
     digest = zlib.crc32(str(state.step).encode())
-    for module in (state.gaussians, state.motion, state.cameras):
+    for module in (state.gaussians, state.motion, state.cameras, state.exposure):
         for parameter in module.parameters():
             digest = zlib.crc32(parameter.detach().cpu().contiguous().numpy().tobytes(), digest)
     if not state.group.agree(digest):

@@ -6,8 +6,8 @@ fixed capacity: a step that needs more changes nothing, nor does its successor, 
 Steps that consist of the same operations are recorded as a CUDA graph and replayed.
 
 The result is that of ``step.training_step``, which takes the steps that cannot be taken this way: those of several
-views, of refined cameras, with debug checks, or with lists beyond the memory. On a CPU the same operations run one by
-one, which is how they are tested.
+views, of refined cameras, of frames with affine colours, with debug checks, or with lists beyond the memory. On a CPU
+the same operations run one by one, which is how they are tested.
 """
 
 from __future__ import annotations
@@ -114,7 +114,8 @@ class RecordedSteps:
     def _fits(self) -> bool:
         """Return True if the present step can be taken without the host, as far as is known beforehand."""
         state = self._state
-        ready = state.motion.takes_time_tensor and not state.refines_cameras and not debug.enabled()
+        ready = state.motion.takes_time_tensor and not state.refines_cameras and not len(state.exposure)
+        ready = ready and not debug.enabled()
         if not ready:
             return False
         if self.capacity > 0 and self._update is not None and self._update.holds():

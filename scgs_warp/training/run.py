@@ -20,6 +20,7 @@ from ..evaluation.run_time import training_seconds
 from ..geometry import cameras
 from ..runtime.progress import progress, say
 from ..runtime.provenance import provenance
+from ..scene.frame_colors import FrameColors
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
 from ..visualization import video
@@ -160,6 +161,7 @@ def write_results(
             lpips=lpips,
             render_dir=renders,
             progress=lambda done, total: bar.advance(),
+            colors=FrameColors.read(folder),
         )
     if origin is not None:
         metrics["provenance"] = origin
@@ -187,7 +189,20 @@ def turntable(scene: Scene, path: Path, frames: int, size: int = FILM_SIZE) -> N
 def summary(metrics: dict[str, Any]) -> str:
     """Format the scores for the terminal, one per line; the last line says where the subject is not covered, if it is
     not."""
-    names = ("psnr", "psnr_worst", "ssim", "lpips", "epe", "jitter", "seconds", "gaussians", "control_points", "step")
+    names = (
+        "psnr",
+        "psnr_fitted",
+        "psnr_interpolated",
+        "psnr_worst",
+        "ssim",
+        "lpips",
+        "epe",
+        "jitter",
+        "seconds",
+        "gaussians",
+        "control_points",
+        "step",
+    )
     scores = [(name, metrics[name]) for name in names if metrics.get(name) is not None]
     lines = [
         f"{name:>15}  {value:.4g}" if isinstance(value, float) else f"{name:>15}  {json.dumps(value)}"

@@ -20,6 +20,7 @@ from ..geometry.normalisation import COMMON_RADIUS, FEWEST_POINTS, Normalisation
 from ..motion.base import Motion
 from ..motion.spheres import Spheres
 from ..optim import Adam
+from ..scene import frame_colors
 from ..scene.scene import Scene, scene_from
 from ..scene.validation import check_metadata, check_motion, check_resumed, check_tensors, reason
 from ..seeding import generator
@@ -27,6 +28,7 @@ from ..storage import checkpoint
 from ..types import Stats
 from .background_points import background_points
 from .camera_refinement import CameraRefinement
+from .exposure import Exposure
 from .frames import first_frames
 from .initial_points import random_points, sample_initial_points
 from .pretrain import (
@@ -86,6 +88,7 @@ class TrainState:
         fingerprint: str,
         frames: int = 0,
         step: int = 0,
+        data: Dataset | None = None,
     ) -> None:
         self.config, self.normalisation, self.overview = config, normalisation, rig
         self.extent, self.points, self.colors = extent, points, colors
@@ -98,6 +101,8 @@ class TrainState:
         """False between an update of the parameters and the increment of ``step``; such a state must not be saved."""
         self.cameras = CameraRefinement(frames if config.optim.cameras > 0 else 0).to(gaussians.means.device)
         self.camera_optimizer = self.cameras.optimizer()
+        self.exposure = Exposure.of(data if config.optim.frame_colors > 0 else None).to(gaussians.means.device)
+        self.exposure_optimizer = self.exposure.optimizer() if len(self.exposure) else None
         self.enter(gaussians, motion)
 
     def enter(self, gaussians: GaussianParameters, motion: Motion) -> None:
@@ -116,7 +121,7 @@ class TrainState:
         # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
         rest = (normalisation, overview(data.cameras), extent, points, colors)
-        identity = {"fingerprint": data.fingerprint, "frames": len(data)}
+        identity = {"fingerprint": data.fingerprint, "frames": len(data), "data": data}
         if config.pretrain_steps > 0:
             wide = THICKEST * half_thickness(data, normalisation) if config.pretrain.silhouette > 0 else math.inf
             spheres = initial_spheres(config, points, colors, device, wide)
@@ -150,7 +155,7 @@ class TrainState:
         return len(self.cameras.twists) > 0 and self.stage == "main" and self.stage_step >= self.config.rest_steps
 
     def optimizers(self) -> list[Adam]:
-        every = [self.gaussian_optimizer, self.motion_optimizer, self.camera_optimizer]
+        every = [self.gaussian_optimizer, self.motion_optimizer, self.camera_optimizer, self.exposure_optimizer]
         return [optimizer for optimizer in every if optimizer is not None]
 
     def reset_stats(self) -> None:
@@ -187,6 +192,10 @@ class TrainState:
         if len(self.cameras.twists):
             tensors["cameras.twists"] = self.cameras.twists
             tensors.update(self.camera_optimizer.tensors("adam.cameras"))
+        if self.exposure_optimizer is not None:
+            tensors[f"{frame_colors.PREFIX}offsets"] = self.exposure.offsets
+            tensors[f"{frame_colors.PREFIX}times"] = self.exposure.times
+            tensors.update(self.exposure_optimizer.tensors("adam.exposure"))
         tensors.update({f"extra.{name}": value for name, value in self.motion.extra_state().items()})
         for name in ("grad_norm", "count", "max_radii"):
             tensors[f"stats.{name}"] = getattr(self.stats, name)
@@ -238,6 +247,7 @@ class TrainState:
                 fingerprint=data.fingerprint,
                 frames=len(data),
                 step=scene.step,
+                data=data,
             )
             state.gaussian_optimizer.load_tensors("adam.gaussians", tensors)
             if state.motion_optimizer is not None:
@@ -245,6 +255,9 @@ class TrainState:
             if len(state.cameras.twists):
                 state.cameras.load_state_dict({"twists": tensors["cameras.twists"]})
                 state.camera_optimizer.load_tensors("adam.cameras", tensors)
+            if state.exposure_optimizer is not None:
+                state.exposure.load_state_dict({"offsets": tensors[f"{frame_colors.PREFIX}offsets"]})
+                state.exposure_optimizer.load_tensors("adam.exposure", tensors)
             state.motion.load_extra_state(checkpoint.strip(tensors, "extra."))
             stats = checkpoint.strip(tensors, "stats.")
             state.stats = Stats(stats["grad_norm"], stats["count"], stats["max_radii"], absolute=state.stats.absolute)

@@ -48,6 +48,9 @@ def training_step(state: TrainState, frames: Frames) -> StepResult:
         if state.refines_cameras:
             state.camera_optimizer.step()
             state.cameras.centre()
+        if state.exposure_optimizer is not None:
+            state.exposure_optimizer.step()
+            state.exposure.centre()
     for optimizer in state.optimizers():
         optimizer.zero_grad()
     return result._replace(failed=failed)
@@ -68,8 +71,11 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     if state.refines_cameras:
         camera = state.cameras.apply(camera, prepared.index)
     times = sent(torch.tensor(plan.times), device)
-    numbers = Numbers(camera, sent(prepared.background, device), times, plan.weight)
+    color = state.exposure.color(prepared.index) if len(state.exposure) else None
+    numbers = Numbers(camera, sent(prepared.background, device), times, plan.weight, color)
     compared = compare(state, prepared, numbers, stats)
+    if color is not None:
+        compared = compared.with_penalty(state.exposure.penalty(prepared.index, state.config.loss))
 
     # 2. Backpropagate, unless the loss is non-finite.
     failed = _non_finite_term(compared.loss, compared.regulariser)
@@ -109,6 +115,9 @@ def set_rates(state: TrainState) -> None:
         for name, group in state.motion_optimizer.groups.items():
             group.rate = rates[name]
     state.camera_optimizer.groups["twists"].rate = camera_rate(step, config.optim, config.rest_steps)
+    if state.exposure_optimizer is not None:
+        settled_colors = settled if state.stage == "main" else 1.0
+        state.exposure_optimizer.groups["offsets"].rate = config.optim.frame_colors * settled_colors
 
 
 def settling(step: int, config: TrainConfig) -> float:

@@ -19,6 +19,7 @@ from ..ops.ssim import photometric_loss
 from ..rendering.render import draw
 from ..seeding import generator
 from ..types import Camera, Splats, Stats, Tiles
+from .exposure import exposed
 from .frames import Frames, view_number
 from .silhouettes import SilhouetteSample, silhouette_term
 from .state import TrainState
@@ -63,6 +64,8 @@ class Numbers(NamedTuple):
     """[T] those of the plan."""
     weight: float | Tensor
     """Weight of the motion's regulariser."""
+    color: Tensor | None = None
+    """[3, 4] affine colour of the frame; None: frames have none."""
 
 
 class Compared(NamedTuple):
@@ -76,6 +79,11 @@ class Compared(NamedTuple):
     regulariser: Tensor | None
     """Weighted; None in steps without the term."""
     picture: Tensor
+
+    def with_penalty(self, penalty: Tensor) -> Compared:
+        """Add a penalty to the regulariser."""
+        regulariser = penalty if self.regulariser is None else self.regulariser + penalty
+        return self._replace(total=self.total + penalty, regulariser=regulariser)
 
 
 def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
@@ -125,7 +133,7 @@ def compare(
         regulariser = sought if regulariser is None else regulariser + sought
 
     # 2. Render.
-    picture, _ = draw(
+    picture, alpha = draw(
         posed,
         camera,
         numbers.background,
@@ -134,6 +142,9 @@ def compare(
         antialiased=config.antialiased,
         binned=binned,
     )
+
+    if numbers.color is not None:
+        picture = exposed(picture, alpha, numbers.background, numbers.color)
 
     # 3. Compare.
     loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
