@@ -1,4 +1,4 @@
-"""Make a data set from a video: ``python apps/capture.py film.mp4 --output data/film``."""
+"""Make a data set from a video, or from those of a rig: ``python apps/capture.py film.mp4 --output data/film``."""
 
 from __future__ import annotations
 
@@ -15,19 +15,31 @@ from scgs_warp.apps.cli import Device, prepare, run
 
 @dataclass(frozen=True)
 class Options:
-    """Find the cameras of a video; write frames, cameras, times and points to a folder for train.py --data."""
+    """Find the cameras of a video, or of a rig; write frames, cameras, times and points to a folder for train.py
+    --data."""
 
-    video: tyro.conf.Positional[Path]
-    """Video, or folder of images from one camera."""
     output: Path
     """Folder to make. The same command continues an interrupted one; finished work is never overwritten."""
+    video: tyro.conf.Positional[Path | None] = None
+    """Video, or folder of images from one camera."""
+    rig: Path | None = None
+    """Instead of VIDEO, folder with one video per camera of a rig: cameras that stand still. They are synchronised by
+    their sound. Beside a poses_bounds.npy (Neural 3D Video), the videos are unpacked and the cameras kept."""
+    offsets: tuple[float, ...] | None = None
+    """Seconds at which the videos of a rig begin, in the order of their names, or 0 if all begin at once; by default
+    found by sound."""
+    held_out: str | None = None
+    """Camera of a rig that is held out for evaluation; the first by default."""
+    lens: Literal["auto", "shared", "each"] = "auto"
+    """Lenses of a rig. shared: all cameras have the same; each: every camera has its own; auto: shared if all videos
+    have one size."""
     frames: int | None = None
     """Largest number of frames to pick: the sharpest, spread over time and motion. By default 150 of a video and all of
-    a folder."""
+    a folder. For a rig, number of instants, 150 at most by default."""
     start: float | None = None
-    """Second of the video to begin at."""
+    """Second of the video to begin at; for a rig, counted from the moment at which all cameras record."""
     end: float | None = None
-    """Second of the video to end at."""
+    """Second of the video to end at, counted likewise."""
     size: int = 1280
     """Longer side of the images in pixels; smaller ones are not enlarged."""
     masks: str = "auto"
@@ -60,18 +72,48 @@ def main(args: list[str] | None) -> None:
 
     import cv2
 
-    from scgs_warp.capture import CaptureRequest, capture
+    from scgs_warp.errors import UserError
     from scgs_warp.runtime import environment
 
     cv2.setNumThreads(environment.thread_count())
+    if (options.video is None) == (options.rig is None):
+        what = "neither VIDEO nor --rig" if options.video is None else "both VIDEO and --rig"
+        raise UserError(f"{what}: give a video (or a folder of images), or --rig and a folder of one video per camera")
+    if options.video is not None:
+        _capture_video(options, options.video, device)
+    elif options.rig is not None:
+        _capture_rig(options, options.rig, device)
+    print(f"next: python apps/train.py --data {options.output}")
+
+
+def _capture_video(options: Options, video: Path, device: str) -> None:
+    """Make a data set from one camera's film."""
+    from scgs_warp.capture import CaptureRequest, capture
+    from scgs_warp.errors import UserError
+
     o = options
-    film = (o.video, o.frames, o.start, o.end, o.size, o.masks)
+    for name in ("offsets", "held_out"):
+        if getattr(o, name) is not None:
+            raise UserError(f"--{name.replace('_', '-')}: is for --rig; leave it out")
+    film = (video, o.frames, o.start, o.end, o.size, o.masks)
     request = CaptureRequest(*film, o.matching, o.camera_model, o.fov, o.features, o.least, o.seed)
     made = capture(request, o.output, device=device)
     print("\n".join(made.lines))
     registered = f"{made.outcome.registered} of {made.outcome.picked} frames have a camera"
     print(f"{o.output}: {registered}; contact_sheet.png, cameras.png{' (made before)' if made.made_before else ''}")
-    print(f"next: python apps/train.py --data {o.output}")
+
+
+def _capture_rig(options: Options, folder: Path, device: str) -> None:
+    """Make a data set from the videos of a rig."""
+    from scgs_warp.capture import RigRequest, capture_rig
+
+    o = options
+    film = (folder, o.frames, o.start, o.end, o.offsets, o.size)
+    request = RigRequest(*film, o.lens, o.camera_model, o.fov, o.features, o.least, o.held_out, o.seed)
+    made = capture_rig(request, o.output, device=device)
+    print("\n".join(made.lines))
+    found = f"{len(made.registered)} of {len(made.names)} cameras, {made.held_out} held out"
+    print(f"{o.output}: {found}{' (made before)' if made.made_before else ''}")
 
 
 def cli(args: list[str] | None = None) -> int:

@@ -72,11 +72,14 @@ def quiet() -> Iterator[Any]:
         pycolmap.logging.minloglevel = before
 
 
-def begin(database: Path, frame_files: FrameFiles, model: CameraModel, focal: float | None) -> None:
-    """Make the database of the frames, with one camera for all, unless it exists.
+def begin(
+    database: Path, frame_files: FrameFiles, model: CameraModel, focal: float | None, shared: bool = True
+) -> None:
+    """Make the database of the frames, unless it exists.
 
     Args:
         focal: focal length in pixels; None if unknown.
+        shared: all frames have one camera; otherwise each has its own.
     """
     with quiet() as pycolmap:
         with pycolmap.Database.open(database) as storage:
@@ -88,7 +91,11 @@ def begin(database: Path, frame_files: FrameFiles, model: CameraModel, focal: fl
             camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
             options.camera_params = ",".join(repr(float(value)) for value in camera.params)
         pycolmap.import_images(
-            database, frame_files.folder, pycolmap.CameraMode.SINGLE, image_names=frame_files.names, options=options
+            database,
+            frame_files.folder,
+            pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE,
+            image_names=frame_files.names,
+            options=options,
         )
 
 
@@ -159,7 +166,7 @@ def match(
         options.ransac.random_seed = seed
         images = [storage.read_image_with_name(name) for name in frame_files.names]
         points = [storage.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
-        camera = storage.read_camera(images[0].camera_id)
+        cameras = [storage.read_camera(image.camera_id) for image in images]
         for a, b in chosen:
             one, two = images[a].image_id, images[b].image_id
             if not storage.exists_two_view_geometry(one, two):
@@ -170,7 +177,9 @@ def match(
                 matches = nearest_mutual(kept[a], kept[b])
                 if not storage.exists_matches(one, two):
                     storage.write_matches(one, two, matches)
-                geometry = pycolmap.estimate_two_view_geometry(camera, points[a], camera, points[b], matches, options)
+                geometry = pycolmap.estimate_two_view_geometry(
+                    cameras[a], points[a], cameras[b], points[b], matches, options
+                )
                 storage.write_two_view_geometry(one, two, geometry)
             done()
 

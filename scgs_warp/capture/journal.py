@@ -22,11 +22,12 @@ class Journal:
     """Chain of stages. A stage's result is reused if the settings of the stage and of all earlier stages are
     unchanged."""
 
-    def __init__(self, folder: Path, source: str) -> None:
+    def __init__(self, folder: Path, source: str, marker: str = FILE) -> None:
         """
         Args:
             folder: must not exist, or be empty, or hold work on the same source.
             source: digest of the source.
+            marker: file whose presence marks a finished folder.
 
         Raises:
             UserError: the folder holds something else.
@@ -47,7 +48,7 @@ class Journal:
             self._stages = {
                 name: entry for name, entry in content["stages"].items() if isinstance(entry, dict) and "key" in entry
             }
-        self.finished = (folder / FILE).exists()
+        self.finished = (folder / marker).exists()
 
     def start(self) -> None:
         """Make the folder."""

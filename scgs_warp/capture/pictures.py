@@ -30,20 +30,19 @@ MAX_FRUSTA = 60
 def sheet(
     path: Path,
     load: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
-    seconds: Sequence[float],
+    captions: Sequence[str],
     registered: set[int],
-    video: bool,
 ) -> None:
     """Write the contact sheet: frames in order of time, masked pixels tinted, and frames without a camera struck out.
 
     Args:
         load: function from the number of a picked frame to its image [H, W, 3] uint8 and mask [H, W] bool or None.
-        seconds: time of each picked frame; for a folder of images, its index.
+        captions: text below each picked frame.
         registered: numbers of the frames with a camera.
     """
-    count = len(seconds)
+    count = len(captions)
     shown = spread(count, MAX_PICTURES)
-    cells = [_cell(*load(k), _caption(k, seconds[k], k in registered, video), k in registered) for k in shown]
+    cells = [_cell(*load(k), _caption(captions[k], k in registered), k in registered) for k in shown]
     height, width = cells[0].shape[:2]
     columns = min(COLUMNS, len(cells))
     rows = -(-len(cells) // columns)
@@ -54,8 +53,7 @@ def sheet(
     write_png(path, canvas)
 
 
-def _caption(number: int, second: float, registered: bool, video: bool) -> str:
-    text = f"{number}: {second:.2f} s" if video else f"{number}"
+def _caption(text: str, registered: bool) -> str:
     return text if registered else f"{text}, no camera"
 
 

@@ -321,7 +321,8 @@ def _draw_sheet(
         mask = None if frame_files.masks is None else read_rgb(frame_files.masks / frame_files.names[k])[..., 0] < 128
         return read_rgb(frame_files.folder / frame_files.names[k]), mask
 
-    pictures.sheet(path, load, frames.seconds, set(solved.places if solved else ()), video)
+    captions = [f"{k}: {second:.2f} s" if video else f"{k}" for k, second in enumerate(frames.seconds)]
+    pictures.sheet(path, load, captions, set(solved.places if solved else ()))
 
 
 def _write(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -102,7 +102,8 @@ class Video:
             raise UserError(f"{self.path}: holds no pictures; give a video, or a folder of images")
         return container
 
-    def frames(self, longest: int) -> Iterator[SourceFrame]:
+    def frames(self, longest: int, wanted: Container[int] | None = None) -> Iterator[SourceFrame]:
+        """Yield all frames in order, or only the ``wanted`` ones by their index; the others are not converted."""
         from av.error import FFmpegError
 
         with self._opened() as container:
@@ -118,7 +119,8 @@ class Video:
                 for frame in decoded:
                     seconds = float(frame.time) if frame.time is not None else index / self.rate
                     first = seconds if first is None else first
-                    yield SourceFrame(index, seconds - first, _picture(frame, longest, shape), "")
+                    if wanted is None or index in wanted:
+                        yield SourceFrame(index, seconds - first, _picture(frame, longest, shape), "")
                     index += 1
         if index == 0:
             raise UserError(f"{self.path}: no frame can be decoded; save it as .mp4, or give a folder of images")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -53,7 +53,20 @@ class CapturedScene(NamedTuple):
     """[P, 3] uint8"""
 
 
-def pinhole_of(solved: CameraSolution) -> tuple[Pinhole, np.ndarray, np.ndarray]:
+class Calibrated(Protocol):
+    """A camera with COLMAP's model and parameters."""
+
+    @property
+    def model(self) -> str: ...
+    @property
+    def params(self) -> tuple[float, ...]: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+
+
+def pinhole_of(solved: Calibrated) -> tuple[Pinhole, np.ndarray, np.ndarray]:
     """Find the largest pinhole image without empty pixels inside the distorted one. Return its intrinsics, and the
     distorted coordinates of its pixels, x [H, W] and y [H, W] float32 in OpenCV's convention."""
     with quiet() as pycolmap:

@@ -15,8 +15,14 @@ from fuzz.files_cases import Format, check_gaussians, check_numbers, expect, fin
 from helpers.edit_scenes import bar_scene
 from scgs_warp.capture import pipeline
 from scgs_warp.capture.journal import Journal
+from scgs_warp.capture.rig.instants import frame_seconds
+from scgs_warp.capture.rig.sound import MAX_SECONDS as MAX_SOUND
+from scgs_warp.capture.rig.sound import RATE, read_sound
+from scgs_warp.capture.rig.synchronisation import synchronise
 from scgs_warp.capture.source import open_source
 from scgs_warp.data.synthetic import builtin, from_mesh
+from scgs_warp.data.synthetic.films.encoding import write_film
+from scgs_warp.data.synthetic.films.sound import SAMPLE_RATE
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.filming import film_camera
 from scgs_warp.export.captions import read_captions
@@ -184,6 +190,27 @@ def load_captions(folder: Path) -> None:
         expect(cue["to"] > cue["from"] >= 0.0 and bool(cue["text"].strip()), "cue")
 
 
+def write_sounding(folder: Path) -> None:
+    """A film with two seconds of sound, of 30 small pictures."""
+    folder.mkdir()
+    random = np.random.default_rng(0)
+    pictures = [random.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(30)]
+    write_film(folder / "cam0.mp4", pictures, 15.0, 40, random.normal(0, 0.1, 2 * SAMPLE_RATE).astype(np.float32))
+
+
+def load_sounding(folder: Path) -> None:
+    """Read sound and moments as ``apps/capture.py --rig`` does."""
+    seconds = frame_seconds(folder / "cam0.mp4")
+    finite("moments", seconds)
+    expect(seconds.ndim == 1 and len(seconds) > 0 and bool((np.diff(seconds) >= 0).all()), "moments ascend")
+    sound = read_sound(folder / "cam0.mp4")
+    if sound is not None:
+        finite("sound", sound.samples, sound.start)
+        expect(sound.samples.ndim == 1 and len(sound.samples) < 10 * MAX_SOUND * RATE, "length of the sound")
+        starts = synchronise([sound, sound]).starts
+        expect(bool(np.isnan(starts).all() or np.isfinite(starts).all()), "starts")
+
+
 FORMATS = (
     Format("captions", write_captions, load_captions, share=0.5),
     Format("edit", write_edit, load_edit, share=2.5),
@@ -191,4 +218,5 @@ FORMATS = (
     Format("marker", write_markers, load_markers, share=0.3),
     Format("film", write_video, load_source, share=0.7),
     Format("images", write_folder, load_source, share=0.7),
+    Format("sound", write_sounding, load_sounding, share=0.5),
 )

@@ -49,11 +49,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path = folder / FILE
-    rows = read_npy(path)
-    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) < 2:
-        raise UserError(
-            f"{path}: has shape {list(rows.shape)}; give [C, 17] with one row for each of two or more cameras"
-        )
+    rows = read_rows(path)
     cameras = _cameras(folder)
     if len(cameras) != len(rows):
         raise UserError(
@@ -73,8 +69,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
                 f"{cameras[index]}: holds {len(files[index])} images, but {cameras[held_out].name} "
                 f"{len(files[held_out])}; all cameras need the same instants"
             )
-        viewmat = _viewmat(path, index, rows[index, :15].reshape(3, 5))
-        lens = partial(_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4])
+        viewmat = row_viewmat(path, index, rows[index, :15].reshape(3, 5))
+        lens = partial(row_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4])
         last = max(len(files[index]) - 1, 1)
         for instant, file in enumerate(files[index]):
             records.append(
@@ -85,6 +81,20 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     data = assemble(frames, options, folder=folder, split=split, notes=choice.notes)
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     return data if points is None else with_points(data, *read_points(points))
+
+
+def read_rows(path: Path) -> np.ndarray:
+    """Read the rows [C, 17] of ``poses_bounds.npy``.
+
+    Raises:
+        UserError: the file is missing, damaged or has another shape.
+    """
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) < 2:
+        raise UserError(
+            f"{path}: has shape {list(rows.shape)}; give [C, 17] with one row for each of two or more cameras"
+        )
+    return rows
 
 
 def _label(folder: Path, camera: Path) -> str:
@@ -105,10 +115,9 @@ def _cameras(folder: Path) -> list[Path]:
         return cameras
     videos = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in VIDEOS)
     if videos:
-        stem = Path(videos[0]).stem
         raise UserError(
-            f"{folder / videos[0]}: a video, not images; unpack each, for example: mkdir -p {folder / stem}/images && "
-            f"ffmpeg -i {folder / videos[0]} {folder / stem}/images/%04d.png"
+            f"{folder / videos[0]}: a video, not images; unpack all of them: python apps/capture.py --rig {folder} "
+            f"--output {folder}-images"
         )
     raise UserError(f"{base}: no folder of images for any camera; put them into cam00/images, cam01/images, ...")
 
@@ -118,7 +127,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(files, key=lambda p: natural(p.name))
 
 
-def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
+def row_viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4], OpenCV, of a row of the file."""
     down, right, backwards, position = pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3]
     rotation = np.stack([right, down, -backwards])
@@ -129,7 +138,7 @@ def _viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:
     return viewmat
 
 
-def _lens(path: Path, index: int, column: np.ndarray, source: tuple[int, int]) -> Lens:
+def row_lens(path: Path, index: int, column: np.ndarray, source: tuple[int, int]) -> Lens:
     """Return the lens of images, which may be smaller than the images of the calibration."""
     height, width, focal = column
     if min(height, width, focal) < 1:

@@ -49,7 +49,7 @@ def test_videos_are_to_be_unpacked(tmp_path):
         for file in (tmp_path / f"cam{camera:02d}/images").iterdir():
             file.unlink()
         (tmp_path / f"cam{camera:02d}.mp4").write_bytes(b"film")
-    with pytest.raises(UserError, match=r"cam00\.mp4: a video, not images; .*ffmpeg -i"):
+    with pytest.raises(UserError, match=r"cam00\.mp4: a video, not images; .*capture\.py --rig"):
         load(tmp_path)
 
 

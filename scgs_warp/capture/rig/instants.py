@@ -1,0 +1,125 @@
+"""One time line for all cameras of a rig: instants within the time that all of them recorded, and the frames nearest to
+them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import UserError
+
+SAME_MOMENT = 0.08
+"""Difference from an instant, as a share of the time between two frames, that is attributed to the error of the
+synchronisation: the frame then belongs to the instant itself."""
+MAX_SECONDS, MAX_RATE = 1e9, 1e6
+"""Largest plausible length of a film, and largest plausible number of frames per second."""
+MIN_INSTANTS = 6
+RIG_INSTANTS = 150
+"""Number of instants unless the user gives one."""
+
+
+@dataclass(frozen=True)
+class TimeLine:
+    """Frames of C cameras at T instants."""
+
+    seconds: np.ndarray
+    """[T] instants on the common clock, from 0."""
+    frames: np.ndarray
+    """[C, T] index of each camera's nearest frame."""
+    moments: np.ndarray
+    """[C, T] second at which that frame was taken."""
+
+    @property
+    def times(self) -> np.ndarray:
+        """[C, T] moments scaled to go from 0 at the first instant to 1 at the last."""
+        span = max(float(self.seconds[-1] - self.seconds[0]), 1e-9)
+        return ((self.moments - self.seconds[0]) / span).clip(0.0, 1.0)
+
+
+def frame_seconds(path: Path) -> np.ndarray:
+    """Return the moments [V] of a video's frames in seconds, counted from the first one; no picture is decoded.
+
+    Raises:
+        UserError: the file is no video.
+    """
+    import av
+    from av.error import FFmpegError
+
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise UserError(f"{path}: holds no pictures; take it out of the folder")
+            stream: Any = container.streams.video[0]
+            rate = float(stream.average_rate or 30)
+            stamps = [packet.pts for packet in container.demux(stream) if packet.size]
+            unit = float(stream.time_base)
+    except (FFmpegError, OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or type(error).__name__
+        raise UserError(f"{path}: is not a video that decodes ({reason}); save it as .mp4, or take it out") from None
+    known = sorted(stamp for stamp in stamps if stamp is not None)
+    if not stamps or not 0.0 < rate < MAX_RATE:
+        raise UserError(f"{path}: holds no frame that can be timed; save it as .mp4, or take it out")
+    if len(known) != len(stamps):
+        return np.arange(len(stamps)) / rate
+    seconds = (np.array(known, np.float64) - known[0]) * unit
+    if not np.isfinite(seconds).all() or seconds[-1] > MAX_SECONDS:
+        raise UserError(f"{path}: its frames are {seconds[-1]:g} seconds apart; save it as .mp4, or take it out")
+    return seconds
+
+
+def time_line(
+    names: Sequence[str],
+    starts: Sequence[float],
+    own: Sequence[np.ndarray],
+    count: int | None,
+    begin: float | None = None,
+    end: float | None = None,
+) -> TimeLine:
+    """Choose instants and frames.
+
+    Instants are moments of frames of the first camera, evenly spread.
+
+    Args:
+        names: names of the cameras, for the message.
+        starts: seconds at which the cameras begin.
+        own: moments of each camera's frames, counted from its first frame.
+        count: number of instants; None: ``RIG_INSTANTS``, or all frames if there are fewer.
+        begin, end: part of the common time to use, counted from the moment at which all cameras record.
+
+    Raises:
+        UserError: the cameras have too little time in common.
+    """
+    moments = [start + seconds for start, seconds in zip(starts, own)]
+    first, last = max(own[0] for own in moments), min(own[-1] for own in moments)
+    if first >= last:
+        late, early = (int(np.argmax([m[0] for m in moments])), int(np.argmin([m[-1] for m in moments])))
+        raise UserError(
+            f"{names[late]} begins when {names[early]} has ended; take one of them out, or correct --offsets"
+        )
+    low = first + (begin or 0.0)
+    high = last if end is None else min(last, first + end)
+    slack = SAME_MOMENT * float(np.median(np.diff(own[0]))) if len(own[0]) > 1 else 0.0
+    reference = moments[0][(moments[0] >= low - slack) & (moments[0] <= high + slack)]
+    if len(reference) < MIN_INSTANTS:
+        raise UserError(
+            f"the cameras have {len(reference)} frames in common ({max(high - low, 0.0):.2f} s); give longer videos, "
+            "or correct --offsets, --start and --end"
+        )
+    wanted = min(count or RIG_INSTANTS, len(reference))
+    chosen = reference[np.round(np.linspace(0, len(reference) - 1, wanted)).astype(int)]
+    interval = float(np.median(np.diff(reference)))
+    frames = np.stack([_nearest(own, chosen) for own in moments])
+    taken = np.stack([own[index] for own, index in zip(moments, frames)])
+    taken = np.where(np.abs(taken - chosen) <= SAME_MOMENT * interval, chosen, taken)
+    return TimeLine(chosen - chosen[0], frames, taken - chosen[0])
+
+
+def _nearest(moments: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the index [T] of the moment nearest to each wanted one."""
+    after = np.searchsorted(moments, wanted).clip(0, len(moments) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(moments[before] - wanted) <= np.abs(moments[after] - wanted), before, after)

@@ -1,0 +1,399 @@
+"""Stages of a rig's capture: sound, frames, still pictures, cameras, points, undistorted images."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import shutil
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from ...data.natural_order import natural
+from ...errors import UserError
+from ...runtime.progress import progress
+from ...storage.json_files import as_number
+from ...visualization.video import write_png
+from .. import features, pictures
+from ..features import CameraModel, FrameFiles
+from ..journal import Journal
+from ..source import Video, read_rgb
+from ..writing import FILE
+from . import cameras, still, synchronisation
+from .instants import TimeLine, frame_seconds, time_line
+from .neural_video import POSES, known_cameras, write_neural_video
+from .points import points_at
+from .sound import read_sound
+from .writing import write_rig
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
+FEWEST_CAMERAS = 2
+SHEET = "contact_sheet.png"
+
+ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
+
+
+@dataclass(frozen=True)
+class RigRequest:
+    """Settings of a rig's capture."""
+
+    folder: Path
+    """Folder with one video per camera."""
+    frames: int | None = None
+    """Number of instants; None: at most ``instants.RIG_INSTANTS``."""
+    start: float | None = None
+    end: float | None = None
+    """Part of the common time to use, in seconds from the moment at which all cameras record."""
+    offsets: tuple[float, ...] | None = None
+    """Seconds at which the videos begin, in the order of their names, or one number for all; None: found by sound."""
+    size: int = 1280
+    """Largest size of the longer side of the images, pixels."""
+    lens: Literal["auto", "shared", "each"] = "auto"
+    """``shared``: one lens for all cameras; ``each``: its own for each; ``auto``: shared if sizes are equal."""
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    fov: float | None = None
+    """Horizontal field of view, degrees; None if unknown."""
+    features: int = 4096
+    least: float = 0.5
+    """Smallest share of the cameras that must be found."""
+    held_out: str | None = None
+    """Name of the camera that is held out; None: the first."""
+    seed: int = 0
+
+
+class RigResult(NamedTuple):
+    """Result of a rig's capture."""
+
+    names: list[str]
+    starts: list[float]
+    """Seconds at which the cameras begin, the earliest at 0."""
+    registered: list[str]
+    """Names of the cameras that were found."""
+    held_out: str
+    lines: list[str]
+    """Description of the result, for the user."""
+    made_before: bool
+
+
+def videos_of(folder: Path) -> list[Path]:
+    """Return the videos of a rig, in the natural order of their names.
+
+    Raises:
+        UserError: there are too few.
+    """
+    if not folder.is_dir():
+        raise UserError(f"--rig {folder}: no such folder; give the folder that holds one video per camera")
+    found = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()]
+    files = sorted((path for path in found if not path.name.startswith(".")), key=lambda path: natural(path.name))
+    if len(files) < FEWEST_CAMERAS:
+        raise UserError(
+            f"--rig {folder}: holds {len(files)} videos ({', '.join(VIDEO_SUFFIXES)}); give one video per camera, at "
+            f"least {FEWEST_CAMERAS}"
+        )
+    stems = [path.stem for path in files]
+    twice = next((name for name in stems if stems.count(name) > 1), None)
+    if twice is not None:
+        raise UserError(f"--rig {folder}: two videos are called {twice}; give each camera its own name")
+    return files
+
+
+def check(request: RigRequest, names: list[str]) -> None:
+    """Check the values of a request.
+
+    Raises:
+        UserError: naming the option, its value and the remedy.
+    """
+    if request.frames is not None and request.frames < 6:
+        raise UserError(f"--frames {request.frames}: give at least 6")
+    if not 64 <= request.size <= 8192:
+        raise UserError(f"--size {request.size}: give 64 to 8192 pixels")
+    if request.fov is not None and not 5.0 <= request.fov <= 170.0:
+        raise UserError(f"--fov {request.fov:g}: give 5 to 170 degrees")
+    if not 64 <= request.features <= 32768:
+        raise UserError(f"--features {request.features}: give 64 to 32768")
+    if not 0.0 <= request.least <= 1.0:
+        raise UserError(f"--least {request.least:g}: give a share from 0 to 1")
+    begin, end = request.start or 0.0, math.inf if request.end is None else request.end
+    if not 0.0 <= begin < end:
+        raise UserError(f"--start {begin:g} --end {end:g}: give two seconds of the common time, the earlier one first")
+    if not 0 <= request.seed < 2**31:
+        raise UserError(f"--seed {request.seed}: give 0 or more")
+    if request.offsets is not None:
+        if len(request.offsets) not in (1, len(names)):
+            raise UserError(
+                f"--offsets: {len(request.offsets)} numbers for {len(names)} videos ({', '.join(names)}); give one for "
+                "each, or a single 0 if all begin at once"
+            )
+        if not all(math.isfinite(value) and abs(value) < 1e6 for value in request.offsets):
+            raise UserError("--offsets: give seconds")
+    if request.held_out is not None and request.held_out not in names:
+        raise UserError(f"--held-out {request.held_out}: the cameras are {', '.join(names)}; name one of them")
+
+
+def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show: ShowProgress = progress) -> RigResult:
+    """Make the data set in ``folder``, or resume an interrupted attempt.
+
+    A folder in the layout of Neural 3D Video (``poses_bounds.npy`` beside the videos) keeps its cameras, and is written
+    in this layout again, with images and points.
+
+    Args:
+        device: device of the comparison of descriptors.
+        show: ``show(total, text)`` is a context manager that shows progress; its value has ``advance()``.
+
+    Raises:
+        UserError: a video or an option is invalid, or too few cameras were found.
+    """
+    files = videos_of(request.folder)
+    names = [file.stem for file in files]
+    check(request, names)
+    known = known_cameras(request.folder, files)
+    rig = _Rig(request, folder, files, FILE if known is None else POSES, device, show)
+    before = rig.journal.finished
+    rig.journal.start()
+    starts = [0.0] * len(files) if known is not None and request.offsets is None else rig.starts()
+    line = rig.frames(starts, everything=known is not None)
+    if known is not None:
+        if not before:
+            found = rig.points(known.cameras(rig.size_of))
+            write_neural_video(folder, request.folder, names, len(line.seconds), rig.picture_file, found, show)
+        lines = [rig.describe(line), f"cameras of {request.folder.name}/poses_bounds.npy"]
+        return RigResult(names, starts, names, names[0], lines, before)
+    solved = rig.cameras(len(line.seconds))
+    missing = [name for number, name in enumerate(names) if number not in solved.cameras]
+    rig.enough(solved, missing)
+    held_out = request.held_out or names[min(solved.cameras)]
+    if held_out in missing:
+        raise UserError(f"--held-out {held_out}: its pose was not found; hold out another camera")
+    lines = [rig.describe(line), rig.describe_clock(starts)]
+    lines += [f"note: {', '.join(missing)} shares too little with the others and is left out"] if missing else []
+    lines += rig.unsteady()
+    if not before:
+        extra = rig.points(solved.cameras)
+        scene = write_rig(folder, solved, extra, names, line, held_out, rig.picture, show)
+        pictures.cameras(folder / "cameras.png", scene)
+    return RigResult(names, starts, [n for n in names if n not in missing], held_out, lines, before)
+
+
+class _Rig:
+    """A rig in work."""
+
+    def __init__(
+        self, request: RigRequest, folder: Path, files: list[Path], marker: str, device: str, show: ShowProgress
+    ) -> None:
+        """
+        Args:
+            marker: file whose presence marks a finished folder.
+        """
+        self.request, self.folder, self.files = request, folder, files
+        self.names = [file.stem for file in files]
+        self.device, self.show = device, show
+        self.videos = [Video(file) for file in files]
+        digest = hashlib.sha256("".join(video.digest() for video in self.videos).encode()).hexdigest()
+        self.journal = Journal(folder, digest, marker)
+        self.work = self.journal.work
+
+    def starts(self) -> list[float]:
+        """Return the seconds at which the cameras begin: the given ones, or those found by sound."""
+        given = self.request.offsets
+        if given is not None:
+            begins = np.broadcast_to(np.array(given, np.float64), len(self.files))
+            return (begins - begins.min()).tolist()
+        stored = self.journal.stage("sound", None, self._listen, lambda: None)
+        found = [as_number(value) for value in stored.get("starts", [])] if isinstance(stored, dict) else []
+        if len(found) != len(self.files) or any(value is None or abs(value) > 1e9 for value in found):
+            raise self.journal.damaged("sound")
+        return [value for value in found if value is not None]
+
+    def _listen(self) -> dict[str, Any]:
+        with self.show(len(self.files), "listening") as bar:
+            sounds = []
+            for file in self.files:
+                sounds.append(read_sound(file))
+                bar.advance()
+        silent = [file.name for file, sound in zip(self.files, sounds) if sound is None]
+        if silent:
+            raise UserError(
+                f"{silent[0]}: has no sound to synchronise by; give --offsets, the second at which each video begins, "
+                "or --offsets 0 if all begin at once"
+            )
+        clock = synchronisation.synchronise(sounds)
+        lost = [file.name for file, start in zip(self.files, clock.starts) if not np.isfinite(start)]
+        if lost:
+            raise UserError(
+                f"{', '.join(lost)}: its sound matches that of no other camera; give --offsets, or take it out"
+            )
+        return {"starts": clock.starts.tolist(), "disagreement": clock.disagreement}
+
+    def describe_clock(self, starts: list[float]) -> str:
+        """Say how the cameras were synchronised."""
+        if self.request.offsets is not None:
+            return "begins as given by --offsets"
+        stored = self.journal.result("sound")
+        begins = ", ".join(f"{name} {start:.3f}" for name, start in zip(self.names, starts))
+        off = as_number(stored.get("disagreement")) or 0.0
+        return f"begins by sound, in seconds: {begins}; pairs of cameras disagree by {1000 * off:.1f} ms"
+
+    def frames(self, starts: list[float], everything: bool) -> TimeLine:
+        """Choose the instants, and write each camera's frames."""
+        request, folder = self.request, self.work / "frames"
+        own = [frame_seconds(file) for file in self.files]
+        count = len(own[0]) if everything and request.frames is None else request.frames
+        line = time_line(self.names, starts, own, count, request.start, request.end)
+
+        def make() -> bool:
+            folder.mkdir(exist_ok=True)
+            with self.show(line.frames.size, "writing frames") as bar:
+                for camera, video in enumerate(self.videos):
+                    self._unpack(video, camera, line, bar)
+            return True
+
+        settings = [request.start, request.end, count, request.size, [round(start, 6) for start in starts]]
+        self.journal.stage("frames", settings, make, lambda: shutil.rmtree(folder, ignore_errors=True))
+        return line
+
+    def _unpack(self, video: Video, camera: int, line: TimeLine, bar: Any) -> None:
+        wanted: dict[int, list[int]] = {}
+        for instant, index in enumerate(line.frames[camera].tolist()):
+            wanted.setdefault(index, []).append(instant)
+        left = len(line.seconds)
+        for frame in video.frames(self.request.size, wanted):
+            for instant in wanted[frame.index]:
+                write_png(self.picture_file(camera, instant), frame.image)
+                left -= 1
+                bar.advance()
+            if left == 0:
+                return
+        raise UserError(f"{video.path}: ends before its last frame; save it again, or give an earlier --end")
+
+    def picture_file(self, camera: int, instant: int) -> Path:
+        """Return the file of a camera's frame."""
+        return self.work / "frames" / f"{self.names[camera]}_{instant:05d}.png"
+
+    def picture(self, camera: int, instant: int) -> np.ndarray:
+        """Read a camera's frame [H, W, 3] uint8 RGB, as recorded."""
+        return read_rgb(self.picture_file(camera, instant))
+
+    def size_of(self, camera: int) -> tuple[int, int]:
+        """Return (width, height) of a camera's frames."""
+        height, width = self.picture(camera, 0).shape[:2]
+        return width, height
+
+    def _stills(self, count: int) -> FrameFiles:
+        """Make one picture per camera in which nothing moves, and its mask, of ``count`` instants."""
+        folder, masks = self.work / "stills", self.work / "still_masks"
+
+        def make() -> dict[str, Any]:
+            folder.mkdir(exist_ok=True)
+            masks.mkdir(exist_ok=True)
+            shares, shifts = [], []
+            with self.show(len(self.files), "finding what stands still") as bar:
+                for camera, name in enumerate(self.names):
+                    some = np.unique(np.linspace(0, count - 1, min(count, still.MOST_MOMENTS)).round().astype(int))
+                    made = still.still_of([self.picture(camera, int(instant)) for instant in some])
+                    write_png(folder / f"{name}.png", made.image)
+                    mask = np.where(made.moves, 0, 255).astype(np.uint8)
+                    write_png(masks / f"{name}.png", np.repeat(mask[..., None], 3, 2))
+                    shares.append(float(made.moves.mean()))
+                    shifts.append(made.shift)
+                    bar.advance()
+            return {"moves": shares, "shifts": shifts}
+
+        def clear() -> None:
+            shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(masks, ignore_errors=True)
+
+        self.journal.stage("stills", None, make, clear)
+        return FrameFiles(folder, [f"{name}.png" for name in self.names], masks)
+
+    def cameras(self, instants: int) -> cameras.RigSolution:
+        """Find the cameras with COLMAP, from pictures of ``instants`` moments."""
+        request, stills = self.request, self._stills(instants)
+        database, model = self.work / "database.db", self.work / "model"
+        count, chosen = len(self.names), cameras.pairs_of(len(self.names))
+        sizes = {self.size_of(camera) for camera in range(count)}
+        shared = request.lens == "shared" or (request.lens == "auto" and len(sizes) == 1)
+        if shared and len(sizes) > 1:
+            raise UserError("--lens shared: the videos have different sizes; give --lens each")
+        width = self.size_of(0)[0]
+        focal = None if request.fov is None else 0.5 * width / math.tan(math.radians(request.fov) / 2)
+
+        def find() -> None:
+            features.begin(database, stills, request.camera_model, focal, shared)
+            with self.show(count, "features") as bar:
+                features.extract(database, stills, request.features, bar.advance)
+
+        def compare() -> None:
+            with self.show(len(chosen), "matching") as bar:
+                features.match(database, stills, chosen, request.seed, self.device, bar.advance)
+
+        settings = [request.camera_model, request.fov, request.features, shared]
+        self.journal.stage("features", settings, find, lambda: database.unlink(missing_ok=True))
+        self.journal.stage("matches", request.seed, compare, lambda: features.forget(database))
+        with self.show(1, "cameras") as bar:
+            self.journal.stage(
+                "cameras",
+                request.seed,
+                lambda: cameras.solve(database, stills, model, request.seed),
+                lambda: shutil.rmtree(model, ignore_errors=True),
+            )
+            bar.advance()
+        solved = cameras.read_solution(model, stills.names)
+        self._draw(stills, set(solved.cameras) if solved else set())
+        if solved is None:
+            raise UserError(self._nothing_found(database, stills))
+        return solved
+
+    def _nothing_found(self, database: Path, stills: FrameFiles) -> str:
+        links = features.links(database, stills)
+        return (
+            f"{self.folder}: no two cameras see enough in common ({links.features} features a camera, {links.inliers} "
+            "matches between neighbours); put cameras closer together (at most 20 degrees apart), or show them more "
+            "texture; contact_sheet.png shows what each camera sees"
+        )
+
+    def _draw(self, stills: FrameFiles, registered: set[int]) -> None:
+        if self.journal.finished:
+            return
+        assert stills.masks is not None
+        masks = stills.masks
+
+        def load(k: int) -> tuple[np.ndarray, np.ndarray]:
+            return read_rgb(stills.folder / stills.names[k]), read_rgb(masks / stills.names[k])[..., 0] < 128
+
+        pictures.sheet(self.folder / SHEET, load, self.names, registered)
+
+    def enough(self, solved: cameras.RigSolution, missing: list[str]) -> None:
+        """Refuse a solution with too few cameras."""
+        found = len(solved.cameras)
+        if found < max(self.request.least * len(self.names), FEWEST_CAMERAS):
+            raise UserError(
+                f"{self.folder}: {found} of {len(self.names)} cameras found; {', '.join(missing)} shares too little "
+                "with the others: put cameras closer together, or show them more texture; --least "
+                f"{math.floor(100 * found / len(self.names)) / 100:g} takes it as it is (finished work is kept; the "
+                "same command continues from it)"
+            )
+
+    def points(self, known: dict[int, cameras.RigCamera]) -> tuple[np.ndarray, np.ndarray]:
+        """Triangulate what the cameras see at the first instant."""
+        first = {number: self.picture(number, 0) for number in known}
+        total = len(known) + len(known) * (len(known) - 1) // 2
+        with self.show(total, "points") as bar:
+            return points_at(first, known, self.request.features, self.device, bar.advance)
+
+    def describe(self, line: TimeLine) -> str:
+        """Describe the time line."""
+        length = float(line.seconds[-1])
+        return (
+            f"{len(self.names)} cameras, {len(line.seconds)} instants within {length:.2f} s that all of them recorded"
+        )
+
+    def unsteady(self) -> list[str]:
+        """Name the cameras that do not stand still."""
+        stored = self.journal.result("stills")
+        shifts = stored.get("shifts", []) if isinstance(stored, dict) else []
+        moved = [n for n, shift in zip(self.names, shifts) if (as_number(shift) or 0.0) > still.MAX_SHIFT]
+        return [f"note: {', '.join(moved)} moved while recording; each camera of a rig gets one pose"] if moved else []

@@ -1,0 +1,61 @@
+"""One time line: common time, nearest frames, their own moments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scgs_warp.capture.rig.instants import frame_seconds, time_line
+from scgs_warp.data.synthetic.films.encoding import write_film
+from scgs_warp.errors import UserError
+
+NAMES = ("a", "b", "c")
+
+
+def test_frames_are_those_nearest_to_common_instants():
+    own = np.arange(60) / 30
+    starts = [0.0, 0.213, 0.05]
+    line = time_line(NAMES, starts, [own] * 3, None)
+    assert line.frames.shape == (3, len(line.seconds)) and line.seconds[0] == 0
+    first = np.ceil(0.213 * 30) / 30
+    for camera, start in enumerate(starts):
+        true = start + own[line.frames[camera]] - first
+        assert np.abs(true - line.seconds).max() <= 0.5 / 30 + 1e-9
+        assert np.abs(true - line.moments[camera]).max() < 0.08 / 30 + 1e-9
+    assert (line.moments[0] == line.seconds).all() and (np.abs(line.moments[1] - line.seconds) > 1e-3).all()
+    assert line.times.min() == 0 and line.times.max() == 1
+
+
+def test_locked_cameras_share_their_moments():
+    own = np.arange(40) / 25
+    line = time_line(NAMES, [0.0, 0.0012, 0.2001], [own] * 3, None)
+    assert (line.moments == line.seconds).all()
+
+
+def test_part_and_number_of_instants():
+    own = np.arange(300) / 30
+    line = time_line(NAMES, [0.0, 0.0, 0.0], [own] * 3, 20, 2.0, 4.0)
+    assert len(line.seconds) == 20 and line.seconds[-1] == pytest.approx(2.0, abs=0.04)
+    assert line.frames[0, 0] == 60
+    assert len(time_line(NAMES, [0.0] * 3, [own] * 3, None).seconds) == 150
+
+
+def test_cameras_of_different_rates():
+    line = time_line(NAMES[:2], [0.0, 0.01], [np.arange(60) / 30, np.arange(100) / 50], None)
+    assert np.abs(line.moments[1] - line.seconds).max() <= 0.5 / 50 + 1e-9
+
+
+def test_no_time_in_common_is_said():
+    own = np.arange(30) / 30
+    with pytest.raises(UserError, match="b begins when a has ended"):
+        time_line(NAMES[:2], [0.0, 5.0], [own, own], None)
+    with pytest.raises(UserError, match="3 frames in common"):
+        time_line(NAMES[:2], [0.0, 0.9], [own, own], None)
+
+
+def test_moments_of_a_film(tmp_path):
+    write_film(tmp_path / "film.mp4", [np.full((64, 64, 3), k * 8, np.uint8) for k in range(20)], 12.5, 20, None)
+    np.testing.assert_allclose(frame_seconds(tmp_path / "film.mp4"), np.arange(20) / 12.5, atol=1e-6)
+    (tmp_path / "text.mp4").write_text("no film")
+    with pytest.raises(UserError, match="not a video"):
+        frame_seconds(tmp_path / "text.mp4")

@@ -1,0 +1,187 @@
+"""A rig's capture as a whole: films of cameras that begin at different moments become a folder that trains."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.rigs import FPS, RigFilms, film_rig, write_poses_bounds
+from scgs_warp.apps import capture as app
+from scgs_warp.capture import RigRequest, capture_rig
+from scgs_warp.capture.rig import pipeline
+from scgs_warp.capture.rig.points import points_at
+from scgs_warp.capture.similarity import align, centres
+from scgs_warp.data import load
+from scgs_warp.data.synthetic.films.encoding import write_film
+from scgs_warp.errors import UserError
+
+LATE = [4, 0, 2, 7, 1, 10]
+"""Frames by which the cameras begin late: up to half a second."""
+COUNT = 18
+
+
+@contextmanager
+def silent(total: int, text: str):
+    """No progress, but it is counted."""
+    counted = SimpleNamespace(done=0, total=total)
+
+    def advance(count: int = 1) -> None:
+        counted.done += count
+
+    counted.advance = advance
+    yield counted
+    assert counted.done <= total, text
+
+
+def run(films: Path, folder: Path, **options):
+    return capture_rig(RigRequest(films, **options), folder, show=silent)
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory) -> RigFilms:
+    return film_rig(tmp_path_factory.mktemp("rigs") / "rig", LATE, COUNT)
+
+
+@pytest.fixture(scope="module")
+def captured(films, tmp_path_factory) -> Path:
+    """Interrupted before the cameras, then finished."""
+    folder = tmp_path_factory.mktemp("captures") / "rig"
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(pipeline.cameras, "solve", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(films.folder, folder)
+    patch.undo()
+    assert not (folder / "transforms.json").exists()
+    made = run(films.folder, folder)
+    assert len(made.registered) == 6 and made.held_out == "cam0" and not made.made_before
+    assert np.abs(np.array(made.starts) - films.starts).max() < 0.5 / FPS / 5
+    return folder
+
+
+def test_cameras_are_where_they_were(films, captured):
+    content = json.loads((captured / "transforms.json").read_text())
+    views = {f["camera"]: np.linalg.inv(np.array(f["transform_matrix"]) @ np.diag([1, -1, -1, 1.0]))
+             for f in content["frames"]}  # fmt: skip
+    found = np.stack([views[f"cam{index}"] for index in range(6)])
+    fit = align(centres(found), centres(films.viewmats))
+    error = np.linalg.norm(centres(fit.viewmats(found)) - centres(films.viewmats), axis=1)
+    assert error.max() < 0.12
+    # The centres lie almost on a line, about which they leave the rotation open: compare the cameras with each other.
+    turns = [views[1:, :3, :3] @ views[0, :3, :3].T for views in (found, films.viewmats)]
+    traces = np.einsum("vij,vij->v", *turns)
+    assert np.degrees(np.arccos(((traces - 1) / 2).clip(-1, 1))).max() < 3.0
+
+
+def test_the_folder_trains_with_one_camera_held_out(films, captured):
+    """All cameras are on one time line, and points lie on the figure, too."""
+    train, test = load(captured), load(captured, "test")
+    common = COUNT - max(LATE)
+    assert len(train) == 5 * common and len(test) == common
+    assert {frame.name.split("_")[0] for frame in test.entries} == {"cam0"}
+    assert sorted(set(test.times.tolist())) == pytest.approx(np.linspace(0, 1, common).tolist(), abs=1e-6)
+    counts = torch.unique(train.times, return_counts=True)[1]
+    assert counts.tolist() == [5] * common, "frames of one instant share its time"
+    assert train.points is not None and train.colors is not None and len(train.points) > 300
+
+
+def test_frames_are_those_of_the_same_moment(films, captured):
+    """Frame 0 of the time line is the first that the latest camera recorded."""
+    content = json.loads((captured / "transforms.json").read_text())
+    seconds = sorted({round(frame["seconds"], 4) for frame in content["frames"]})
+    np.testing.assert_allclose(seconds, np.arange(COUNT - max(LATE)) / FPS, atol=1e-3)
+
+
+def test_a_finished_capture_is_left_alone(films, captured):
+    before = (captured / "transforms.json").stat().st_mtime_ns
+    assert run(films.folder, captured).made_before
+    with pytest.raises(UserError, match="finished capture, made with other settings"):
+        run(films.folder, captured, size=200)
+    assert (captured / "transforms.json").stat().st_mtime_ns == before
+
+
+def test_videos_of_neural_3d_video_are_unpacked(films, tmp_path, capsys):
+    """With cameras of their own, all begin at once; the reader loads what comes of it, with points."""
+    source = tmp_path / "scene"
+    shutil.copytree(films.folder, source)
+    write_poses_bounds(films._replace(folder=source), 320, 180)
+    with pytest.raises(UserError, match=r"capture\.py --rig"):
+        load(source)
+    assert app.cli(["--rig", str(source), "--output", str(tmp_path / "images"), "--device", "cpu"]) == 0
+    assert "6 of 6 cameras, cam0 held out" in capsys.readouterr().out
+    train, test = load(tmp_path / "images"), load(tmp_path / "images", "test")
+    assert len(test) == COUNT and len(train) == 5 * COUNT
+    np.testing.assert_allclose(test.entries[0].camera.viewmat.numpy(), films.viewmats[0], atol=1e-5)
+    assert train.points is not None and len(train.points) > 150
+    points = train.points.numpy()
+    on_floor_or_above = points[:, 2] > films.floor - 0.15
+    assert on_floor_or_above.mean() > 0.95 and (np.abs(points) < 4.6).all(1).mean() > 0.95
+    assert run(source, tmp_path / "images").made_before
+
+
+def test_points_lie_where_the_rays_meet():
+    """The same picture in two cameras of a flat wall: exact positions."""
+    from scgs_warp.capture.rig.cameras import RigCamera
+
+    rng = np.random.default_rng(0)
+    wall = np.kron(rng.integers(0, 255, (45, 80, 3)), np.ones((4, 4, 1))).astype(np.uint8)
+    cameras = {}
+    for number, x in enumerate((0.0, 0.5)):
+        viewmat = np.eye(4)
+        viewmat[0, 3] = -x
+        cameras[number] = RigCamera("PINHOLE", (300.0, 300.0, 160.0, 90.0), 320, 180, viewmat)
+    pictures = {0: wall, 1: np.roll(wall, -60, axis=1)}  # 300 px x 0.5 / 2.5
+    points, colors = points_at(pictures, cameras, 1000)
+    assert len(points) > 50 and colors.dtype == np.uint8
+    assert np.median(np.abs(points[:, 2] - 2.5)) < 0.02
+
+
+# What cannot work is said in one line
+
+
+def test_mistakes_are_named(films, tmp_path, capsys):
+    folder = str(films.folder)
+    for arguments, words in (
+        ([], "neither VIDEO nor --rig"),
+        ([f"{folder}/cam0.mp4", "--rig", folder], "both VIDEO and --rig"),
+        ([f"{folder}/cam0.mp4", "--offsets", "0"], "--offsets: is for --rig"),
+        (["--rig", folder, "--offsets", "0", "1"], "2 numbers for 6 videos"),
+        (["--rig", folder, "--held-out", "cam9"], "--held-out cam9"),
+        (["--rig", folder, "--frames", "2"], "--frames 2"),
+        (["--rig", str(tmp_path)], "holds 0 videos"),
+        (["--rig", str(tmp_path / "none")], "no such folder"),
+    ):
+        assert app.cli([*arguments, "--output", str(tmp_path / "out"), "--device", "cpu"]) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1, error
+    assert not (tmp_path / "out").exists()
+
+
+def test_rows_and_videos_must_match(films, tmp_path):
+    source = tmp_path / "scene"
+    shutil.copytree(films.folder, source)
+    write_poses_bounds(films._replace(folder=source, viewmats=films.viewmats[:4]), 320, 180)
+    with pytest.raises(UserError, match=r"4 rows, but .* holds 6 videos"):
+        run(source, tmp_path / "out")
+
+
+def test_silent_films_and_blank_films(tmp_path):
+    source = tmp_path / "mute"
+    source.mkdir()
+    for index in range(3):
+        write_film(source / f"cam{index}.mp4", [np.full((64, 96, 3), 100, np.uint8)] * 10, 10.0, 20, None)
+    with pytest.raises(UserError, match=r"cam0\.mp4: has no sound .*--offsets 0"):
+        run(source, tmp_path / "out")
+    with pytest.raises(UserError, match="no two cameras see enough in common"):
+        run(source, tmp_path / "blank", offsets=(0.0,))
+    assert (tmp_path / "blank/contact_sheet.png").exists()
