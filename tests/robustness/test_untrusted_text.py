@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 from fuzz.files_runs import write_model
-from helpers.edit_scenes import bar_scene
 from helpers.nerfstudio_files import write as write_nerfstudio
 from scgs_warp.ablation.cells import read_metrics
 from scgs_warp.ablation.zoo import read_table
 from scgs_warp.apps import train
 from scgs_warp.data import load
 from scgs_warp.data.readers.transforms import read_transforms
-from scgs_warp.edit import EditSession
+from scgs_warp.edit.field_reader import read_object
 from scgs_warp.errors import UserError
 from scgs_warp.scene.scene import Scene
 from scgs_warp.visualization.figures import read_log
@@ -36,7 +35,7 @@ def refusal(action: Callable[[], object], *words: str) -> None:
 
 JSON_READERS: dict[str, Any] = {
     "config.json": (lambda path: train.cli(["--config", str(path), "--output", str(path.parent / "out")]), "--config"),
-    "edit.json": (lambda path: EditSession(bar_scene(nodes=12, gaussians=30)).load(path), "--script"),
+    "edit.json": (read_object, "--script"),
     "transforms.json": (read_transforms, "a data set"),
     "zoo.json": (lambda path: read_table(path.parent), "--compare"),
     "metrics.json": (lambda path: read_metrics(path.parent), "a cell"),
