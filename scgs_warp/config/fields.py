@@ -215,10 +215,10 @@ class DensifyConfig:
     """Visibility pruning, before each opacity reset and at the end of densification: remove Gaussians that contribute
     less than this many pixels to every sampled view (sum of blending weights, at the size of the training images). 0:
     off."""
-    least_views: int = newer(1, before=1, least=1, most=1_000)
+    least_views: int = newer(2, before=1, least=1, most=1_000)
     """Visibility pruning without alpha: also remove Gaussians that contribute ``min_contribution`` to fewer views than
     this, if all views are sampled: they explain one photo and hide the scene from others. 1: off."""
-    clear_distance: float = newer(0.0, before=0.0, least=0, most=1)
+    clear_distance: float = newer(0.25, before=0.0, least=0, most=1)
     """Visibility pruning without alpha: also remove Gaussians that a view sees nearer than this share of the distance
     at which its content begins: they become fog before the lens. 0: off."""
     prune_large: Literal["auto", "always", "never"] = "auto"

@@ -17,6 +17,10 @@ from ..types import Camera
 from .readers.transforms import read_pose
 
 MOST_CAMERAS = 100_000
+FARTHEST = 1e9
+"""Largest coordinate of a camera."""
+NARROWEST, WIDEST = 1e-3, 3.1
+"""Limits of the vertical field of view in radians."""
 
 
 class PathCamera(NamedTuple):
@@ -122,7 +126,7 @@ def _time(where: str, entry: dict[str, Any]) -> float | None:
 def _fov(where: str, value: Any, degrees: bool) -> float:
     number = as_number(value)
     angle = math.radians(number) if degrees and number is not None else number
-    if angle is None or not 0.001 < angle < 3.1:
+    if angle is None or not NARROWEST < angle < WIDEST:
         raise UserError(f"{where} is {str(value)[:40]}, no field of view; correct it or leave it out")
     return angle
 
@@ -140,7 +144,7 @@ def _nerfstudio(
         raise UserError(f"{where}.camera_to_world is not 16 finite numbers; export the path again")
     viewmat = read_pose(path, index, {"transform_matrix": matrix.reshape(4, 4).tolist()})
     fov = _fov(f"{where}.fov", entry["fov"], True) if "fov" in entry else _usual_fov(overview, aspect)
-    return PathCamera(viewmat, fov, _time(where, entry))
+    return _checked(where, PathCamera(viewmat, fov, _time(where, entry)))
 
 
 def _frame(
@@ -158,4 +162,13 @@ def _frame(
         across = _fov(f"{path}: camera_angle_x", fields["camera_angle_x"], False)
     else:
         across = math.radians(overview.fov_x)
-    return PathCamera(viewmat, 2.0 * math.atan(math.tan(across / 2.0) / aspect), _time(where, entry))
+    return _checked(where, PathCamera(viewmat, 2.0 * math.atan(math.tan(across / 2.0) / aspect), _time(where, entry)))
+
+
+def _checked(where: str, camera: PathCamera) -> PathCamera:
+    """Refuse a camera that no picture could be made with."""
+    if not np.abs(camera.viewmat).max() < FARTHEST:
+        raise UserError(f"{where}: the camera is farther than {FARTHEST:g} units away; correct its pose")
+    if not NARROWEST < camera.fov < WIDEST:
+        raise UserError(f"{where}: a field of view of {math.degrees(camera.fov):.3g} degrees; correct the intrinsics")
+    return camera

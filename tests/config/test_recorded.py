@@ -56,6 +56,8 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "loss.log_error_from": 0.58,
         "sharpness": 0.5,
         "loss.pooled": "auto",
+        "densify.least_views": 2,
+        "densify.clear_distance": 0.25,
     }
     assert {name: best[name] for name in best.keys() - values.keys()} == {**newer, **added}
 

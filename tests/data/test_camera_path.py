@@ -76,6 +76,7 @@ FAULTS = {
     "fov": ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 200}]}, "fov is 200"),
     "time": ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "time": 2}]}, "time is 2"),
     "size": ({"render_width": 0}, "render_width"),
+    "far": ({"camera_path": [{"camera_to_world": [*np.eye(4).ravel()[:3], 1e300, *np.eye(4).ravel()[4:]]}]}, "farther"),
 }
 
 

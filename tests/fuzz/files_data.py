@@ -11,13 +11,15 @@ import torch
 
 from fuzz.files_cases import Format, check_dataset, expect, finite, suffixed, within
 from helpers.layouts import write_colmap, write_nerfies, write_panoptic, write_poses_bounds
-from helpers.nerfstudio_files import HEIGHT, WIDTH
+from helpers.nerfstudio_files import HEIGHT, WIDTH, viewmat
 from helpers.nerfstudio_files import write as write_nerfstudio_plain
 from helpers.tiny import write_dnerf
 from scgs_warp.data import load
+from scgs_warp.data.camera_path import read_camera_path
 from scgs_warp.evaluation.motion_metrics import load_ground_truth, score_motion
 from scgs_warp.evaluation.thin_structures import RodCheck, load_rods
 from scgs_warp.export.tracks import read_points
+from scgs_warp.geometry.cameras import Overview
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.types import Camera, Frame
 
@@ -128,6 +130,26 @@ def load_points(folder: Path) -> None:
     within("points", points, -1e9, 1e9)
 
 
+def write_paths(folder: Path) -> None:
+    """A camera path in nerfstudio's layout, and one as a list of frames."""
+    folder.mkdir()
+    poses = [np.linalg.inv(viewmat(index)) @ np.diag([1.0, -1.0, -1.0, 1.0]) for index in range(3)]
+    path = {"camera_path": [{"camera_to_world": pose.ravel().tolist(), "fov": 50.0, "time": 0.5} for pose in poses]}
+    frames = {"fl_x": 40.0, "w": 60, "h": 40, "frames": [{"transform_matrix": pose.tolist()} for pose in poses]}
+    (folder / "path.json").write_text(json.dumps({**path, "render_width": 60, "render_height": 40}))
+    (folder / "frames.json").write_text(json.dumps(frames))
+
+
+def load_paths(folder: Path) -> None:
+    overview = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0, 40.0, 20.0)
+    for name in ("path.json", "frames.json"):
+        for camera, time in read_camera_path(folder / name, overview).film(4, 64):
+            finite("camera of a path", camera.viewmat, camera.K)
+            expect(2 <= camera.width <= 64 and 2 <= camera.height <= 64, "size of a picture")
+            if time is not None:
+                within("time", time)
+
+
 NOT_PICTURES = suffixed(".json", ".npy", ".npz", ".ply", ".bin", ".txt")
 
 FORMATS = (
@@ -137,6 +159,7 @@ FORMATS = (
     Format("nerfstudio-smaller", write_nerfstudio, load_smaller, share=0.5),
     Format("nerfies", lambda folder: write_nerfies(folder, 6), load_train, NOT_PICTURES),
     Format("panoptic", lambda folder: write_panoptic(folder, 3, 3), load_train, NOT_PICTURES),
+    Format("camera_path", write_paths, load_paths),
     Format("poses_bounds", lambda folder: write_poses_bounds(folder, 3, 2), load_train),
     Format("colmap-binary", lambda folder: write_colmap(folder, 6), load_train, NOT_PICTURES),
     Format("colmap-text", lambda folder: write_colmap(folder, 6, "OPENCV", True), load_train, NOT_PICTURES),

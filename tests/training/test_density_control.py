@@ -140,6 +140,15 @@ def test_size_on_screen_may_be_of_no_account(max_screen, left):
     assert len(gaussians) == left
 
 
+class Many:
+    """A hundred and fifty frames, of which nothing is asked."""
+
+    frames = None
+
+    def __len__(self) -> int:
+        return 150
+
+
 def seen_by_all(count: int) -> Seen:
     """Every Gaussian fills a pixel of many views, far away."""
     return Seen(torch.ones(count), torch.full((count,), 99, dtype=torch.int32), torch.full((count,), 9.0))
@@ -235,12 +244,13 @@ def test_when_the_presets_look(name, steps, looks, monkeypatch):
     state, _ = state_with_hidden_gaussian()
     state.config, state.stage = preset(name), "main"
     monkeypatch.setattr(density_control, "seen_by", lambda *_: seen_by_all(1))
+    monkeypatch.setattr(density_control, "nearest_content", lambda *_: 1.0)
     assert state.config.steps == steps
     due = []
     for step in range(0, state.config.main_steps):
         if visibility_pruning_due(state.config.densify, step + 1):
             state.step = step + state.config.pretrain_steps
-            due += [(step + 1) / 1000] if visible_gaussians(state, [0] * 150) is not None else []
+            due += [(step + 1) / 1000] if visible_gaussians(state, Many()) is not None else []
     assert tuple(due) == looks
 
 
