@@ -38,6 +38,12 @@ class Options:
     """Print the parts that moved together, with their joints, and end (docs/editing.md)."""
     parts: int | None = None
     """Number of parts, instead of as many as turn against their neighbours."""
+    motion: Path | None = None
+    """Motion to play on the scene's parts as keyframes: a run folder, or a glTF character (.glb, .gltf)."""
+    clip: str | None = None
+    """Name of the animation of --motion; the first one by default."""
+    match: Path | None = None
+    """JSON object that names, for parts of the scene, those of --motion; by default those of the same name."""
     nodes: int = 512
     """Number of control points to make for a scene without motion."""
     size: int | None = None
@@ -80,9 +86,12 @@ def check(options: Options) -> None:
         raise UserError("--skeleton prints and ends; leave --output and --export out")
     if options.size is not None and not 16 <= options.size <= 8192:
         raise UserError(f"--size {options.size}: give 16 to 8192 pixels")
+    for name in ("clip", "match"):
+        if getattr(options, name) is not None and options.motion is None:
+            raise UserError(f"--{name}: belongs to --motion; give both, or neither")
     if options.output is not None:
-        if options.script is None:
-            raise UserError(f"--output {options.output}: a film needs --script")
+        if options.script is None and options.motion is None:
+            raise UserError(f"--output {options.output}: a film needs --script or --motion")
         video.check_path(options.output)
     if options.export is not None and output_suffix(options.export) not in [SUFFIXES[kind] for kind in STILL_FORMATS]:
         raise UserError(f"--export {options.export}: end the name in .ply, .compressed.ply, .splat, .spz, .sog or .glb")
@@ -112,6 +121,8 @@ def open_session(options: Options, device: str) -> EditSession:
     if options.script is not None:
         session.load(options.script)
         warn_of_another_scene(options.script, session)
+    if options.motion is not None:
+        play_motion(session, options, device)
     if options.size is not None:
         session.resize_film(options.size)
     return session
@@ -125,6 +136,23 @@ def warn_of_another_scene(script: Path, session: EditSession) -> None:
     found = misplaced(read_object(script), session.engine)
     if found is not None:
         print(f"warning: {script}: made for another scene? {found}", file=sys.stderr)
+
+
+def play_motion(session: EditSession, options: Options, device: str) -> None:
+    """Play the motion of a run or of a glTF character on the session's scene, frozen where its edit freezes it."""
+    from scgs_warp.edit import EditSession, motion_of_gltf, motion_of_session, retarget
+    from scgs_warp.edit.retarget import read_match
+    from scgs_warp.scene.scene import Scene
+
+    assert options.motion is not None
+    if options.motion.is_dir():
+        source = EditSession(Scene.load(options.motion, device=device))
+        motion = motion_of_session(source, source.edit.film.seconds)
+    else:
+        motion = motion_of_gltf(options.motion, options.clip)
+    match = None if options.match is None else read_match(options.match)
+    matched = retarget(session, motion, match, session.edit.playback.freeze or 0.0)
+    print(f"{options.motion}: plays on {', '.join(matched)}", flush=True)
 
 
 def open_browser(session: EditSession, options: Options) -> None:
@@ -168,6 +196,9 @@ def open_browser(session: EditSession, options: Options) -> None:
 
 def skeleton_lines(session: EditSession) -> list[str]:
     """Describe the skeleton, a line for each part."""
+    said = (
+        ["nothing moves by itself: these parts follow from the shape"] if session.skeleton.source == "geometry" else []
+    )
     rows = [["part", "hangs on", "points", "joint", "axis", "turns by", "confidence"]]
     for part in session.parts():
         joint, axis = (
@@ -177,7 +208,7 @@ def skeleton_lines(session: EditSession) -> list[str]:
         turns = [f"{part.degrees:.0f} degrees", f"{part.confidence:.2f}"] if part.parent else ["", ""]
         rows.append([part.name, part.parent or "", str(len(part.nodes)), joint, axis, *turns])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+    return [*said, *("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows)]
 
 
 def main(args: list[str] | None) -> None:

@@ -80,28 +80,35 @@ def fit_parts(patches: Patches, labels: np.ndarray) -> tuple[Moments, Motions]:
     return pooled, pooled.motions()
 
 
-def _largest_turn(base: np.ndarray, own: np.ndarray, spread: np.ndarray) -> float:
-    """Return the largest turn of ``own`` [T, 3, 3] against ``base`` between two instants, radians.
+def relative_turns(moments: Moments, motions: Motions, pairs: np.ndarray) -> np.ndarray:
+    """Return the largest turn of one body against another between two instants, [E] radians, for pairs [E, 2].
+
+    Of the two bodies' values the larger is taken.
+    """
+    spreads, rotations = moments.covariance(), motions.rotations
+    first, second = pairs.T
+    return np.maximum(
+        _largest_turns(rotations[first], rotations[second], spreads[second]),
+        _largest_turns(rotations[second], rotations[first], spreads[first]),
+    )
+
+
+def _largest_turns(base: np.ndarray, own: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return the largest turn of bodies ``own`` [E, T, 3, 3] against ``base`` between two instants, [E] radians.
 
     It is the distance by which the turn moves a body's points about their centre, relative to the largest distance for
     that angle about any axis: a turn of a thin body about its own axis hardly counts.
 
     Args:
-        spread: [3, 3] covariance of the body's points in the reference pose.
+        spread: [E, 3, 3] covariance of the bodies' points in the reference pose.
     """
-    relative = np.einsum("tki,tkj->tij", base, own)
-    change = (relative[:, None] - relative[None]).reshape(-1, 3, 3)
-    most = float(np.linalg.eigvalsh(spread)[1:].sum())
-    moved = ((change @ spread) * change).sum((1, 2)).max() / max(most, 1e-300)
-    return 2.0 * math.asin(min(0.5 * math.sqrt(max(float(moved), 0.0)), 1.0))
-
-
-def relative_turns(moments: Moments, motions: Motions, pairs: np.ndarray) -> np.ndarray:
-    """Return the largest turn of one body against another between two instants, [E] radians, for pairs [E, 2]. Of the
-    two bodies' values the smaller is taken."""
-    spreads, rotations = moments.covariance(), motions.rotations
-    both = [(rotations[a], rotations[b], spreads[a], spreads[b]) for a, b in pairs.tolist()]
-    return np.array([min(_largest_turn(a, b, second), _largest_turn(b, a, first)) for a, b, first, second in both])
+    relative = np.swapaxes(base, 2, 3) @ own
+    flat = (len(relative), relative.shape[1], 9)
+    # |A - B|^2 = |A|^2 + |B|^2 - 2 <A, B>, with A and B the two rotations of the points, whose norms are the same
+    same = (relative @ spread[:, None]).reshape(flat) @ np.swapaxes(relative.reshape(flat), 1, 2)
+    moved = np.maximum(2.0 * np.trace(spread, axis1=1, axis2=2) - 2.0 * same.min((1, 2)), 0.0)
+    most = np.maximum(np.linalg.eigvalsh(spread)[:, 1:].sum(1), 1e-300)
+    return 2.0 * np.arcsin(np.minimum(0.5 * np.sqrt(moved / most), 1.0))
 
 
 def _neighbors(edges: np.ndarray, labels: np.ndarray) -> np.ndarray:

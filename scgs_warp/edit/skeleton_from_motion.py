@@ -6,35 +6,54 @@ import math
 
 import numpy as np
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from ..errors import UserError
 from ..scene.scene import Scene
 from .joints import Joint, find_joints
+from .necks import find_necks
 from .parts import find_parts
 from .patches import Patches, make_patches
-from .skeleton import Part, Skeleton
+from .skeleton import Part, Skeleton, Source
 
 INSTANTS = 16
 """Number of instants at which the motion is compared; the first one, time 0, is the reference pose."""
 MIN_OPACITY = 0.5
 """Opacity below which a Gaussian does not show how the surface moves."""
+STILL = 3e-3
+"""Root mean square distance of the Gaussians from a rigid motion, relative to the scene's size, below which nothing
+moves."""
 MAX_GAUSSIANS = 50_000
 """Number of Gaussians that are looked at; of more, an even sample."""
 
 
 def find_skeleton(scene: Scene, binding: tuple[np.ndarray, np.ndarray], count: int | None = None) -> Skeleton:
-    """Find parts and joints; parts are in order of decreasing size and called ``part-1``, ``part-2``, ...
+    """Find parts and joints; parts are in order of decreasing size and called ``part-1``, ``part-2``, ... Where nothing
+    moves, parts are those of the shape, between narrow necks, and the skeleton's source says so.
 
     Args:
         binding: indices and skinning weights of the control points of each Gaussian, [N, K] each.
         count: number of parts; None: chosen from the motion.
     """
     patches = observe(scene, binding)
+    source: Source = "motion"
     labels = find_parts(patches, count)
+    if not moves(patches):
+        source, labels = "geometry", find_necks(patches.edges, len(patches.nodes), count)
     joints = find_joints(patches, labels)
     owner = _labels_of_nodes(scene, patches, labels)
-    return Skeleton(tuple(_part(scene, row, joint, owner) for row, joint in enumerate(joints)))
+    return Skeleton(tuple(_part(scene, row, joint, owner) for row, joint in enumerate(joints)), source)
+
+
+def moves(patches: Patches) -> bool:
+    """Return whether anything moves but for a rigid motion of each piece of the body."""
+    count = len(patches.nodes)
+    ends = patches.edges.T
+    piece = connected_components(coo_matrix((np.ones(len(ends[0])), (ends[0], ends[1])), shape=(count, count)))[1]
+    pooled = patches.moments.pooled(piece, int(piece.max()) + 1)
+    return bool(math.sqrt(pooled.errors().sum() / pooled.count.sum()) > STILL * patches.size)
 
 
 def observe(scene: Scene, binding: tuple[np.ndarray, np.ndarray]) -> Patches:

@@ -147,17 +147,45 @@ def test_pieces_are_parts_and_crumbs_belong_to_the_nearest():
     assert 10 in make_patches(tracks, both, np.tile([0.7, 0.3], (400, 1))).edges, "a crumb is connected"
 
 
-def test_relative_turns_measure_the_swing_and_not_the_twist():
+def measured_turn(first: list[float], second: list[float], axis: tuple[int, int, int]) -> float:
+    """Degrees measured between two clouds of these extents, of which the second turns by 30 degrees."""
     random = np.random.default_rng(0)
-    rest = np.concatenate([random.normal(size=(200, 3)), random.normal(size=(200, 3)) * [0.05, 0.05, 2.0] + 5.0])
-    for axis, least, most in (((1, 0, 0), 28, 32), ((0, 0, 1), 0, 3)):
-        turned = rest.copy()
-        turned[200:] = rotate(from_axis(axis, 30), rest[200:] - 5.0) + 5.0
-        index = np.repeat([0, 1], 200)
-        patches = make_patches(np.stack([rest, turned]), np.stack([index, index], 1), np.tile([1.0, 0.0], (400, 1)))
-        found = relative_turns(patches.moments, patches.moments.motions(), np.array([[0, 1]]))
-        assert least <= math.degrees(found[0]) <= most
+    rest = np.concatenate([random.normal(size=(200, 3)) * first, random.normal(size=(200, 3)) * second + 5.0])
+    turned = rest.copy()
+    turned[200:] = rotate(from_axis(axis, 30), rest[200:] - 5.0) + 5.0
+    index = np.repeat([0, 1], 200)
+    patches = make_patches(np.stack([rest, turned]), np.stack([index, index], 1), np.tile([1.0, 0.0], (400, 1)))
+    pairs = np.array([[0, 1], [1, 0]])
+    found = relative_turns(patches.moments, patches.moments.motions(), pairs)
+    assert found[0] == pytest.approx(found[1])
+    return math.degrees(found[0])
+
+
+def test_relative_turns_measure_the_swing_and_hardly_the_twist_of_thin_bodies():
+    ball, rod = [1.0, 1.0, 1.0], [0.05, 0.05, 2.0]
+    assert measured_turn(rod, rod, (1, 0, 0)) == pytest.approx(30, abs=2)
+    assert measured_turn(rod, rod, (0, 0, 1)) < 3
+    for axis in ((1, 0, 0), (0, 0, 1)):
+        assert measured_turn(ball, rod, axis) == pytest.approx(30, abs=2)
+        assert measured_turn(ball, ball, axis) == pytest.approx(30, abs=2)
     assert math.degrees(LEAST_TURN) == pytest.approx(15)
+
+
+def test_turns_of_many_instants_are_the_largest_of_all_pairs():
+    patches, segment, _ = chain([40.0, 25.0])
+    moments = patches.moments.pooled(segment, 3)
+    motions, pairs = moments.motions(), np.array([[0, 1], [1, 2]])
+    for (a, b), found in zip(pairs.tolist(), relative_turns(moments, motions, pairs)):
+        relative = np.swapaxes(motions.rotations[a], 1, 2) @ motions.rotations[b]
+        values = []
+        for spread, mine in (
+            (moments.covariance()[b], relative),
+            (moments.covariance()[a], np.swapaxes(relative, 1, 2)),
+        ):
+            most = np.sort(np.linalg.eigvalsh(spread))[1:].sum()
+            moved = max(np.trace((x - y) @ spread @ (x - y).T) for x in mine for y in mine)
+            values.append(2.0 * math.asin(min(0.5 * math.sqrt(moved / most), 1.0)))
+        assert found == pytest.approx(max(values), rel=1e-6)
 
 
 @pytest.mark.parametrize("nodes", [256, 512])
