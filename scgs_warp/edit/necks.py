@@ -7,7 +7,7 @@ neck of all pieces is cut first.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix, diags
@@ -90,7 +90,8 @@ def _fiedler(graph: csr_matrix) -> np.ndarray:
     if count < 32:
         vectors = np.linalg.eigh(laplacian.toarray())[1]
     else:
-        vectors = eigsh(laplacian.tocsc(), k=2, sigma=shift, which="LM", v0=start)[1]
+        solved: Any = eigsh(laplacian.tocsc(), k=2, sigma=shift, which="LM", v0=start)
+        vectors = solved[1]
         vectors = vectors[:, np.argsort(np.abs(vectors.sum(0)))[::-1]]  # the constant one first
     vector = vectors[:, 1]
     vector = np.round(vector / (TIE * np.abs(vector).max()))
