@@ -67,8 +67,7 @@ def _neck(graph: csr_matrix, nodes: np.ndarray, least: int) -> Neck:
     order = np.argsort(_fiedler(inside), kind="stable")
     place = np.empty(len(nodes), np.int64)
     place[order] = np.arange(len(nodes))
-    ends = inside.tocoo()
-    first, second = ends.row, ends.col
+    first, second = inside.nonzero()
     low, high = np.minimum(place[first], place[second]), np.maximum(place[first], place[second])
     opened, closed = (np.bincount(x, minlength=len(nodes)) / 2.0 for x in (low, high))
     across = np.cumsum(opened - closed)[:-1]  # edges between the first k + 1 nodes and the others
@@ -82,8 +81,8 @@ def _neck(graph: csr_matrix, nodes: np.ndarray, least: int) -> Neck:
 
 def _fiedler(graph: csr_matrix) -> np.ndarray:
     """Return the Fiedler vector of a connected graph, [N], up to its sign and small differences."""
-    count = graph.shape[0]
     degree = np.asarray(graph.sum(1)).reshape(-1)
+    count = len(degree)
     laplacian = diags(degree) - graph
     start = np.cos(np.arange(count) * 2.399963)  # any fixed vector, so that each call does the same
     shift = -SHIFT * max(float(degree.mean()), 1e-12)
