@@ -23,8 +23,9 @@ FIRST_PARTS = 90
 """Number of parts at which merging by angle begins."""
 BOUNDARY_COST = 1.7e-3
 """Distance, relative to the scene's size, by which a patch may be off before a boundary edge is cheaper."""
-MIN_PATCHES = 3
-"""Number of patches below which a part joins a neighbour: the skin between two parts moves half with each."""
+MIN_PATCHES, MIN_SHARE = 3, 0.01
+"""Number of patches, and share of all patches, below which a part joins a neighbour: the skin between two parts moves
+half with each."""
 SWEEPS = 10
 MAX_ROUNDS = 4
 """Number of merges, relative to the first number of parts, after which patches stay in their parts: where a few patches
@@ -41,6 +42,7 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
     """
     first = max(FIRST_PARTS, 3 * count if count else 0)
     labels = _merge_by_cost(patches, first)
+    least = max(MIN_PATCHES, math.ceil(MIN_SHARE * len(patches.nodes)))
     rounds = MAX_ROUNDS * (int(labels.max()) + 1)
     while True:
         if rounds > 0:
@@ -54,7 +56,7 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
             break
         turns = relative_turns(*fit_parts(patches, labels), pairs)
         sizes = np.bincount(labels)
-        small = np.minimum(sizes[pairs[:, 0]], sizes[pairs[:, 1]]) < MIN_PATCHES
+        small = np.minimum(sizes[pairs[:, 0]], sizes[pairs[:, 1]]) < least
         chosen = int(np.where(small, turns - 2.0 * math.pi, turns).argmin())
         if count is None and turns[chosen] > LEAST_TURN and not small[chosen]:
             break
