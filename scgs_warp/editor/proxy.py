@@ -14,6 +14,7 @@ import hmac
 import http
 import secrets
 import threading
+import traceback
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
@@ -125,9 +126,17 @@ def guarded(key: str | None) -> Iterator[None]:
 
     start, started = module.serve, False
 
-    def serve(*args: Any, process_request: Any = None, **options: Any) -> Any:
+    def serve(handler: Any, *args: Any, process_request: Any = None, **options: Any) -> Any:
         nonlocal started
         started = True
+
+        async def patient(connection: Any) -> None:
+            try:
+                await handler(connection)
+            except Exception as error:
+                if not _is_malformed(error):
+                    raise
+                await connection.close(1007, "not a message of this page")
 
         def check(connection: Any, request: Any) -> Any:
             why = refusal(request.headers, key)
@@ -135,7 +144,7 @@ def guarded(key: str | None) -> Iterator[None]:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, why)
             return None if process_request is None else process_request(connection, request)
 
-        return start(*args, process_request=check, **options)
+        return start(patient, *args, process_request=check, **options)
 
     module.serve = serve  # type: ignore[assignment]
     try:
@@ -144,6 +153,12 @@ def guarded(key: str | None) -> Iterator[None]:
         module.serve = start
     if not started:
         raise UserError("the editor cannot guard this version of viser; install: pip install 'viser>=1.1,<1.2'")
+
+
+def _is_malformed(error: Exception) -> bool:
+    """Return whether an error is about a message that a page sent, and not about our answer to it: whether it was
+    raised while viser decoded the message."""
+    return any(frame.f_code.co_name == "_message_consumer" for frame, _ in traceback.walk_tb(error.__traceback__))
 
 
 class Proxy:

@@ -271,3 +271,22 @@ def test_a_request_that_is_never_finished_ends(shared, monkeypatch):
         slow.sendall(b"GET / HTTP/1.1\r\nHost: a\r\n")
         slow.settimeout(20)
         assert slow.recv(1) == b""
+
+
+@pytest.mark.parametrize(
+    "message", ["text", b"", b"\xff\xff", b"\x81\xa4type\xa4Nope", b"\x93\x01\x02\x03", b"\xc1" * 9]
+)
+def test_a_malformed_message_closes_its_connection_alone(editor, message, capfd):
+    """What a page sends is no reason for a traceback, and does not disturb other pages."""
+    origin = f"http://127.0.0.1:{editor.port}"
+    with websockets.connect(
+        f"ws://127.0.0.1:{editor.port}", origin=origin, subprotocols=[PROTOCOL], max_size=None
+    ) as page:
+        page.send(message)
+        with pytest.raises(exceptions.ConnectionClosed) as closed:
+            while True:
+                page.recv(timeout=20)
+    assert closed.value.rcvd.code == 1007
+    assert opens(editor.port, origin)
+    said = capfd.readouterr()
+    assert "Traceback" not in said.err + said.out and "Error" not in said.err + said.out
