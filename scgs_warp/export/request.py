@@ -229,7 +229,8 @@ def _check_unused(request: ExportRequest) -> None:
 
 def _check_mesh(request: ExportRequest) -> None:
     for name in ("sequence", "faces", "resolution"):
-        if request.kind != "mesh" and getattr(request, name):
+        value = getattr(request, name)
+        if request.kind != "mesh" and value is not None and value is not False:
             raise UserError(f"--{name}: belongs to a mesh; leave it out, or give --format mesh")
     for name, (least, most) in MESH_LIMITS.items():
         value = getattr(request, name)

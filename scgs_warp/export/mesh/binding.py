@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_matrix, diags
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 from ...edit.rotations import conjugate, multiply, rotate
 from ..skeleton import Skeleton
@@ -138,4 +139,4 @@ def _neighbor_mean(surface: Surface) -> csr_matrix:
 
 def _distances(points: np.ndarray) -> np.ndarray:
     """Return distances [M, M] between points [M, 3]."""
-    return np.linalg.norm(points[:, None] - points[None], axis=2)
+    return cdist(points, points)

@@ -127,6 +127,7 @@ def app_scene(path: Path):
         (("--format", "mesh", "--sequence", "--output", "a.glb"), "give one of --run and --ply"),
         (("--ply", "BALL", "--format", "mesh", "--sequence", "--output", "a.glb"), "needs --run, or an --edit"),
         (("--ply", "BALL", "--faces", "500", "--output", "a.spz"), "--faces: belongs to a mesh"),
+        (("--ply", "BALL", "--resolution", "0", "--output", "a.spz"), "--resolution: belongs to a mesh"),
         (("--ply", "BALL", "--sequence", "--output", "a.glb"), "--sequence: belongs to a mesh"),
         (("--ply", "BALL", "--format", "mesh", "--faces", "3", "--output", "a.obj"), "--faces 3: give 100 to"),
         (("--ply", "BALL", "--format", "mesh", "--resolution", "9999", "--output", "a.obj"), "--resolution 9999: give"),
