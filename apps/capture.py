@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -15,8 +15,8 @@ from scgs_warp.apps.cli import Device, prepare, run
 
 @dataclass(frozen=True)
 class Options:
-    """Find the cameras of a video, or of a rig; write frames, cameras, times and points to a folder for train.py
-    --data."""
+    """Find the cameras of a video or of a rig, or import them; write frames, cameras, times and points to a folder for
+    train.py --data."""
 
     output: Path
     """Folder to make. The same command continues an interrupted one; finished work is never overwritten."""
@@ -25,6 +25,9 @@ class Options:
     rig: Path | None = None
     """Instead of VIDEO, folder with one video per camera of a rig: cameras that stand still. They are synchronised by
     their sound. Beside a poses_bounds.npy (Neural 3D Video), the videos are unpacked and the cameras kept."""
+    poses: Path | None = None
+    """Instead of VIDEO, what another program has found: an .npz of MegaSaM, VGGT or Depth Anything 3, or a folder of
+    MonST3R, Polycam, Record3D or 3D Scanner App. Its cameras are taken as they are; its depth gives initial points."""
     offsets: tuple[float, ...] | None = None
     """Seconds at which the videos of a rig begin, in the order of their names, or 0 if all begin at once; by default
     found by sound."""
@@ -76,13 +79,20 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.runtime import environment
 
     cv2.setNumThreads(environment.thread_count())
-    if (options.video is None) == (options.rig is None):
-        what = "neither VIDEO nor --rig" if options.video is None else "both VIDEO and --rig"
-        raise UserError(f"{what}: give a video (or a folder of images), or --rig and a folder of one video per camera")
+    given = [name for name in ("video", "rig", "poses") if getattr(options, name) is not None]
+    if len(given) != 1:
+        shown = ["VIDEO" if name == "video" else f"--{name}" for name in given]
+        what = f"both {' and '.join(shown)}" if given else "neither VIDEO nor --rig nor --poses"
+        raise UserError(
+            f"{what}: give a video (or a folder of images), or --rig and a folder of one video per camera, or --poses "
+            "and what another program exported"
+        )
     if options.video is not None:
         _capture_video(options, options.video, device)
     elif options.rig is not None:
         _capture_rig(options, options.rig, device)
+    elif options.poses is not None:
+        _import_scene(options, options.poses)
     print(f"next: python apps/train.py --data {options.output}")
 
 
@@ -118,6 +128,19 @@ def _capture_rig(options: Options, folder: Path, device: str) -> None:
 
 def cli(args: list[str] | None = None) -> int:
     return run(main, args)
+
+
+def _import_scene(options: Options, path: Path) -> None:
+    """Make a data set from the cameras of another program."""
+    from scgs_warp.capture import import_scene
+    from scgs_warp.errors import UserError
+
+    for field in fields(options):
+        if field.name not in ("output", "poses", "device", "threads") and getattr(options, field.name) != field.default:
+            raise UserError(f"--{field.name.replace('_', '-')}: is for films, not for --poses; leave it out")
+    made = import_scene(path, options.output)
+    points = f"{made.points:,} points from its depth" if made.points else "no depth that could give points"
+    print(f"{options.output}: {made.frames} frames of {made.program}; {points}")
 
 
 if __name__ == "__main__":

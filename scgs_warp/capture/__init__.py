@@ -3,7 +3,17 @@ camera poses (pycolmap) and undistortion."""
 
 from __future__ import annotations
 
+from .imports import ImportResult, import_scene
 from .pipeline import CaptureRequest, CaptureResult, capture
 from .rig import RigRequest, RigResult, capture_rig
 
-__all__ = ["CaptureRequest", "CaptureResult", "RigRequest", "RigResult", "capture", "capture_rig"]
+__all__ = [
+    "CaptureRequest",
+    "CaptureResult",
+    "ImportResult",
+    "RigRequest",
+    "RigResult",
+    "capture",
+    "capture_rig",
+    "import_scene",
+]

@@ -24,7 +24,7 @@ class Format:
     """One kind of input files."""
 
     name: str
-    make: Callable[[Path], None]
+    make: Callable[[Path], Any]
     """Function that fills a new folder."""
     load: Callable[[Path], Any]
     """Function that reads the folder and raises ``Broken`` for values that are not finite or out of range."""

@@ -28,7 +28,7 @@ from fuzz.files_cases import Broken, Format
 from fuzz.files_forms import mutate
 from scgs_warp.errors import UserError
 
-MODULES = ("files_data", "files_gaussians", "files_runs", "files_edits")
+MODULES = ("files_data", "files_gaussians", "files_runs", "files_edits", "files_imports")
 FORMATS: dict[str, Format] = {}
 
 

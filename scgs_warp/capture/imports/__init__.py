@@ -1,0 +1,7 @@
+"""Cameras and depth that other programs have found, as a data set: ``import_scene``."""
+
+from __future__ import annotations
+
+from .importing import ImportResult, import_scene
+
+__all__ = ["ImportResult", "import_scene"]

@@ -1,0 +1,204 @@
+"""The import itself: choose the layout, and write images, cameras, times, points and depth in nerfstudio's layout."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from ...data.dataset import spread
+from ...data.held_out import held_out
+from ...data.images import header_sizes, size_text
+from ...data.points import write_points
+from ...data.synthetic.renderer import write_folder_atomically
+from ...errors import UserError
+from ...runtime.progress import progress
+from ...visualization.video import write_png
+from ..similarity import Similarity, upright
+from ..source import read_rgb
+from . import arrays, monst3r, phone_apps
+from .scene import MAX_NUMBER, OPENGL_TO_OPENCV, ImportedFrame, ImportedScene
+
+FILE, POINTS = "transforms.json", "points.ply"
+ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".7z")
+MIN_FRAMES = 2
+POINT_FRAMES = 24
+"""Number of frames whose depth gives points."""
+POINT_COUNT = 40_000
+"""Number of points, from all these frames together."""
+RANGE = 20.0
+"""Depth gives points between the median divided by this and multiplied by it: sky and unknown depth do not."""
+EDGE = 0.1
+"""Relative difference of depth within 3 x 3 pixels beyond which they lie on an outline, where depth is blurred."""
+
+MAX_MOMENT = 1e19
+"""Largest time of a frame, in the unit of the file: microseconds since 1970 are below it."""
+
+ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
+
+
+class ImportResult(NamedTuple):
+    """Result of an import."""
+
+    program: str
+    frames: int
+    points: int
+    """Number of points that depth gave; 0 without depth."""
+
+
+def read_scene(path: Path) -> ImportedScene:
+    """Read the scene of another program.
+
+    Raises:
+        UserError: the layout is unknown, or a file does not fit it; one line says what.
+    """
+    if not path.exists():
+        raise UserError(f"--poses {path}: no such file or folder; give what the other program exported")
+    if arrays.recognises(path):
+        return arrays.read(path)
+    if path.is_dir():
+        if monst3r.recognises(path):
+            return monst3r.read(path)
+        for recognises, read in phone_apps.LAYOUTS:
+            if recognises(path):
+                return read(path)
+        if (path / FILE).is_file():
+            raise UserError(f"--poses {path}: is in nerfstudio's layout already; python apps/train.py --data {path}")
+    if path.is_file() and path.suffix.lower() in ARCHIVES:
+        raise UserError(f"--poses {path}: is an archive; unpack it, and give the folder")
+    raise UserError(
+        f"--poses {path}: is no scene of MegaSaM, VGGT or Depth Anything 3 (.npz), MonST3R ({monst3r.TRAJECTORY}), "
+        "Polycam (keyframes), Record3D (metadata.json, rgb) or 3D Scanner App (frame_00000.json); export one of these"
+    )
+
+
+def import_scene(path: Path, folder: Path, show: ShowProgress = progress) -> ImportResult:
+    """Make a data set of the scene at ``path``. The folder appears when it is complete.
+
+    Args:
+        folder: must not exist, or be empty.
+        show: ``show(total, text)`` is a context manager that shows progress; its value has ``advance()``.
+
+    Raises:
+        UserError: the scene is invalid, or the folder holds something.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
+    scene = read_scene(path)
+    if len(scene.frames) < MIN_FRAMES:
+        raise UserError(f"{path}: has {len(scene.frames)} frames with an image, but two are needed; export it again")
+    made: list[int] = []
+    write_folder_atomically(folder, lambda work: made.append(_write(work, scene, show)))
+    return ImportResult(scene.program, len(scene.frames), made[0])
+
+
+def _write(work: Path, scene: ImportedScene, show: ShowProgress) -> int:
+    (work / "images").mkdir()
+    frames = scene.frames
+    chosen = set(spread(len(frames), POINT_FRAMES))
+    share = POINT_COUNT // len(chosen)
+    names, sizes, clouds = [], [], []
+    with show(len(frames), f"importing from {scene.program}") as bar:
+        for index, frame in enumerate(frames):
+            image, name = _write_image(work / "images", frame, f"frame_{index:05d}")
+            names.append(f"images/{name}")
+            sizes.append((image.shape[1], image.shape[0]))
+            if sizes[-1] != sizes[0]:
+                where = frame.image if isinstance(frame.image, Path) else f"frame {index}"
+                raise UserError(
+                    f"{where}: is {size_text(sizes[-1])}, but the first image is {size_text(sizes[0])}; export images "
+                    "of one size"
+                )
+            if frame.depth is not None and index in chosen:
+                clouds.append(_cloud(frame, frame.depth(), image, share, f"frame {index}"))
+            bar.advance()
+    points = np.concatenate([np.zeros((0, 3)), *(cloud[0] for cloud in clouds)])
+    colors = np.concatenate([np.zeros((0, 3), np.uint8), *(cloud[1] for cloud in clouds)])
+    viewmats = np.stack([frame.viewmat for frame in frames])
+    moved = Similarity(1.0, np.eye(3), np.zeros(3)) if scene.gravity else upright(viewmats, points)
+    viewmats, points = moved.viewmats(viewmats), moved.points(points)
+    if not (np.abs(viewmats).max() < MAX_NUMBER and np.abs(points).max(initial=0.0) < MAX_NUMBER**2):
+        raise UserError(
+            f"the cameras of this scene of {scene.program} are too close together for its depth; export it again"
+        )
+    if len(points):
+        write_points(work / POINTS, points, colors)
+    content = _transforms(work, frames, names, sizes, viewmats, bool(len(points)))
+    (work / FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return len(points)
+
+
+def _write_image(folder: Path, frame: ImportedFrame, stem: str) -> tuple[np.ndarray, str]:
+    """Write or copy a frame's image; return it, [H, W, 3] uint8 RGB, and its name."""
+    if isinstance(frame.image, Path):
+        name = f"{stem}{frame.image.suffix.lower()}"
+        image = read_rgb(frame.image)
+        if image.shape[1::-1] not in header_sizes(frame.image)[:1]:
+            raise UserError(f"{frame.image}: is turned by its EXIF tag, but its camera is not; export it upright")
+        shutil.copyfile(frame.image, folder / name)
+        return image, name
+    image = frame.image()
+    write_png(folder / f"{stem}.png", image)
+    return image, f"{stem}.png"
+
+
+def _cloud(
+    frame: ImportedFrame, depth: np.ndarray, image: np.ndarray, most: int, where: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points [P, 3] in the world of the frame and their colours [P, 3] uint8, evenly over the image."""
+    if depth.ndim != 2 or min(depth.shape) < 2:
+        raise UserError(f"{where}: its depth is {list(depth.shape)}, not [h, w]; export the scene again")
+    known = np.isfinite(depth) & (depth > 0) & (depth < MAX_NUMBER)
+    middle = float(np.median(depth[known])) if known.any() else 0.0
+    known &= (depth > middle / RANGE) & (depth < middle * RANGE)
+    safe = np.where(known, depth, np.inf).astype(np.float32)
+    around = np.ones((3, 3))
+    low = cv2.erode(safe, around)
+    high = cv2.dilate(np.where(known, depth, 0.0).astype(np.float32), around)
+    known &= (high - low) < EDGE * safe
+    rows, columns = np.nonzero(known)
+    every = max(1, int(np.ceil(len(rows) / max(most, 1))))
+    rows, columns = rows[::every], columns[::every]
+    sx, sy = image.shape[1] / depth.shape[1], image.shape[0] / depth.shape[0]
+    x, y, z = (columns + 0.5) * sx, (rows + 0.5) * sy, depth[rows, columns]
+    local = np.stack([(x - frame.K[0, 2]) / frame.K[0, 0] * z, (y - frame.K[1, 2]) / frame.K[1, 1] * z, z], 1)
+    rotation, translation = frame.viewmat[:3, :3], frame.viewmat[:3, 3]
+    pixels = np.floor(y).astype(int).clip(0, image.shape[0] - 1), np.floor(x).astype(int).clip(0, image.shape[1] - 1)
+    return (local - translation) @ rotation, image[pixels]
+
+
+def _transforms(
+    work: Path, frames: list[ImportedFrame], names: list[str], sizes: list[tuple[int, int]], viewmats: np.ndarray,
+    has_points: bool,
+) -> dict[str, Any]:  # fmt: skip
+    """Make the content of ``transforms.json``."""
+    moments = np.array([frame.moment for frame in frames])
+    if not np.abs(moments).max() < MAX_MOMENT:
+        raise UserError(f"a frame has the time {np.abs(moments).max():g}; export the scene again")
+    first, last = float(moments.min()), float(moments.max())
+    times = (moments - first) / (last - first) if last > first else np.linspace(0.0, 1.0, len(frames))
+    entries = []
+    for frame, name, (width, height), viewmat, time in zip(frames, names, sizes, viewmats, times.tolist()):
+        K = frame.K
+        entries.append(
+            {
+                "file_path": name,
+                "transform_matrix": (np.linalg.inv(viewmat) @ OPENGL_TO_OPENCV).tolist(),
+                "time": min(max(time, 0.0), 1.0),
+                **{"w": width, "h": height, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+            }
+        )
+    order = np.argsort(times, kind="stable").tolist()
+    lists = {split: held_out(work, order, split) for split in ("train", "test")}
+    return {
+        "camera_model": "PINHOLE",
+        **({"ply_file_path": POINTS} if has_points else {}),
+        "frames": entries,
+        **{f"{split}_filenames": [names[index] for index in chosen] for split, chosen in lists.items()},
+    }

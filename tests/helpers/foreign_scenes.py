@@ -1,0 +1,174 @@
+"""A small scene in the layouts of other programs: a textured wall that a camera passes, with its depth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+WIDTH, HEIGHT, COUNT = 48, 36, 6
+WALL = 3.0
+"""Distance of the wall, y in the world (z up)."""
+K = np.array([[50.0, 0.0, 24.0], [0.0, 50.0, 18.0], [0.0, 0.0, 1.0]])
+Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+OPENGL = np.diag([1.0, -1, -1, 1])
+
+
+class Wall(NamedTuple):
+    viewmats: np.ndarray
+    """[V, 4, 4] world-to-camera, OpenCV, z up."""
+    images: np.ndarray
+    """[V, H, W, 3] uint8"""
+    depths: np.ndarray
+    """[V, H, W]"""
+
+
+def wall() -> Wall:
+    """Cameras at y = 0 that look along +y and turn a little."""
+    views, images, depths = [], [], []
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    for index in range(COUNT):
+        axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # right, down, forward in the world
+        turn = Rotation.from_euler("y", 4.0 * index - 10.0, degrees=True).as_matrix()
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = turn @ axes
+        viewmat[:3, 3] = -viewmat[:3, :3] @ np.array([0.2 * index, 0.0, 1.0 + 0.05 * index])
+        directions = rays @ viewmat[:3, :3]
+        depth = WALL / directions[..., 1]
+        places = directions * depth[..., None] + np.array([0.2 * index, 0.0, 1.0 + 0.05 * index])
+        color = 0.5 + 0.5 * np.sin(places[..., [0, 2, 0]] * [3.0, 4.0, 7.0])
+        views.append(viewmat)
+        images.append(np.rint(color * 255).astype(np.uint8))
+        depths.append(depth)
+    return Wall(np.stack(views), np.stack(images), np.stack(depths))
+
+
+def arkit_pose(viewmat: np.ndarray) -> np.ndarray:
+    """[4, 4] camera-to-world with OpenGL's axes in a world with y up."""
+    return np.linalg.inv(Y_UP) @ np.linalg.inv(viewmat) @ OPENGL
+
+
+def _save(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+def write_megasam(folder: Path) -> Path:
+    made = wall()
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(
+        folder / "scene_sgd_cvd_hr.npz",
+        images=made.images,
+        depths=np.float16(made.depths),
+        intrinsic=np.float32(K),
+        cam_c2w=np.linalg.inv(made.viewmats).astype(np.float32),
+    )
+    return folder / "scene_sgd_cvd_hr.npz"
+
+
+def write_vggt(folder: Path) -> Path:
+    """With an object array, as its demo writes one: it is never read."""
+    made = wall()
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(
+        folder / "predictions.npz",
+        images=np.moveaxis(made.images, 3, 1).astype(np.float32) / 255,
+        depth=np.float32(made.depths)[..., None],
+        depth_conf=1 + np.random.default_rng(0).random(made.depths.shape, np.float32),
+        extrinsic=made.viewmats[:, :3].astype(np.float32),
+        intrinsic=np.tile(np.float32(K), (COUNT, 1, 1)),
+        pose_enc_list=np.array(None, dtype=object),
+    )
+    return folder / "predictions.npz"
+
+
+def write_depth_anything(folder: Path) -> Path:
+    made = wall()
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        folder / "results.npz",
+        image=made.images,
+        depth=np.float32(made.depths),
+        conf=1 + np.random.default_rng(1).random(made.depths.shape, np.float32),
+        extrinsics=made.viewmats[:, :3].astype(np.float32),
+        intrinsics=np.tile(np.float32(K), (COUNT, 1, 1)),
+    )
+    return folder / "results.npz"
+
+
+def write_monst3r(folder: Path) -> Path:
+    made = wall()
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for index, viewmat in enumerate(made.viewmats):
+        pose = np.linalg.inv(viewmat)
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        rows.append(" ".join(str(v) for v in (float(index), *pose[:3, 3], w, x, y, z)))
+        _save(folder / f"frame_{index:04d}.png", made.images[index])
+        np.save(folder / f"frame_{index:04d}.npy", np.float32(made.depths[index]))
+        np.save(folder / f"conf_{index}.npy", 1 + np.float32(made.depths[index]))
+    (folder / "pred_traj.txt").write_text("\n".join(rows) + "\n")
+    np.savetxt(folder / "pred_intrinsics.txt", np.tile(K.ravel(), (COUNT, 1)), fmt="%.6f")
+    return folder
+
+
+def write_polycam(folder: Path) -> Path:
+    made = wall()
+    base = folder / "keyframes"
+    for index, viewmat in enumerate(made.viewmats):
+        stem, pose = f"{1_000_000 + 33_333 * index}", arkit_pose(viewmat)
+        _save(base / f"corrected_images/{stem}.png", made.images[index])
+        values = {"fx": 100.0, "fy": 100.0, "cx": 48.0, "cy": 36.0, "width": 96, "height": 72, "blur_score": 90.0}
+        values |= {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        (base / "corrected_cameras").mkdir(exist_ok=True)
+        (base / f"corrected_cameras/{stem}.json").write_text(json.dumps(values))
+        small = cv2.resize(made.depths[index], (24, 18), interpolation=cv2.INTER_AREA)
+        (base / "depth").mkdir(exist_ok=True)
+        (base / "confidence").mkdir(exist_ok=True)
+        cv2.imwrite(str(base / f"depth/{stem}.png"), np.rint(small * 1000).astype(np.uint16))
+        cv2.imwrite(str(base / f"confidence/{stem}.png"), np.full_like(small, 255, np.uint8))
+    return folder
+
+
+def write_record3d(folder: Path) -> Path:
+    made = wall()
+    poses = []
+    for index, viewmat in enumerate(made.viewmats):
+        pose = arkit_pose(viewmat)
+        poses.append([*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]])
+        _save(folder / f"rgb/{index}.png", made.images[index])
+    content = {"poses": poses, "K": K.T.ravel().tolist(), "w": WIDTH, "h": HEIGHT, "fps": 30}
+    content["frameTimestamps"] = [0.5 + index / 30 for index in range(COUNT)]
+    (folder / "metadata.json").write_text(json.dumps(content))
+    return folder
+
+
+def write_scanner(folder: Path) -> Path:
+    """With a frame that has no image, as most have none."""
+    made = wall()
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, viewmat in enumerate(made.viewmats):
+        stem = f"{index:05d}"
+        _save(folder / f"frame_{stem}.png", made.images[index])
+        cv2.imwrite(str(folder / f"depth_{stem}.png"), np.rint(made.depths[index] * 1000).astype(np.uint16))
+        cv2.imwrite(str(folder / f"conf_{stem}.png"), np.full_like(made.depths[index], 2, np.uint8))
+        values = {"cameraPoseARFrame": arkit_pose(viewmat).ravel().tolist(), "intrinsics": K.ravel().tolist()}
+        (folder / f"frame_{stem}.json").write_text(json.dumps({**values, "time": 10.0 + index / 60}))
+    (folder / "frame_00099.json").write_text("{}")
+    return folder
+
+
+WRITERS = {
+    "MegaSaM": write_megasam,
+    "VGGT": write_vggt,
+    "Depth Anything 3": write_depth_anything,
+    "MonST3R": write_monst3r,
+    "Polycam": write_polycam,
+    "Record3D": write_record3d,
+    "3D Scanner App": write_scanner,
+}
