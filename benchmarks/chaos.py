@@ -57,6 +57,8 @@ def begin(work: Callable[[], None], log: Path, before: Callable[[], None] = lamb
     status = 70
     try:
         os.setsid()
+        for struck in (signal.SIGTERM, signal.SIGHUP):  # forked from a process with handlers of its own
+            signal.signal(struck, signal.SIG_DFL)
         number = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         for stream in (1, 2):
             os.dup2(number, stream)

@@ -18,6 +18,7 @@ TRAINING = (
     *(*RENDERING, "scgs_warp/training", "scgs_warp/data", "scgs_warp/config", "scgs_warp/evaluation"),
     *("scgs_warp/optim.py", "scgs_warp/seeding.py"),
 )
+MESHES = (*RENDERING, "scgs_warp/export/mesh")
 EDITING = (*RENDERING, "scgs_warp/edit", "scgs_warp/editor")
 
 

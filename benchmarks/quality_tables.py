@@ -19,6 +19,7 @@ from typing import Any
 from literature_tables import Column, Literature, literature_table, read_literature
 from markdown_table import duration, number, percent, signed, table, thousands
 from provenance import OLDER, REPORTED, TRAINING, changed_since, older_note, reported_note
+from zoo_tables import change_of_defaults, differences, zoo
 
 from scgs_warp.ablation.published import PUBLISHED_PSNR, TABLE_S1
 
@@ -324,31 +325,6 @@ def overview(source: Source) -> str:
     return table(["", "PSNR", "SSIM", "motion error", "training"], lines)
 
 
-BALLS = ("balls", "balls-steady")
-ZOO = ("robot", "rods", "rods-dark", *BALLS, "cloth", "fan", "touch", "opening", "still", *DNERF, "handheld")
-
-
-def change_of_defaults(source: Source) -> str:
-    """Write mean and worst PSNR of each scene before and after a change of defaults, and the mean over several scenes.
-
-    Runs with another seed are recorded as scenes of their own: ``hook-seed-1``.
-    """
-    every = [f"{scene}{seed}" for scene in ZOO for seed in ("", "-seed-1")]
-    scenes = [scene for scene in every if source.run("before", scene) and source.run("after", scene)]
-    rows = []
-    for scene in scenes:
-        before, after = source.run("before", scene), source.run("after", scene)
-        pairs = [(before[key], after[key]) for key in ("psnr", "psnr_worst")]
-        rows.append([value for old, new in pairs for value in (old, new, new - old)])
-    if len(scenes) > 1:
-        rows.append([math.fsum(column) / len(scenes) for column in zip(*rows)])
-    marked = [source.label(row, row) for row in ("before", "after")]
-    head = ["", *marked, "difference", *(f"worst image, {text}" for text in marked), "difference"]
-    cells = [[signed(value) if i % 3 == 2 else number(value, 2) for i, value in enumerate(row)] for row in rows]
-    names = [*(scene.replace("-seed-", ", seed ") for scene in scenes), "mean"]
-    return table(head, [[name, *row] for name, row in zip(names, cells)])
-
-
 WRITERS: dict[str, Callable[[Source], str]] = {
     "published": beside((*DNERF, DNERF, *ALL_DNERF[4:], ALL_DNERF), OWN_ROWS),
     "published-cost": own_cost,
@@ -365,6 +341,8 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "sharpness": change_of_defaults,
     "fast-parts": change_of_defaults,
     "levers": levers,
+    "levers-today": differences,
+    "zoo": zoo,
     "parts": changes(TWO, "none"),
     "parts-shading": changes(TWO, "parts/shading"),
     "parts-threshold": changes(TWO, "parts-shading/threshold"),

@@ -1,5 +1,5 @@
-"""Writers of the tables in docs/scaling.md and docs/editing.md whose results can be measured again with committed
-scripts.
+"""Writers of the tables in docs/scaling.md, docs/editing.md and docs/mesh.md whose results can be measured again with
+committed scripts.
 
 Until all results of a table are there, the reported table stands in its place. A column NAME of the tables of sharing
 comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharing-NAME-alone.json``:
@@ -9,7 +9,7 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
     python benchmarks/sharing.py --size 400 --steps 25 --threads 1 --json benchmarks/results/sharing-400-alone.json
 
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
-and without ``--nodes 4096``).
+and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from markdown_table import number, table
-from provenance import EDITING, OLDER, TRAINING, changed_since, older_note
+from provenance import EDITING, MESHES, OLDER, TRAINING, changed_since, older_note
 from timing_tables import machine_line
 
 COLUMNS = {"200": "200 x 200", "400": "400 x 400", "800": "800 x 800", "400-300k": "400 x 400, 300,000 Gaussians"}
@@ -75,6 +75,16 @@ def edit_updates(results: Results) -> str:
     return table(["control points", "a drag update (solve, skin)", "of which solve", "up to the picture"], lines)
 
 
+def mesh_distance(results: Results) -> str:
+    """Write the distances of exported meshes from true surfaces."""
+    lines = []
+    for row in results["mesh-distance"]["rows"]:
+        pairs = ((row[f"{way}_mean"], row[f"{way}_p95"]) for way in ("to_mesh", "to_true"))
+        told = [f"{mean:.2f} %, {most:.2f} %" for mean, most in pairs]
+        lines.append([row["subject"], row["mesh"], f"{row['time']:g}", f"{row['faces']:,}", *told])
+    return table(["subject", "mesh", "time", "triangles", "from the true surface", "from the mesh"], lines)
+
+
 class Repeatable(NamedTuple):
     """A table, the names of its results, and the folders with the code that they measure."""
 
@@ -90,6 +100,7 @@ REPEATABLE = {
     "scaling-memory": Repeatable(
         sharing_memory, (*(f"sharing-{n}" for n in ALONE), *(f"sharing-{n}-alone" for n in ALONE)), TRAINING
     ),
+    "mesh-distance": Repeatable(mesh_distance, ("mesh-distance",), MESHES),
     "editing-updates": Repeatable(edit_updates, ("edit-cpu", "edit-4096-cpu"), EDITING),
 }
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..edit.rotations import conjugate, multiply, rotate, unit
+from ..edit.rotations import conjugate, multiply, rotate, to_matrix, unit
 from ..errors import UserError
 from ..storage.files import write_atomically
 from .skeleton import Skeleton, continuous
@@ -131,9 +131,14 @@ def xyzw(quats: np.ndarray) -> np.ndarray:
     return unit(quats)[..., [1, 2, 3, 0]].astype("<f4")
 
 
-def add_skeleton(document: GltfDocument, skeleton: Skeleton, up: tuple[float, float, float], name: str) -> int:
-    """Append joints under one root, their animation, and the skin that binds vertices at rest. Joints without names are
-    called ``node_0000`` and so on.
+def add_skeleton(
+    document: GltfDocument, skeleton: Skeleton, up: tuple[float, float, float], name: str, frame: int | None = None
+) -> int:
+    """Append joints under one root, their animation, and the skin that binds vertices. Joints without names are called
+    ``node_0000`` and so on.
+
+    Args:
+        frame: frame of the skeleton whose pose the vertices show. None: they are at rest.
 
     Returns:
         Index of the skin.
@@ -156,7 +161,11 @@ def add_skeleton(document: GltfDocument, skeleton: Skeleton, up: tuple[float, fl
     root = document.append("nodes", {"name": title, "rotation": upright(up), "children": tops})
     document.json["scenes"][0]["nodes"].append(root)
     bind = np.tile(np.eye(4), (count, 1, 1))
-    bind[:, 3, :3] = -skeleton.rest  # column-major
+    if frame is None:
+        bind[:, 3, :3] = -skeleton.rest  # column-major
+    else:
+        bind[:, :3, :3] = to_matrix(skeleton.rotations[frame])  # of the inverse, column-major
+        bind[:, 3, :3] = -rotate(conjugate(skeleton.rotations[frame]), skeleton.positions[frame])
     skin = {"inverseBindMatrices": document.accessor(bind.astype("<f4")), "joints": joints, "skeleton": root}
     if len(skeleton.seconds) > 1:
         when = document.accessor(skeleton.seconds.astype("<f4"), bounds=True)

@@ -96,7 +96,7 @@ def write_page(scene: Scene, path: Path, options: PageOptions | None = None, **f
     if options.max_mib is not None and not options.max_mib > 0:
         raise UserError(f"--max-mib (max_mib) is {options.max_mib:g}; give a size in MiB above 0, or none")
     picture = options.picture or functools.partial(poster, scene)
-    page, count = _fitting(scene, path, options, picture(POSTER_SIZE))
+    page, count = _fitting(scene, path, options, picture)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -107,13 +107,14 @@ def write_page(scene: Scene, path: Path, options: PageOptions | None = None, **f
     return count
 
 
-def _fitting(scene: Scene, path: Path, options: PageOptions, picture: bytes) -> tuple[bytes, int]:
+def _fitting(scene: Scene, path: Path, options: PageOptions, picture: Callable[[int], bytes]) -> tuple[bytes, int]:
     """Return the page with the highest degree of spherical harmonics that fits, and its number of Gaussians."""
-    page, most = b"", options.max_mib
+    page, drawn, most = b"", b"", options.max_mib
     for degree in range(min(scene.gaussians.sh_degree, MAX_DEGREE), -1, -1):
         content = page_scene(scene, degree, motion_of=options.motion)
+        drawn = drawn or picture(POSTER_SIZE)  # after the scene has been checked
         facts = {**content.facts, "captions": list(options.captions)}
-        page = assemble(pack(facts, content.columns), options.title, picture, Card(url=options.url), "pose" in facts)
+        page = assemble(pack(facts, content.columns), options.title, drawn, Card(url=options.url), "pose" in facts)
         if most is None or len(page) <= most * MIB:
             return page, content.facts["gaussians"]
     least = len(page) / MIB

@@ -27,6 +27,7 @@ Format = Literal[
     "4dgs",
     "cameras",
     "html",
+    "mesh",
 ]
 SUFFIXES: dict[Format, str] = {
     "ply": ".ply",
@@ -43,12 +44,15 @@ SUFFIXES: dict[Format, str] = {
     "graph": ".glb",
     "ply-sequence": "",
     "sog-sequence": "",
+    "mesh": ".obj",
 }
 """Suffix of each format's output. Formats may share a suffix, which then selects the first of them. If a name ends in
 several suffixes, the longest of them counts."""
 TRACK_SUFFIXES = (".csv", ".npz", ".glb")
 """Suffixes of tracks. The last two select other formats unless ``--format tracks`` is given."""
-OTHER_SUFFIXES = {".htm": ".html", "meta.json": ".sog"}
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+"""Suffixes of meshes. The last two select Gaussians unless ``--format mesh`` is given."""
+OTHER_SUFFIXES = {".htm": ".html", ".stl": ".obj", "meta.json": ".sog"}
 """Alternative suffixes, and a whole name: a SOG that is not bundled."""
 STILL_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb")
 """Formats of Gaussians at one instant; ``glb`` holds the motion if no instant is given."""
@@ -57,6 +61,8 @@ FRAME_FORMATS = (*SEQUENCES, "tracks", "4dgs")
 """Formats of many moments, which hold the motion of every motion model."""
 MAX_FRAMES = 100_000
 MAX_POINTS = 1_000_000
+MESH_LIMITS = {"faces": (100, 10_000_000), "resolution": (16, 2048)}
+"""Smallest and largest value of the options of meshes."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +82,18 @@ class ExportRequest:
     frame. glb: glTF with Gaussians, moved by control points as an animated skeleton; still with --time. graph: the
     control points and their edges as an animated glTF mesh. npz: Gaussians, weights and trajectories as arrays.
     cameras: the run's cameras as nerfstudio's transforms.json. html: a page that plays the scene. tracks: paths of
-    surface points, in .npz, .csv or .glb. 4dgs: Gaussians in linear segments, for players of that format. By default
-    the output's suffix decides."""
+    surface points, in .npz, .csv or .glb. 4dgs: Gaussians in linear segments, for players of that format. mesh: the
+    surface as triangles, in .obj, .stl, .ply or .glb (docs/mesh.md). By default the output's suffix decides."""
     time: float | None = None
-    """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion."""
+    """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion, and a mesh is that of time
+    0."""
+    sequence: bool = False
+    """The moving mesh, as one animated .glb whose triangles stay the same."""
+    faces: int | None = None
+    """Largest number of a mesh's triangles; 100,000 by default."""
+    resolution: int | None = None
+    """Number of steps into which the longest side of a mesh is divided; 256 by default. More show finer details, and
+    take more time and memory."""
     edit: Path | None = None
     """Edit (docs/editing.md) to apply to the scene."""
     at: float | None = None
@@ -128,7 +142,9 @@ class ExportRequest:
 
     @property
     def still(self) -> bool:
-        """True if the output holds Gaussians at one instant."""
+        """True if the output holds one instant."""
+        if self.kind == "mesh":
+            return not self.sequence
         if self.kind != "glb":
             return self.kind in STILL_FORMATS
         return self.time is not None or self.at is not None or (self.run is None and self.edit is None)
@@ -151,18 +167,19 @@ def check_request(request: ExportRequest) -> None:
         raise UserError("export.py: give one of --run and --ply")
     if request.run is None and kind == "cameras":
         raise UserError(f"--format {kind}: needs --run; a file of Gaussians has no cameras")
-    if request.run is None and request.edit is None and kind not in (*STILL_FORMATS, "html"):
+    one_instant = kind in STILL_FORMATS or (kind == "mesh" and not request.sequence)
+    if request.run is None and request.edit is None and not one_instant and kind != "html":
         raise UserError(f"--format {kind}: needs --run, or an --edit that moves the Gaussians of {request.ply}")
     if request.time is not None and not 0 <= request.time <= 1:
         raise UserError(f"--time {request.time:g}: give a time from 0 to 1")
-    if request.time is not None and (kind not in STILL_FORMATS or request.edit is not None):
+    if request.time is not None and (not one_instant or request.edit is not None):
         other = (
             "an edit's film is shown at --at SECONDS" if request.edit else "leave it out: the format holds all times"
         )
         raise UserError(f"--time {request.time:g}: {other}")
     if request.edit is not None and kind == "cameras":
         raise UserError(f"--format {kind}: holds the cameras of the training; leave --edit out")
-    if request.at is not None and (request.edit is None or kind not in STILL_FORMATS):
+    if request.at is not None and (request.edit is None or not one_instant):
         raise UserError(f"--at {request.at:g}: is a second of an edit's film; give it with --edit and a still format")
     if request.at is not None and not 0 <= request.at <= 3600:
         raise UserError(f"--at {request.at:g}: give a second of the film, from 0 to 3600")
@@ -173,6 +190,7 @@ def check_request(request: ExportRequest) -> None:
     if request.fps is not None and not 0 < request.fps <= 1000:
         raise UserError(f"--fps {request.fps:g}: give more than 0 and at most 1000 frames a second")
     _check_unused(request)
+    _check_mesh(request)
     if request.max_mib is not None and not request.max_mib > 0:
         raise UserError(f"--max-mib {request.max_mib:g}: give more than 0 MiB")
     if request.url and not re.fullmatch(r"https?://[^\s/]+/\S*\.html?", request.url, re.IGNORECASE):
@@ -194,6 +212,7 @@ def _check_unused(request: ExportRequest) -> None:
     name = "--frames" if request.frames is not None else "--fps" if request.fps is not None else None
     if name is not None and request.still:
         remedy = "leave out --time" if kind == "glb" and request.time is not None else "give --format ply-sequence"
+        remedy = "give --sequence" if kind == "mesh" else remedy
         raise UserError(f"{name}: --output {request.output} is to hold one instant; leave {name} out, or {remedy}")
     if name is not None and kind in ("html", "cameras"):
         raise UserError(f"{name}: --format {kind} has no frames; leave it out")
@@ -208,6 +227,19 @@ def _check_unused(request: ExportRequest) -> None:
         raise UserError(f"--fps: a {kind} does not say how fast it is; leave it out, and give --frames")
 
 
+def _check_mesh(request: ExportRequest) -> None:
+    for name in ("sequence", "faces", "resolution"):
+        value = getattr(request, name)
+        if request.kind != "mesh" and value is not None and value is not False:
+            raise UserError(f"--{name}: belongs to a mesh; leave it out, or give --format mesh")
+    for name, (least, most) in MESH_LIMITS.items():
+        value = getattr(request, name)
+        if value is not None and not least <= value <= most:
+            raise UserError(f"--{name} {value}: give {least:,} to {most:,}")
+    if request.sequence and request.output.suffix.lower() != ".glb":
+        raise UserError(f"--sequence: --output {request.output} holds one instant; a moving mesh is a .glb")
+
+
 def check_output(path: Path, kind: Format) -> None:
     """Check that the output can be written; make missing folders.
 
@@ -215,12 +247,10 @@ def check_output(path: Path, kind: Format) -> None:
         UserError: the suffix is wrong, a file or folder is in the way, or the folder cannot be written.
     """
     ending, suffix = SUFFIXES[kind], output_suffix(path)
-    if kind == "tracks" and suffix in TRACK_SUFFIXES:
-        ending = suffix
-    if ending and suffix != ending:
+    choices = {"tracks": TRACK_SUFFIXES, "mesh": MESH_SUFFIXES}.get(kind, (ending,))
+    if ending and suffix not in choices:
         longer = f", not in {suffix}," if suffix.endswith(ending) else f" (not {META})" if path.name == META else ""
-        choice = " or ".join(TRACK_SUFFIXES) if kind == "tracks" else ending
-        raise UserError(f"--output {path}: end the name in {choice}{longer} for --format {kind}")
+        raise UserError(f"--output {path}: end the name in {' or '.join(choices)}{longer} for --format {kind}")
     if ending and path.is_dir():
         raise UserError(f"--output {path}: is a folder; give another name")
     if not ending and path.exists() and not path.is_dir():

@@ -63,7 +63,9 @@ def export(request: ExportRequest, device: str = "cpu") -> str:
     check_request(request)
     if request.kind in SEQUENCES:
         check_folder(request.output)
-    if request.still:
+    if request.kind == "mesh":
+        held = _export_mesh(request, device)
+    elif request.still:
         held = _export_still(request, device)
     elif request.kind == "cameras":
         held = _export_cameras(request, device)
@@ -264,6 +266,29 @@ def _export_cameras(request: ExportRequest, device: str) -> str:
     splits["train"] = refined(splits["train"], request.run, scene.normalisation) or splits["train"]
     count = write_cameras(request.output, splits)
     return f"{count} cameras"
+
+
+def _export_mesh(request: ExportRequest, device: str) -> str:
+    from .mesh.job import FACES, RESOLUTION, MeshJob, MeshSettings
+
+    scene = _open(request, device)
+    moves = scene.motion.moves or request.edit is not None
+    if request.sequence and not moves:
+        raise UserError(f"--sequence: {request.run or request.ply} stands still; leave --sequence out")
+    if request.sequence and scene.motion.moves and not isinstance(scene.motion, ControlPoints):
+        raise UserError(
+            f"--sequence: the motion model {scene.motion_name!r} has no control points, which move a mesh; write "
+            "a mesh of each instant with --time"
+        )
+    session = _open_session(request, scene) if request.sequence or request.edit is not None else None
+    job = MeshJob(scene, session, MeshSettings(request.faces or FACES, request.resolution or RESOLUTION))
+    if request.sequence:
+        assert session is not None
+        frames = even_moments(request.frames or FRAMES, request.fps or FPS)
+        return job.write_moving(request.output, film_moments(session) if request.edit is not None else frames)
+    at = (request.at or 0.0) if request.edit is not None else None
+    time = session.scene_time(at) if session is not None and at is not None else request.time or 0.0
+    return job.write_still(request.output, AnimationMoment(at or 0.0, time, at))
 
 
 def _export_page(request: ExportRequest, device: str) -> str:

@@ -51,10 +51,12 @@ def read_text(path: Path | str, most: int = MAX_TEXT, errors: str = "strict") ->
         OSError: the file is missing, not a regular file, cannot be read, or is too large.
         UnicodeDecodeError: the bytes are no UTF-8 text.
     """
+    content = bytearray()
     with open_regular(path) as file:
-        content = file.read(most + 1)
-    if len(content) > most:
-        raise OSError(errno.EFBIG, f"larger than {most >> 20} MiB", str(path))
+        while piece := file.read(2**20):  # read(most) would allocate that much for the smallest file
+            content += piece
+            if len(content) > most:
+                raise OSError(errno.EFBIG, f"larger than {most >> 20} MiB", str(path))
     return content.decode("utf-8", errors).replace("\r\n", "\n").replace("\r", "\n")
 
 

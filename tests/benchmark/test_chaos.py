@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -59,7 +60,14 @@ def test_a_child_is_an_app(tmp_path):
 
 
 def test_a_signal_meets_a_child_that_works(tmp_path):
-    child = chaos.begin(signal.pause, tmp_path / "log")
+    def leak(number: int, frame: Any) -> None:
+        raise RuntimeError("a handler of the parent's")
+
+    before = signal.signal(signal.SIGTERM, leak)
+    try:
+        child = chaos.begin(signal.pause, tmp_path / "log")
+    finally:
+        signal.signal(signal.SIGTERM, before)
     struck = fault("terminate", tmp_path)
     struck.outside(child, 0.1)
     assert struck.allows(chaos.end(child))

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+import trimesh
 
 from helpers.chromium import chromium
 from helpers.edit_scenes import bar_scene, figure_scene
@@ -16,6 +17,9 @@ from scgs_warp.edit.rotations import rotate
 from scgs_warp.export.control_graph import write_graph
 from scgs_warp.export.glb import write_glb
 from scgs_warp.export.gltf import upright
+from scgs_warp.export.mesh.binding import bind, posed
+from scgs_warp.export.mesh.files import write_mesh
+from scgs_warp.export.mesh.surface import Surface
 from scgs_warp.export.part_rig import build_rig
 from scgs_warp.export.run import write_still
 from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
@@ -191,6 +195,25 @@ def test_the_graph_plays_in_three(page):
         assert np.abs(balls.mean(1) - nodes).max() < 5e-6
         ends = bars.reshape(-1, 2, 3, 3).mean(2)
         assert np.abs(ends - nodes[session.graph.edges]).max() < 5e-6
+
+
+def test_the_moving_mesh_plays_in_three(page):
+    window, folder = page
+    scene = bar_scene()
+    up, frame = scene.overview.up, 3
+    skeleton = build_skeleton(EditSession(scene), even_moments(FRAMES, FPS))
+    box = trimesh.creation.box((1.2, 0.15, 0.15)).subdivide().subdivide()
+    surface = Surface(np.asarray(box.vertices) + np.array([0.5, -1.0, 0.25]), np.asarray(box.faces, np.int32))
+    tracks = np.stack([scene.gaussians_at(frame / (FRAMES - 1)).means.double().numpy()] * 2)
+    bound = bind(surface, tracks, skeleton)
+    colors = np.full((len(surface.vertices), 3), 0.5)
+    write_mesh(folder / "m.glb", surface, colors, up, skeleton=bound, frame=frame)
+    found = window.evaluate("([url, times]) => window.play(url, times)", ["/m.glb", [0.0, frame / FPS, 2.0]])
+    for shown, at in zip(found["frames"], (0, frame, FRAMES - 1)):
+        expected = turned(posed(surface.vertices, bound, frame, at), up)
+        assert np.abs(np.array(shown["vertices"]) - expected).max() < 5e-6
+    first, last = (np.array(found["frames"][i]["vertices"]) for i in (0, 2))
+    assert np.abs(first - last).max() > 0.1
 
 
 def test_three_reads_the_gaussians(page):

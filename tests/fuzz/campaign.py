@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 HERE = Path(__file__).resolve().parent
-MODULES = ("fuzz.cases_render", "fuzz.cases_motion", "fuzz.cases_training", "fuzz.cases_cuda")
+MODULES = ("fuzz.cases_render", "fuzz.cases_motion", "fuzz.cases_training", "fuzz.cases_mesh", "fuzz.cases_cuda")
 SAVE_EVERY = 5.0
 """Seconds between two summaries."""
 PATIENCE = 240

@@ -33,12 +33,14 @@ REGISTERS = {
 """Registers of the hot kernels. Steps of occupancy for blocks of 256 threads: 32 registers 100 %, 40 75 %, 48 62 %,
 64 50 %, 80 38 %, 96 25 %."""
 STACK = {
+    "bending": {"bend": 40},  # the singular value decomposition of a stretched Gaussian, of edits alone
     "cuda.compositing_blocks": {"composite_adjoint": 48},  # more than eight channels alone
     "compositing": {"sum_line_slots": 64},  # for a CPU
     "encoding": {"encode": 32},  # sine and cosine of large angles
+    "surface_depth": {"surface_depth": 1024},  # the Gaussians of a ray; part of no frame and no step
 }
 """Bytes of stack of the kernels that have one, with the reason."""
-ASIDE = ("benchmark", "raycast_figure", "raycast_mesh", "solid_textures")
+ASIDE = ("benchmark", "raycast_figure", "raycast_hits", "raycast_mesh", "solid_textures")
 """Modules that no frame and no step launches."""
 
 

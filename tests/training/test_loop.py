@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -12,7 +13,6 @@ import pytest
 import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
-from scgs_warp.config.presets import with_steps
 from scgs_warp.errors import UserError
 from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.evaluation.image_metrics import psnr
@@ -170,8 +170,10 @@ def test_refusals(tmp_path):
     fit(config, data, output=tmp_path / "run")
     with pytest.raises(UserError, match="holds a run already"):
         fit(config, data, output=tmp_path / "run")
-    with pytest.raises(UserError, match="made with steps"):
-        fit(with_steps(config, 40), data, output=tmp_path / "run", resume=True)
+    with pytest.raises(UserError, match="made with batch = 1, now 2"):
+        fit(dataclasses.replace(config, batch=2), data, output=tmp_path / "run", resume=True)
+    with pytest.raises(UserError, match="is at step 20 already, beyond --steps 10; give at least 20"):
+        fit(dataclasses.replace(config, steps=10), data, output=tmp_path / "run", resume=True)
     with pytest.raises(UserError, match="no such run"):
         fit(config, data, output=tmp_path / "new", resume=True)
     assert not (tmp_path / "new").exists()

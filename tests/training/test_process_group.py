@@ -162,7 +162,7 @@ def test_torchrun_trains(tmp_path):
         [*command, *SMALL], env=environ, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.count("contact_sheet.png") == 1 and "2 processes: this one waited" in done.stdout
+    assert done.stdout.count("metrics.json, contact_sheet.png") == 1 and "2 processes: this one waited" in done.stdout
     assert json.loads((tmp_path / "run/config.json").read_text())["batch"] == 2
     assert json.loads((tmp_path / "run/metrics.json").read_text())["step"] == 24
 

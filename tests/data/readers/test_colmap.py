@@ -104,8 +104,10 @@ def test_a_model_of_other_images(data_root):
     folder = data_root / "colmap"
     if not folder.is_dir():
         pytest.skip("no such model here")
-    with pytest.raises(UserError, match=r"camera \d+, of \d+\.jpg, is of 269\d x 20\d\d pixels, but the image is 2704"):
+    with pytest.raises(UserError, match=r"the images of 3 of 5 frames are missing .* pass --min-frames 2"):
         load(folder)
+    with pytest.raises(UserError, match=r"camera \d+, of \d+\.jpg, is of 269\d x 20\d\d pixels, but the image is 2704"):
+        load(folder, min_frames=2)
 
 
 def test_a_video_is_the_same_from_transforms_and_from_colmap(data_root, tmp_path):

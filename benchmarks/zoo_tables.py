@@ -1,0 +1,90 @@
+"""Tables whose rows are the subjects of the zoo and other scenes."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from markdown_table import number, percent, signed, table, thousands
+
+if TYPE_CHECKING:
+    from quality_tables import Source
+
+BALLS = ("balls", "balls-steady")
+DNERF = ("jumpingjacks", "hook", "mutant", "standup")
+ZOO = ("robot", "rods", "rods-dark", *BALLS, "cloth", "fan", "touch", "opening", "still", *DNERF, "handheld")
+
+
+def change_of_defaults(source: Source) -> str:
+    """Write mean and worst PSNR of each scene before and after a change of defaults, and the mean over several scenes.
+
+    Runs with another seed are recorded as scenes of their own: ``hook-seed-1``.
+    """
+    every = [f"{scene}{seed}" for scene in ZOO for seed in ("", "-seed-1")]
+    scenes = [scene for scene in every if source.run("before", scene) and source.run("after", scene)]
+    rows = []
+    for scene in scenes:
+        before, after = source.run("before", scene), source.run("after", scene)
+        pairs = [(before[key], after[key]) for key in ("psnr", "psnr_worst")]
+        rows.append([value for old, new in pairs for value in (old, new, new - old)])
+    if len(scenes) > 1:
+        rows.append([math.fsum(column) / len(scenes) for column in zip(*rows)])
+    marked = [source.label(row, row) for row in ("before", "after")]
+    head = ["", *marked, "difference", *(f"worst image, {text}" for text in marked), "difference"]
+    cells = [[signed(value) if i % 3 == 2 else number(value, 2) for i, value in enumerate(row)] for row in rows]
+    names = [*(scene.replace("-seed-", ", seed ") for scene in scenes), "mean"]
+    return table(head, [[name, *row] for name, row in zip(names, cells)])
+
+
+ALTERNATIVES = {
+    "arap": "ARAP 1e-2 to the end",
+    "nodes-512": "512 control points",
+    "progressive": "`--progressive`",
+    "time-10": "10 frequencies of the time",
+}
+"""Other settings that were tried on single subjects, by the names of their rows."""
+
+
+def zoo(source: Source) -> str:
+    """Write the scores of every scene with the defaults, and the best of the other settings that were tried on it."""
+    head = source.label("cpu", "PSNR")
+    for row in ALTERNATIVES:
+        source.label(row, "")
+    lines = []
+    for scene in ZOO:
+        run = source.run("cpu", scene)
+        if not run:
+            continue
+        tried = {row: own["psnr"] for row in ALTERNATIVES if (own := source.run(row, scene))}
+        best = max(tried, key=tried.__getitem__, default=None)
+        lines.append(
+            [
+                scene,
+                number(run["psnr"], 2),
+                number(run["psnr_median"], 2),
+                f"{run['psnr_worst']:.2f} ({run['psnr_worst_time']:.2f})",
+                percent(100 * run["missing"], 1),
+                percent(run.get("epe"), 1),
+                thousands(run["gaussians"], 1),
+                ""
+                if best is None
+                else f"{signed(tried[best] - run['psnr'])} ({ALTERNATIVES[best]}; {len(tried)} tried)",
+            ]
+        )
+    names = ["median", "worst (at t)", "missing", "motion error", "Gaussians", "best other setting"]
+    return table(["", head, *names], lines)
+
+
+def differences(source: Source) -> str:
+    """Write the PSNR of the row ``none`` and, each change's differences from it where it was tried."""
+    rows = dict.fromkeys(row for name, row, _ in source.runs if name == source.name)
+    scenes = [scene for scene in (*DNERF, *ZOO[: -len(DNERF) - 1]) if source.run("none", scene)]
+    lines = []
+    for row in rows:
+        runs = {scene: run for scene in scenes if (run := source.run(row, scene))}
+        cells = []
+        for scene in scenes:
+            value, base = runs.get(scene, {}).get("psnr"), source.run("none", scene)["psnr"]
+            cells.append(number(value, 2) if row == "none" or value is None else signed(value - base))
+        lines.append([source.label(row, next(iter(runs.values()))["label"]), *cells])
+    return table(["change", *scenes], lines)

@@ -1,0 +1,1 @@
+"""Triangle meshes of a scene: the surface at a moment, its colours, its motion, and files that hold them."""
