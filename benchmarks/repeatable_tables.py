@@ -1,5 +1,5 @@
 """Writers of the tables in docs/scaling.md, docs/editing.md and docs/mesh.md whose results can be measured again with
-committed scripts.
+committed scripts (for those on parts and poses, see ``posing_tables.py``).
 
 Until all results of a table are there, the reported table stands in its place. A column NAME of the tables of sharing
 comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharing-NAME-alone.json``:
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from markdown_table import number, table
+from posing_tables import gestures, parts_found, pictures
 from provenance import EDITING, MESHES, OLDER, TRAINING, changed_since, older_note
 from timing_tables import machine_line
 
@@ -101,6 +102,9 @@ REPEATABLE = {
         sharing_memory, (*(f"sharing-{n}" for n in ALONE), *(f"sharing-{n}-alone" for n in ALONE)), TRAINING
     ),
     "mesh-distance": Repeatable(mesh_distance, ("mesh-distance",), MESHES),
+    "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-man"), EDITING),
+    "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
+    "posing-pictures": Repeatable(pictures, ("posing-pictures",), EDITING),
     "editing-updates": Repeatable(edit_updates, ("edit-cpu", "edit-4096-cpu"), EDITING),
 }
 

@@ -1,0 +1,81 @@
+"""Writers of the tables of docs/editing.md on parts and poses. Runs are those of the built-in figure with three seeds:
+
+    python apps/train.py --seed S --nodes 256 --threads 1 --output fig-S
+    python benchmarks/parts.py --run fig-0 fig-1 fig-2 --data data/figure --json benchmarks/results/parts-figure.json
+    python benchmarks/posing.py --run fig-0 fig-1 fig-2 --json benchmarks/results/posing-figure.json
+    python benchmarks/posing_pictures.py --run fig-0 fig-1 fig-2 --size 200 --json benchmarks/results/posing-pictures.json
+
+and of a glTF character, ``man``, filmed by ``apps/synthesize.py`` and trained with ``--preset cpu --steps 6000``:
+
+    python benchmarks/parts.py --run man --data data/man --mesh CesiumMan.glb --json benchmarks/results/parts-man.json
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from markdown_table import table
+
+Results = dict[str, dict[str, Any]]
+
+GESTURES = {"default": "one pull on the hand or foot", "part": "the part turned about its joint", "point": "one point"}
+
+
+def parts_found(results: Results) -> str:
+    """Write how well the parts and joints of each run agree with the true bones."""
+    lines = []
+    for result in results.values():
+        for whole in (row for row in result["rows"] if row["bone"] == "all"):
+            own = [row for row in result["rows"] if row["run"] == whole["run"] and row["bone"] != "all"]
+            joints = sorted(row["joint_error"] for row in own if "joint_error" in row)
+            axes = sorted(row["axis_error"] for row in own if "axis_error" in row)
+            lines.append([
+                whole["run"], f"{100 * whole['agreement']:.0f} %", f"{whole['parts']} ({whole['bones']})",
+                _spread(joints, " %"), _spread(axes, "°"), f"{whole['seconds']:.1f} s",
+            ])  # fmt: skip
+    head = ["run", "surface", "parts (bones)", "joints off: median, largest", "axes off: median, largest", "found in"]
+    return table(head, lines)
+
+
+def _spread(values: list[float], unit: str) -> str:
+    if not values:
+        return ""
+    return f"{values[len(values) // 2]:.1f}{unit}, {values[-1]:.1f}{unit} ({len(values)})"
+
+
+def gestures(results: Results) -> str:
+    """Write what the gestures do to the limbs, for each run."""
+    rows, lines = results["posing-figure"]["rows"], []
+    for gesture, text in GESTURES.items():
+        for limb in ("arm", "leg"):
+            for degrees in sorted({row["degrees"] for row in rows}):
+                key = (gesture, limb, degrees)
+                own = [row for row in rows if (row["gesture"], row["limb"], row["degrees"]) == key]
+
+                def cells(name: str, write: Callable[[float], str], own: list[dict[str, Any]] = own) -> str:
+                    return " ".join(write(row[name]) for row in own)
+
+                lines.append([
+                    f"{text}: {limb}, {degrees}", cells("worst_edge", _percent),
+                    cells("least_determinant", "{:.2f}".format), cells("limb_error", _percent),
+                    cells("torso_moved", lambda value: f"{100 * value:.1f}"),
+                ])  # fmt: skip
+    return table(["gesture, degrees", "worst edge, %", "determinant", "error, %", "trunk, %"], lines, numbers=False)
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.0f}"
+
+
+def pictures(results: Results) -> str:
+    """Write the PSNR of posed runs against ray-cast pictures of the same pose."""
+    rows = results["posing-pictures"]["rows"]
+    runs = list(dict.fromkeys(row["run"] for row in rows))
+    unedited = {row["run"]: row["psnr_unedited"] for row in rows}
+    lines = [["not posed", *[" ".join(f"{unedited[run]:.1f}" for run in runs)] * 3]]
+    for limb, degrees in dict.fromkeys((row["limb"], row["degrees"]) for row in rows):
+        own = {(r["run"], r["skin"]): r["psnr"] for r in rows if (r["limb"], r["degrees"]) == (limb, degrees)}
+        skins = [" ".join(f"{own[run, skin]:.1f}" for run in runs) for skin in ("parts", "dual", "nodes")]
+        lines.append([f"{limb}, {degrees}", *skins])
+    return table(["joint, degrees", "`parts`", "`dual`", "`nodes`"], lines, numbers=False)
