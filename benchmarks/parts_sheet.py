@@ -1,6 +1,6 @@
 """Draw the parts that were found in trained runs: each moment beside itself with its parts in colours.
 
-    python benchmarks/parts_sheet.py --run runs/jumpingjacks runs/hook ... --output docs/images/edit-parts.png
+python benchmarks/parts_sheet.py --run runs/jumpingjacks runs/hook ... --output docs/images/edit-parts.png
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
     python apps/train.py --seed S --nodes 256 --threads 1 --output fig-S
     python benchmarks/parts.py --run fig-0 fig-1 fig-2 --data data/figure --json benchmarks/results/parts-figure.json
     python benchmarks/posing.py --run fig-0 fig-1 fig-2 --json benchmarks/results/posing-figure.json
-    python benchmarks/posing_pictures.py --run fig-0 fig-1 fig-2 --size 200 --json benchmarks/results/posing-pictures.json
+    python benchmarks/posing_pictures.py --run fig-0 fig-1 fig-2 --size 200 \\
+        --json benchmarks/results/posing-pictures.json
 
 and of a glTF character, ``man``, filmed by ``apps/synthesize.py`` and trained with ``--preset cpu --steps 6000``:
 
