@@ -45,6 +45,7 @@ EXPORTS = {
     "sog": "scene.sog --time 0.5",
     "4dgs": "scene.4dgs --frames 3",
     "tracks": "tracks.npz --frames 3",
+    "mesh": "mesh.obj --time 0.5 --resolution 32",
 }
 
 
@@ -68,11 +69,11 @@ def prepare(place: Path) -> None:
     (place / "edit.json").write_text(json.dumps(content))
 
 
-def _train(name: str, said: str) -> Step:
+def _train(name: str, said: str, more: str = "") -> Step:
     run = f"runs/{name}"
     return Step(
         name,
-        f"train --data data/{name} --output {run} {{tiny}}",
+        f"train --data data/{name} --output {run} {{tiny}}{more}",
         (said, f"{run}: metrics.json"),
         tuple(f"{run}/{file}" for file in WRITTEN),
     )
@@ -84,7 +85,7 @@ CHAPTERS: dict[str, tuple[Step, ...]] = {
         Step("version", "--version", ("scgs-warp",)),
         Step("help", "--help", ("usage: scgs-warp COMMAND",)),
         Step("settings", "config nodes", ("motion.nodes",)),
-        _train("blobs", LAYOUTS["blobs"][1]),
+        _train("blobs", LAYOUTS["blobs"][1], " --steps 300"),  # until Gaussians are opaque
     ),
     "data": (
         *(_train(name, said) for name, (_, said) in LAYOUTS.items() if name != "blobs"),
@@ -110,10 +111,16 @@ CHAPTERS: dict[str, tuple[Step, ...]] = {
             Step(name, f"export --run {RUN} --format {name} --output {words}", (), (words.split()[0],))
             for name, words in EXPORTS.items()
         ),
+        Step(
+            "moving-mesh",
+            f"export --run {RUN} --format mesh --sequence --frames 3 --resolution 32 --output mesh.glb",
+            ("control points",),
+            ("mesh.glb",),
+        ),
         Step("flight", f"view --run {RUN} --path cameras.json --size 48 --output flight", (), ("flight",)),
     ),
     "more": (
-        Step("longer", f"train --output {RUN} --resume --steps 30", ("30",), (), (RUN,)),
+        Step("longer", f"train --output {RUN} --resume --steps 320", ("320",), (), (RUN,)),
         Step("seen", "view --ply moment.ply --output moment.gif --frames 2 --size 48", (), ("moment.gif",)),
     ),
 }
