@@ -11,7 +11,10 @@ from markdown_table import number, percent, table
 from provenance import OLDER, changed_since, older_note
 
 Report = dict[str, Any]
-ASIDE = ("benchmark", "harmonics_rotation", "raycast_figure", "raycast_mesh", "sampling", "solid_textures")
+ASIDE = (
+    *("benchmark", "fusion", "harmonics_rotation", "raycast_figure", "raycast_hits", "raycast_mesh", "sampling"),
+    *("solid_textures", "surface_depth"),
+)
 """Modules that neither a frame nor a training step launches; their kernels are in the JSON file alone."""
 COUNTED = ("all", "FP32", "MUFU", "shared", "SHFL", "global", "atomic", "vote", "barrier", "branch", "local", "other")
 CODE = ("kernels", "benchmarks/cubins.py", "benchmarks/sass.py")
