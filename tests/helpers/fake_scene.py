@@ -104,3 +104,4 @@ def install(monkeypatch: pytest.MonkeyPatch, scene: FakeScene) -> None:
     module = types.ModuleType("scgs_warp.scene.scene")
     module.Scene = Scene  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "scgs_warp.scene.scene", module)
+    monkeypatch.setattr("scgs_warp.scene.frame_colors.FrameColors.read", lambda folder: None)  # has no checkpoint
