@@ -51,7 +51,7 @@ class Options:
     port: int = 8080
     """Port of the editor on 127.0.0.1; if it is taken, the next free one. With --share, the port for other machines."""
     share: bool = False
-    """Serve the editor to other machines: on all interfaces, behind a proxy that asks for a token."""
+    """Serve the editor to other machines, too: on all interfaces, to whoever has the token of the printed address."""
     folder: Path | None = None
     """Folder for the editor's edits, films and exports; by default edits/ in the run folder, or beside the file
     that --ply names. The editor keeps its edit there after every change and restores it when it starts again."""
@@ -161,9 +161,7 @@ def open_browser(session: EditSession, options: Options) -> None:
     Raises:
         UserError: the editor cannot run here.
     """
-    import secrets
-
-    from scgs_warp.editor import Editor, Proxy
+    from scgs_warp.editor import Editor
     from scgs_warp.editor.autosave import Autosave, folder_for
     from scgs_warp.runtime.stop_signals import stop_signals
 
@@ -172,26 +170,20 @@ def open_browser(session: EditSession, options: Options) -> None:
     folder = folder_for(source, options.folder)
     autosave = Autosave(session, folder, "" if options.ply is None else options.ply.name)
     autosave.start(restore=options.script is None and not options.new)
-    key = secrets.token_urlsafe(24) if options.share else None
+    title = source.resolve().name
     with stop_signals() as stop:  # Shells may make background processes ignore Ctrl-C.
-        editor = Editor(session, folder, 0 if options.share else options.port, key=key, autosave=autosave)
-        proxy = None
+        editor = Editor(session, folder, title=title, port=options.port, shared=options.share, autosave=autosave)
         try:
-            print(autosave.said or f"the edit is kept in {autosave.path}", flush=True)
-            if key is None:
-                print(f"open {editor.url} in a browser; Ctrl-C ends", flush=True)
-            else:
-                proxy = Proxy(editor.port, key, public=options.port)
-                print(f"open {proxy.url} in a browser; Ctrl-C ends", flush=True)
+            print(autosave.said or f"the edit is kept in {autosave.path}")
+            print(f"open {editor.url} in a browser; Ctrl-C ends", flush=True)
+            if options.share:
                 print("from other machines: the same with this machine's name; whoever has the token may edit")
                 print("what is sent is not encrypted: outside a network that you trust, forward the port over SSH")
                 sys.stdout.flush()
             stop.wait()
-            print(f"the editor has ended; the edit is in {autosave.path}", flush=True)
         finally:
-            if proxy is not None:
-                proxy.stop()
             editor.stop()
+        print(f"the editor has ended; the edit is in {autosave.path}", flush=True)
 
 
 def skeleton_lines(session: EditSession) -> list[str]:
@@ -216,9 +208,9 @@ def main(args: list[str] | None) -> None:
     check(options)
     browser = options.output is None and options.export is None and not options.skeleton
     if browser:
-        from scgs_warp.editor.app import import_viser
+        from scgs_warp.live.server import import_aiohttp
 
-        import_viser()  # A missing package is reported before the scene is loaded.
+        import_aiohttp()  # A missing package is reported before the scene is loaded.
     device = prepare(options.device, options.threads, options.memory_gib)
     session = open_session(options, device)
     if options.skeleton:

@@ -81,6 +81,14 @@ class EditSession(Posing):
             self._future.clear()
             self.edit = edit
 
+    @property
+    def can_undo(self) -> bool:
+        return bool(self._past) or self._before_drag is not None
+
+    @property
+    def can_redo(self) -> bool:
+        return bool(self._future)
+
     def undo(self) -> bool:
         """Return to the previous edit; return False if there is none."""
         self.release()

@@ -1,8 +1,7 @@
-"""The editor in the browser: viser serves the page, and the package's own renderer draws the scene on it."""
+"""The editor in the browser: a page that draws the scene itself, and a server that poses its control points."""
 
 from __future__ import annotations
 
 from .app import Editor
-from .proxy import Proxy
 
-__all__ = ["Editor", "Proxy"]
+__all__ = ["Editor"]

@@ -1,394 +1,330 @@
-"""The editor: serves an ``EditSession`` to browsers and turns clicks and drags into edits."""
+"""The editor: a page that draws the scene itself, and a server that sends it the poses of the control points."""
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import io
+import re
 import sys
 import time
 import traceback
-from collections.abc import Callable
 from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ..edit import EditSession, Target
-from ..edit.handles import STAY
-from ..edit.rotations import IDENTITY
-from ..errors import UserError
-from ..geometry.cameras import orbit_camera
-from . import gizmo_pose
+from ..edit import EditSession
+from ..edit.field_reader import FieldReader
+from ..errors import UserError, one_line
+from ..export.page import MAX_DEGREE, SCRIPTS, document, program_text, read_web
+from ..export.page_data import pack
+from ..export.page_edit import own_motion
+from ..export.page_pose import with_parts
+from ..export.page_scene import page_scene
+from ..live.server import Client, PageServer
+from . import files
+from .actions import ACTIONS
 from .autosave import Autosave
-from .display import RADIUS, Display
-from .frame_image import FINE_QUALITY, QUALITY, Picture, take_picture
-from .model import Combine, EditorModel, Moment
-from .overlays import GIZMO, Overlays
-from .panel.panel import Panel
-from .parts_tool import Hit, PartFrame, PartsTool, hit
-from .proxy import guarded
-from .views import FULL, ClientCamera, Pace, PictureSchedule
+from .exports import EXPORTS, downloadable
+from .gizmo_pose import GizmoFrame
+from .jobs import JobProgress, Jobs
+from .model import EditorModel, Moment
+from .parts_tool import PartsTool
+from .pictures import camera_of, scene_jpeg
+from .pose_schedule import PoseSchedule, Wanted
+from .poses import picture_message, pose_message, pose_table
+from .state import page_state
 from .worker import Worker
 
 if TYPE_CHECKING:
-    import viser
+    from aiohttp import web
 
-HOST = "127.0.0.1"
-MOVING_SECONDS, STILL_SECONDS = 0.11, 0.8
-"""Target times for drawing a picture, in seconds: while something moves, and while all is still."""
-MAX_SCREENSHOT_SIZE = 4096
-"""Upper limit for the longer side of a screenshot in pixels, whatever window size a page reports."""
-REPEAT_SECONDS = 1.5
-"""Seconds during which the same message is not repeated."""
-
-
-def import_viser() -> Any:
-    """Import the package that serves the page.
-
-    Raises:
-        UserError: the package is not installed.
-    """
-    try:
-        import viser
-    except ImportError:
-        raise UserError("the editor needs the package viser; install it with: pip install 'scgs_warp[edit]'") from None
-    return viser
+WEB = Path(__file__).parent / "web"
+OWN_SCRIPTS = ("connection", "overlay", "gizmo", "tools", "pictures", "timeline", "panel", "commands", "studio")
+"""Scripts of ``web/``, after those of the exported page."""
+SHADERS = ("overlay.vert", "overlay.frag")
 
 
 class Editor:
-    """Server of one session for any number of browsers, until ``stop``.
+    """Server of one session for any number of pages, until ``stop``.
 
     Args:
         session: scene and edit.
         folder: folder of edits, films and exports.
-        port: port on 127.0.0.1; if it is taken, the next free one is used. 0: any.
-        size: upper limit for the longer side of a picture in pixels.
-        key: secret of the proxy in front of the editor, if there is one.
+        title: name of the scene.
+        port, shared: as for ``PageServer``.
         autosave: keeper of the session's edit; None: it is saved on request alone.
 
-    Attributes: ``server`` (viser's), ``model``, ``parts`` (what clicks and drags do with parts), ``worker``, ``port``,
-    ``gizmo_frame`` (a pair, or None if no gizmo is shown: the gizmo's frame, of a handle or of a part, and the handle's
-    target, translation and rotation, when a drag begins), ``latency`` (seconds from a drag to its picture, the latest
-    hundred).
+    Attributes: ``server``, ``model``, ``parts`` (what clicks and drags do with parts), ``worker``, ``jobs``, ``held``
+    (frame and pose of the handle that is dragged; None: a part is), ``latency`` (seconds from a drag to its pose, the
+    latest hundred).
 
     Raises:
-        UserError: viser is not installed.
+        UserError: aiohttp is not installed, or the port is not available.
     """
 
     def __init__(
         self,
         session: EditSession,
         folder: Path,
+        *,
+        title: str = "scene",
         port: int = 8080,
-        size: int = 1024,
-        key: str | None = None,
+        shared: bool = False,
         autosave: Autosave | None = None,
     ) -> None:
-        viser = import_viser()
-        self.session, self.folder = session, folder
-        self.schedule = PictureSchedule()
-        self.quick, self.full = Pace(MOVING_SECONDS, 256, 512), Pace(STILL_SECONDS, min(640, size), size)
-        self.worker = Worker(self.schedule, self._draw, lambda: self.model.busy, failed=self.picture_failed)
-        self.autosave = autosave
-        self._autosave_problem: str | None = None
+        self.session, self.folder, self.title, self.autosave = session, folder, title, autosave
+        self.schedule = PoseSchedule()
         self.model = EditorModel(session, self._changed)
         self.parts = PartsTool(self.model)
+        self.worker = Worker(self.schedule, self._send_pose, lambda: self.model.dragging, failed=self._pose_failed)
+        self.jobs = Jobs(lambda progress: self._show_job(progress), self._job_ended)
+        self.held: tuple[GizmoFrame, tuple[Any, Any]] | None = None
         self.latency: list[float] = []
-        self._notified: dict[str, float] = {}
-        self._first = True
-        """True if no picture has been drawn yet."""
-        self._waiting: dict[int, Any] = {}
+        self._version, self._posed = 1, self._pose_key()
+        self._asked: float | None = None
+        """Time of the latest message of a drag whose pose is not sent yet."""
+        self._drag: tuple[float, Client, dict[str, Any]] | None = None
+        """Time, page and latest message of the drag that is not yet applied."""
         self._dragger: int | None = None
-        self._dragged_at: float | None = None
-        self.gizmo_frame: tuple[gizmo_pose.GizmoFrame | PartFrame, Target] | None = None
-        self.display = Display.of(session.scene.overview)
-        with guarded(key), contextlib.redirect_stdout(io.StringIO()):  # viser's banner names its own port
-            self.server: viser.ViserServer = viser.ViserServer(HOST, port, label="scgs_warp", verbose=False)
-        self.port: int = self.server.get_port()
-        self._set_up_page()
-        self.panel = Panel(self)
+        self._pictures: dict[int, dict[str, Any]] = {}
+        self._job: JobProgress | None = None
+        self._content: bytes | None = None
+        self._page = page_of(title)
+        routes = {"/": self._serve_page, "/scene": self._serve_scene, "/file/{name}": self._serve_file}
+        self.server = PageServer(
+            routes, port=port, shared=shared, received=self._receive, connected=self._greet, left=self._dismiss
+        )
+        if autosave is not None:
+            autosave.done = self.tell
         self.worker.start()
-        self.server.on_client_connect(self._connect)
-        self.server.on_client_disconnect(self._disconnect)
-        self.refresh()
 
     @property
     def url(self) -> str:
-        return f"http://{HOST}:{self.port}"
+        return self.server.url
 
     def stop(self) -> None:
-        self.panel.jobs.stop()
+        self.jobs.stop()
         self.worker.stop()
+        self.server.stop()
         if self.autosave is not None:
             self.autosave.stop()
-        self.server.stop()
 
-    def _set_up_page(self) -> None:
-        """Set up direction, initial camera, overlays and click callbacks."""
-        server, overview = self.server, self.session.scene.overview
-        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
-        server.gui.main_panel.dock_right()  # beside the picture, not over it
-        server.scene.world_axes.visible = False
-        server.scene.set_up_direction(overview.up)
-        start = orbit_camera(overview, overview.azimuth, 256)
-        camera = server.initial_camera
-        camera.position = tuple(self.display.show(start.position.numpy()).tolist())  # type: ignore[assignment]
-        camera.look_at, camera.up = (0.0, 0.0, 0.0), overview.up
-        camera.fov = 2 * float(np.arctan(start.height / (2 * float(start.K[1, 1]))))
-        camera.near, camera.far = 0.01 * RADIUS, 100.0 * RADIUS
-        self.edge_length = self.session.graph.edge_length / self.session.engine.units[1]
-        self.node_size = 0.16 * self.edge_length * self.display.scale
-        points = self.display.show(self.session.node_positions(0.0))
-        self.overlays = Overlays(server, self.session.graph.edges, points, self.node_size, GIZMO * RADIUS)
-        self.overlays.gizmo.on_update(self._gizmo_moved)
-        scene = server.scene
-        for modifier, how in ((None, None), ("shift", "add"), ("cmd/ctrl", "subtract")):
-            scene.on_click(modifier=modifier)(functools.partial(self._clicked, how=how))  # type: ignore[arg-type]
+    # Pages
 
-    # Clients
+    def _greet(self, client: Client) -> None:
+        self.worker.post(lambda: self._welcome(client))
 
-    def _connect(self, client: viser.ClientHandle) -> None:
-        if self.autosave is not None and self.autosave.said:
-            client.add_notification("Your edit", self.autosave.said, auto_close_seconds=10.0)
-        if self._first:
-            text = "Kernels are compiled on first use, which may take a minute."
-            self._waiting[client.client_id] = client.add_notification("Drawing the scene", text, loading=True)
-        client.camera.on_update(lambda camera: self._moved(client))
-        self._moved(client)
+    def _welcome(self, client: Client) -> None:
+        scene, edges = self.session.scene, self.session.graph.edges.reshape(-1).tolist()
+        hello = {
+            "title": self.title,
+            "said": "" if self.autosave is None else self.autosave.said,
+            "edges": edges,
+            "folder": str(self.folder),
+            "files": list(files.saved_edits(self.folder)),
+            "overview": scene.overview.to_dict(),
+            "normalisation": {"centre": scene.normalisation.centre.tolist(), "scale": scene.normalisation.scale},
+            "background": list(scene.background_color),
+            "parts": [{"name": part.name} for part in self.session.parts()],
+        }
+        client.send({"hello": hello})
+        client.send({"state": self._state()}, latest="state")
 
-    def _disconnect(self, client: viser.ClientHandle) -> None:
-        if client.client_id == self._dragger:  # the window was closed during a drag
-            self._dragger = None
-            self.model.release()
-        self._waiting.pop(client.client_id, None)
+    def _dismiss(self, client: Client) -> None:
+        def forget() -> None:
+            if client.number == self._dragger:  # the page was closed during a drag
+                self._dragger = None
+                self.model.release()
+
         with self.worker.changing() as schedule:
-            schedule.drop(client.client_id)
+            schedule.drop(client.number)
+        self.worker.post(forget)
 
-    def _moved(self, client: viser.ClientHandle) -> None:
-        if client.client_id not in self.server.get_clients():
-            return
-        with self.worker.changing() as schedule:
-            schedule.move(client.client_id, self.camera(client), time.monotonic())
+    def _state(self) -> dict[str, Any]:
+        return page_state(self.model, self.parts, self._version, self.autosave, self._job)
+
+    def _pose_key(self) -> Any:
+        return self.session.edit, self.model.following
 
     def _changed(self) -> None:
-        """Keep the edit, unless it is in the middle of a drag, and show it."""
-        self.refresh()
-        if self.autosave is None or self.model.dragging:
-            return
-        self.autosave.note(self.session.edit)
-        problem, before = self.autosave.problem, self._autosave_problem
-        self._autosave_problem = problem
-        if problem is not None and problem != before:
-            self.say(None, "The edit is not saved", problem)
+        """Keep the edit, and tell all pages; called after every change of the model."""
+        key = self._pose_key()
+        if key != self._posed:
+            self._posed = key
+            self._version += 1
+        if self.model.dragging:
+            with self.worker.changing() as schedule:
+                schedule.ask_live()
+        elif self.autosave is not None:
+            self.autosave.note(self.session.edit)
+        self.tell()
 
-    def refresh(self) -> None:
-        """Request new pictures for all clients."""
+    def tell(self) -> None:
+        """Send the state to all pages."""
+        self.server.broadcast({"state": self._state()}, latest="state")
+
+    def say(self, client: Client | None, text: str, kind: str = "error") -> None:
+        """Show a message on one page or, with None, on all of them."""
+        message = {"said": {"text": text, "kind": kind}}
+        (self.server.broadcast if client is None else client.send)(message)
+
+    def _show_job(self, progress: JobProgress | None) -> None:
+        self._job = progress
+        self.tell()
+
+    def _job_ended(self, who: Any, name: str, result: Path | None, problem: str | None) -> None:
+        if result is None:
+            self.say(None, f"{name}: {problem or 'nothing was written'}")
+        else:
+            self.server.broadcast({"file": result.name, "job": name})
+
+    # What pages ask for
+
+    def _receive(self, client: Client, message: dict[str, Any]) -> None:
+        """Take a message, on the server's thread: nothing here computes."""
+        what = message.get("do")
+        if what == "frames":
+            self._want(client, message)
+        elif what == "picture":
+            self._pictures[client.number] = message
+            self.worker.post(self._draw_pictures, once=True)
+        elif what == "drag":
+            if self._dragger == client.number:
+                self._drag = time.monotonic(), client, message
+                self.worker.post(self._apply_drag, once=True)
+        elif isinstance(what, str) and (what in ACTIONS or what in EXPORTS):
+            self.worker.post(lambda: self._act(client, what, message))
+
+    def _want(self, client: Client, message: dict[str, Any]) -> None:
+        version, frames = message.get("version"), message.get("frames")
+        if version != self._version or not isinstance(frames, list):
+            return
+        wanted = [frame for frame in frames[:64] if isinstance(frame, int) and 0 <= frame <= 100_000]
         with self.worker.changing() as schedule:
-            schedule.change(time.monotonic())
+            schedule.ask_frames(client.number, self._version, wanted)
 
-    def say(self, client: viser.ClientHandle | None, title: str, text: str, color: str = "red") -> None:
-        """Notify one client or all (None). The same text is shown again only after ``REPEAT_SECONDS``, because every
-        step of a drag repeats its error."""
-        now = time.monotonic()
-        if now - self._notified.get(text, -np.inf) < REPEAT_SECONDS:
-            return
-        self._notified = {said: at for said, at in self._notified.items() if now - at < REPEAT_SECONDS} | {text: now}
-        everybody = self.server.get_clients().values()
-        for one in [client] if client is not None else list(everybody):
-            one.add_notification(title, text, auto_close_seconds=8.0, color=color)  # type: ignore[arg-type]
-
-    def guarded(self, action: Callable[..., Any]) -> Callable[[Any], None]:
-        """Wrap a callback such that errors become notifications. Events without a client, which the program causes by
-        setting values in the panel, are ignored."""
-
-        def callback(event: Any) -> None:
-            if event.client is None:
-                return
-            try:
-                action(event)
-            except UserError as error:
-                self.say(event.client, "That does not work", str(error))
-            except CancelledError:
-                pass
-            except Exception as error:
-                self._failed(event.client, error)
-            self.panel.show()
-
-        return callback
-
-    def _failed(self, client: viser.ClientHandle | None, error: Exception) -> None:
-        """Report an internal error; call it inside the ``except`` block."""
-        traceback.print_exc(file=sys.stderr)
-        self.say(client, "Internal error", f"{type(error).__name__}: {error}")
-
-    def picture_failed(self, number: int, error: Exception) -> None:
-        """Report that a client's picture could not be drawn; called on the worker's thread, inside the ``except``
-        block."""
-        client = self.server.get_clients().get(number)
-        if client is None:
-            return
-        if isinstance(error, UserError):
-            self.say(client, "The picture cannot be drawn", str(error))
-        else:
-            self._failed(client, error)
-
-    def on_value(self, handle: Any, action: Callable[[Any], Any]) -> Any:
-        """Call ``action`` with a control's value whenever a user changes it; return the control."""
-        handle.on_update(self.guarded(lambda event: action(event.target.value)))
-        return handle
-
-    def color_overlays(self) -> None:
-        model, edit = self.model, self.session.edit
-        held = {node for handle in edit.handles for node in handle.nodes}
-        part = self.parts.shown()
-        if part is None:
-            self.overlays.color(model.selection, held, edit.pins)
-        else:
-            self.overlays.color(*part)
-
-    # Pictures
-
-    def camera(self, client: viser.ClientHandle) -> ClientCamera:
-        """Return a client's present camera, world units."""
-        camera = client.camera
+    def _act(self, client: Client, what: str, message: dict[str, Any]) -> None:
+        """Do what a page asks for, on the worker's thread, and answer it."""
+        if what in ("grab", "release", "cancel"):
+            if self._dragger not in (None, client.number):
+                return  # one page drags at a time
+            self._apply_drag()
+            self._dragger = client.number if what == "grab" else None
+        fields = FieldReader({key: value for key, value in message.items() if key not in ("do", "id")}, "the page")
+        answer: dict[str, Any] = {"id": message.get("id"), "done": what}
         try:
-            width, height = int(camera.image_width), int(camera.image_height)
-        except (TypeError, ValueError, OverflowError):
-            width = height = 0
-        position = self.display.world(np.asarray(camera.position, np.float64))
-        wxyz = np.asarray(camera.wxyz, np.float64)
-        return ClientCamera(tuple(wxyz.tolist()), tuple(position.tolist()), float(camera.fov), width, height)
-
-    def take_picture(self, moment: Moment, camera: ClientCamera) -> Picture:
-        """Render a picture at the client's full size; call it on the worker's thread."""
-        return take_picture(self.session, moment, camera, min(max(camera.width, camera.height), MAX_SCREENSHOT_SIZE))
-
-    def _draw(self, number: int, quality: str) -> None:
-        """Draw a client's picture; runs on the worker's thread."""
-        client = self.server.get_clients().get(number)
-        with self.worker.changing() as schedule:
-            camera = schedule.camera(number)
-        if client is None or camera is None:
-            return
-        asked = self._dragged_at
-        moment = self.model.moment()
-        pace = self.full if quality == FULL else self.quick
-        begin = time.perf_counter()
-        picture = take_picture(self.session, moment, camera, min(pace.size, max(camera.width, camera.height)))
-        depth = self.display.empty_depth
-        if not self.model.through:
-            behind = 0.5 * self.edge_length * self.display.scale  # control points lie inside the surface
-            depth = self.display.depth(picture.depth, behind, 2 if quality == FULL else 1)
-        client.scene.set_background_image(
-            picture.rgb, format="jpeg", jpeg_quality=FINE_QUALITY if quality == FULL else QUALITY, depth=depth
-        )
-        client.flush()
-        self._first = False
-        waiting = self._waiting.pop(number, None)
-        if waiting is not None:
-            waiting.remove()
-        took = time.perf_counter() - begin
-        pace.took(took)
-        if asked is not None and asked == self._dragged_at:
-            self._dragged_at = None
-        if asked is not None and moment.live:
-            self.latency = [*self.latency[-99:], time.monotonic() - asked]
-        self._update_page(moment)
-
-    def _update_page(self, moment: Moment) -> None:
-        """Update overlays, gizmo and panel after the picture."""
-        points = self.session.node_positions(moment.time, moment.at, live=moment.live)
-        self.overlays.move(self.display.show(points))
-        self._place_gizmo(moment, points)
-        self.panel.show_time()
-        again = self.model.playing or (moment.live and not self.session.engine.settled(self.session.edit))
-        if again:
-            self.refresh()
-
-    def _place_gizmo(self, moment: Moment, points: np.ndarray) -> None:
-        """Place the gizmo at the control points' positions [M, 3]."""
-        model = self.model
-        if model.dragging:
-            return
-        part = self.parts.frame(points)
-        if part is not None and moment.show not in ("original", "side by side"):
-            self.gizmo_frame = part, STAY
-            self.overlays.place_gizmo((self.display.show(part.point), IDENTITY))
-            return
-        handle = self.session.edit.handle(model.active or "")
-        if moment.show in ("original", "side by side") or (handle is None and not model.selection):
-            self.gizmo_frame = None
-            self.overlays.place_gizmo(None)
-            return
-        if handle is None:
-            frame, target = gizmo_pose.frame_of_selection(self.session, model.selection, moment)
-        else:
-            target = self.session.engine.targets(self.session.edit, moment.at).get(handle.name, STAY)
-            frame = gizmo_pose.frame_of_handle(self.session, handle, moment)
-        self.gizmo_frame = frame, target
-        position, wxyz = frame.pose(target)
-        self.overlays.place_gizmo((self.display.show(position), wxyz))
-
-    # What users do in the picture
-
-    def _clicked(self, event: Any, how: Combine | None) -> None:
-        self.guarded(lambda event: self.pick(event.client, event.screen_pos, how))(event)
-
-    def pick(self, client: viser.ClientHandle, screen: tuple[float, float], how: Combine | None = None) -> None:
-        """Select by a click at a point of the canvas (0 to 1 from the upper left): a part, at the second click its
-        control points. The background clears the selection unless it is to be extended or reduced."""
-        model, moment = self.model, self.model.moment()
-
-        def find() -> Hit | None:
-            point = gizmo_pose.surface_point(self.session, self.camera(client), screen, moment)
-            return None if point is None else hit(self.session, point, model.region, moment)
-
-        self.parts.click(self.worker.call(find), how or model.combine)
-
-    async def _gizmo_moved(self, event: Any) -> None:
-        """Handle gizmo events in order on the server's loop, without waiting for solutions. One client drags at a
-        time."""
-        if self._dragger not in (None, event.client_id):
-            return
-        self._dragger = None if event.phase == "end" else event.client_id
-        try:
-            self.drag_gizmo(event.phase, self.display.world(event.target.position), np.array(event.target.wxyz))
+            self._seek(message.get("at"))
+            result = {**ACTIONS, **EXPORTS}[what](self, fields)
+            if isinstance(result, str):
+                answer["name"] = result
+            if what == "save":
+                answer["files"] = list(files.saved_edits(self.folder))
         except UserError as error:
-            self.say(event.client, "That does not work", str(error))
+            answer["problem"] = one_line(error)
+            self._dragger = None if what == "grab" else self._dragger
+        except CancelledError:
+            return
         except Exception as error:
-            self._failed(event.client, error)
+            traceback.print_exc(file=sys.stderr)
+            answer["problem"] = f"internal error: {type(error).__name__}: {error}"
+        client.send(answer)
+        self.tell()
 
-    def drag_gizmo(self, phase: str, position: np.ndarray, wxyz: np.ndarray) -> None:
-        if self.gizmo_frame is None:
-            return
-        frame, target = self.gizmo_frame
-        if phase == "start":
-            if isinstance(frame, PartFrame):
-                self.parts.grab()
-            else:
-                self.model.grab(target)
-        elif phase == "update":
-            if self.model.dragging:
-                self._dragged_at = self._dragged_at or time.monotonic()
-                if isinstance(frame, PartFrame):
-                    self.parts.drag(frame, position, wxyz)
-                else:
-                    self.model.drag(frame.target(position, wxyz))
-        else:
-            self._dragged_at = None
-            self.model.release()
-            self.panel.show()
+    def _seek(self, at: Any) -> None:
+        """Set the moment that the page shows: requests refer to it."""
+        if isinstance(at, int | float) and not isinstance(at, bool) and not self.model.dragging:
+            self.model.look(float(at))
 
-    def put(self, target: Target) -> None:
-        """Move the chosen handle, or the joint of the chosen part, to a target in one step, for the panel's number
-        fields."""
-        if self.parts.part is not None:
-            self.parts.put(target)
+    def _apply_drag(self) -> None:
+        drag, self._drag = self._drag, None
+        if drag is None or not self.model.dragging:
             return
-        self.model.grab(STAY if self.gizmo_frame is None else self.gizmo_frame[1])
+        asked, client, message = drag
+        fields = FieldReader({key: value for key, value in message.items() if key not in ("do", "id")}, "the page")
         try:
-            self.model.drag(target)
-        finally:
-            self.model.release()
+            ACTIONS["drag"](self, fields)
+            self._asked = asked
+        except UserError as error:
+            self.say(client, one_line(error))
+
+    # Poses
+
+    def _send_pose(self, number: int, wanted: Wanted | None) -> None:
+        """Compute a pose and send it, on the worker's thread."""
+        if wanted is None:
+            moment = self.model.moment()
+            table = pose_table(self.session, moment)
+            self.server.broadcast(pose_message(table, self._version, -1), latest="pose")
+            if moment.live and not self.session.engine.settled(self.session.edit):
+                with self.worker.changing() as schedule:
+                    schedule.ask_live()
+            asked, self._asked = self._asked, None
+            if asked is not None:
+                self.latency = [*self.latency[-99:], time.monotonic() - asked]
+            return
+        client = self.server.clients.get(number)
+        if client is None or wanted.version != self._version:
+            return
+        at = wanted.frame / self.session.edit.film.fps
+        moment = Moment(self.session.scene_time(at), at if self.model.following else None, False, "edited")
+        client.send(pose_message(pose_table(self.session, moment), wanted.version, wanted.frame))
+
+    def _draw_pictures(self) -> None:
+        """Draw the newest view of each page that cannot draw itself, on the worker's thread."""
+        wanted, self._pictures = self._pictures, {}
+        for number, message in wanted.items():
+            client = self.server.clients.get(number)
+            if client is None:
+                continue
+            try:
+                self._seek(message.get("at"))
+                jpeg = scene_jpeg(self.session, self.model.moment(), camera_of(FieldReader(message, "the page")))
+                client.send(picture_message(jpeg, self._version), latest="picture")
+            except UserError as error:
+                self.say(client, one_line(error))
+
+    def _pose_failed(self, number: int, error: Exception) -> None:
+        if isinstance(error, UserError):
+            self.say(self.server.clients.get(number), str(error))
+        else:
+            traceback.print_exc(file=sys.stderr)
+            self.say(None, f"internal error: {type(error).__name__}: {error}")
+
+    # Routes
+
+    async def _serve_page(self, request: web.Request) -> web.StreamResponse:
+        from aiohttp import web
+
+        return web.Response(body=self._page, content_type="text/html", charset="utf-8")
+
+    async def _serve_scene(self, request: web.Request) -> web.StreamResponse:
+        from aiohttp import web
+
+        if self._content is None:
+            import asyncio
+
+            self._content = await asyncio.to_thread(self.worker.call, self._pack)
+        return web.Response(body=self._content, content_type="application/octet-stream")
+
+    def _pack(self) -> bytes:
+        scene = self.session.scene
+        motion = with_parts(self.session, own_motion(self.session))
+        content = page_scene(scene, min(scene.gaussians.sh_degree, MAX_DEGREE), motion_of=motion)
+        return pack(content.facts, content.columns)
+
+    async def _serve_file(self, request: web.Request) -> web.StreamResponse:
+        from aiohttp import web
+
+        try:
+            path = downloadable(self.folder, request.match_info["name"])
+        except UserError as error:
+            return web.Response(status=404, text=str(error))
+        quiet = re.sub(r"[^A-Za-z0-9 ._-]", "_", path.name)
+        return web.FileResponse(path, headers={"Content-Disposition": f'attachment; filename="{quiet}"'})
+
+
+def page_of(title: str) -> bytes:
+    """Return the editor's page for a scene."""
+    scripts = [read_web(f"{name}.js", WEB) for name in OWN_SCRIPTS]
+    shaders = {name: read_web(f"{name}.glsl", WEB) for name in SHADERS}
+    program = program_text((*SCRIPTS, "rotations"), scripts, shaders)
+    template, style = read_web("editor.html", WEB), read_web("editor.css", WEB)
+    return document(program, title, network="'self'", template=template, further_style=style)

@@ -6,6 +6,7 @@ import hashlib
 import os
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -82,6 +83,8 @@ class Autosave:
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror}); give another --folder") from None
         self.said = ""
+        self.done: Callable[[], None] = lambda: None
+        """Called on another thread after each attempt to save."""
         self.problem: str | None = None
         self._saved: Edit | None = None
         self._wanted: Edit | None = None
@@ -145,6 +148,7 @@ class Autosave:
                 if problem is None:
                     self._saved = edit
                 self._condition.notify_all()
+            self.done()
 
     def _write(self, edit: Edit) -> str | None:
         try:

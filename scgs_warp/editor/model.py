@@ -16,6 +16,7 @@ import numpy as np
 from ..edit import Edit, EditSession, Target, edit_file
 from ..edit.handles import STAY
 from ..errors import UserError
+from .keys import keyed
 
 Show = Literal["edited", "original", "side by side", "split"]
 Combine = Literal["replace", "add", "subtract"]
@@ -73,9 +74,12 @@ class EditorModel:
         """True if the handle was moved since ``grab``; None: no drag."""
         self._led = False
         """True if keyframes placed the handles before ``grab``."""
+        self._start: dict[str, Target] = {}
+        """Targets when the drag began."""
         self._automatic: deque[tuple[int, ...]] = deque(maxlen=100)
         """Sets of pins that ``grab`` made automatically."""
-        self._following = False
+        self._following = bool(session.edit.keyframes)
+        """True if keyframes place the handles: always, once there are any, but during a drag."""
         self._played_from: tuple[float, float] | None = None
 
     # Time
@@ -98,11 +102,15 @@ class EditorModel:
         """Scene time shown."""
         return self.session.scene_time(self.at)
 
-    def seek(self, at: float) -> None:
-        """Show a second of the film; keyframes then place the handles."""
+    def look(self, at: float) -> None:
+        """Take a second of the film as the one that a request refers to."""
         with self.lock:
             self.at = min(max(float(at), 0.0), self.seconds) if np.isfinite(at) else self.at
-            self._following = bool(self.session.edit.keyframes)
+
+    def seek(self, at: float) -> None:
+        """Show a second of the film."""
+        with self.lock:
+            self.look(at)
             if self._played_from is not None:
                 self._played_from = (time.monotonic(), self.at)
         self.changed()
@@ -110,7 +118,6 @@ class EditorModel:
     def play(self, on: bool, now: float | None = None) -> None:
         with self.lock:
             self._played_from = (time.monotonic() if now is None else now, self.at) if on else None
-            self._following = self._following or bool(on and self.session.edit.keyframes)
         self.changed()
 
     def tick(self, now: float | None = None) -> None:
@@ -149,7 +156,7 @@ class EditorModel:
         if edit.handle(self.active or "") is None:
             self.active = self._holder()
         self.at = min(self.at, self.seconds)
-        self._following = self._following and bool(edit.keyframes)
+        self._following = bool(edit.keyframes) and not self.dragging
 
     def undo(self) -> bool:
         with self.changing() as session:
@@ -267,6 +274,7 @@ class EditorModel:
             self._let_go()
             self._dragged, self._led = False, self._following
             self._take_over()
+            self._start = dict(self.session.edit.targets)
             self.dragging, self._played_from = True, None
             return self.session.edit
 
@@ -323,14 +331,32 @@ class EditorModel:
             self._let_go()
         self.changed()
 
+    def cancel(self) -> None:
+        """End the drag and restore the edit before it."""
+        with self.lock:
+            if self._dragged is not None:
+                self._dragged = False
+            self._let_go()
+        self.changed()
+
     def _let_go(self) -> None:
         self.dragging = False
         if self._dragged is False:
             self.session.cancel()
             self._following = self._led
             self._check()
+        elif self._dragged and self.session.edit.keyframes:
+            edit = self.session.edit
+            changed = {name: t for name, t in edit.targets.items() if t != self._start.get(name, STAY)}
+            self.session.preview(keyed(edit, self.at, changed) if changed else edit)
+            self._following = True
         self._dragged = None
         self.session.release()
+
+    @property
+    def following(self) -> bool:
+        """True if keyframes place the handles."""
+        return self._following
 
     def add_keyframe(self, easing: Any = "smooth") -> None:
         """Add a keyframe at the moment shown; from then on keyframes place the handles."""

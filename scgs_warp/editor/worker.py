@@ -14,15 +14,21 @@ import traceback
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
-
-from .views import PictureSchedule
 
 Result = TypeVar("Result")
 PATIENCE = 1.0
 """Seconds after which a piece of a job takes precedence over pictures."""
+
+
+class Schedule(Protocol):
+    """Order of the work that pages wait for; the worker's lock guards it."""
+
+    def next(self, now: float, busy: bool) -> tuple[int, Any] | None: ...
+    def settled(self, now: float, busy: bool) -> bool: ...
+    def wait(self, now: float, busy: bool) -> float | None: ...
 
 
 class Worker:
@@ -37,8 +43,8 @@ class Worker:
 
     def __init__(
         self,
-        schedule: PictureSchedule,
-        draw: Callable[[int, str], None],
+        schedule: Any,
+        draw: Callable[[int, Any], None],
         busy: Callable[[], bool],
         clock: Callable[[], float] = time.monotonic,
         failed: Callable[[int, Exception], None] | None = None,
@@ -105,6 +111,17 @@ class Worker:
             self._condition.notify_all()
         return future.result()
 
+    def post(self, action: Callable[[], Any], *, once: bool = False) -> None:
+        """Run ``action`` on the worker's thread soon, without waiting for it; nothing happens after ``stop``.
+
+        Args:
+            once: leave it out if the same function is waiting already.
+        """
+        with self._condition:
+            if not self._stopped and not (once and any(call[1] == action for call in self._calls)):
+                self._calls.append((Future(), action))
+                self._condition.notify_all()
+
     def _run(self) -> None:
         torch.set_flush_denormal(True)  # set per thread; without it results differ from a script's
         while True:
@@ -137,7 +154,7 @@ class Worker:
             client, quality = due
             return lambda: self._picture(client, quality)
 
-    def _picture(self, client: int, quality: str) -> None:
+    def _picture(self, client: int, quality: Any) -> None:
         try:
             self._draw(client, quality)
         except Exception as error:  # a failed picture must not end the editor

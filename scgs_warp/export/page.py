@@ -151,13 +151,21 @@ def document(
     picture: bytes = b"",
     card: Card | None = None,
     network: str = "'none'",
+    template: str | None = None,
+    further_style: str = "",
 ) -> bytes:
-    """Return the page's HTML around a program; ``network`` is the policy for its connections."""
-    style = read_web("style.css")
+    """Return a page's HTML around a program.
+
+    Args:
+        network: policy for its connections.
+        template: HTML with the same places as ``index.html``, which it replaces.
+        further_style: added to ``style.css``.
+    """
+    style = read_web("style.css") + further_style
     policy = (
         # No network access and no other script, whatever the title contains.
         f"default-src 'none'; script-src {_hash(program)} blob:; worker-src blob:; style-src {_hash(style)}; "
-        f"img-src data:; connect-src {network}; base-uri 'none'; form-action 'none'"
+        f"img-src data: blob:; connect-src {network}; base-uri 'none'; form-action 'none'"
     )
     title = title.encode("utf-8", "replace").decode()  # file names may contain surrogates
     shown = " ".join(title.split()) or TITLE
@@ -173,15 +181,16 @@ def document(
         "program": program,
         "data": data,
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], read_web("index.html")).encode()
+    whole = read_web("index.html") if template is None else template
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], whole).encode()
 
 
-def program_text(scripts: Sequence[str], further: Sequence[str] = ()) -> str:
-    """Return scripts of ``web/`` and further texts as one program, with the shaders and the worker's source as
-    strings."""
-    shaders = json.dumps({name: read_web(f"{name}.glsl") for name in SHADERS})
+def program_text(scripts: Sequence[str], further: Sequence[str] = (), shaders: Mapping[str, str] | None = None) -> str:
+    """Return scripts of ``web/`` and further texts as one program, with the shaders, further ones by name, and the
+    worker's source as strings."""
+    texts_of_shaders = json.dumps({name: read_web(f"{name}.glsl") for name in SHADERS} | dict(shaders or {}))
     sort = read_web("sort.js")
-    texts = [f"const SHADERS = {shaders};", f"const SHARED = {json.dumps({'sort': sort})};", sort]
+    texts = [f"const SHADERS = {texts_of_shaders};", f"const SHARED = {json.dumps({'sort': sort})};", sort]
     texts += [*(read_web(f"{name}.js") for name in scripts), *further]
     program = '(() => {\n"use strict";\n' + "\n".join(texts) + "\n})();\n"
     if "</" in program or "<!--" in program:
@@ -189,9 +198,9 @@ def program_text(scripts: Sequence[str], further: Sequence[str] = ()) -> str:
     return program
 
 
-def read_web(name: str) -> str:
-    """Return the text of a file of ``web/``."""
-    return (WEB / name).read_text(encoding="utf-8")  # newlines as \n, as the browser hashes them
+def read_web(name: str, folder: Path = WEB) -> str:
+    """Return the text of a file of ``web/``, here or in another folder of the package."""
+    return (folder / name).read_text(encoding="utf-8")  # newlines as \n, as the browser hashes them
 
 
 def _hash(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -24,11 +25,16 @@ JUMP = 0.25
 
 
 @torch.no_grad()
-def edited_motion(session: EditSession, advance: Callable[[], None] | None = None) -> PageMotion:
+def edited_motion(
+    session: EditSession,
+    advance: Callable[[], None] | None = None,
+    compute: Callable[[Callable[[], Any]], Any] = lambda pose: pose(),
+) -> PageMotion:
     """Sample the control points of a session under its edit.
 
     Args:
-        advance: called after each of the ``sample_count(session)`` moments.
+        advance: called after each of the ``film_times(session)``.
+        compute: calls the function that computes a pose and returns its result, so that another thread may compute.
 
     Raises:
         UserError: the motion is not finite, or the scene's motion has a mask.
@@ -42,7 +48,7 @@ def edited_motion(session: EditSession, advance: Callable[[], None] | None = Non
     times = [session.scene_time(at) for at in moments]
     tracks: dict[str, list[np.ndarray]] = {}
     for at, time in zip(moments, times):
-        for name, values in edited_pose(session, time, at).items():
+        for name, values in compute(functools.partial(edited_pose, session, time, at)).items():
             tracks.setdefault(name, []).append(values)
         if advance is not None:
             advance()

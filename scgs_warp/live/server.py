@@ -57,7 +57,7 @@ class Client:
     def __init__(self, number: int, wire: web.WebSocketResponse, loop: asyncio.AbstractEventLoop) -> None:
         self.number, self._wire, self._loop = number, wire, loop
         self._waiting: list[str | bytes] = []
-        self._latest: dict[str, bytes] = {}
+        self._latest: dict[str, str | bytes] = {}
         self._ready = asyncio.Event()
         self._lock = threading.Lock()
         self._allowance, self._refilled = BURST, time.monotonic()
@@ -74,7 +74,7 @@ class Client:
             if latest is None:
                 self._waiting.append(content)
             else:
-                self._latest[latest] = content if isinstance(content, bytes) else content.encode()
+                self._latest[latest] = content
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._ready.set)
 
@@ -208,7 +208,7 @@ class PageServer:
 
     async def _serve_socket(self, request: web.Request) -> web.StreamResponse:
         web, kinds = self._aiohttp.web, self._aiohttp.WSMsgType
-        wire = web.WebSocketResponse(max_msg_size=MAX_MESSAGE, heartbeat=20.0, compress=False)
+        wire = web.WebSocketResponse(max_msg_size=MAX_MESSAGE, heartbeat=60.0, compress=False)
         await wire.prepare(request)
         self._count += 1
         client = Client(self._count, wire, self._loop)

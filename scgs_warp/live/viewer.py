@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import UserError
-from ..export.page import SCRIPTS, document, program_text
+from ..export.page import SCRIPTS, document, program_text, read_web
 from .server import Client, PageServer
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class SceneView:
     """
 
     def __init__(self, title: str, *, port: int = 0, shared: bool = False) -> None:
-        program = program_text(SCRIPTS, [(WEB / "live.js").read_text(encoding="utf-8")])
+        program = program_text(SCRIPTS, [read_web("live.js", WEB)])
         self._page = document(program, title, network="'self'")
         self._content, self._version, self._status = b"", 0, "waiting for the scene"
         self._lock = threading.Lock()

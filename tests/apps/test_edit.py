@@ -96,7 +96,7 @@ def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
     assert open_gaussians(ply).gaussian_count == 300
 
 
-def test_without_viser_the_editor_says_what_to_install(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "viser", None)
+def test_without_aiohttp_the_editor_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "aiohttp.web", None)
     assert app.cli(["--run", str(tmp_path)]) == 2
     assert "pip install 'scgs_warp[edit]'" in capsys.readouterr().err

@@ -1,47 +1,266 @@
-"""The editor as a whole, without a browser."""
+"""The editor's server without a browser: what pages ask for, what they are sent, and who may."""
 
 from __future__ import annotations
 
-import time
+import io
+import random
+import re
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from helpers.edit_scenes import bar_scene
-from helpers.editor_models import canvas_camera
-from scgs_warp.edit import EditSession
-from scgs_warp.editor.app import Editor
-from scgs_warp.errors import UserError
+from helpers.studios import Page
+from helpers.web_clients import get, key, opens
+from scgs_warp.edit import EditSession, edit_file
+from scgs_warp.edit.rotations import to_matrix
+from scgs_warp.editor import Editor
+from scgs_warp.editor.autosave import Autosave
+from scgs_warp.export.page_data import unpack
+from scgs_warp.formats.gaussian_ply import write_gaussian_ply
+from scgs_warp.geometry.cameras import orbit_camera
 
-pytest.importorskip("viser", reason="the editor needs viser: pip install 'scgs_warp[edit]'")
+pytest.importorskip("aiohttp", reason="the package aiohttp is not installed")
 
 
 @pytest.fixture
 def editor(tmp_path) -> Iterator[Editor]:
-    made = Editor(EditSession(bar_scene()), tmp_path, port=0)
+    session = EditSession(bar_scene(nodes=60, gaussians=1500))
+    keeper = Autosave(session, tmp_path)
+    keeper.start(restore=True)
+    made = Editor(session, tmp_path, title="bar", port=0, autosave=keeper)
     yield made
     made.stop()
 
 
-def fail_to_draw(editor: Editor, monkeypatch: pytest.MonkeyPatch, client: int, error: Exception, said: list) -> None:
-    """Have the editor's worker draw a picture for a client, which raises; wait until the client was told."""
-    monkeypatch.setattr(editor.session, "render", lambda *_, **__: (_ for _ in ()).throw(error))
-    before, end = len(said), time.monotonic() + 30
-    with editor.worker.changing() as schedule:
-        schedule.move(client, canvas_camera(), 0.0)
-    while len(said) == before and time.monotonic() < end:
-        time.sleep(0.01)
-    with editor.worker.changing() as schedule:
-        schedule.drop(client)
+@pytest.fixture
+def page(editor) -> Iterator[Page]:
+    made = Page(editor)
+    yield made
+    made.close()
 
 
-def test_a_picture_that_fails_says_so(editor, monkeypatch, capsys):
-    said = []
-    monkeypatch.setattr(editor, "say", lambda client, title, text, color="red": said.append((client, title, text)))
-    monkeypatch.setattr(editor.server, "get_clients", lambda: {7: "a window"})
-    for error, title in ((UserError("no room"), "The picture cannot be drawn"), (ValueError("odd"), "Internal error")):
-        fail_to_draw(editor, monkeypatch, 7, error, said)
-        assert said[-1][:2] == ("a window", title) and str(error) in said[-1][2]
-    count = len(said)
-    editor.picture_failed(8, ValueError("a window that is gone"))
-    assert len(said) == count and "odd" in capsys.readouterr().err
+def end_of_bar(editor: Editor) -> list[float]:
+    places = editor.session.node_positions(0.0)
+    return places[places[:, 0].argmin()].tolist()
+
+
+def pull(editor: Editor, page: Page, shift=(0.0, 0.1, 0.3), at: float = 0.0) -> None:
+    """Take the end of the bar and pull it, as a drag does."""
+    page.ask("tool", parts_first=False)
+    grip = end_of_bar(editor)
+    page.ask("pick", point=grip, how="replace", at=at)
+    assert "problem" not in page.ask("grab", at=at)
+    for share in (0.3, 0.6, 1.0):
+        page.send({"do": "drag", "grip": grip, "to": [g + share * s for g, s in zip(grip, shift)]})
+    page.ask("release", at=at)
+
+
+def test_a_drag_is_posed_kept_and_undone(editor, page, tmp_path):
+    assert page.state["unedited"] and page.hello["title"] == "bar" and not page.state["undo"]
+    pull(editor, page)
+    state = page.state
+    assert not state["unedited"] and not state["dragging"] and len(state["handles"]) == 1 and state["undo"]
+    assert -1 in page.poses, "the pose of the drag was sent"
+    assert editor.latency
+    assert editor.autosave.flush() and edit_file.read(tmp_path / "autosave.json", editor.session.engine) == (
+        editor.session.edit
+    )
+    edit = editor.session.edit
+    page.ask("undo")
+    assert page.state["unedited"] and page.state["redo"]
+    page.ask("redo")
+    assert editor.session.edit == edit
+    assert page.ask("redo")["problem"] == "there is nothing to redo"
+
+
+def test_frames_are_those_of_the_session(editor, page):
+    pull(editor, page)
+    page.ask("key", at=0.0)
+    pull(editor, page, (0.0, 0.0, -0.4), at=2.0)
+    assert [frame["at"] for frame in page.state["keyframes"]] == [0.0, 2.0], "a drag keys itself once there are keys"
+    version, film = page.state["version"], editor.session.edit.film
+    page.poses.clear()
+    page.send({"do": "frames", "version": version - 1, "frames": [3]})
+    page.send({"do": "frames", "version": version, "frames": [0, 30, 45, -5, "x", 10**9]})
+    page.until(lambda: {0, 30, 45} <= page.poses.keys())
+    editor.worker.call(lambda: None)
+    assert set(page.poses) - {-1} == {0, 30, 45}, "of another version, or none, nothing is sent"
+    rest = editor.session.engine.rig.positions.detach().double().numpy()
+    for frame in (0, 30, 45):
+        at = frame / film.fps
+        table = page.poses[frame].astype(np.float64)
+        rows = table[:, :12].reshape(-1, 3, 4)
+        places = np.einsum("mij,mj->mi", rows[:, :, :3], rest) + rows[:, :, 3]
+        wanted = editor.session.node_positions(editor.session.scene_time(at), at)
+        np.testing.assert_allclose(editor.session.engine.to_world(places), wanted, atol=1e-5)
+        if not editor.session.engine.motion_at(0.0).pose.shape_rotations:
+            np.testing.assert_allclose(to_matrix(table[:, 12:16]), rows[:, :, :3], atol=1e-5)
+
+
+def test_escape_restores_the_edit(editor, page):
+    page.ask("tool", parts_first=False)
+    grip = end_of_bar(editor)
+    page.ask("pick", point=grip)
+    page.ask("grab")
+    page.send({"do": "drag", "grip": grip, "to": [0.0, 0.0, 2.0]})
+    page.ask("cancel")
+    assert page.state["unedited"] and not page.state["handles"] and not page.state["undo"]
+
+
+def test_a_page_that_leaves_lets_go(editor, page):
+    other = Page(editor)
+    other.ask("tool", parts_first=False)
+    other.ask("pick", point=end_of_bar(editor))
+    other.ask("grab")
+    page.until(lambda: page.state["dragging"])
+    page.send({"do": "drag", "grip": [0, 0, 0], "to": [0, 0, 1]})  # not its drag
+    other.close()
+    page.until(lambda: not page.state["dragging"])
+    assert page.state["unedited"]
+
+
+REQUESTS = [
+    ("pick", {"point": [1, 2]}, "point"), ("pick", {"point": [0, 0, float("inf")]}, None),
+    ("choose_part", {"name": "nobody"}, "no part is called"), ("activate", {"name": 3}, "name"),
+    ("grab", {}, "nothing is chosen"), ("handle", {"lasts": "never"}, "lasts"), ("handle", {"window": -1}, "window"),
+    ("film", {"seconds": 1e9}, "seconds"), ("film", {"background": [1, 2]}, "background"),
+    ("film", {"size": 1e6}, "size"), ("playback", {"speed": "fast"}, "speed"), ("hold", {}, "nothing is chosen"),
+    ("unhold", {"index": 7}, "index"), ("change_key", {"what": "move", "from": 1.0, "to": 2.0}, "no keyframe"),
+    ("key", {}, "needs a handle"), ("load", {"name": "../x"}, "file name"), ("load", {"name": "none"}, "none.json"),
+    ("upload", {"text": "{"}, "the file"), ("upload", {"text": 3}, "text"), ("save", {"name": "a/b"}, "file name"),
+    ("put", {"degrees": ["a", 0, 0]}, "degrees"), ("remove", {}, "no handle"), ("pin", {"what": "rest"}, "no handle"),
+    ("shot", {"kind": "fixed", "target": [1]}, "target"), ("pick_pixel", {"width": 10**9}, "width"),
+    ("export_film", {"name": "x", "format": ".exe"}, "format"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("what", "fields", "words"), [row for row in REQUESTS if row[2]], ids=lambda v: str(v)[:20])
+def test_wrong_requests_get_one_line_and_change_nothing(what, fields, words, editor, page):
+    answer = page.ask(what, **fields)
+    assert words in answer["problem"] and "\n" not in answer["problem"] and "internal" not in answer["problem"]
+    assert page.state["unedited"] and not page.state["undo"] and editor.session.edit == type(editor.session.edit)()
+
+
+def test_nonsense_is_ignored(editor, page, capfd):
+    odd = ["[]", "{}", '{"do": 3}', '{"do": "__init__"}', '{"do": "drag", "to": [1, 2]}', "{" * 5000]
+    odd += ['{"do": "frames", "version": {}, "frames": {}}', '{"do": "picture", "width": 0}']
+    for message in odd:
+        page.send(message)
+    assert "problem" not in page.ask("tool", rings=3)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_random_session_returns_to_the_same_bytes(editor, page):
+    """Scrub, drag, key, unkey, undo and redo in any order: no keyframe is lost, and undo returns to the same bytes."""
+    choose = random.Random(3)
+    pull(editor, page)
+    states = [edit_file.to_json(editor.session.edit, editor.session.engine)]
+    for _ in range(40):
+        at = choose.choice([0.0, 1.0, 2.0, 3.0])
+        before = {frame.at: dict(frame.targets) for frame in editor.session.edit.keyframes}
+        what = choose.choice(["pull", "key", "delete", "seek", "move"])
+        if what == "pull":
+            pull(editor, page, (0.0, 0.05 * choose.random(), 0.1), at)
+        elif what == "key":
+            page.ask("key", at=at)
+        elif what == "delete":
+            page.ask("change_key", what="delete", **{"from": at})
+        elif what == "move":
+            page.ask("change_key", what="copy", to=choose.choice([0.5, 1.5]), **{"from": at})
+        else:
+            page.ask("tool", rings=2, at=at)
+        after = {frame.at: dict(frame.targets) for frame in editor.session.edit.keyframes}
+        if what != "delete":
+            assert before.keys() <= after.keys(), what
+        if what == "seek":
+            assert before == after
+        states.append(edit_file.to_json(editor.session.edit, editor.session.engine))
+    different = [state for row, state in enumerate(states) if row == 0 or state != states[row - 1]]
+    for state in reversed(different[:-1]):
+        page.ask("undo")
+        assert edit_file.to_json(editor.session.edit, editor.session.engine) == state
+    for state in different[1:]:
+        page.ask("redo")
+        assert edit_file.to_json(editor.session.edit, editor.session.engine) == state
+
+
+def test_files_are_written_offered_and_read(editor, page, tmp_path):
+    pull(editor, page)
+    edit = editor.session.edit
+    answer = page.ask("save", name="mine")
+    assert answer["name"] == "mine.json" and "mine.json" in answer["files"]
+    page.ask("reset")
+    page.ask("load", name="mine.json")
+    assert editor.session.edit == edit
+    page.ask("reset")
+    page.ask("upload", text=(tmp_path / "mine.json").read_text())
+    assert editor.session.edit == edit
+    page.ask("film", seconds=0.2, fps=10, size=32)
+    for what in ("export_film", "export_ply", "export_page"):
+        name = page.ask(what, name="out", pose=True)["name"]
+        page.until(lambda name=name: any(m.get("file") == name for m in page.heard))
+        assert get(editor.server.port, f"/file/{name}").status == 403
+        sent = get(editor.server.port, f"/file/{name}", Cookie=key(editor.server))
+        assert sent.status == 200 and "attachment" in (sent.getheader("Content-Disposition") or "")
+    for name in ("..%2Fx.json", "none.mp4", "x.py", ".autosave.json.lock"):
+        assert get(editor.server.port, f"/file/{name}", Cookie=key(editor.server)).status == 404
+
+
+def test_the_scene_has_parts_and_its_motion(editor):
+    raw = get(editor.server.port, "/scene", Cookie=key(editor.server))
+    assert raw.status == 200
+    facts, columns = unpack(editor._content or b"")
+    assert facts["edited"] and facts["nodes"] == 60 and len(facts["pose"]["chains"]) == len(facts["parts"])
+    assert len(columns["part"]) == 60 and get(editor.server.port, "/scene").status == 403
+
+
+def test_pages_without_webgl_get_pictures(editor, page):
+    camera = orbit_camera(editor.session.scene.overview, 40.0, 64)
+    asked = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
+    page.send({"do": "picture", "at": 0.0, **asked})
+    page.until(lambda: page.pictures)
+    with Image.open(io.BytesIO(page.pictures[0])) as picture:
+        assert picture.size == (camera.width, camera.height)
+        bright = np.asarray(picture, np.float64).sum(2)
+    row, column = np.unravel_index(bright.argmax(), bright.shape)
+    page.ask("pick_pixel", pixel=[column + 0.5, row + 0.5], **asked)
+    assert page.state["selection"]
+    page.ask("pick_pixel", pixel=[1.0, 1.0], **asked)
+    assert not page.state["selection"]
+
+
+def test_only_its_own_pages_are_served(editor):
+    assert get(editor.server.port).status == 403 and get(editor.server.port, Cookie=key(editor.server)).status == 200
+    assert opens(editor.server, "own") and not opens(editor.server, "http://evil.example")
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_the_app_serves_until_it_is_interrupted(tmp_path, share):
+    ply = tmp_path / "scene.ply"
+    write_gaussian_ply(ply, bar_scene().gaussians_at(0.0))
+    command = [sys.executable, "-m", "scgs_warp.apps.edit", "--ply", str(ply), "--nodes", "40", "--port", "0"]
+    process = subprocess.Popen(
+        [*command, *(["--share"] if share else [])], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert "scene.ply.autosave.json" in process.stdout.readline()
+        said = re.search(r"http://127\.0\.0\.1:(\d+)/(\?token=\S+)", process.stdout.readline())
+        assert said is not None
+        port = int(said[1])
+        assert get(port, "/").status == 403 and get(port, f"/{said[2]}").status == 303
+        second = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        assert second.returncode == 2 and "another editor is open" in second.stderr
+        assert len(second.stderr.strip().splitlines()) == 1
+        process.send_signal(signal.SIGINT)
+        assert "has ended" in process.communicate(timeout=60)[0] and process.returncode == 0
+    finally:
+        process.kill()
+        process.wait()

@@ -1,11 +1,10 @@
-"""The editor in a real browser: what a user does with mouse and buttons, seen on the screen."""
+"""The editor in a real browser: what a user does with mouse and keys, and what the page then shows."""
 
 from __future__ import annotations
 
 import io
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -14,274 +13,276 @@ import torch
 from PIL import Image
 
 from helpers.chromium import chromium
-from helpers.edit_scenes import figure_scene
-from scgs_warp.edit import EditSession, render_film
-from scgs_warp.edit.edit_file import read
-from scgs_warp.editor import Editor, Proxy
-from scgs_warp.editor.gizmo_pose import surface_point
-from scgs_warp.editor.views import ClientCamera
-from scgs_warp.errors import UserError
-from scgs_warp.types import Camera
+from helpers.edit_scenes import bar_scene, figure_scene
+from helpers.node_packages import package
+from scgs_warp.edit import EditSession
+from scgs_warp.editor import Editor
+from scgs_warp.editor.autosave import Autosave
+from scgs_warp.scene.scene import Scene
 
-pytest.importorskip("viser", reason="the package viser is not installed")
-
-SIZE = {"width": 1000, "height": 640}
+pytest.importorskip("aiohttp", reason="the package aiohttp is not installed")
 PATIENCE = 120.0
+SIZE = {"width": 900, "height": 700}
 
 
-def until(condition: Callable[[], Any], seconds: float = PATIENCE) -> None:
-    """Wait until something is true; browsers on busy machines take their time."""
-    end = time.monotonic() + seconds
+def until(condition: Callable[[], Any]) -> None:
+    end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.05)
 
 
-def still(editor: Editor) -> None:
-    """Wait until the picture on the screen is the last and full one."""
-    until(lambda: editor.worker.idle)
-    time.sleep(1.5)  # until the page has drawn it
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as started:
+        yield started
 
 
-class Window:
-    """One browser window with the editor in it."""
+@pytest.fixture(scope="module")
+def figure() -> Scene:
+    return figure_scene(nodes=200, points=4000)[0]
 
-    def __init__(self, browser: Any, editor: Editor, url: str) -> None:
-        self.editor, self.problems = editor, []
-        self.page = browser.new_page(viewport=SIZE, accept_downloads=True)
-        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
-        self.page.on("console", lambda m: self.problems.append(m.text) if m.type == "error" else None)
-        self.page.goto(url)
-        self.page.set_default_timeout(1e3 * PATIENCE)
-        self.page.get_by_text("Undo", exact=True).wait_for(timeout=1e3 * PATIENCE)
-        until(lambda: len(editor.schedule))
-        still(editor)
 
-    def picture(self) -> np.ndarray:
-        """[H, W, 3] what is on the screen beside the panel."""
-        still(self.editor)
-        image = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"), np.int32)
-        return image[160:, : self.client().width]  # below what it says of WebGL in software
-
-    def press(self, name: str) -> None:
-        self.page.get_by_role("button", name=name, exact=True).click()
-
-    def tab(self, name: str) -> None:
-        self.page.get_by_role("tab", name=name, exact=True).click()
-
-    def hush(self) -> None:
-        """Close what lies over the picture."""
-        buttons = self.page.locator(".mantine-Notification-closeButton")
-        while buttons.count():
-            with suppress(Exception):  # it may have closed by itself
-                buttons.first.click(timeout=1000)
-
-    def field(self, label: str) -> Any:
-        """The input beside a label."""
-        return self.page.locator(f"xpath=//*[text()='{label}']/following::input[1]")
-
-    def client(self) -> ClientCamera:
-        return self.editor.camera(next(iter(self.editor.server.get_clients().values())))
-
-    def camera(self) -> Camera:
-        client = self.client()
-        return client.at_size(max(client.width, client.height))
-
-    def pixel(self, point: np.ndarray) -> tuple[float, float]:
-        """Where a point of the world is on the screen."""
-        camera = self.camera()
-        seen = camera.K @ (camera.viewmat[:3, :3] @ torch.from_numpy(point).float() + camera.viewmat[:3, 3])
-        return float(seen[0] / seen[2]), float(seen[1] / seen[2])
-
-    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        mouse = self.page.mouse
-        mouse.move(*start)
-        time.sleep(0.3)  # the gizmo notices who hovers
-        mouse.down()
-        for share in np.linspace(0, 1, 8)[1:]:
-            mouse.move(*(np.array(start) + share * (np.array(end) - start)))
-            time.sleep(0.1)
-        self.latest = len(self.editor.latency)
-        mouse.up()
+def serve(scene: Scene, folder: Any) -> Editor:
+    session = EditSession(scene)
+    session.parts()
+    keeper = Autosave(session, folder)
+    keeper.start(restore=True)
+    return Editor(session, folder, title="figure", port=0, autosave=keeper)
 
 
 @pytest.fixture
-def editor(tmp_path) -> Iterator[Editor]:
-    made = Editor(EditSession(figure_scene(nodes=200, points=5000)[0]), tmp_path / "edits", port=0, size=512)
+def editor(figure, tmp_path) -> Iterator[Editor]:
+    made = serve(figure, tmp_path)
     yield made
     made.stop()
 
 
-def changed(before: np.ndarray, after: np.ndarray) -> float:
-    """Share of the pixels that are clearly different."""
-    return float((np.abs(before - after).max(-1) > 40).mean())
+class Window:
+    """One window with the editor in it."""
+
+    def __init__(self, browser: Any, editor: Editor, query: str = "", size: dict[str, int] = SIZE) -> None:
+        self.editor, self.problems = editor, []
+        self.context = browser.new_context(viewport=size)
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(1e3 * PATIENCE)
+        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self.page.on("console", lambda m: self.problems.append(m.text) if m.type == "error" else None)
+        self.page.goto(editor.url + query)
+        self.page.evaluate("window.scgs.ready.then(() => 1)")
+
+    def ask(self, expression: str, argument: Any = None) -> Any:
+        """Value of an expression in ``player``, ``clock``, ``studio`` and ``argument``."""
+        return self.page.evaluate(
+            f"(argument) => window.scgs.ready.then(({{ player, clock, studio }}) => ({expression}))", argument
+        )
+
+    def still(self) -> None:
+        def settled() -> bool:
+            idle = "!player.stale && !player.unsorted && !player.sorting && !player.moving && !player.tools.drag"
+            return self.editor.worker.idle and self.ask(f"{idle} && !studio.link.state.dragging")
+
+        until(settled)
+
+    def part_on_screen(self, part: int) -> tuple[float, float]:
+        x, y = self.ask(
+            """(() => { const { tools } = player, v = player.view(), n = tools.members[argument], s = [0, 0, 0];
+            for (const m of n) for (let k = 0; k < 3; k++) s[k] += player.places[3 * m + k] / n.length;
+            const [x, y, z] = v.rows.map((r, k) => r[0] * s[0] + r[1] * s[1] + r[2] * s[2] + v.shift[k]);
+            const b = player.canvas.getBoundingClientRect(), { width, height } = player.canvas;
+            return [(v.lens[0] * x / z + v.lens[2]) * b.width / width + b.left,
+              (v.lens[1] * y / z + v.lens[3]) * b.height / height + b.top]; })()""",
+            part,
+        )
+        return x, y
+
+    def lowest_limb(self) -> int:
+        """The foot that nothing hides."""
+        session = self.editor.session
+        names = [part.name for part in session.parts()]
+        found = []
+        for name in names:
+            x, y = self.part_on_screen(names.index(name))
+            event = {"clientX": x, "clientY": y}
+            seen = self.ask(
+                "(() => { const p = player.tools.surface(argument); return p ? player.tools.nearest(p) : -1; })()",
+                event,
+            )
+            if len(session.chain(name)) > 1 and seen in session.skeleton.part(name).nodes:
+                found.append((y, names.index(name)))
+        return max(found)[1]
+
+    def drag(self, start: tuple[float, float], shift: tuple[float, float]) -> None:
+        mouse = self.page.mouse
+        mouse.move(*start)
+        mouse.down()
+        mouse.move(start[0] + shift[0], start[1] + shift[1], steps=5)
+        mouse.up()
+        self.still()
+
+    def close(self) -> None:
+        assert self.problems == []
+        self.context.close()
 
 
-def take_arm(window: Window, key: str = "") -> None:
-    """Click on what sticks out to the left, at half the figure's height, while a key is held."""
-    editor = window.editor
-    window.hush()
-    camera, moment = window.client(), editor.model.moment()
-    seen = np.array([window.pixel(point) for point in editor.session.node_positions(0.0)])
-    seen = seen[(seen[:, 1] > 300) & (seen[:, 1] < 480)]
+def test_a_limb_is_pulled_keyed_undone_and_kept(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    part = window.lowest_limb()
+    x, y = window.part_on_screen(part)
+    window.page.mouse.move(x, y)
+    until(lambda: window.ask("player.tools.lit") == part)
+    azimuth = window.ask("player.orbit.azimuth")
+    window.drag((x, y), (25, -45))
+    until(lambda: not window.ask("studio.link.state.unedited"))
+    window.still()
+    moved = np.array(window.part_on_screen(part)) - (x, y)
+    assert np.linalg.norm(moved - (25, -45)) < 25, "the part follows the pointer"
+    assert window.ask("player.orbit.azimuth") == azimuth and window.ask("studio.link.state.part")
+    until(lambda: window.page.locator("#status").inner_text() == "saved")
+    edit = editor.session.edit
 
-    def hit() -> np.ndarray:
-        ordered = seen[seen[:, 0].argsort()] + [5, 0]
-        screens = ordered / [camera.width, camera.height]
-        met = (surface_point(editor.session, camera, tuple(screen), moment) is not None for screen in screens)
-        return next(pixel for pixel, good in zip(ordered, met) if good)
+    window.page.keyboard.press("k")
+    until(lambda: window.page.locator(".key").count() > 1)
+    window.ask("player.seek(0.5)")
+    window.still()
+    window.drag(window.part_on_screen(part), (-20, -20))
+    until(lambda: len(editor.session.edit.keyframes) == 2)
+    keys = window.page.locator("#tracks .ruler .key")
+    box = keys.nth(1).bounding_box()
+    window.page.mouse.move(box["x"] + 8, box["y"] + 8)
+    window.page.mouse.down()
+    window.page.mouse.move(box["x"] + 120, box["y"] + 8, steps=4)
+    window.page.mouse.up()
+    until(lambda: editor.session.edit.keyframes[-1].at > 2.2)
+    keys.nth(1).click()
+    window.page.keyboard.press("Delete")
+    until(lambda: len(editor.session.edit.keyframes) == 1)
+    for _ in range(4):
+        window.page.keyboard.press("Control+z")
+    until(lambda: editor.session.edit == edit)
+    window.page.keyboard.press("Control+z")
+    until(lambda: window.ask("studio.link.state.unedited"))
+    window.page.keyboard.press("Control+y")
+    until(lambda: editor.session.edit == edit)
 
-    where = editor.worker.call(hit)
-    if key:
-        window.page.keyboard.down(key)
-    window.page.mouse.click(*where)
-    if key:
-        window.page.keyboard.up(key)
-    until(lambda: editor.model.selection)
-    until(lambda: editor.overlays.gizmo.visible)
-    still(editor)
-
-
-def pull(window: Window, away: float = 90.0) -> None:
-    """Drag the gizmo by its upward arrow."""
-    gizmo, reach = window.editor.overlays.gizmo, window.editor.overlays.reach
-    window.page.mouse.move(10, 630)
-    world = window.editor.display.world
-    start = window.pixel(world(gizmo.position + np.array([0, 0, 0.9 * reach])))
-    base = np.array(window.pixel(world(gizmo.position)))
-    step = (np.array(start) - base) / np.linalg.norm(np.array(start) - base)
-    window.drag(start, tuple(np.array(start) + away * step))
-    until(lambda: not window.editor.model.dragging)
-
-
-def test_a_point_is_dragged_undone_and_filmed(editor, tmp_path):
-    with chromium() as browser:
-        window = Window(browser, editor, editor.url)
-        session, model = editor.session, editor.model
-        begin = window.picture()
-        assert changed(begin, np.zeros_like(begin)) > 0.1, "the scene is on the screen"
-
-        take_arm(window)
-        part = editor.parts.part
-        assert part is not None, "a click takes a part"
-        before = window.picture()
-        pull(window)
-        assert {handle.part for handle in session.edit.handles} == set(session.chain(part))
-        assert editor.latency and changed(before, window.picture()) > 0.005
-        window.press("Undo")
-        until(lambda: not session.edit.handles)
-
-        take_arm(window)
-        assert editor.parts.part is None, "a second click takes control points"
-        chosen = window.picture()
-        pull(window)
-        assert len(session.edit.handles) == 1 and session.edit.pins
-        lifted = session.edit.targets["handle 1"].translation
-        assert lifted[2] > 0.05 and editor.latency, "the gizmo's arrow lifts the handle"
-        moved = window.picture()
-        assert changed(chosen, moved) > 0.005
-
-        window.press("Undo")
-        until(lambda: not session.edit.handles)
-        assert changed(chosen, window.picture()) < 0.25 * changed(chosen, moved)
-        window.press("Redo")
-        until(lambda: session.edit.handles)
-
-        window.tab("Film")
-        window.press("Add keyframe here")
-        until(lambda: len(session.edit.keyframes) == 1)
-        window.field("Seconds").fill("0.5")
-        until(lambda: session.edit.film.seconds == 0.5)  # The server's answer may overwrite a field filled meanwhile.
-        window.field("Frames a second").fill("8")
-        until(lambda: session.edit.film.fps == 8)
-        window.field("Longer side").fill("64")
-        until(lambda: session.edit.film.size == 64)
-        model.seek(0.5)
-        pull(window, -60.0)
-        window.press("Add keyframe here")
-        until(lambda: len(session.edit.keyframes) == 2)
-
-        window.tab("Files")
-        window.press("Export film")
-        until(lambda: (editor.folder / "edit.mp4").is_file())
-        window.press("Save edit")
-        until(lambda: (editor.folder / "edit.json").is_file())
-        window_size = window.client().width, window.client().height
-        window.press("Screenshot")
-        until(lambda: (editor.folder / "edit.png").is_file())
-        window.press("Export PLY")
-        until(lambda: (editor.folder / "edit.ply").is_file())
-        edit = session.edit
-        window.press("Reset")
-        until(lambda: not session.edit.handles)
-        window.press("Load edit")
-        until(lambda: session.edit == edit)
-        model.seek(0.0)
-        window.press("Play")
-        until(lambda: model.at > 0.2)
-        window.press("Pause")
-        until(lambda: not model.playing)
-        assert window.problems == []
-
-    assert read(editor.folder / "edit.json", session.engine) == session.edit
-    script = EditSession(figure_scene(nodes=200, points=5000)[0])
-    script.load(editor.folder / "edit.json")
-    assert render_film(script, tmp_path / "script.mp4") == 4
-    assert (tmp_path / "script.mp4").read_bytes() == (editor.folder / "edit.mp4").read_bytes()
-    shown = np.asarray(Image.open(editor.folder / "edit.png"))
-    assert shown.shape == (window_size[1], window_size[0], 3)
+    window.page.keyboard.press(" ")
+    until(lambda: window.ask("clock.playing && player.time > 0.05"))
+    window.page.keyboard.press(" ")
+    window.page.reload()
+    window.page.evaluate("window.scgs.ready.then(() => 1)")
+    assert window.ask("player.time") > 0.05, "the moment and the view survive a reload"
+    assert not window.ask("studio.link.state.unedited")
+    window.close()
 
 
-def test_mistakes_are_said_and_the_shared_editor_survives(tmp_path):
-    key = "between the two"
-    editor = Editor(EditSession(figure_scene(nodes=100, points=2000)[0]), tmp_path, port=0, size=256, key=key)
-    proxy = Proxy(editor.port, key, "127.0.0.1")
-    session, model = editor.session, editor.model
+def test_rings_turn_a_part_about_its_joint(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    part = window.lowest_limb()
+    name = editor.session.parts()[part].name
+    window.page.mouse.click(*window.part_on_screen(part))
+    until(lambda: window.ask("studio.link.state.part") == name)
+    window.page.keyboard.press("2")
+    window.still()
+    start, end = window.ask(
+        """(() => { const g = player.tools.gizmo, b = player.canvas.getBoundingClientRect();
+        const on = (k) => { const [x, y] = g.overlay.project(g.ring(0)[k]), s = b.width / player.canvas.width;
+          return [x * s + b.left, y * s + b.top]; };
+        return [on(8), on(14)]; })()"""
+    )
+    window.drag(tuple(start), (end[0] - start[0], end[1] - start[1]))
+    until(lambda: not window.ask("studio.link.state.unedited"))
+    target = editor.session.edit.targets[editor.session.edit.handles[-1].name]
+    angle = np.degrees(2 * np.arccos(min(1.0, abs(target.rotation[0]))))
+    assert 15 < angle < 60, "about six of the ring's 64 steps"
+    assert editor.session.edit.handles[-1].part == name
+    window.page.keyboard.press("Escape")
+    until(lambda: window.ask("studio.link.state.part") is None)
+    window.close()
 
-    def says(window: Window, words: str) -> None:
-        window.page.get_by_text(words).first.wait_for(timeout=1e3 * PATIENCE)
 
+def test_a_point_drawn_on_the_tip_stays_there_while_the_view_turns(browser, tmp_path):
+    """The tip's Gaussians are magenta; centroids of the canvas' pixels at 10 views."""
+    scene = bar_scene(nodes=30, gaussians=600)
+    motion, gaussians = scene.motion, scene.gaussians
+    with torch.no_grad():
+        tip = int(motion.positions[:, 0].argmin())
+        away = (gaussians.means - motion.positions[tip]).norm(dim=1)
+        mine = away.argsort()[:12]
+        gaussians.sh_dc[:], gaussians.sh_rest[:] = -1.6, 0.0
+        gaussians.means[mine] = motion.positions[tip].clone()
+        gaussians.log_scales[mine], gaussians.opacity_logits[mine] = -3.2, 6.0
+        gaussians.sh_dc[mine] = torch.tensor([1.7, -1.7, 1.7])
+    scene.freeze_binding()
+    editor = serve(scene, tmp_path)
     try:
-        with chromium() as browser:
-            window = Window(browser, editor, proxy.url)
-            assert proxy.token not in window.page.url
-            window.press("Undo")
-            says(window, "nothing to undo")
-            window.press("Grow")
-            says(window, "click on the picture first")
-            window.tab("Film")
-            window.press("Add keyframe here")
-            says(window, "a keyframe needs a handle")
-            window.tab("Files")
-            window.field("Name").fill("../../outside")
-            until(lambda: editor.panel.files.name.value == "../../outside")
-            window.press("Save edit")
-            says(window, "take letters, digits")
-            assert list(tmp_path.rglob("*.json")) == []
-
-            editor.parts.set(False)
-            take_arm(window)
-            place = editor.gizmo_frame[0]
-            with pytest.raises(UserError, match="finite"):
-                editor.drag_gizmo("start", np.zeros(3), np.array([1.0, 0, 0, 0]))
-                editor.drag_gizmo("update", np.array([np.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
-            editor.drag_gizmo("update", place.pivot + np.array([0, 0, 1000.0]), np.array([1.0, 0, 0, 0]))
-            editor.drag_gizmo("end", place.pivot, np.array([1.0, 0, 0, 0]))
-            still(editor)
-            assert session.edit.targets["handle 1"].translation == pytest.approx((0, 0, 1000))
-            window.page.mouse.click(5, 600)
-            until(lambda: not model.selection)
-            window.page.keyboard.press("Control+z")
-            until(lambda: not session.edit.handles)
-            take_arm(window, "Shift")
-            window.tab("View")
-            window.field("Show").click()
-            window.page.get_by_role("option", name="side by side").click()
-            until(lambda: model.show == "side by side")
-            halves = window.picture()
-            middle = halves.shape[1] // 2
-            assert (halves[:, middle - 5 : middle + 6].max(axis=(1, 2)) > 60).all(), "a line between the halves"
-            assert window.problems == []
+        window = Window(browser, editor)
+        window.still()
+        window.ask("studio.link.ask('select', { what: 'nodes', nodes: [argument] })", tip)
+        until(lambda: window.ask("studio.link.state.selection") == [tip])
+        for view in range(10):
+            window.ask("(player.orbit.turn(0.6, argument), player.changed())", 0.1 if view % 2 else -0.1)
+            window.still()
+            frame = window.ask(
+                """(() => { const { width, height } = player.canvas, c = player.orbit.camera(width, height);
+                const { pixels } = player.renderAt(player.time, c.viewmat, c.K, width, height, [0, 0, 0]);
+                let x = 0, y = 0, n = 0;
+                for (let i = 0; i < pixels.length; i += 4) {
+                  const w = Math.max(0, Math.min(pixels[i], pixels[i + 2]) - pixels[i + 1]), p = i / 4;
+                  x += w * (p % width + 0.5); y += w * (Math.floor(p / width) + 0.5); n += w; }
+                return [x / n, y / n, n]; })()"""
+            )
+            assert frame[2] > 1000, "the tip is seen"
+            shot = window.page.locator("#view").screenshot()
+            image = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), np.float64)
+            weight = np.clip(np.minimum(image[..., 0], image[..., 1]) - image[..., 2] - 60, 0, None)  # the yellow point
+            rows, columns = np.indices(weight.shape)
+            point = [(weight * (columns + 0.5)).sum() / weight.sum(), (weight * (rows + 0.5)).sum() / weight.sum()]
+            assert np.hypot(point[0] - frame[0], point[1] - frame[1]) < 1.5, view
+        window.close()
     finally:
-        proxy.stop()
         editor.stop()
+
+
+def test_a_page_without_webgl_shows_pictures(browser, editor):
+    window = Window(browser, editor, "&pictures")
+    until(lambda: window.ask("player.canvas.width > 100 && !player.waits && !player.stale"))
+    shot = np.asarray(Image.open(io.BytesIO(window.page.locator("#view").screenshot())).convert("RGB"))
+    assert (shot > 40).any(2).mean() > 0.02
+    assert "The server draws instead" in window.page.locator("#notes").inner_text()
+    window.page.get_by_label("Part", exact=True).select_option(index=2)
+    until(lambda: window.ask("studio.link.state.part"))
+    window.close()
+
+
+def test_the_server_may_go(browser, editor):
+    window = Window(browser, editor)
+    editor.server.stop()
+    until(lambda: window.page.locator("#status").inner_text() == "no server")
+    assert "The server has gone" in window.page.locator("#notes").inner_text()
+    window.context.close()
+
+
+@pytest.mark.parametrize("size", [(1400, 900), (390, 844)])
+def test_every_control_can_be_named_reached_and_read(browser, editor, size):
+    """Labels, contrast, titles and roles, by axe-core; nothing sticks out of the window."""
+    source = (package("axe-core") / "axe.min.js").read_text(encoding="utf-8")
+    window = Window(browser, editor, size={"width": size[0], "height": size[1]})
+    window.still()
+    for name in ("dark", "light"):
+        window.ask("studio.theme(argument)", name)
+        window.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+        window.page.evaluate(source)
+        found = window.page.evaluate("axe.run({ resultTypes: ['violations'] }).then((r) => r.violations)")
+        told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in found]
+        assert told == [], name
+    assert window.page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert window.page.title() == "figure - scgs_warp editor"
+    window.page.keyboard.press("Control+k")
+    window.page.locator("#sought").fill("trajec")
+    window.page.keyboard.press("Enter")
+    assert window.ask("player.tools.show.ribbons")
+    window.page.keyboard.press("?")
+    assert window.page.locator("dialog#keys").is_visible()
+    window.close()

@@ -1,5 +1,5 @@
-"""Programs of others that read what we export, as node packages: looked for in the folder that SCGS_NODE names, in
-.node beside the sources (where .ci/run puts them), and among node's global packages. Tests are skipped, with the
+"""Node packages of others, which read what we export or check our pages: looked for in the folder that SCGS_NODE names,
+in .node beside the sources (where .ci/run puts them), and among node's global packages. Tests are skipped, with the
 reason, where node or a package is missing."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import pytest
 from helpers.paths import ROOT
 
 SPLAT_TRANSFORM = "@playcanvas/splat-transform"
-INSTALL = "npm install --prefix .node @playcanvas/splat-transform gltf-validator three"
+INSTALL = "npm install --prefix .node @playcanvas/splat-transform gltf-validator three axe-core"
 """Command that installs the packages, as in .ci/run."""
 
 

@@ -171,6 +171,7 @@ class Player {
     this.stale = false;
     if (this.unsorted) this.requestOrder(view);
     this.renderer.render(view, this.table, this.background, null);
+    this.overlay?.draw(view);
     this.frames++;
   }
 

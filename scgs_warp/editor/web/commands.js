@@ -1,0 +1,142 @@
+// Every action with its name and key: buttons, keys, the palette and the list of keys are made from this one table.
+
+function commandTable(studio) {
+  const { link, player, clock, tools, timeline } = studio;
+  const ask = (what, fields = {}) => link.ask(what, { at: player.at, ...fields });
+  const chosen = () => link.state?.selection.length > 0, step = (by) => () => {
+    clock.play(false);
+    player.seek(player.time + by / Math.max(1, player.seconds * player.fps));
+  };
+  return [
+    ["play", "Play or pause", " ", () => clock.play(!clock.playing)],
+    ["key", "Key the pose here", "k", () => ask("key"), () => link.state?.handles.length > 0],
+    ["undo", "Undo", "ctrl+z", () => ask("undo"), () => link.state?.undo],
+    ["redo", "Redo", "ctrl+y", () => ask("redo"), () => link.state?.redo],
+    ["redo-too", "Redo", "ctrl+shift+z", () => ask("redo"), () => link.state?.redo],
+    ["tool-pull", "Tool: pull parts", "1", () => studio.use("pull")],
+    ["grab", "Grab: pull parts", "g", () => studio.use("pull")],
+    ["tool-turn", "Tool: turn parts about their joints", "2", () => studio.use("turn")],
+    ["rotate", "Rotate: turn parts", "r", () => studio.use("turn")],
+    ["tool-points", "Tool: choose control points", "3", () => studio.use("points")],
+    ["hold", "Hold the selection as it is now", "h", () => ask("hold", { frame: studio.holdFrame }), chosen],
+    ["frame", "Frame the scene", "f", () => studio.frame()],
+    ["cancel", "Cancel, or choose nothing", "Escape", () => tools.cancel()],
+    ["delete", "Delete the chosen key, else the handle", "Delete",
+      () => (timeline.chosen ? timeline.remove() : ask("remove")), () => timeline.chosen || link.state?.active],
+    ["all", "Choose all control points", "ctrl+a", () => ask("select", { what: "all" })],
+    ["grow", "Grow the selection", "+", () => ask("select", { what: "grow" }), chosen],
+    ["back", "One frame back", "ArrowLeft", step(-1)],
+    ["forth", "One frame forth", "ArrowRight", step(1)],
+    ["begin", "First frame", "Home", () => player.seek(0)],
+    ["end", "Last frame", "End", () => player.seek(1)],
+    ["original", "Show the original while held", "o", () => studio.compare(true)],
+    ["points", "Show control points", "p", () => studio.display("points", !tools.show.points)],
+    ["ribbons", "Show trajectories", "t", () => studio.display("ribbons", !tools.show.ribbons)],
+    ["black", "Black or white background", "b", () => studio.paint(player.background[0] < 0.5 ? [1, 1, 1] : [0, 0, 0])],
+    ["reset", "Remove the whole edit", "", () => ask("reset"), () => link.state && !link.state.unedited],
+    ["save", "Save a copy of the edit", "ctrl+s", () => studio.save()],
+    ["share", "Share: write a web page that plays the edit", "", () => studio.share()],
+    ["film", "Export the film", "", () => ask("export_film", { name: studio.name, format: ".mp4" })],
+    ["picture", "Save a picture of the view", "", () => studio.picture()],
+    ["theme", "Dark or light page", "",
+      () => studio.theme(document.body.classList.contains("light") ? "dark" : "light")],
+    ["panel", "Show or hide the panel", "n", () => studio.fold()],
+    ["palette", "Search all commands", "ctrl+k", () => studio.palette()],
+    ["keys", "Show all keys", "?", () => element("keys").showModal()],
+  ].map(([id, label, key, run, when]) => ({ id, label, key, run, when: when ?? (() => true) }));
+}
+
+const KEY_NAMES = { " ": "Space", ArrowLeft: "\u2190", ArrowRight: "\u2192", Escape: "Esc" };
+const named = (part) => KEY_NAMES[part] ?? part[0].toUpperCase() + part.slice(1);
+const keyText = (key) => (key === "+" ? "+" : key.split("+").filter(Boolean).map(named).join("+"));
+
+class Commands {
+  constructor(studio) {
+    this.list = commandTable(studio);
+    for (const button of document.querySelectorAll("[data-command]")) {
+      const command = this.list.find(({ id }) => id === button.dataset.command);
+      button.title = command.key ? `${command.label} (${keyText(command.key)})` : command.label;
+      button.addEventListener("click", () => command.run());
+    }
+    element("keylist").replaceChildren(...this.list.filter(({ key }) => key).flatMap(({ key, label }) => {
+      const name = document.createElement("dt"), text = document.createElement("dd");
+      name.append(Object.assign(document.createElement("kbd"), { textContent: keyText(key) }));
+      text.textContent = label;
+      return [name, text];
+    }));
+    document.addEventListener("keydown", (event) => this.press(event));
+    document.addEventListener("keyup", (event) => event.key.toLowerCase() === "o" && studio.compare(false));
+    element("sought").addEventListener("input", () => this.search());
+    element("sought").addEventListener("keydown", (event) => this.walk(event));
+  }
+
+  press(event) {
+    if (event.altKey || document.querySelector("dialog[open]")) return;
+    const typed = /^(input|select|textarea)$/i.test(event.target.tagName) && event.target.type !== "checkbox";
+    const onButton = event.target.tagName === "BUTTON" && /^( |Enter|Arrow)/.test(event.key);
+    const onSummary = event.target.tagName === "SUMMARY" && /^( |Enter)/.test(event.key);
+    const control = event.ctrlKey || event.metaKey;
+    if ((typed && !(control && /[zyk]/i.test(event.key) && event.target.type !== "text")) || onButton || onSummary) return;
+    const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    const plain = (control ? "ctrl+" : "") + (event.shiftKey && control ? "shift+" : "") + name;
+    const command = this.list.find(({ key }) => key === plain || (key === "Delete" && plain === "Backspace"));
+    if (!command) return;
+    event.preventDefault();
+    if (command.when() && !(event.repeat && command.id === "play")) command.run();
+  }
+
+  show() {
+    for (const button of document.querySelectorAll("[data-command]")) {
+      const command = this.list.find(({ id }) => id === button.dataset.command);
+      button.disabled = !command.when();
+    }
+  }
+
+  open() {
+    element("sought").value = "";
+    this.search();
+    element("palette").showModal();
+    element("sought").focus();
+  }
+
+  search() {
+    const words = element("sought").value.toLowerCase().split(/\s+/);
+    this.found = this.list.filter(({ id, label }) => id !== "redo-too" && id !== "palette"
+      && words.every((word) => label.toLowerCase().includes(word)));
+    this.at = 0;
+    element("found").replaceChildren(...this.found.map((command, k) => {
+      const row = document.createElement("li"), key = document.createElement("kbd");
+      row.setAttribute("role", "option");
+      row.setAttribute("aria-disabled", String(!command.when()));
+      key.textContent = keyText(command.key);
+      row.append(command.label, key);
+      row.addEventListener("click", () => this.run(k));
+      return row;
+    }));
+    this.mark();
+  }
+
+  mark() {
+    [...element("found").children].forEach((row, k) => row.setAttribute("aria-selected", String(k === this.at)));
+    element("found").children[this.at]?.scrollIntoView({ block: "nearest" });
+  }
+
+  walk(event) {
+    const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    if (by) {
+      event.preventDefault();
+      this.at = (this.at + by + this.found.length) % Math.max(1, this.found.length);
+      this.mark();
+    }
+    if (event.key === "Enter") {
+      event.preventDefault();
+      this.run(this.at);
+    }
+  }
+
+  run(k) {
+    element("palette").close();
+    const command = this.found[k];
+    if (command?.when()) command.run();
+  }
+}

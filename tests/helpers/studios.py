@@ -1,0 +1,91 @@
+"""A page of the editor without a browser: it asks, and keeps what it hears."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+import threading
+from typing import Any
+
+import numpy as np
+
+from helpers.web_clients import key
+from scgs_warp.editor import Editor
+
+PATIENCE = 60.0
+
+
+class Page:
+    """Connection of one page, on a thread of its own."""
+
+    def __init__(self, editor: Editor) -> None:
+        self.editor = editor
+        self.state: dict[str, Any] = {}
+        self.hello: dict[str, Any] = {}
+        self.heard: list[dict[str, Any]] = []
+        self.poses: dict[int, np.ndarray] = {}
+        self.pictures: list[bytes] = []
+        self.closed = threading.Event()
+        self._count = 0
+        self._changed = threading.Condition()
+        self._loop = asyncio.new_event_loop()
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=lambda: self._loop.run_until_complete(self._run()), daemon=True)
+        self._thread.start()
+        assert self._ready.wait(PATIENCE)
+        self.until(lambda: self.state and self.hello)
+
+    async def _run(self) -> None:
+        import aiohttp
+
+        address = f"http://127.0.0.1:{self.editor.server.port}"
+        headers = {"Cookie": key(self.editor.server), "Origin": address}
+        async with aiohttp.ClientSession() as session:
+            async with session.ws_connect(f"{address}/socket", headers=headers, max_msg_size=0) as wire:
+                self._wire = wire
+                self._ready.set()
+                async for message in wire:
+                    self._take(message.data)
+        self.closed.set()
+
+    def _take(self, data: str | bytes) -> None:
+        with self._changed:
+            if isinstance(data, bytes):
+                kind, _, frame, _ = struct.unpack("<4i", data[:16])
+                if kind == 1:
+                    self.poses[frame] = np.frombuffer(data[16:], "<f4").reshape(-1, 28)
+                else:
+                    self.pictures.append(data[16:])
+            else:
+                message = json.loads(data)
+                self.state = message.get("state", self.state)
+                self.hello = message.get("hello", self.hello)
+                self.heard.append(message)
+            self._changed.notify_all()
+
+    def until(self, condition: Any) -> None:
+        with self._changed:
+            assert self._changed.wait_for(condition, PATIENCE), (
+                f"waited in vain: {self.heard[-3:]}, {self.editor.worker.idle}"
+            )
+
+    def send(self, message: Any) -> None:
+        text = message if isinstance(message, str) else json.dumps(message)
+        asyncio.run_coroutine_threadsafe(self._wire.send_str(text), self._loop).result(PATIENCE)
+
+    def ask(self, what: str, /, **fields: Any) -> dict[str, Any]:
+        """The answer, once the state that follows from it has come, too."""
+        self._count += 1
+        number = self._count
+        self.send({"do": what, "id": number, **fields})
+        self.until(lambda: any(message.get("id") == number for message in self.heard))
+        answer = next(message for message in self.heard if message.get("id") == number)
+        self.editor.worker.call(lambda: None)
+        want = self.editor._state()["version"]
+        self.until(lambda: self.state["version"] >= want)
+        return answer
+
+    def close(self) -> None:
+        asyncio.run_coroutine_threadsafe(self._wire.close(), self._loop).result(PATIENCE)
+        self._thread.join(PATIENCE)
