@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -18,14 +18,12 @@ from ..edit.playback import Exaggerate, Hold
 from ..edit.rotations import exponential
 from ..errors import UserError
 from . import keys
+from .host import Host
 from .model import Combine
 from .parts_tool import hit
 from .pictures import camera_of
 
-if TYPE_CHECKING:
-    from .app import Editor
-
-Action = Callable[["Editor", FieldReader], Any]
+Action = Callable[[Host, FieldReader], Any]
 LIMIT = 1e6
 """Largest coordinate, as a multiple of which no scene is drawn."""
 COMBINE = get_args(Combine)
@@ -38,14 +36,14 @@ def _point(fields: FieldReader, name: str = "point") -> tuple[float, float, floa
     return value
 
 
-def _text(fields: FieldReader, name: str, most: int = 200) -> str:
+def short_text(fields: FieldReader, name: str, most: int = 200) -> str:
     value = fields.raw(name)
     if not isinstance(value, str) or len(value) > most:
         raise fields.wrong(name, "is no short text", f"give at most {most} characters")
     return value
 
 
-def _need_selection(editor: Editor) -> tuple[int, ...]:
+def _need_selection(editor: Host) -> tuple[int, ...]:
     if not editor.model.selection:
         raise UserError("nothing is chosen; click on the picture first")
     return editor.model.selection
@@ -54,7 +52,7 @@ def _need_selection(editor: Editor) -> tuple[int, ...]:
 # Choosing
 
 
-def pick(editor: Editor, fields: FieldReader) -> None:
+def pick(editor: Host, fields: FieldReader) -> None:
     """Choose what a click at a surface point means; without a point, the click was beside the scene."""
     how = fields.choice("how", COMBINE, editor.model.combine)
     if fields.raw("point") is None:
@@ -64,17 +62,17 @@ def pick(editor: Editor, fields: FieldReader) -> None:
     editor.parts.click(hit(editor.session, point, editor.model.region, moment), how)
 
 
-def pick_pixel(editor: Editor, fields: FieldReader) -> None:
+def pick_pixel(editor: Host, fields: FieldReader) -> None:
     """Choose what a click at a pixel of a page's picture means."""
     camera, pixel, moment = camera_of(fields), fields.vector("pixel", 2), editor.model.moment()
     if pixel is None:
         raise fields.wrong("pixel", "is missing", "give 2 numbers")
-    point = editor.session.pick(camera, *pixel, moment.time, moment.at)
+    point = editor.session.pick(camera, pixel[0], pixel[1], moment.time, moment.at)
     found = None if point is None else hit(editor.session, point, editor.model.region, moment)
     editor.parts.click(found, fields.choice("how", COMBINE, editor.model.combine))
 
 
-def select(editor: Editor, fields: FieldReader) -> None:
+def select(editor: Host, fields: FieldReader) -> None:
     """Select all, none, more or other control points, or those of a lasso."""
     model, count = editor.model, len(editor.session)
     what = fields.choice("what", ("all", "none", "grow", "invert", "nodes"), "nodes")
@@ -88,22 +86,22 @@ def select(editor: Editor, fields: FieldReader) -> None:
         model.select(tuple(n for n in range(count) if n not in chosen))
 
 
-def choose_part(editor: Editor, fields: FieldReader) -> None:
+def choose_part(editor: Host, fields: FieldReader) -> None:
     """Choose a part by name, held at the mean of its control points."""
-    name, moment = _text(fields, "name"), editor.model.moment()
+    name, moment = short_text(fields, "name"), editor.model.moment()
     places = editor.session.node_positions(moment.time, moment.at)
     nodes = list(editor.session.skeleton.part(name).nodes)
     editor.parts.choose(name, places[nodes].mean(0), places)
 
 
-def activate(editor: Editor, fields: FieldReader) -> None:
-    editor.model.activate(_text(fields, "name"))
+def activate(editor: Host, fields: FieldReader) -> None:
+    editor.model.activate(short_text(fields, "name"))
 
 
 # Moving
 
 
-def grab(editor: Editor, fields: FieldReader) -> None:
+def grab(editor: Host, fields: FieldReader) -> None:
     """Begin to drag what is chosen: a part, or a handle on the selected control points."""
     from . import gizmo_pose
 
@@ -123,7 +121,7 @@ def grab(editor: Editor, fields: FieldReader) -> None:
     editor.held = frame, frame.pose(target)
 
 
-def drag(editor: Editor, fields: FieldReader) -> None:
+def drag(editor: Host, fields: FieldReader) -> None:
     """Pull what is held by a point to a place, or turn it. Both are given since the beginning of the drag."""
     if not editor.model.dragging:
         return
@@ -144,15 +142,15 @@ def drag(editor: Editor, fields: FieldReader) -> None:
         editor.model.drag(frame.target(position + shift, quat))
 
 
-def release(editor: Editor, fields: FieldReader) -> None:
+def release(editor: Host, fields: FieldReader) -> None:
     editor.model.release()
 
 
-def cancel(editor: Editor, fields: FieldReader) -> None:
+def cancel(editor: Host, fields: FieldReader) -> None:
     editor.model.cancel()
 
 
-def put(editor: Editor, fields: FieldReader) -> None:
+def put(editor: Host, fields: FieldReader) -> None:
     """Set the target of the chosen handle, or of the chosen part's joint."""
     model, old = editor.model, editor.model.target
     move, degrees = fields.vector("translation", 3), fields.vector("degrees", 3)
@@ -171,25 +169,25 @@ def put(editor: Editor, fields: FieldReader) -> None:
 # The edit
 
 
-def undo(editor: Editor, fields: FieldReader) -> None:
+def undo(editor: Host, fields: FieldReader) -> None:
     if not editor.model.undo():
         raise UserError("there is nothing to undo")
 
 
-def redo(editor: Editor, fields: FieldReader) -> None:
+def redo(editor: Host, fields: FieldReader) -> None:
     if not editor.model.redo():
         raise UserError("there is nothing to redo")
 
 
-def reset(editor: Editor, fields: FieldReader) -> None:
+def reset(editor: Host, fields: FieldReader) -> None:
     editor.model.reset()
 
 
-def remove(editor: Editor, fields: FieldReader) -> None:
+def remove(editor: Host, fields: FieldReader) -> None:
     editor.model.remove_handle()
 
 
-def handle(editor: Editor, fields: FieldReader) -> None:
+def handle(editor: Host, fields: FieldReader) -> None:
     """Set how long and how firmly the active handle, and handles made later, act."""
     changes: dict[str, Any] = {}
     if "lasts" in fields:
@@ -204,7 +202,7 @@ def handle(editor: Editor, fields: FieldReader) -> None:
         editor.model.change_handle(**changes)
 
 
-def pin(editor: Editor, fields: FieldReader) -> None:
+def pin(editor: Host, fields: FieldReader) -> None:
     model = editor.model
     what = fields.choice("what", ("selection", "rest", "none"), "selection")
     off = fields.boolean("off") or False
@@ -220,7 +218,7 @@ def pin(editor: Editor, fields: FieldReader) -> None:
             (session.unpin if off else session.pin)(nodes)
 
 
-def hold(editor: Editor, fields: FieldReader) -> None:
+def hold(editor: Host, fields: FieldReader) -> None:
     """Hold the selection in its present pose."""
     model, nodes = editor.model, _need_selection(editor)
     frame = fields.choice("frame", ("body", "world"), "body")
@@ -229,13 +227,13 @@ def hold(editor: Editor, fields: FieldReader) -> None:
     model.replace(holds=(*kept, made))
 
 
-def unhold(editor: Editor, fields: FieldReader) -> None:
+def unhold(editor: Host, fields: FieldReader) -> None:
     holds = editor.session.edit.holds
     index = fields.integer("index", 0, 0, max(len(holds) - 1, 0))
     editor.model.replace(holds=tuple(hold for row, hold in enumerate(holds) if row != index))
 
 
-def exaggerate(editor: Editor, fields: FieldReader) -> None:
+def exaggerate(editor: Host, fields: FieldReader) -> None:
     """Scale the turns of the motion."""
     model = editor.model
     if fields.boolean("off"):
@@ -255,11 +253,11 @@ def exaggerate(editor: Editor, fields: FieldReader) -> None:
 # Time
 
 
-def key(editor: Editor, fields: FieldReader) -> None:
+def key(editor: Host, fields: FieldReader) -> None:
     editor.model.add_keyframe(fields.choice("easing", get_args(Easing), "smooth"))
 
 
-def change_key(editor: Editor, fields: FieldReader) -> None:
+def change_key(editor: Host, fields: FieldReader) -> None:
     """Move, copy or delete a handle's key, or with no name a whole keyframe; or set the way to the next."""
     what = fields.choice("what", ("move", "copy", "delete", "ease"), "move")
     at, name, edit = fields.number("from", 0.0, 0.0, 3600.0), fields.text_or_none("name"), editor.session.edit
@@ -273,7 +271,7 @@ def change_key(editor: Editor, fields: FieldReader) -> None:
         session.apply(changed)
 
 
-def film(editor: Editor, fields: FieldReader) -> None:
+def film(editor: Host, fields: FieldReader) -> None:
     changes: dict[str, Any] = {}
     if "seconds" in fields:
         changes["seconds"] = fields.number("seconds", 4.0, 0.04, 600.0)
@@ -286,7 +284,7 @@ def film(editor: Editor, fields: FieldReader) -> None:
     editor.model.replace(film=dataclasses.replace(editor.session.edit.film, **changes))
 
 
-def playback(editor: Editor, fields: FieldReader) -> None:
+def playback(editor: Host, fields: FieldReader) -> None:
     model, changes = editor.model, {}
     if "speed" in fields:
         changes["speed"] = fields.number("speed", 1.0, -100.0, 100.0)
@@ -298,7 +296,7 @@ def playback(editor: Editor, fields: FieldReader) -> None:
     model.replace(playback=dataclasses.replace(model.session.edit.playback, **changes))
 
 
-def shot(editor: Editor, fields: FieldReader) -> None:
+def shot(editor: Host, fields: FieldReader) -> None:
     """Film all around, or from the page's present view, or add that view to the path."""
     kind = fields.choice("kind", ("turntable", "fixed", "orbit"), "turntable")
     settings = editor.session.edit.film
@@ -318,7 +316,7 @@ def shot(editor: Editor, fields: FieldReader) -> None:
     editor.model.replace(film=film_now)
 
 
-def tool(editor: Editor, fields: FieldReader) -> None:
+def tool(editor: Host, fields: FieldReader) -> None:
     """Set what clicks take and what drags leave behind."""
     model, region = editor.model, editor.model.region
     if "parts_first" in fields:

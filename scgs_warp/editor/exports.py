@@ -12,52 +12,52 @@ from ..edit.field_reader import MAX_BYTES, FieldReader, parse_object
 from ..edit.filming import render_film
 from ..errors import UserError
 from . import files
-from .actions import _text
+from .actions import short_text
+from .host import Host
 
 if TYPE_CHECKING:
     from ..export.page_scene import PageMotion
-    from .app import Editor
 
 Advance = Callable[[], None]
 
 
-def _path(editor: Editor, fields: FieldReader, suffix: str) -> Path:
+def _path(editor: Host, fields: FieldReader, suffix: str) -> Path:
     """Return the path of a new file; a number is added to a name that exists, unless it is to be replaced."""
-    path = files.output_path(editor.folder, _text(fields, "name"), suffix)
+    path = files.output_path(editor.folder, short_text(fields, "name"), suffix)
     return path if fields.boolean("replace") else files.unused_path(path)
 
 
-def _forked(editor: Editor) -> EditSession:
+def _forked(editor: Host) -> EditSession:
     with editor.model.lock:
         return editor.session.fork()
 
 
-def save(editor: Editor, fields: FieldReader) -> str:
+def save(editor: Host, fields: FieldReader) -> str:
     path = _path(editor, fields, ".json")
     with editor.model.lock:
         editor.session.save(path)
     return path.name
 
 
-def load(editor: Editor, fields: FieldReader) -> None:
+def load(editor: Host, fields: FieldReader) -> None:
     """Load a saved edit of the folder."""
-    path = files.output_path(editor.folder, _text(fields, "name"), ".json")
+    path = files.output_path(editor.folder, short_text(fields, "name"), ".json")
     _take(editor, edit_file.read(path, editor.session.engine, lambda: editor.session.skeleton))
 
 
-def upload(editor: Editor, fields: FieldReader) -> None:
+def upload(editor: Host, fields: FieldReader) -> None:
     """Load an edit that the page sends."""
-    text = _text(fields, "text", MAX_BYTES)
+    text = short_text(fields, "text", MAX_BYTES)
     content = parse_object(text, "the file")
     _take(editor, edit_file.parse(content, "the file", editor.session.engine, lambda: editor.session.skeleton))
 
 
-def _take(editor: Editor, edit: Any) -> None:
+def _take(editor: Host, edit: Any) -> None:
     with editor.model.changing() as session:
         session.apply(edit)
 
 
-def export_film(editor: Editor, fields: FieldReader) -> str:
+def export_film(editor: Host, fields: FieldReader) -> str:
     """Start to write the film of the edit as it is now; later changes do not affect it."""
     path = _path(editor, fields, fields.choice("format", (".mp4", ".gif"), ".mp4"))
     session = _forked(editor)
@@ -70,7 +70,7 @@ def export_film(editor: Editor, fields: FieldReader) -> str:
     return path.name
 
 
-def export_ply(editor: Editor, fields: FieldReader) -> str:
+def export_ply(editor: Host, fields: FieldReader) -> str:
     """Start to write the edited Gaussians at the moment shown."""
     path, moment, session = _path(editor, fields, ".ply"), editor.model.moment(), _forked(editor)
 
@@ -82,7 +82,7 @@ def export_ply(editor: Editor, fields: FieldReader) -> str:
     return path.name
 
 
-def export_page(editor: Editor, fields: FieldReader) -> str:
+def export_page(editor: Host, fields: FieldReader) -> str:
     """Start to write a web page that plays the edit, with parts to pull if the page asks for them."""
     from ..export.page import PageOptions, write_page
     from ..export.page_edit import edited_motion, film_times
@@ -90,7 +90,7 @@ def export_page(editor: Editor, fields: FieldReader) -> str:
     from ..export.poster import edited_poster
 
     path, posed, session = _path(editor, fields, ".html"), bool(fields.boolean("pose")), _forked(editor)
-    title = _text(fields, "title") if "title" in fields else editor.title
+    title = short_text(fields, "title") if "title" in fields else editor.title
 
     def finish(motion: PageMotion) -> Path:
         motion = with_parts(session, motion) if posed else motion
@@ -106,7 +106,7 @@ def export_page(editor: Editor, fields: FieldReader) -> str:
     return path.name
 
 
-def stop_job(editor: Editor, fields: FieldReader) -> None:
+def stop_job(editor: Host, fields: FieldReader) -> None:
     editor.jobs.cancel()
 
 

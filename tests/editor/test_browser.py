@@ -211,6 +211,7 @@ def test_a_point_drawn_on_the_tip_stays_there_while_the_view_turns(browser, tmp_
         away = (gaussians.means - motion.positions[tip]).norm(dim=1)
         mine = away.argsort()[:12]
         gaussians.sh_dc[:], gaussians.sh_rest[:] = -1.6, 0.0
+        gaussians.opacity_logits[away < 0.6] = -9.0  # nothing hides it
         gaussians.means[mine] = motion.positions[tip].clone()
         gaussians.log_scales[mine], gaussians.opacity_logits[mine] = -3.2, 6.0
         gaussians.sh_dc[mine] = torch.tensor([1.7, -1.7, 1.7])

@@ -135,6 +135,7 @@ class Commands {
   }
 
   run(k) {
+    element("sought").blur(); // keys are the page's again at once
     element("palette").close();
     const command = this.found[k];
     if (command?.when()) command.run();

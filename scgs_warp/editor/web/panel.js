@@ -48,6 +48,7 @@ class Panel {
     const input = document.createElement(row.type === "choice" ? "select" : "input");
     if (row.title) label.title = row.title;
     if (row.type !== "choice") input.type = row.type;
+    input.setAttribute("aria-label", row.label);
     for (const name of ["min", "max", "step", "maxlength"]) if (row[name] !== undefined) input.setAttribute(name, row[name]);
     const fillOptions = (options) => {
       const key = JSON.stringify(options);
