@@ -19,6 +19,7 @@ from ..export.page_edit import own_motion
 from ..export.page_pose import with_parts
 from ..export.page_scene import page_scene
 from ..live.server import Client, PageServer
+from ..storage.json_files import as_number
 from . import files
 from .actions import ACTIONS
 from .autosave import Autosave
@@ -40,6 +41,9 @@ WEB = Path(__file__).parent / "web"
 OWN_SCRIPTS = ("connection", "overlay", "gizmo", "tools", "pictures", "timeline", "panel", "commands", "studio")
 """Scripts of ``web/``, after those of the exported page."""
 SHADERS = ("overlay.vert", "overlay.frag")
+REQUESTS = {**ACTIONS, **EXPORTS}
+MAX_WAITING = 200
+"""Largest number of requests that may wait; further ones are refused."""
 
 
 class Editor:
@@ -190,8 +194,15 @@ class Editor:
             if self._dragger == client.number:
                 self._drag = time.monotonic(), client, message
                 self.worker.post(self._apply_drag, once=True)
-        elif isinstance(what, str) and (what in ACTIONS or what in EXPORTS):
+        elif isinstance(what, str) and what in REQUESTS:
+            self._queue(client, what, message)
+
+    def _queue(self, client: Client, what: str, message: dict[str, Any]) -> None:
+        """Have the worker do what a page asks for, unless too much waits already."""
+        if self.worker.backlog < MAX_WAITING:
             self.worker.post(lambda: self._act(client, what, message))
+        else:
+            client.send({"id": number_of(message), "done": what, "problem": "too many requests at once; try again"})
 
     def _want(self, client: Client, message: dict[str, Any]) -> None:
         version, frames = message.get("version"), message.get("frames")
@@ -209,29 +220,31 @@ class Editor:
             self._apply_drag()
             self._dragger = client.number if what == "grab" else None
         fields = FieldReader({key: value for key, value in message.items() if key not in ("do", "id")}, "the page")
-        answer: dict[str, Any] = {"id": message.get("id"), "done": what}
+        answer: dict[str, Any] = {"id": number_of(message), "done": what}
         try:
             self._seek(message.get("at"))
-            result = {**ACTIONS, **EXPORTS}[what](self, fields)
+            result = REQUESTS[what](self, fields)
             if isinstance(result, str):
                 answer["name"] = result
             if what == "save":
                 answer["files"] = list(files.saved_edits(self.folder))
         except UserError as error:
             answer["problem"] = one_line(error)
-            self._dragger = None if what == "grab" else self._dragger
         except CancelledError:
             return
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
             answer["problem"] = f"internal error: {type(error).__name__}: {error}"
+        if what == "grab" and "problem" in answer:
+            self._dragger = None
         client.send(answer)
         self.tell()
 
     def _seek(self, at: Any) -> None:
         """Set the moment that the page shows: requests refer to it."""
-        if isinstance(at, int | float) and not isinstance(at, bool) and not self.model.dragging:
-            self.model.look(float(at))
+        second = as_number(at)
+        if second is not None and not self.model.dragging:
+            self.model.look(second)
 
     def _apply_drag(self) -> None:
         drag, self._drag = self._drag, None
@@ -319,6 +332,12 @@ class Editor:
             return web.Response(status=404, text=str(error))
         quiet = re.sub(r"[^A-Za-z0-9 ._-]", "_", path.name)
         return web.FileResponse(path, headers={"Content-Disposition": f'attachment; filename="{quiet}"'})
+
+
+def number_of(message: dict[str, Any]) -> int | None:
+    """Return the number by which a page knows the answer to its request."""
+    number = message.get("id")
+    return number if isinstance(number, int) and abs(number) < 1 << 53 else None
 
 
 def page_of(title: str) -> bytes:

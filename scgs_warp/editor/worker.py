@@ -69,6 +69,12 @@ class Worker:
                 return False
             return self.schedule.settled(self._clock(), self._busy())
 
+    @property
+    def backlog(self) -> int:
+        """Number of calls that wait."""
+        with self._condition:
+            return len(self._calls)
+
     def stop(self) -> None:
         """Finish the present task, cancel waiting calls, and return."""
         with self._condition:

@@ -28,6 +28,8 @@ MAX_MESSAGE = 4 << 20
 """Largest message of a page in bytes."""
 MESSAGES_PER_SECOND, BURST = 400.0, 1200.0
 """Rate and burst of messages that a page may send; beyond them its connection is closed."""
+MAX_BACKLOG = 64 << 20
+"""Largest number of bytes that may wait for a page that does not read; beyond it its connection is closed."""
 HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -54,16 +56,24 @@ def import_aiohttp() -> Any:
 class Client:
     """One page that is connected by a WebSocket. ``send`` may be called from any thread."""
 
-    def __init__(self, number: int, wire: web.WebSocketResponse, loop: asyncio.AbstractEventLoop) -> None:
-        self.number, self._wire, self._loop = number, wire, loop
+    def __init__(
+        self,
+        number: int,
+        wire: web.WebSocketResponse,
+        loop: asyncio.AbstractEventLoop,
+        transport: asyncio.Transport | None = None,
+    ) -> None:
+        self.number, self._wire, self._loop, self._transport = number, wire, loop, transport
         self._waiting: list[str | bytes] = []
         self._latest: dict[str, str | bytes] = {}
+        self._backlog = 0
+        """Bytes of ``_waiting``."""
         self._ready = asyncio.Event()
         self._lock = threading.Lock()
         self._allowance, self._refilled = BURST, time.monotonic()
 
     def send(self, message: Mapping[str, Any] | bytes, latest: str | None = None) -> None:
-        """Send a JSON object or bytes.
+        """Send a JSON object or bytes. A page that leaves ``MAX_BACKLOG`` unread is cut off.
 
         Args:
             latest: kind of the message. A later one of the same kind replaces it while it waits, so that a slow page
@@ -71,12 +81,18 @@ class Client:
         """
         content = message if isinstance(message, bytes) else json.dumps(message, allow_nan=False)
         with self._lock:
-            if latest is None:
-                self._waiting.append(content)
-            else:
+            if latest is not None:
                 self._latest[latest] = content
+            elif self._backlog <= MAX_BACKLOG:
+                self._waiting.append(content)
+                self._backlog += len(content)
+            full = self._backlog > MAX_BACKLOG
         if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._ready.set)
+            self._loop.call_soon_threadsafe(self._cut if full else self._ready.set)
+
+    def _cut(self) -> None:
+        if self._transport is not None:
+            self._transport.abort()
 
     async def pump(self) -> None:
         """Send what waits, until the connection is closed."""
@@ -89,6 +105,8 @@ class Client:
                 self._latest = {}
             for message in messages:
                 await (self._wire.send_bytes(message) if isinstance(message, bytes) else self._wire.send_str(message))
+            with self._lock:
+                self._backlog = sum(map(len, self._waiting))
 
     def allows(self) -> bool:
         """Count a message of the page; return False if there are too many."""
@@ -211,7 +229,7 @@ class PageServer:
         wire = web.WebSocketResponse(max_msg_size=MAX_MESSAGE, heartbeat=60.0, compress=False)
         await wire.prepare(request)
         self._count += 1
-        client = Client(self._count, wire, self._loop)
+        client = Client(self._count, wire, self._loop, request.transport)
         self.clients[client.number] = client
         pumping = asyncio.ensure_future(client.pump())
         try:

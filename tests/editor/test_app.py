@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -20,6 +21,7 @@ from helpers.web_clients import get, key, opens
 from scgs_warp.edit import EditSession, edit_file
 from scgs_warp.edit.rotations import to_matrix
 from scgs_warp.editor import Editor
+from scgs_warp.editor.app import MAX_WAITING
 from scgs_warp.editor.autosave import Autosave
 from scgs_warp.export.page_data import unpack
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
@@ -66,8 +68,8 @@ def test_a_drag_is_posed_kept_and_undone(editor, page, tmp_path):
     pull(editor, page)
     state = page.state
     assert not state["unedited"] and not state["dragging"] and len(state["handles"]) == 1 and state["undo"]
-    assert -1 in page.poses, "the pose of the drag was sent"
-    assert editor.latency
+    page.until(lambda: -1 in page.poses)
+    assert editor.latency, "the pose of the drag was sent"
     assert editor.autosave.flush() and edit_file.read(tmp_path / "autosave.json", editor.session.engine) == (
         editor.session.edit
     )
@@ -149,11 +151,37 @@ def test_wrong_requests_get_one_line_and_change_nothing(what, fields, words, edi
 
 def test_nonsense_is_ignored(editor, page, capfd):
     odd = ["[]", "{}", '{"do": 3}', '{"do": "__init__"}', '{"do": "drag", "to": [1, 2]}', "{" * 5000]
-    odd += ['{"do": "frames", "version": {}, "frames": {}}', '{"do": "picture", "width": 0}']
+    odd += ['{"do": "frames", "version": {}, "frames": {}}', '{"do": "picture", "width": 0}', "text", ""]
+    odd += [f'{{"do": "tool", "at": 1{"0" * 400}, "id": [{"0, " * 9}0]}}', '{"do": "undo", "at": NaN, "id": NaN}']
     for message in odd:
         page.send(message)
     assert "problem" not in page.ask("tool", rings=3)
     assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["binary", "no UTF-8"])
+def test_a_malformed_message_closes_its_connection_alone(editor, page, kind, capfd):
+    """What a page sends is no reason for a traceback, and does not disturb other pages."""
+    import aiohttp
+
+    other = Page(editor)
+    text = aiohttp.WSMsgType.BINARY if kind == "binary" else aiohttp.WSMsgType.TEXT
+    other.send_frame(b"\x81\xa4type\xa4Nope\xff\xff", text)
+    assert other.closed.wait(20)
+    assert "problem" not in page.ask("tool", rings=3)
+    said = capfd.readouterr()
+    assert "Traceback" not in said.err + said.out and "Error" not in said.err + said.out
+
+
+def test_requests_do_not_pile_up(editor, page):
+    release = threading.Event()
+    editor.worker.post(lambda: release.wait(60))
+    for number in range(MAX_WAITING + 50):
+        page.send({"do": "tool", "rings": 2, "id": 1000 + number})
+    page.until(lambda: sum("too many" in message.get("problem", "") for message in page.heard) >= 40)
+    release.set()
+    page.until(lambda: sum(message.get("done") == "tool" for message in page.heard) == MAX_WAITING + 50)
+    assert editor.worker.backlog < MAX_WAITING
 
 
 def test_a_random_session_returns_to_the_same_bytes(editor, page):

@@ -74,6 +74,10 @@ class Page:
         text = message if isinstance(message, str) else json.dumps(message)
         asyncio.run_coroutine_threadsafe(self._wire.send_str(text), self._loop).result(PATIENCE)
 
+    def send_frame(self, content: bytes, kind: Any) -> None:
+        """Send a frame that may break the protocol."""
+        asyncio.run_coroutine_threadsafe(self._wire._writer.send_frame(content, kind), self._loop).result(PATIENCE)
+
     def ask(self, what: str, /, **fields: Any) -> dict[str, Any]:
         """The answer, once the state that follows from it has come, too."""
         self._count += 1

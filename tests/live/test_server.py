@@ -140,6 +140,23 @@ def test_a_slow_page_gets_the_newest_state(server):
     assert text == '{"said": "once"}' and poses == [bytes([99])]
 
 
+def test_a_page_that_does_not_read_is_cut_off(server, monkeypatch):
+    monkeypatch.setattr(module, "MAX_BACKLOG", 1 << 20)
+
+    async def sleep(wire: Any) -> bool:
+        while not server.clients:
+            await asyncio.sleep(0.01)
+        (client,) = server.clients.values()
+        wire._response.connection.transport.pause_reading()
+        for _ in range(200):
+            client.send(bytes(1 << 18))
+            await asyncio.sleep(0.01)
+        return await asyncio.to_thread(server.gone.wait, 20)
+
+    assert talk(server, sleep)
+    assert server.clients == {} and get(server.port, Cookie=key(server)).status == 200
+
+
 @pytest.mark.parametrize("flood", ["messages", "size", "bytes"])
 def test_a_page_that_sends_too_much_is_cut_off(server, flood):
     async def send(wire: Any) -> Any:

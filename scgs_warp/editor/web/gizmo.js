@@ -39,12 +39,18 @@ class Gizmo {
     this.overlay.point(this.pivot, 5, [1, 1, 1, 1], true);
   }
 
-  // The ring at a place of the canvas (canvas pixels), -1: none.
+  // Where a point is seen, in CSS pixels of the canvas, whose own pixels may become fewer during a drag.
+  seen(point) {
+    const { overlay } = this, place = overlay.project(point);
+    return place && [place[0] / overlay.scale, place[1] / overlay.scale];
+  }
+
+  // The ring at a place of the canvas in CSS pixels, -1: none.
   hit(x, y) {
     if (!this.pivot) return -1;
-    let best = -1, least = GRAB * this.overlay.scale;
+    let best = -1, least = GRAB;
     for (let axis = 0; axis < 3; axis++) {
-      const seen = this.ring(axis).map((point) => this.overlay.project(point));
+      const seen = this.ring(axis).map((point) => this.seen(point));
       for (let k = 0; k < SEGMENTS; k++) {
         const [a, b] = [seen[k], seen[k + 1]];
         if (!a || !b) continue;
@@ -57,21 +63,28 @@ class Gizmo {
     return best;
   }
 
-  // Begin to turn; the result maps a place of the canvas to a quaternion since the beginning.
+  // Begin to turn at a place in CSS pixels; the result maps a later place to a quaternion since the beginning.
   turn(axis, x, y) {
-    const { overlay, pivot } = this, direction = this.axes[axis], { view } = overlay;
-    const centre = overlay.project(pivot), towards = dot(plus(view.eye, pivot, -1), direction);
-    const sign = towards >= 0 ? -1 : 1; // seen from the front, an angle on the screen runs the other way
-    const angleAt = (px, py) => Math.atan2(py - centre[1], px - centre[0]);
-    const flat = Math.abs(towards) / Math.hypot(...plus(view.eye, pivot, -1)) < 0.2, start = angleAt(x, y);
-    const side = overlay.project(plus(pivot, direction, this.radius)) ?? centre;
-    const along = [-(side[1] - centre[1]), side[0] - centre[0]], size = Math.hypot(...along) || 1;
+    const { pivot, radius } = this, direction = this.axes[axis], centre = this.seen(pivot) ?? [x, y];
+    // Where a step along an axis of the space leads on the screen.
+    const step = (along) => {
+      const seen = this.seen(plus(pivot, along, radius)) ?? centre;
+      return [seen[0] - centre[0], seen[1] - centre[1]];
+    };
+    const [u, v] = [1, 2].map((k) => step(this.axes[(axis + k) % 3])), area = u[0] * v[1] - u[1] * v[0];
+    // The angle along the ring, whose ellipse on the screen is undone.
+    const angleAt = (px, py) => {
+      const [dx, dy] = [px - centre[0], py - centre[1]];
+      return Math.atan2((u[0] * dy - u[1] * dx) / area, (dx * v[1] - dy * v[0]) / area);
+    };
+    const flat = Math.abs(area) < 0.2 * RING * RING, start = flat ? 0 : angleAt(x, y);
+    const side = step(direction), along = [-side[1], side[0]], length = Math.hypot(...along) || 1;
     let turned = 0, last = start;
     return (px, py) => {
-      if (flat) turned = ((px - x) * along[0] + (py - y) * along[1]) / size / (RING * overlay.scale);
+      if (flat) turned = ((px - x) * along[0] + (py - y) * along[1]) / length / RING;
       else {
         const now = angleAt(px, py);
-        turned += sign * Math.atan2(Math.sin(now - last), Math.cos(now - last));
+        turned += Math.atan2(Math.sin(now - last), Math.cos(now - last));
         last = now;
       }
       return qExponential(direction.map((value) => value * turned));

@@ -6,6 +6,8 @@ const HINTS = {
   points: "Click to choose control points; Shift and drag: lasso; drag chosen ones to move them.",
 };
 
+const MOST_SENT = 2e6; // bytes of an edit file; quoted, they fit into one message
+
 // The time of the film: real seconds, over its frames.
 class FilmClock {
   constructor(player) {
@@ -68,7 +70,8 @@ class Studio {
   }
 
   lost() {
-    if (!this.gone) this.note("The server has gone. Nothing can be edited until it is back; the page waits for it.");
+    if (!this.gone) this.note("The server has gone. Nothing can be edited until it is back; the page waits for it. Open the printed address"
+      + " if the editor was started anew.");
     this.gone = true;
     element("status").textContent = "no server";
     element("status").className = "bad";
@@ -225,7 +228,10 @@ class Studio {
   choose() {
     const input = Object.assign(document.createElement("input"), { type: "file", accept: ".json,application/json" });
     input.addEventListener("change", async () => {
-      if (input.files[0]) this.link.ask("upload", { text: await input.files[0].text() });
+      const [file] = input.files;
+      if (!file) return;
+      if (file.size > MOST_SENT) this.note(`${file.name} is too large to be sent; put it into ${this.folder} and choose it there.`);
+      else this.link.ask("upload", { text: await file.text() });
     });
     input.click();
   }

@@ -106,6 +106,12 @@ class Tools {
     return [((clientX - box.left) * canvas.width) / box.width, ((clientY - box.top) * canvas.height) / box.height];
   }
 
+  // In CSS pixels.
+  spot({ clientX, clientY }) {
+    const box = this.player.canvas.getBoundingClientRect();
+    return [clientX - box.left, clientY - box.top];
+  }
+
   surface(event) {
     const { player } = this;
     return player.renderer?.surface(player.view(), ...this.pixel(event)) ?? null;
@@ -131,14 +137,14 @@ class Tools {
   // Called for every press: true keeps it from turning the view.
   takes(event, fingers) {
     if (this.drag || fingers || event.button !== 0 || !this.state || this.player.original) return Boolean(this.drag);
-    const { player } = this, [x, y] = this.pixel(event);
+    const { player } = this, spot = this.spot(event);
     const begin = (drag) => {
       player.canvas.setPointerCapture(event.pointerId);
       this.drag = { pointer: event.pointerId, from: event, moved: false, ...drag };
       return true;
     };
-    const axis = this.gizmo.hit(x, y);
-    if (axis >= 0 && !event.shiftKey) return begin({ kind: "turn", turn: this.gizmo.turn(axis, x, y) });
+    const axis = this.gizmo.hit(...spot);
+    if (axis >= 0 && !event.shiftKey) return begin({ kind: "turn", turn: this.gizmo.turn(axis, ...spot) });
     if (this.kind === "points" && event.shiftKey) return begin({ kind: "lasso", way: [[event.clientX, event.clientY]] });
     const point = this.surface(event);
     if (!point) {
@@ -191,10 +197,10 @@ class Tools {
   }
 
   send(drag) {
-    const place = this.pixel(drag.latest);
-    if (drag.kind === "turn") this.link.tell("drag", { rotation: drag.turn(...place) });
+    if (drag.kind === "turn") this.link.tell("drag", { rotation: drag.turn(...this.spot(drag.latest)) });
     else {
-      this.link.tell("drag", { grip: this.world(drag.point), to: this.world(this.lift(place, drag.depth)) });
+      const place = this.lift(this.pixel(drag.latest), drag.depth);
+      this.link.tell("drag", { grip: this.world(drag.point), to: this.world(place) });
     }
   }
 
@@ -269,7 +275,7 @@ class Tools {
   // Once a frame: what the pointer is on.
   tick() {
     if (!this.wanted || this.drag || this.player.stale || !this.state) return;
-    const event = this.wanted, [x, y] = this.pixel(event), ring = this.gizmo.hit(x, y);
+    const event = this.wanted, ring = this.gizmo.hit(...this.spot(event));
     this.wanted = null;
     if (ring !== this.gizmo.lit) {
       this.gizmo.lit = ring;
