@@ -48,6 +48,10 @@ class Options:
     masks: str = "auto"
     """Masks of image regions to ignore when finding the cameras. auto: moving regions are detected; none: nothing is
     ignored; otherwise a folder or video of masks, black where something moves."""
+    keep_static: Literal["on", "off"] = "on"
+    """off: only what the given masks mark as moving, cut out by alpha, for a scene of the mover alone."""
+    keep_moving: Literal["on", "off"] = "on"
+    """off: only what stands still, for a scene of the background alone; training ignores what the masks mark."""
     matching: Literal["auto", "sequential", "exhaustive"] = "auto"
     """Frames to compare. sequential: neighbours in time; exhaustive: each with each; auto: depends on their number."""
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
@@ -105,8 +109,11 @@ def _capture_video(options: Options, video: Path, device: str) -> None:
     for name in ("offsets", "held_out"):
         if getattr(o, name) is not None:
             raise UserError(f"--{name.replace('_', '-')}: is for --rig; leave it out")
+    if o.keep_static == o.keep_moving == "off":
+        raise UserError("--keep-static off --keep-moving off: nothing is left; give one of them")
+    keep = "moving" if o.keep_static == "off" else "static" if o.keep_moving == "off" else "all"
     film = (video, o.frames, o.start, o.end, o.size, o.masks)
-    request = CaptureRequest(*film, o.matching, o.camera_model, o.fov, o.features, o.least, o.seed)
+    request = CaptureRequest(*film, o.matching, o.camera_model, o.fov, o.features, o.least, o.seed, keep)
     made = capture(request, o.output, device=device)
     print("\n".join(made.lines))
     registered = f"{made.outcome.registered} of {made.outcome.picked} frames have a camera"
@@ -116,8 +123,12 @@ def _capture_video(options: Options, video: Path, device: str) -> None:
 def _capture_rig(options: Options, folder: Path, device: str) -> None:
     """Make a data set from the videos of a rig."""
     from scgs_warp.capture import RigRequest, capture_rig
+    from scgs_warp.errors import UserError
 
     o = options
+    for name in ("keep_static", "keep_moving"):
+        if getattr(o, name) != "on":
+            raise UserError(f"--{name.replace('_', '-')}: is for one camera, not for --rig; leave it out")
     film = (folder, o.frames, o.start, o.end, o.offsets, o.size)
     request = RigRequest(*film, o.lens, o.camera_model, o.fov, o.features, o.least, o.held_out, o.seed)
     made = capture_rig(request, o.output, device=device)

@@ -89,6 +89,10 @@ class Journal:
         self._save()
         return result
 
+    def knows(self, name: str) -> bool:
+        """Return whether the stage was begun."""
+        return name in self._stages
+
     def result(self, name: str) -> Any:
         """Return the stored result of a finished stage."""
         return self._stages[name]["result"]

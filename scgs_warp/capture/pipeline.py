@@ -57,6 +57,8 @@ class CaptureRequest:
     least: float = 0.5
     """Smallest share of the frames that must get a camera."""
     seed: int = 0
+    keep: writing.Keep = "all"
+    """What the data set shows. ``moving`` needs given masks."""
 
 
 class PickedFrames(NamedTuple):
@@ -112,6 +114,13 @@ def check(request: CaptureRequest) -> None:
         raise UserError(f"--start {start:g} --end {end:g}: give two seconds of the video, the earlier one as --start")
     if not 0 <= request.seed < 2**31:
         raise UserError(f"--seed {request.seed}: give 0 or more")
+    if request.keep == "moving" and request.masks in ("auto", "none"):
+        raise UserError(
+            "--keep-static off: needs masks of the whole mover, black where it is; give --masks DIR or --masks "
+            "FILE.mp4 (masks that are found cover only a part of it)"
+        )
+    if request.keep == "static" and request.masks == "none":
+        raise UserError("--keep-moving off: needs masks; leave out --masks none, or give --masks DIR")
 
 
 def capture(
@@ -136,14 +145,18 @@ def capture(
     frames = _frames(request, source, journal, show)
     _enough(request, frames)
     frame_files = _masks(request, source, frames, journal, show)
+    if request.keep == "moving" and _share(journal) == 0.0:
+        raise UserError(f"{request.masks}: no pixel is black, so nothing moves; masks are black where something moves")
     outcome, solved = _solve(request, source, frames, frame_files, journal, device, show)
+    if request.keep != "all" or journal.knows("images"):  # Folders of earlier versions have no such stage.
+        journal.stage("images", request.keep, dict, lambda: None)
     lines = _lines(frames, outcome)
     if not before:
         _draw_sheet(folder / SHEET, frames, frame_files, solved, source.video)
     if solved is None or outcome.registered < max(request.least * len(frames.indices), 3):
         raise UserError(too_few(str(folder), outcome))
     if not before:
-        _write(folder, frames, frame_files, solved, show)
+        _write(folder, frames, frame_files, solved, request.keep, show)
     return CaptureResult(outcome, [*lines, *notes(outcome)], before)
 
 
@@ -326,10 +339,11 @@ def _draw_sheet(
 
 
 def _write(
-    folder: Path, frames: PickedFrames, frame_files: FrameFiles, solved: mapping.CameraSolution, show: ShowProgress
-) -> None:
+    folder: Path, frames: PickedFrames, frame_files: FrameFiles, solved: mapping.CameraSolution, keep: writing.Keep,
+    show: ShowProgress,
+) -> None:  # fmt: skip
     with show(len(solved.places), "undistorting") as bar:
-        pinhole = writing.undistort(frame_files, solved, folder, bar.advance)
+        pinhole = writing.undistort(frame_files, solved, folder, bar.advance, keep)
     scene = writing.scene_of(frame_files, solved, pinhole, frames.seconds, frames.span)
     pictures.cameras(folder / CAMERAS, scene)
-    writing.write_scene(folder, scene)
+    writing.write_scene(folder, scene, keep)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -19,6 +19,9 @@ from .features import FrameFiles, quiet
 from .mapping import CameraSolution
 from .similarity import upright
 from .source import read_rgb
+
+Keep = Literal["all", "moving", "static"]
+"""What the data set shows: the images; what moves, cut out by alpha; or what stands still, with movers masked."""
 
 FILE = "transforms.json"
 POINTS = "points.ply"
@@ -80,11 +83,14 @@ def pinhole_of(solved: Calibrated) -> tuple[Pinhole, np.ndarray, np.ndarray]:
     return Pinhole(fx, fy, cx, cy, flat.width, flat.height), pixels[..., 0].copy(), pixels[..., 1].copy()
 
 
-def undistort(frame_files: FrameFiles, solved: CameraSolution, folder: Path, done: Callable[[], object]) -> Pinhole:
+def undistort(
+    frame_files: FrameFiles, solved: CameraSolution, folder: Path, done: Callable[[], object], keep: Keep = "all"
+) -> Pinhole:
     """Write ``images/`` of the registered frames, and ``masks/`` if there are masks.
 
     Args:
         done: called after each frame.
+        keep: ``moving`` gives the images an alpha channel, which is 0 where the masks are white.
     """
     pinhole, x, y = pinhole_of(solved)
     (folder / "images").mkdir(exist_ok=True)
@@ -93,11 +99,14 @@ def undistort(frame_files: FrameFiles, solved: CameraSolution, folder: Path, don
     for number in solved.places:
         name = frame_files.names[number]
         image = cv2.remap(read_rgb(frame_files.folder / name), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        write_png(folder / "images" / name, image)
         if frame_files.masks is not None:
             mask = read_rgb(frame_files.masks / name)
             moved = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
             write_png(folder / "masks" / name, moved)
+            if keep == "moving":
+                still = cv2.remap(mask[..., 0], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                image = np.dstack([image, 255 - still])
+        write_png(folder / "images" / name, image)
         done()
     return pinhole
 
@@ -124,14 +133,20 @@ def scene_of(
     )
 
 
-def write_scene(folder: Path, scene: CapturedScene) -> None:
-    """Write ``points.ply`` and then ``transforms.json``, whose presence marks a complete folder."""
-    write_points(folder / POINTS, scene.points, scene.colors)
+def write_scene(folder: Path, scene: CapturedScene, keep: Keep = "all") -> None:
+    """Write ``points.ply`` and then ``transforms.json``, whose presence marks a complete folder.
+
+    Args:
+        keep: ``moving`` leaves out the points, which stand still; ``static`` names the masks of the frames.
+    """
+    if keep != "moving":
+        write_points(folder / POINTS, scene.points, scene.colors)
     inside = [f"images/{name}" for name in scene.names]
     lists = {split: held_out(folder, range(len(inside)), split) for split in ("train", "test")}
     frames = [
         {
             "file_path": file,
+            **({"mask_path": f"masks/{Path(file).name}"} if keep == "static" else {}),
             "transform_matrix": (np.linalg.inv(viewmat) @ OPENGL_TO_OPENCV).tolist(),
             "time": time,
             "seconds": second,
@@ -142,7 +157,7 @@ def write_scene(folder: Path, scene: CapturedScene) -> None:
     content = {
         "camera_model": "PINHOLE",
         **{"w": p.width, "h": p.height, "fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy},
-        "ply_file_path": POINTS,
+        **({} if keep == "moving" else {"ply_file_path": POINTS}),
         "frames": frames,
         **{f"{split}_filenames": [inside[index] for index in chosen] for split, chosen in lists.items()},
     }

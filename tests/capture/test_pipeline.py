@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -126,6 +127,54 @@ def test_a_finished_capture_is_left_alone(filmed, captured, tmp_path):
     assert files == {file: file.stat().st_mtime_ns for file in files}
 
 
+def test_the_background_alone(filmed, captured, tmp_path):
+    """Frames name the masks of what moves, cameras and points stay; the folder keeps to its settings."""
+    folder = tmp_path / "room"
+    shutil.copytree(captured, folder)
+    (folder / "transforms.json").unlink()
+    assert not run(filmed[1], folder, keep="static", **OPTIONS).made_before
+    (one, _, whole), (two, _, background) = read(captured), read(folder)
+    np.testing.assert_array_equal(one, two)
+    assert (folder / "points.ply").read_bytes() == (captured / "points.ply").read_bytes()
+    assert not any("mask_path" in frame for frame in whole["frames"])
+    ignored = [float((~frame.mask).float().mean()) for frame in load(folder) if frame.mask is not None]
+    assert len(ignored) == len(load(folder)) and 0.005 < np.mean(ignored) < 0.3 and not load(folder).with_alpha
+    assert all(frame["mask_path"] == frame["file_path"].replace("images", "masks") for frame in background["frames"])
+    assert run(filmed[1], folder, keep="static", **OPTIONS).made_before
+    for finished, keep in ((folder, "all"), (captured, "static")):
+        with pytest.raises(UserError, match=r"made with other settings \(images\)"):
+            run(filmed[1], finished, keep=keep, **OPTIONS)
+
+
+def write_masks(folder: Path, masks) -> Path:
+    folder.mkdir()
+    for index, moving in enumerate(masks):
+        write_png(folder / f"{index:03d}.png", np.repeat(np.where(moving, 0, 255).astype(np.uint8)[..., None], 3, 2))
+    return folder
+
+
+def test_the_mover_alone(filmed, captured, tmp_path):
+    """Alpha shows the box that moves, and nothing else; its world is that of the background."""
+    truth, film = filmed
+    given = write_masks(tmp_path / "given", truth.moving)
+    run(film, tmp_path / "mover", masks=str(given), keep="moving", **OPTIONS)
+    check_cameras(truth, tmp_path / "mover")
+    data = load(tmp_path / "mover")
+    assert data.with_alpha and data.points is None
+    shared = []
+    for frame in data:
+        alpha = frame.alpha.numpy()
+        moving = truth.moving[int(frame.name.split("_")[1])].astype(np.uint8)
+        moving = cv2.resize(moving, alpha.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
+        shared.append((moving & (alpha > 0.5)).sum() / max((moving | (alpha > 0.5)).sum(), 1))
+        picture = cv2.imread(str(tmp_path / f"mover/images/{frame.name}.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_allclose(picture[..., 2::-1] / 255 * alpha[..., None], frame.image.numpy(), atol=0.01)
+    assert np.mean(shared) > 0.9
+    white = write_masks(tmp_path / "white", [np.zeros_like(moving) for moving in truth.moving])
+    with pytest.raises(UserError, match="no pixel is black"):
+        run(film, tmp_path / "nothing", masks=str(white), keep="moving", **OPTIONS)
+
+
 def test_the_same_film_gives_the_same_bytes(filmed, captured, tmp_path):
     """Matching and mapping once more, in a copy."""
     again = tmp_path / "again"
@@ -188,7 +237,8 @@ def test_a_film_that_is_too_short_or_rests(tmp_path, filmed):
     ("options", "named"),
     [({"frames": 2}, "--frames 2"), ({"size": 4}, "--size 4"), ({"fov": 500.0}, "--fov 500"),
      ({"least": 2.0}, "--least"), ({"features": 1}, "--features"), ({"seed": -1}, "--seed"),
-     ({"start": 3.0, "end": 2.0}, "--start 3 --end 2")],
+     ({"start": 3.0, "end": 2.0}, "--start 3 --end 2"), ({"keep": "moving"}, "--keep-static off: needs masks"),
+     ({"keep": "static", "masks": "none"}, "--keep-moving off: needs masks")],
 )  # fmt: skip
 def test_options_that_cannot_work(tmp_path, options, named):
     with pytest.raises(UserError, match=named):
@@ -205,6 +255,8 @@ def test_the_app_says_it_in_one_line(tmp_path, captured, filmed):
     done = app(str(tmp_path / "film.mp4"), "--output", str(tmp_path / "out"))
     assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1 and "film.mp4" in done.stderr
     assert not (tmp_path / "out").exists()
+    done = app("film.mp4", "--output", str(tmp_path / "out"), "--keep-static", "off", "--keep-moving", "off")
+    assert done.returncode == 2 and "nothing is left" in done.stderr and len(done.stderr.strip().splitlines()) == 1
     done = app(str(filmed[1]), "--output", str(captured), "--features", "1500", "--matching", "sequential")
     assert done.returncode == 0 and f"{FRAMES} of {FRAMES} frames have a camera" in done.stdout, done.stderr
 

@@ -158,6 +158,7 @@ def test_mistakes_are_named(films, tmp_path, capsys):
         (["--rig", folder, "--offsets", "0", "1"], "2 numbers for 6 videos"),
         (["--rig", folder, "--held-out", "cam9"], "--held-out cam9"),
         (["--rig", folder, "--frames", "2"], "--frames 2"),
+        (["--rig", folder, "--keep-static", "off"], "--keep-static: is for one camera"),
         (["--rig", str(tmp_path)], "holds 0 videos"),
         (["--rig", str(tmp_path / "none")], "no such folder"),
     ):
