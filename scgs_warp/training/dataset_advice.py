@@ -26,6 +26,8 @@ SAME_PLACE = 5.0
 """Largest angle in degrees between two cameras that see a surface in the same light."""
 LITTLE_PARALLAX = 5.0
 """Angle in degrees, seen from the scene. If all cameras lie within it, depth cannot be determined reliably."""
+BRIEFLY = 0.1
+"""Share of the film within which a mover hardly changes its shape, so that several frames together show its depth."""
 JUMPS = 10.0
 """Angle in degrees between the cameras of neighbouring instants. Beyond it, the camera jumps at every instant, as in
 D-NeRF."""
@@ -76,6 +78,8 @@ class Survey:
     moves."""
     points: int
     """Number of initial points in the data."""
+    sweep: float = 180.0
+    """Median angle in degrees between cameras that are ``BRIEFLY`` apart in time, seen from the centre of the scene."""
     look_away: bool = False
     """True if the content lies behind most cameras."""
 
@@ -107,8 +111,19 @@ def survey(data: Dataset) -> Survey:
         in_parts=is_in_parts(data),
         flicker=_flicker(data, [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(following < SAME_PLACE)]),
         points=0 if data.points is None else len(data.points),
+        sweep=_sweep(near, times[order]),
         look_away=looks_away(data),
     )
+
+
+def _sweep(directions: np.ndarray, times: np.ndarray) -> float:
+    """Measure ``Survey.sweep`` from directions [V, 3] in the order of their times [V]."""
+    later = np.searchsorted(times, times + BRIEFLY - 1e-6)
+    pairs = np.flatnonzero(later < len(times))
+    if len(pairs) == 0:
+        return 180.0
+    cosines = np.einsum("vi,vi->v", directions[pairs], directions[later[pairs]])
+    return float(np.median(np.degrees(np.arccos(np.clip(cosines, -1, 1)))))
 
 
 def looks_away(data: Dataset) -> bool:
@@ -203,6 +218,11 @@ def _expectation(facts: Survey) -> str:
         return "good views between the cameras at all times: each instant is seen from several sides"
     if facts.turn > JUMPS:
         return "good views from all around: the camera stands elsewhere at each instant"
+    if facts.sweep < LITTLE_PARALLAX:
+        return (
+            f"good views near the camera's path; it moves by {facts.sweep:.1f} degrees within a tenth of the time, so "
+            "the depth of what moves is a guess"
+        )
     return "good views near the camera's path; motion along the line of sight stays uncertain"
 
 

@@ -46,6 +46,16 @@ def test_hardly_any_parallax():
     assert "leaves depth unknown" in lines(handheld(30, 0.1))[1]
 
 
+def test_depth_of_movers_that_cannot_be_known():
+    """A camera that moves by 0.5 degrees from frame to frame moves by 2 while four of 40 intervals pass."""
+    assert survey(handheld(41, 0.5)).sweep == pytest.approx(2.0, abs=0.1)
+    assert "it moves by 2.0 degrees within a tenth of the time" in lines(handheld(41, 0.5))[1]
+    assert "is a guess" not in lines(handheld(41, 2.0))[1]
+    mixed = list(handheld(41, 0.5))[::-1]
+    assert survey(Dataset(mixed, folder=Path("mixed"), split="train")).sweep == pytest.approx(2.0, abs=0.1)
+    assert survey(handheld(1)).sweep == 180.0
+
+
 def test_exposure():
     assert "brightness changes by 20 %" in lines(handheld(exposure=0.2))[1]
     assert "brightness" not in lines(handheld(exposure=0.04))[1]
