@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,17 @@ def test_only_regular_files_are_opened(special: Path):
         read_text(special)
     with pytest.raises(UserError, match=r"special: cannot be read \(not a regular file\); give a \.spz"):
         read_bytes(special, "give a .spz")
+
+
+def test_a_short_text_takes_little_memory(tmp_path: Path):
+    path = tmp_path / "short.json"
+    path.write_text("{}")
+    tracemalloc.start()
+    try:
+        assert read_text(path) == "{}"
+        assert tracemalloc.get_traced_memory()[1] < 4 * 2**20, "not room for the largest text"
+    finally:
+        tracemalloc.stop()
 
 
 def test_text_is_bounded(tmp_path: Path):
