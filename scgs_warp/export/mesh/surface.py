@@ -35,6 +35,8 @@ MARGIN = 0.03
 OPAQUE = 0.5
 REACH = 0.8
 """Radius of the region of a scene with surroundings, relative to the distance of the cameras from its centre."""
+ON_PLANE = 1e-4
+"""Distance in voxels from a plane of the grid below which a vertex is on it."""
 BYTES_PER_VOXEL = 24
 """Bytes that the sums, the weights, the distances and marching cubes' indices take."""
 
@@ -162,7 +164,9 @@ def zero_level(volume: Volume, closed: bool) -> Surface:
     faces = indices.numpy().reshape(-1, 3).astype(np.int32)
     if not closed:
         known = (volume.weights > 0).cpu().numpy()
-        low, high = np.floor(cells).astype(int), np.ceil(cells).astype(int)
+        last = np.array(known.shape) - 1  # rounding moves vertices off the grid's planes, at its border out of the grid
+        low = np.clip(np.floor(cells + ON_PLANE), 0, last).astype(int)
+        high = np.clip(np.ceil(cells - ON_PLANE), 0, last).astype(int)
         seen = known[tuple(low.T)] & known[tuple(high.T)]
         faces = faces[seen[faces].all(axis=1)]
     return Surface(volume.lower + volume.voxel * cells, faces)

@@ -87,6 +87,16 @@ def test_of_an_open_scene_only_what_was_seen_is_kept():
     assert used[:, 1].max() == pytest.approx(0.5) and used[:, 1].min() == 0.0
 
 
+@pytest.mark.parametrize("side", [20, 64, 107])
+def test_an_open_surface_may_reach_the_border_of_its_volume(side):
+    volume = Volume.empty(np.zeros(3), np.array([11.0, side, 6.0]), 1.0, 1.0)
+    x, y = (torch.linspace(-1, 1, count) for count in volume.sums.shape[:2])
+    volume.sums.copy_((x[:, None] + 0.3 * y)[..., None].expand(volume.sums.shape))
+    volume.weights.fill_(1.0)
+    surface = zero_level(volume, closed=False)
+    assert len(surface.faces) > side and surface.vertices[surface.faces.ravel()].max() == pytest.approx(side)
+
+
 def test_what_no_view_saw_is_inside_of_a_closed_subject():
     mesh = trimesh.Trimesh(*slab(closed=True), process=False)
     assert mesh.is_watertight and mesh.volume > 0.5
