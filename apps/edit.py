@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
+from scgs_warp.geometry.axes import Axis
 
 if TYPE_CHECKING:
     from scgs_warp.edit import EditSession
@@ -25,6 +26,8 @@ class Options:
     ply: Path | None = None
     """Instead of a run: a file of Gaussians, which does not move by itself: .ply, .compressed.ply, .splat, .spz, .sog
     or a SOG's meta.json."""
+    up: Axis | None = None
+    """Axis of --ply's file that points up; -y by default, as in reconstructions from photographs."""
     script: Path | None = None
     """Edit to load, as JSON (docs/editing.md). Without an output, the editor opens with it."""
     output: Path | None = None
@@ -78,6 +81,8 @@ def check(options: Options) -> None:
 
     if (options.run is None) == (options.ply is None):
         raise UserError("edit.py: give one of --run and --ply")
+    if options.up is not None and options.ply is None:
+        raise UserError(f"--up {options.up}: belongs to --ply; a run knows from its cameras what is up")
     if not 1 <= options.nodes <= MAX_NODES:
         raise UserError(f"--nodes {options.nodes}: give 1 to {MAX_NODES}")
     if options.parts is not None and not 1 <= options.parts <= MAX_NODES:
@@ -109,7 +114,7 @@ def open_session(options: Options, device: str) -> EditSession:
     from scgs_warp.scene.scene import Scene
 
     if options.ply is not None:
-        scene = open_gaussians(options.ply, device, options.nodes)
+        scene = open_gaussians(options.ply, device, options.nodes, options.up)
     else:
         assert options.run is not None
         scene = Scene.load(options.run, device=device)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
+from scgs_warp.geometry.axes import Axis
 
 if TYPE_CHECKING:
     from scgs_warp.scene.scene import Scene
@@ -30,6 +31,8 @@ class Options:
     ply: Path | None = None
     """Instead of a run: a file of Gaussians, which does not move: .ply, .compressed.ply, .splat, .spz, .sog or a SOG's
     meta.json."""
+    up: Axis | None = None
+    """Axis of --ply's file that points up; -y by default, as in reconstructions from photographs."""
     mode: Literal["turntable", "time", "both"] = "both"
     """turntable: the camera moves round a still scene; time: the scene moves; both: both at once. If the training
     cameras saw the scene from one side only, the camera swings within that range."""
@@ -79,6 +82,8 @@ def check(options: Options) -> None:
 
     if (options.run is None) == (options.ply is None):
         raise UserError("view.py: give one of --run and --ply")
+    if options.up is not None and options.ply is None:
+        raise UserError(f"--up {options.up}: belongs to --ply; a run knows from its cameras what is up")
     if options.live:
         if options.output is not None:
             raise UserError("--live shows the scene in the browser and writes nothing; leave --output out")
@@ -111,7 +116,7 @@ def open_scene(options: Options, device: str) -> Scene:
     if options.ply is not None:
         from scgs_warp.scene.from_gaussians import open_gaussians
 
-        return open_gaussians(options.ply, device)
+        return open_gaussians(options.ply, device, up=options.up)
     assert options.run is not None
     return Scene.load(options.run, device=device)
 
@@ -133,7 +138,7 @@ def show_live(options: Options, device: str) -> None:
         say(f"reading {source}")
         watcher = view_run(source, view, device) if options.run is not None else None
         if watcher is None:
-            view_file(source, view, device)
+            view_file(source, view, device, options.up)
         print(view.invitation, flush=True)
         stop.wait()
         if watcher is not None:

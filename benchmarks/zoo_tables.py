@@ -88,3 +88,14 @@ def differences(source: Source) -> str:
             cells.append(number(value, 2) if row == "none" or value is None else signed(value - base))
         lines.append([source.label(row, next(iter(runs.values()))["label"]), *cells])
     return table(["change", *scenes], lines)
+
+
+def gallery(source: Source) -> str:
+    """Write the scores of the runs whose films the gallery shows."""
+    lines = []
+    for scene in (*DNERF, "handheld", "man", "figure"):
+        run = source.run("run", scene)
+        cells = [number(run["psnr"], 2), number(run["psnr_worst"], 2), number(run["ssim"], 3)]
+        lines.append([scene, *cells, thousands(run["gaussians"], 1), f"{run['step']:,}"])
+    source.label("run", "")
+    return table(["run", "PSNR", "worst image", "SSIM", "Gaussians", "steps"], lines)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ..errors import UserError
+from ..geometry.axes import Axis
 from ..formats.sog_files import META, check_folder
 from ..storage.output_folders import make_parent
 from ..storage.suffixes import longest_suffix
@@ -77,6 +78,8 @@ class ExportRequest:
     ply: Path | None = None
     """Instead of a run: Gaussians to convert, in a .ply of 3D Gaussian splatting, a .compressed.ply, a .splat, a .spz,
     a .sog or a SOG's meta.json."""
+    up: Axis | None = None
+    """Axis of --ply's file that points up; -y by default, as in reconstructions from photographs."""
     format: Format | None = None
     """ply, compressed.ply, splat, spz, sog: Gaussians at one instant. ply-sequence, sog-sequence: a file for every
     frame. glb: glTF with Gaussians, moved by control points as an animated skeleton; still with --time. graph: the
@@ -165,6 +168,8 @@ def check_request(request: ExportRequest) -> None:
     kind = request.kind
     if (request.run is None) == (request.ply is None):
         raise UserError("export.py: give one of --run and --ply")
+    if request.up is not None and request.ply is None:
+        raise UserError(f"--up {request.up}: belongs to --ply; a run knows from its cameras what is up")
     if request.run is None and kind == "cameras":
         raise UserError(f"--format {kind}: needs --run; a file of Gaussians has no cameras")
     one_instant = kind in STILL_FORMATS or (kind == "mesh" and not request.sequence)

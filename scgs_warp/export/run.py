@@ -16,6 +16,7 @@ from ..config.fields import IMAGE_SETTINGS
 from ..edit import EditSession
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
+from ..geometry.axes import Axis, direction
 from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
 from ..formats.sog_files import META
 from ..motion.control_points import ControlPoints
@@ -49,7 +50,7 @@ from .skeleton import (
 if TYPE_CHECKING:
     from .page import PageOptions
 
-FILE_UP = (0.0, -1.0, 0.0)
+FILE_UP: Axis = "-y"
 """Up direction of Gaussians from files, which do not state it."""
 FRAMES, FPS = 60, 30.0
 
@@ -86,7 +87,7 @@ def _open(request: ExportRequest, device: str) -> Scene:
     if request.run is not None:
         return Scene.load(request.run, device=device)
     assert request.ply is not None
-    return open_gaussians(request.ply, device)
+    return open_gaussians(request.ply, device, up=request.up)
 
 
 def _open_session(request: ExportRequest, scene: Scene) -> EditSession:
@@ -97,7 +98,7 @@ def _open_session(request: ExportRequest, scene: Scene) -> EditSession:
 
 
 def _export_still(request: ExportRequest, device: str) -> str:
-    up, antialiased, when = FILE_UP, False, "at rest"
+    up, antialiased, when = direction(request.up or FILE_UP), False, "at rest"
     if request.run is None and request.edit is None:
         assert request.ply is not None
         antialiased = read_antialiased(request.ply)
@@ -126,7 +127,7 @@ def write_still(
     path: Path,
     gaussians: Gaussians,
     *,
-    up: tuple[float, float, float] = FILE_UP,
+    up: tuple[float, float, float] = direction(FILE_UP),
     antialiased: bool = False,
     spz_version: Literal[3, 4] = 4,
 ) -> int:

@@ -8,6 +8,7 @@ from ..errors import UserError
 from ..export.page import MAX_DEGREE
 from ..export.page_data import pack
 from ..export.page_scene import page_scene
+from ..geometry.axes import Axis
 from ..scene.from_gaussians import open_gaussians
 from ..scene.scene import Scene
 from ..storage import checkpoint
@@ -51,10 +52,10 @@ def view_run(folder: Path, view: SceneView, device: str) -> RunWatcher:
     return RunWatcher(folder / checkpoint.FILE, view, lambda: read_run(folder, device))
 
 
-def view_file(path: Path, view: SceneView, device: str) -> None:
-    """Show a file of Gaussians.
+def view_file(path: Path, view: SceneView, device: str, up: Axis | None = None) -> None:
+    """Show a file of Gaussians, with one of its axes up (``open_gaussians``).
 
     Raises:
         UserError: the file cannot be read.
     """
-    view.publish(packed(open_gaussians(path, device)))
+    view.publish(packed(open_gaussians(path, device, up=up)))

@@ -12,6 +12,7 @@ import torch
 from ..config.presets import preset
 from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error
 from ..gaussians import GaussianParameters
+from ..geometry.axes import Axis, direction
 from ..geometry.cameras import Overview
 from ..geometry.normalisation import COMMON_RADIUS, Normalisation
 from ..motion.static_nodes import COUNT, StaticNodes
@@ -25,20 +26,21 @@ MIN_OPACITY = 0.1
 
 
 def open_gaussians(
-    path: str | Path, device: str = "cpu", nodes: int = COUNT, up: tuple[float, float, float] | None = None
+    path: str | Path, device: str = "cpu", nodes: int = COUNT, up: Axis | tuple[float, float, float] | None = None
 ) -> Scene:
     """Open a file of Gaussians (``gaussian_files.READERS``) as a static scene with control points.
 
     Args:
         nodes: number of control points, sampled from the Gaussians.
-        up: up direction of the overview; None: -y, the convention of structure from motion.
+        up: up direction of the overview, or its axis; None: -y, the convention of structure from motion.
 
     Raises:
         UserError: as :func:`~scgs_warp.formats.gaussian_files.read_gaussians`.
     """
     gaussians = read_gaussians(path)
     with shortage_as_user_error(Path(path)):
-        return _static_scene(Path(path), gaussians, device, nodes, up)
+        towards = direction(up) if isinstance(up, str) else up
+        return _static_scene(Path(path), gaussians, device, nodes, towards)
 
 
 def _static_scene(

@@ -150,7 +150,8 @@ while step < 1000:
     print(json.dumps({"step": step, "seconds": seconds}), file=log.open("a"), flush=True)
     if asked:
         sys.exit(130)
-(folder / "metrics.json").write_text(json.dumps({"psnr": 31.0, "ssim": 0.9, "seconds": seconds, "gaussians": 7}))
+(folder / "written").write_text(json.dumps({"psnr": 31.0, "ssim": 0.9, "seconds": seconds, "gaussians": 7}))
+(folder / "written").rename(folder / "metrics.json")
 """
 
 
