@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from ..errors import UserError
-from ..geometry.axes import Axis
 from ..formats.sog_files import META, check_folder
+from ..geometry.axes import Axis
 from ..storage.output_folders import make_parent
 from ..storage.suffixes import longest_suffix
 

@@ -16,9 +16,9 @@ from ..config.fields import IMAGE_SETTINGS
 from ..edit import EditSession
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
-from ..geometry.axes import Axis, direction
 from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
 from ..formats.sog_files import META
+from ..geometry.axes import Axis, direction
 from ..motion.control_points import ControlPoints
 from ..runtime.progress import progress
 from ..scene.from_gaussians import open_gaussians
