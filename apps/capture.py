@@ -91,13 +91,14 @@ def main(args: list[str] | None) -> None:
             f"{what}: give a video (or a folder of images), or --rig and a folder of one video per camera, or --poses "
             "and what another program exported"
         )
+    further = ""
     if options.video is not None:
         _capture_video(options, options.video, device)
     elif options.rig is not None:
         _capture_rig(options, options.rig, device)
     elif options.poses is not None:
-        _import_scene(options, options.poses)
-    print(f"next: python apps/train.py --data {options.output}")
+        further = _import_scene(options, options.poses)
+    print(f"next: python apps/train.py --data {options.output}{further}")
 
 
 def _capture_video(options: Options, video: Path, device: str) -> None:
@@ -141,9 +142,10 @@ def cli(args: list[str] | None = None) -> int:
     return run(main, args)
 
 
-def _import_scene(options: Options, path: Path) -> None:
-    """Make a data set from the cameras of another program."""
+def _import_scene(options: Options, path: Path) -> str:
+    """Make a data set from the cameras of another program; return the further options that training needs."""
     from scgs_warp.capture import import_scene
+    from scgs_warp.capture.imports import TOLERATED
     from scgs_warp.errors import UserError
 
     for field in fields(options):
@@ -152,6 +154,10 @@ def _import_scene(options: Options, path: Path) -> None:
     made = import_scene(path, options.output)
     points = f"{made.points:,} points from its depth" if made.points else "no depth that could give points"
     print(f"{options.output}: {made.frames} frames of {made.program}; {points}")
+    if made.pose_error is None or made.pose_error <= TOLERATED:
+        return ""
+    print(f"note: the poses differ from the images by {made.pose_error:.1f} pixels; training should correct them")
+    return " --set optim.cameras=2e-4"
 
 
 if __name__ == "__main__":

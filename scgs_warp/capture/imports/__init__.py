@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .agreement import TOLERATED
 from .importing import ImportResult, import_scene
 
-__all__ = ["ImportResult", "import_scene"]
+__all__ = ["TOLERATED", "ImportResult", "import_scene"]

@@ -22,7 +22,7 @@ from ...runtime.progress import progress
 from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
-from . import arrays, monst3r, phone_apps
+from . import agreement, arrays, monst3r, phone_apps
 from .scene import MAX_NUMBER, OPENGL_TO_OPENCV, ImportedFrame, ImportedScene
 
 FILE, POINTS = "transforms.json", "points.ply"
@@ -50,6 +50,8 @@ class ImportResult(NamedTuple):
     frames: int
     points: int
     """Number of points that depth gave; 0 without depth."""
+    pose_error: float | None
+    """Distance of static features from the epipolar lines of the poses, pixels; None if too few are in common."""
 
 
 def read_scene(path: Path) -> ImportedScene:
@@ -93,12 +95,13 @@ def import_scene(path: Path, folder: Path, show: ShowProgress = progress) -> Imp
     scene = read_scene(path)
     if len(scene.frames) < MIN_FRAMES:
         raise UserError(f"{path}: has {len(scene.frames)} frames with an image, but two are needed; export it again")
-    made: list[int] = []
+    made: list[tuple[int, float | None]] = []
     write_folder_atomically(folder, lambda work: made.append(_write(work, scene, show)))
-    return ImportResult(scene.program, len(scene.frames), made[0])
+    return ImportResult(scene.program, len(scene.frames), *made[0])
 
 
-def _write(work: Path, scene: ImportedScene, show: ShowProgress) -> int:
+def _write(work: Path, scene: ImportedScene, show: ShowProgress) -> tuple[int, float | None]:
+    """Write the folder; return the number of points and the error of the poses."""
     (work / "images").mkdir()
     frames = scene.frames
     chosen = set(spread(len(frames), POINT_FRAMES))
@@ -131,7 +134,10 @@ def _write(work: Path, scene: ImportedScene, show: ShowProgress) -> int:
         write_points(work / POINTS, points, colors)
     content = _transforms(work, frames, names, sizes, viewmats, bool(len(points)))
     (work / FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    return len(points)
+    with show(len(agreement.pairs(len(frames))), "comparing the poses with the images") as bar:
+        lenses = [frame.K for frame in frames]
+        error = agreement.pose_error(lambda index: read_rgb(work / names[index]), viewmats, lenses, bar.advance)
+    return len(points), error
 
 
 def _write_image(folder: Path, frame: ImportedFrame, stem: str) -> tuple[np.ndarray, str]:
