@@ -271,6 +271,17 @@ def change_key(editor: Host, fields: FieldReader) -> None:
         session.apply(changed)
 
 
+def change_view(editor: Host, fields: FieldReader) -> None:
+    """Move, copy or delete a view of the film's camera."""
+    what = fields.choice("what", ("move", "copy", "delete"), "move")
+    at, edit = fields.number("from", 0.0, 0.0, 3600.0), editor.session.edit
+    if what == "delete":
+        changed = keys.view_removed(edit, at)
+    else:
+        changed = keys.view_moved(edit, at, fields.number("to", 0.0, 0.0, 3600.0), copy=what == "copy")
+    editor.model.replace(film=changed.film)
+
+
 def film(editor: Host, fields: FieldReader) -> None:
     changes: dict[str, Any] = {}
     if "seconds" in fields:
@@ -340,6 +351,6 @@ ACTIONS: dict[str, Action] = {
     action.__name__: action
     for action in (
         pick, pick_pixel, select, choose_part, activate, grab, drag, release, cancel, put, undo, redo, reset, remove,
-        handle, pin, hold, unhold, exaggerate, key, change_key, film, playback, shot, tool,
+        handle, pin, hold, unhold, exaggerate, key, change_key, change_view, film, playback, shot, tool,
     )
 }  # fmt: skip

@@ -31,14 +31,25 @@ from .parts_tool import PartsTool
 from .pictures import camera_of, scene_jpeg
 from .pose_schedule import PoseSchedule, Wanted
 from .poses import picture_message, pose_message, pose_table
-from .state import page_state
+from .state import film_camera_of, page_state, turn_curve
 from .worker import Worker
 
 if TYPE_CHECKING:
     from aiohttp import web
 
 WEB = Path(__file__).parent / "web"
-OWN_SCRIPTS = ("connection", "overlay", "gizmo", "tools", "pictures", "timeline", "panel", "commands", "studio")
+OWN_SCRIPTS = (
+    "connection",
+    "overlay",
+    "gizmo",
+    "areas",
+    "tools",
+    "pictures",
+    "timeline",
+    "panel",
+    "commands",
+    "studio",
+)
 """Scripts of ``web/``, after those of the exported page."""
 SHADERS = ("overlay.vert", "overlay.frag")
 REQUESTS = {**ACTIONS, **EXPORTS}
@@ -82,7 +93,9 @@ class Editor:
         self.jobs = Jobs(lambda progress: self._show_job(progress), self._job_ended)
         self.held: tuple[GizmoFrame, tuple[Any, Any]] | None = None
         self.latency: list[float] = []
-        self._version, self._posed = 1, self._pose_key()
+        self._version, self._posed, self._film = 1, self._pose_key(), session.edit.film
+        self._curve: tuple[tuple[Any, Any], list[list[float]]] = (None, None), []
+        """Edit and active handle, and the curve of its turns."""
         self._asked: float | None = None
         """Time of the latest message of a drag whose pose is not sent yet."""
         self._drag: tuple[float, Client, dict[str, Any]] | None = None
@@ -130,6 +143,7 @@ class Editor:
             "parts": [{"name": part.name} for part in self.session.parts()],
         }
         client.send({"hello": hello})
+        client.send({"camera": film_camera_of(self.session)}, latest="camera")
         client.send({"state": self._state()}, latest="state")
 
     def _dismiss(self, client: Client) -> None:
@@ -143,7 +157,11 @@ class Editor:
         self.worker.post(forget)
 
     def _state(self) -> dict[str, Any]:
-        return page_state(self.model, self.parts, self._version, self.autosave, self._job)
+        state = page_state(self.model, self.parts, self._version, self.autosave, self._job)
+        key = self.session.edit, self.model.active
+        if not self.model.dragging and not all(new is old for new, old in zip(key, self._curve[0])):
+            self._curve = key, turn_curve(self.session, *key)
+        return {**state, "curve": self._curve[1]}
 
     def _pose_key(self) -> Any:
         return self.session.edit, self.model.following
@@ -159,6 +177,9 @@ class Editor:
                 schedule.ask_live()
         elif self.autosave is not None:
             self.autosave.note(self.session.edit)
+        if self.session.edit.film is not self._film:
+            self._film = self.session.edit.film
+            self.server.broadcast({"camera": film_camera_of(self.session)}, latest="camera")
         self.tell()
 
     def tell(self) -> None:

@@ -1,5 +1,5 @@
-"""Changes of keyframes as a timeline makes them: one handle's part of a keyframe is moved, copied or deleted. Every
-function returns another edit."""
+"""Changes of keyframes as a timeline makes them: one handle's part of a keyframe, or a view of the film's camera, is
+moved, copied or deleted. Every function returns another edit."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 
 from ..edit import Edit, Keyframe, Target
+from ..edit.document import View
 from ..edit.keyframes import Easing
 from ..errors import UserError
 
@@ -67,6 +68,45 @@ def eased(edit: Edit, at: float, easing: Easing) -> Edit:
         UserError: there is no such keyframe.
     """
     return _changed(edit, _frame(edit, at), lambda frame: dataclasses.replace(frame, easing=easing))
+
+
+def view_moved(edit: Edit, begin: float, end: float, *, copy: bool = False) -> Edit:
+    """Move a view of the film's camera to another moment; a view that is there is replaced.
+
+    Raises:
+        UserError: there is no such view, or the moment lies outside the film.
+    """
+    old = _view(edit, begin)
+    if not 0.0 <= end <= edit.film.seconds:
+        raise UserError(f"second {end:g}: a view lies within the film of {edit.film.seconds:g} s")
+    kept = [view for view in edit.film.shot.views if (copy or view is not old) and abs(view.at - end) > SAME]
+    return _with_views(edit, [*kept, dataclasses.replace(old, at=end)])
+
+
+def view_removed(edit: Edit, at: float) -> Edit:
+    """Remove a view of the film's camera.
+
+    Raises:
+        UserError: there is no such view, or no other.
+    """
+    old = _view(edit, at)
+    kept = [view for view in edit.film.shot.views if view is not old]
+    if not kept:
+        raise UserError("the path of the camera needs a view; let the film go round instead")
+    return _with_views(edit, kept)
+
+
+def _view(edit: Edit, at: float) -> View:
+    shot = edit.film.shot
+    view = next((view for view in shot.views if abs(view.at - at) <= SAME), None) if shot.kind == "orbit" else None
+    if view is None:
+        raise UserError(f"the camera has no view at second {at:g}; choose one on the timeline")
+    return view
+
+
+def _with_views(edit: Edit, views: list[View]) -> Edit:
+    shot = dataclasses.replace(edit.film.shot, views=tuple(sorted(views, key=lambda view: view.at)))
+    return dataclasses.replace(edit, film=dataclasses.replace(edit.film, shot=shot))
 
 
 def _frame(edit: Edit, at: float) -> Keyframe:

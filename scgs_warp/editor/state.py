@@ -7,19 +7,45 @@ from typing import Any
 
 import numpy as np
 
-from ..edit import Edit
+from ..edit import Edit, EditSession
+from ..edit.filming import film_view
 from ..edit.handles import STAY
 from ..edit.rotations import logarithm
+from ..export.page_edit import camera_path
 from .autosave import Autosave
 from .jobs import JobProgress
 from .model import EditorModel
 from .parts_tool import PartsTool
 
+MAX_PATH = 301
+"""Largest number of moments in the path of the camera."""
+
+
+CURVE = 97
+"""Number of moments of the film in a curve."""
+
+
+def turn_curve(session: EditSession, edit: Edit, name: str | None) -> list[list[float]]:
+    """Return how the keyframes turn a handle over the film, [CURVE, 3] degrees about x, y and z at once, at even
+    moments. It is empty without keyframes."""
+    if name is None or not any(name in frame.targets for frame in edit.keyframes):
+        return []
+    moments = np.linspace(0.0, edit.film.seconds, CURVE).tolist()
+    turns = np.array([session.engine.targets(edit, at).get(name, STAY).rotation for at in moments])
+    return np.degrees(logarithm(turns)).round(1).tolist()
+
+
+def film_camera_of(session: EditSession) -> dict[str, Any]:
+    """Return the path of the film's camera at even moments, as exported pages hold it, and its overview."""
+    film = session.edit.film
+    moments = np.linspace(0.0, film.seconds, min(max(film.frames, 2), MAX_PATH)).tolist()
+    return {"path": camera_path(session, moments), "overview": film_view(session, 0.0)[0].to_dict()}
+
 
 def page_state(
     model: EditorModel, parts: PartsTool, version: int, autosave: Autosave | None, job: JobProgress | None
 ) -> dict[str, Any]:
-    """Return what changes while a scene is edited. Poses are not part of it."""
+    """Return what changes while a scene is edited. Poses, curves and the path of the camera are not part of it."""
     with model.lock:
         session, edit = model.session, model.session.edit
         shown = parts.shown()
@@ -74,7 +100,8 @@ def _film(edit: Edit) -> dict[str, Any]:
     film = edit.film
     background = None if film.background is None else list(film.background)
     return {
-        "seconds": film.seconds, "fps": film.fps, "size": film.size, "background": background, "shot": film.shot.kind
+        "seconds": film.seconds, "fps": film.fps, "size": film.size, "background": background, "shot": film.shot.kind,
+        "views": [view.at for view in film.shot.views] if film.shot.kind == "orbit" else [],
     }  # fmt: skip
 
 

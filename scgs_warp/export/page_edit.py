@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,7 @@ def edited_motion(
     facts: dict[str, Any] = {
         "seconds": edit.film.seconds,
         "jumps": [] if turned_back else np.flatnonzero(steps > JUMP).tolist(),
-        "path": _path(session, moments),
+        "path": camera_path(session, moments),
         "overview": film_view(session, 0.0)[0].to_dict(),
     }
     if edit.film.background is not None:
@@ -113,7 +113,7 @@ def _turns(pose: Pose) -> np.ndarray:
     return to_array(pose.rotations if pose.shape_rotations is None else pose.shape_rotations)
 
 
-def _path(session: EditSession, moments: list[float]) -> list[list[float]]:
+def camera_path(session: EditSession, moments: Sequence[float]) -> list[list[float]]:
     """Return azimuth, elevation (degrees), distance and target (world units) of the film's camera at each moment."""
     rows = []
     for at in moments:

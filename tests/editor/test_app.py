@@ -19,10 +19,12 @@ from helpers.edit_scenes import bar_scene
 from helpers.studios import Page
 from helpers.web_clients import get, key, opens
 from scgs_warp.edit import EditSession, edit_file
+from scgs_warp.edit.filming import film_view
 from scgs_warp.edit.rotations import to_matrix
 from scgs_warp.editor import Editor
 from scgs_warp.editor.app import MAX_WAITING
 from scgs_warp.editor.autosave import Autosave
+from scgs_warp.editor.state import CURVE
 from scgs_warp.export.page_data import unpack
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
 from scgs_warp.geometry.cameras import orbit_camera
@@ -103,6 +105,36 @@ def test_frames_are_those_of_the_session(editor, page):
         np.testing.assert_allclose(editor.session.engine.to_world(places), wanted, atol=1e-5)
         if not editor.session.engine.motion_at(0.0).pose.shape_rotations:
             np.testing.assert_allclose(to_matrix(table[:, 12:16]), rows[:, :, :3], atol=1e-5)
+
+
+def test_the_camera_of_the_film_and_curves(editor, page):
+    pull(editor, page)
+    assert page.state["curve"] == [] and page.state["film"]["views"] == []
+    page.ask("put", degrees=[0.0, 0.0, 40.0], at=0.0)
+    page.ask("key", at=0.0)
+    page.ask("put", degrees=[0.0, 0.0, -20.0], at=4.0)
+    page.ask("key", at=4.0)
+    curve = np.array(page.state["curve"])
+    assert curve.shape == (CURVE, 3)
+    np.testing.assert_allclose(curve[[0, -1]], [[0, 0, 40], [0, 0, -20]], atol=0.1)
+    cameras = [message["camera"] for message in page.heard if "camera" in message]
+    assert len(cameras) == 1 and cameras[0]["path"][0][0] != cameras[0]["path"][30][0], "once round"
+
+    views = {"elevation": 10.0, "distance": 4.0, "target": [0, 0, 0]}
+    page.ask("shot", kind="orbit", azimuth=10.0, at=1.0, **views)
+    page.ask("shot", kind="orbit", azimuth=70.0, at=3.0, **views)
+    page.ask("change_view", what="move", to=2.0, **{"from": 3.0})
+    assert page.state["film"]["views"] == [1.0, 2.0]
+    path = [message["camera"] for message in page.heard if "camera" in message][-1]["path"]
+    for row, (azimuth, *_) in enumerate(path):
+        at = editor.session.edit.film.seconds * row / (len(path) - 1)
+        assert abs(azimuth - film_view(editor.session, at)[1]) < 1e-5, "the film's own"
+    page.ask("change_view", what="copy", to=3.5, **{"from": 1.0})
+    assert page.state["film"]["views"] == [1.0, 2.0, 3.5]
+    for at in (1.0, 3.5):
+        page.ask("change_view", what="delete", **{"from": at})
+    assert "needs a view" in page.ask("change_view", what="delete", **{"from": 2.0})["problem"]
+    assert "no view at second 3" in page.ask("change_view", what="move", to=1.0, **{"from": 3.0})["problem"]
 
 
 def test_escape_restores_the_edit(editor, page):

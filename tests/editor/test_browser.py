@@ -154,7 +154,7 @@ def test_a_limb_is_pulled_keyed_undone_and_kept(browser, editor):
     window.page.mouse.down()
     window.page.mouse.move(box["x"] + 120, box["y"] + 8, steps=4)
     window.page.mouse.up()
-    until(lambda: editor.session.edit.keyframes[-1].at > 2.2)
+    until(lambda: window.ask("studio.link.state.keyframes.at(-1).at") > 2.2)
     keys.nth(1).click()
     window.page.keyboard.press("Delete")
     until(lambda: len(editor.session.edit.keyframes) == 1)
@@ -244,6 +244,73 @@ def test_a_point_drawn_on_the_tip_stays_there_while_the_view_turns(browser, tmp_
         window.close()
     finally:
         editor.stop()
+
+
+def test_points_are_chosen_by_lasso_and_brush(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    window.page.keyboard.press("3")
+    x, y = window.part_on_screen(window.lowest_limb())
+    window.page.keyboard.down("Shift")
+    mouse = window.page.mouse
+    mouse.move(x - 40, y - 40)
+    mouse.down()
+    for corner in ((x + 40, y - 40), (x + 40, y + 40), (x - 40, y + 40)):
+        mouse.move(*corner, steps=3)
+    mouse.up()
+    window.page.keyboard.up("Shift")
+    until(lambda: window.ask("studio.link.state.selection.length") > 0)
+    inside = window.ask(
+        """(() => { const v = player.view(), p = player.places, b = player.canvas.getBoundingClientRect(), found = [];
+        for (let m = 0; m < p.length / 3; m++) {
+          const [x, y, z] = v.rows.map((r, k) => r[0] * p[3*m] + r[1] * p[3*m+1] + r[2] * p[3*m+2] + v.shift[k]);
+          const s = b.width / player.canvas.width, at = [(v.lens[0] * x / z + v.lens[2]) * s + b.left,
+            (v.lens[1] * y / z + v.lens[3]) * s + b.top];
+          if (at.every((value, k) => Math.abs(value - argument[k]) < 38)) found.push(m);
+        }
+        return found; })()""",
+        [x, y],
+    )
+    assert inside and set(inside) <= set(window.ask("studio.link.state.selection"))
+
+    window.page.keyboard.press("Escape")
+    until(lambda: window.ask("studio.link.state.selection.length") == 0)
+    window.ask("studio.link.ask('tool', { region: 'brush', radius: 0.15 })")
+    window.page.keyboard.down("Shift")
+    window.drag((x, y), (4, 4))
+    window.page.keyboard.up("Shift")
+    until(lambda: window.ask("studio.link.state.selection.length") > 0)
+    places = editor.session.node_positions(0.0)
+    chosen = window.ask("studio.link.state.selection")
+    far = np.linalg.norm(places[chosen][:, None] - places[chosen][None], axis=-1).max()
+    assert far < 0.4, "what the brush covered, and nothing else"
+    window.page.keyboard.down("Control")
+    window.page.keyboard.down("Shift")
+    window.drag((x, y), (4, 4))
+    window.page.keyboard.up("Shift")
+    window.page.keyboard.up("Control")
+    until(lambda: window.ask("studio.link.state.selection.length") == 0)
+    window.close()
+
+
+def test_the_page_looks_through_the_camera_of_the_film(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    own = window.ask("player.orbit.azimuth")
+    window.page.keyboard.press("v")
+    until(lambda: window.ask("studio.link.state.film.views.length") == 1)
+    window.ask("(player.orbit.turn(1, 0), player.seek(0.5))")
+    window.page.keyboard.press("v")
+    until(lambda: window.page.locator(".key.camera").count() == 2)
+    window.ask("(player.orbit.turn(1, 0), player.seek(0.25))")
+    window.page.get_by_label("Film camera").check()
+    window.still()
+    assert own + 0.2 < window.ask("player.orbit.azimuth") < own + 0.8, "between its views"
+    assert float(window.page.locator("#filmed").get_attribute("width") or 0) > 100
+    box = window.page.locator("#view").bounding_box()
+    window.drag((box["x"] + 10, box["y"] + 10), (40, 0))
+    assert not window.ask("player.follows"), "the view is the user's again"
+    window.close()
 
 
 def test_a_page_without_webgl_shows_pictures(browser, editor):

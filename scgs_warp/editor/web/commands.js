@@ -29,6 +29,8 @@ function commandTable(studio) {
     ["forth", "One frame forth", "ArrowRight", step(1)],
     ["begin", "First frame", "Home", () => player.seek(0)],
     ["end", "Last frame", "End", () => player.seek(1)],
+    ["camera", "Look through the film's camera", "c", () => followFilm(player, !player.follows)],
+    ["view", "Add this view to the path of the film's camera", "v", () => ask("shot", { kind: "orbit", ...studio.view() })],
     ["original", "Show the original while held", "o", () => studio.compare(true)],
     ["points", "Show control points", "p", () => studio.display("points", !tools.show.points)],
     ["ribbons", "Show trajectories", "t", () => studio.display("ribbons", !tools.show.ribbons)],

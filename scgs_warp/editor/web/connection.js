@@ -6,7 +6,7 @@ const KINDS = { pose: 1, picture: 2 };
 
 class Link {
   constructor(listener) {
-    this.listener = listener; // hello, state, said, file, pose, gone
+    this.listener = listener; // hello, camera, state, said, file, pose, gone
     this.state = null;
     this.live = null; // pose of a drag
     this.cache = new Map(); // frame -> pose
@@ -56,6 +56,7 @@ class Link {
       this.arrived();
       this.listener.state(this.state, before);
     }
+    if (message.camera) this.listener.camera(message.camera);
     if (message.said) this.listener.said(message.said);
     if (message.file) this.listener.file(message);
     if (message.done) {

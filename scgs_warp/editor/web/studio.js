@@ -3,7 +3,7 @@
 const HINTS = {
   pull: "Drag a part to pull it; drag beside the scene to turn the view. ? shows all keys.",
   turn: "Click a part, then drag a ring to turn it about its joint.",
-  points: "Click to choose control points; Shift and drag: lasso; drag chosen ones to move them.",
+  points: "Click to choose control points; Shift and drag: lasso or brush, with Ctrl to remove; drag chosen ones to move them.",
 };
 
 const MOST_SENT = 2e6; // bytes of an edit file; quoted, they fit into one message
@@ -47,7 +47,7 @@ class Studio {
     this.files = [];
     this.folder = "";
     this.link = new Link({
-      hello: (hello) => this.greet(hello), state: (state) => this.show(state), said: (said) => this.note(said.text, said.kind),
+      hello: (hello) => this.greet(hello), camera: (camera) => this.film(camera), state: (state) => this.show(state), said: (said) => this.note(said.text, said.kind),
       file: ({ file, job }) => this.offer(file, job), pose: () => this.player?.changed(),
       gone: () => this.lost(), picture: (jpeg) => this.player?.take(jpeg),
     });
@@ -69,6 +69,12 @@ class Studio {
     this.gone = false;
   }
 
+  // The film's camera has changed.
+  film(camera) {
+    this.camera = camera;
+    this.player?.film?.(camera);
+  }
+
   lost() {
     if (!this.gone) this.note("The server has gone. Nothing can be edited until it is back; the page waits for it. Open the printed address"
       + " if the editor was started anew.");
@@ -87,6 +93,7 @@ class Studio {
     this.panel = new Panel(element("panel"), panelSections(this));
     this.commands = new Commands(this);
     listenToPointers(player);
+    element("follow").addEventListener("change", () => followFilm(player, element("follow").checked));
     element("fold").addEventListener("click", () => this.fold());
     if (innerWidth <= 760) this.fold();
     addEventListener("pagehide", () => this.remember());
@@ -119,6 +126,7 @@ class Studio {
       const report = (share) => say(`Loading ${Math.round(100 * share)} %`, share);
       this.player = new StudioPlayer(canvas, await readModel(await fetchedScene("scene", report)));
       this.player.link = this.link;
+      this.player.film(this.camera);
       this.tools = new Tools(this.player, this.link);
       this.tools.edges = this.edges;
     }
@@ -207,7 +215,7 @@ class Studio {
 
   frame() {
     this.player.orbit.reset();
-    this.player.changed();
+    followFilm(this.player, false);
   }
 
   // The view as the film's camera takes it.

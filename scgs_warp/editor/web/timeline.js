@@ -1,5 +1,7 @@
 // The strip below the picture: one track a part or handle, keyframes as diamonds that are dragged, copied and deleted.
 
+const CAMERA = Symbol("camera"); // in place of a handle's name
+
 class Timeline {
   constructor(player, link, clock) {
     Object.assign(this, { player, link, clock });
@@ -30,11 +32,11 @@ class Timeline {
     const { place } = this, names = [...new Set(state.keyframes.flatMap((frame) => frame.names))];
     for (const handle of state.handles) if (!names.includes(handle.name)) names.push(handle.name);
     const label = (name) => state.handles.find((handle) => handle.name === name)?.part ?? name;
-    const key = JSON.stringify([names, state.keyframes, state.film, this.chosen, state.active]);
-    if (key === this.shown) return;
+    const key = JSON.stringify([names, state.keyframes, state.film, this.chosen, state.active, state.curve]);
+    if (key === this.shown || this.moving) return; // a key that is pressed stays what it is
     this.shown = key;
-    const rows = [["Film", null], ...names.map((name) => [label(name), name])];
-    place.replaceChildren(...rows.flatMap(([text, name]) => {
+    const rows = [["Film", null], ...names.map((name) => [label(name), name])], { views } = state.film;
+    const lanes = rows.map(([text, name]) => {
       const title = document.createElement("button");
       title.type = "button";
       title.className = "name";
@@ -48,12 +50,47 @@ class Timeline {
       for (const frame of state.keyframes) {
         if (name === null || frame.names.includes(name)) lane.append(this.diamond(frame, name, state, text));
       }
+      if (name !== null && name === state.active && state.curve.length) {
+        for (const one of [title, lane]) one.classList.add("tall");
+        lane.append(...this.curve(state.curve));
+      }
       return [title, lane];
-    }));
+    });
+    if (views.length) lanes.splice(1, 0, this.cameraLane(state));
+    place.replaceChildren(...lanes.flat());
     this.head = document.createElement("div");
     this.head.id = "head";
     this.place.append(this.head);
     this.tick();
+  }
+
+  // Views of the film's camera, on a lane of their own.
+  cameraLane(state) {
+    const title = document.createElement("span"), lane = document.createElement("div");
+    title.className = "name";
+    title.textContent = "Camera";
+    lane.className = "lane";
+    for (const type of ["pointerdown", "pointermove"]) lane.addEventListener(type, this.scrubbed);
+    lane.append(...state.film.views.map((at) => this.diamond({ at }, CAMERA, state, "the camera")));
+    return [title, lane];
+  }
+
+  // What the keys of a part add to its turn: about x, y and z, in the colours of the rings.
+  curve(degrees) {
+    const draw = (tag, attributes) => {
+      const shape = document.createElementNS("http://www.w3.org/2000/svg", tag);
+      for (const [name, value] of Object.entries(attributes)) shape.setAttribute(name, value);
+      return shape;
+    };
+    const most = Math.max(10, ...degrees.flat().map(Math.abs)), last = degrees.length - 1;
+    const svg = draw("svg", { viewBox: "0 0 100 100", preserveAspectRatio: "none", "aria-hidden": "true" });
+    svg.append(draw("line", { x1: 0, x2: 100, y1: 50, y2: 50 }), ...AXIS_COLORS.map((color, axis) => draw("polyline", {
+      stroke: hex(color), points: degrees.map((turn, k) => `${(100 * k) / last},${50 - (45 * turn[axis]) / most}`).join(" "),
+    })));
+    const scale = document.createElement("span");
+    scale.className = "scale";
+    scale.textContent = `turn, \u00b1${Math.round(most)}\u00b0`;
+    return [svg, scale];
   }
 
   addMarks(lane, { film }) {
@@ -69,9 +106,9 @@ class Timeline {
   diamond(frame, name, state, text) {
     const button = document.createElement("button");
     button.type = "button";
-    button.className = "key";
+    button.className = name === CAMERA ? "key camera" : "key";
     button.style.left = `${(100 * frame.at) / state.film.seconds}%`;
-    button.setAttribute("aria-label", `Keyframe of ${name === null ? "all" : text} at ${frame.at.toFixed(2)} seconds`);
+    button.setAttribute("aria-label", `${name === CAMERA ? "View" : "Keyframe"} of ${name === null ? "all" : text} at ${frame.at.toFixed(2)} seconds`);
     button.title = "Drag to move, with Alt to copy; Delete removes it";
     const its = { name, at: frame.at };
     button.classList.toggle("chosen", this.chosen?.name === name && this.chosen?.at === frame.at);
@@ -96,6 +133,13 @@ class Timeline {
         this.change(copy ? "copy" : "move", its, { to });
       }
     });
+    for (const name of ["pointercancel", "lostpointercapture"]) {
+      button.addEventListener(name, () => {
+        if (this.moving?.its !== its) return;
+        this.moving = null;
+        this.show(this.link.state);
+      });
+    }
     button.addEventListener("keydown", (event) => {
       if (event.key === "Enter") this.choose(its);
       if (event.key === "ArrowLeft" || event.key === "ArrowRight") {
@@ -117,6 +161,7 @@ class Timeline {
 
   change(what, its, fields = {}) {
     this.shown = null;
+    if (its.name === CAMERA) return this.link.ask("change_view", { what, from: its.at, ...fields });
     return this.link.ask("change_key", { what, from: its.at, ...(its.name === null ? {} : { name: its.name }), ...fields });
   }
 

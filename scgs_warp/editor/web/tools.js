@@ -3,6 +3,18 @@
 const CLICK = 4; // pixels that a click may move
 
 class StudioPlayer extends Player {
+  // Take the film's camera: its path over the film, and its lens and upright axis.
+  film({ path, overview }) {
+    this.model.facts.path = path;
+    this.filmed = overview;
+    if (this.follows) this.changed();
+  }
+
+  view() {
+    this.orbit.overview = this.follows ? this.filmed : this.model.facts.overview;
+    return super.view();
+  }
+
   // The second of the film that is shown.
   get at() {
     return this.time * this.seconds;
@@ -145,7 +157,10 @@ class Tools {
     };
     const axis = this.gizmo.hit(...spot);
     if (axis >= 0 && !event.shiftKey) return begin({ kind: "turn", turn: this.gizmo.turn(axis, ...spot) });
-    if (this.kind === "points" && event.shiftKey) return begin({ kind: "lasso", way: [[event.clientX, event.clientY]] });
+    if (this.kind === "points" && event.shiftKey) {
+      const area = this.state.tool.region === "brush" ? new Brush(this, event) : new Lasso(this, event);
+      return begin({ kind: "area", area, how: event.ctrlKey || event.metaKey ? "subtract" : "add" });
+    }
     const point = this.surface(event);
     if (!point) {
       this.pressed = event;
@@ -171,14 +186,14 @@ class Tools {
       this.grab(drag);
     }
     drag.latest = event;
-    if (drag.kind === "lasso") this.draw_lasso(drag, event);
+    if (drag.area) drag.area.move(event);
     else if (drag.held) this.send(drag);
   }
 
   // Choose what is under the pointer unless it is chosen already, and take hold of it.
   async grab(drag) {
     const { player, state } = this, at = player.at;
-    if (drag.kind === "lasso") return;
+    if (drag.area) return;
     if (drag.kind === "pull") {
       const row = this.owner[drag.node], chosen = this.kind === "points" && state.selection.includes(drag.node);
       if (!chosen && (this.kind === "points" || state.part !== this.parts[row].name)) {
@@ -204,13 +219,6 @@ class Tools {
     }
   }
 
-  draw_lasso(drag, event) {
-    drag.way.push([event.clientX, event.clientY]);
-    const box = this.player.canvas.getBoundingClientRect();
-    const points = drag.way.map(([x, y]) => `${x - box.left},${y - box.top}`).join(" ");
-    document.querySelector("#lasso polygon").setAttribute("points", points);
-  }
-
   end(event) {
     const { drag, pressed } = this;
     this.pressed = null;
@@ -221,8 +229,9 @@ class Tools {
       return;
     }
     if (event.pointerId !== drag.pointer) return;
-    if (drag.kind === "lasso") {
-      this.lasso(drag);
+    if (drag.area) {
+      const nodes = drag.area.take(event);
+      if (nodes.length) this.link.ask("select", { at: this.player.at, what: "nodes", nodes, how: drag.how });
       this.stop();
     } else if (!drag.moved) {
       if (drag.kind === "pull") {
@@ -243,7 +252,7 @@ class Tools {
     this.drag = null;
     this.player.clock.hold(false);
     this.player.changed();
-    document.querySelector("#lasso polygon").setAttribute("points", "");
+    clearLasso();
   }
 
   cancel() {
@@ -255,25 +264,10 @@ class Tools {
     this.stop();
   }
 
-  lasso({ way }) {
-    const { player } = this, { canvas, places } = player, box = canvas.getBoundingClientRect(), view = player.view();
-    const inside = (x, y) => way.reduce((odd, [ax, ay], k) => {
-      const [bx, by] = way[(k + 1) % way.length];
-      return (ay > y) !== (by > y) && x < ((bx - ax) * (y - ay)) / (by - ay) + ax ? !odd : odd;
-    }, false);
-    const nodes = [];
-    for (let m = 0; m < places.length / 3; m++) {
-      const point = [places[3 * m], places[3 * m + 1], places[3 * m + 2]];
-      const [x, y, z] = view.rows.map((row, r) => dot(row, point) + view.shift[r]);
-      const px = ((view.lens[0] * x) / z + view.lens[2]) * (box.width / canvas.width) + box.left;
-      const py = ((view.lens[1] * y) / z + view.lens[3]) * (box.height / canvas.height) + box.top;
-      if (z > 0 && inside(px, py)) nodes.push(m);
-    }
-    this.link.ask("select", { at: player.at, what: "nodes", nodes, how: "add" });
-  }
-
   // Once a frame: what the pointer is on.
   tick() {
+    this.drag?.area?.tick?.();
+    showFilmed(this.player);
     if (!this.wanted || this.drag || this.player.stale || !this.state) return;
     const event = this.wanted, ring = this.gizmo.hit(...this.spot(event));
     this.wanted = null;
@@ -282,7 +276,7 @@ class Tools {
       this.player.stale = true;
     }
     const point = ring < 0 ? this.surface(event) : null;
-    this.hover = point;
+    showBrush(this, this.kind === "points" && this.state.tool.region === "brush" ? point : null);
     this.light(point ? this.owner[this.nearest(point)] : -1);
   }
 
@@ -300,7 +294,7 @@ class Tools {
   draw() {
     const { state, overlay, show, player } = this;
     if (!state || !player.places || player.original) return;
-    const chosen = new Set(state.selection), row = this.parts.findIndex((part) => part.name === state.part);
+    const chosen = this.drag?.area?.chosen(state.selection, this.drag.how) ?? new Set(state.selection), row = this.parts.findIndex((part) => part.name === state.part);
     const held = new Set(state.handles.filter((h) => !h.part).flatMap((h) => h.nodes)), pins = new Set(state.pins);
     if (show.graph) {
       for (const [a, b] of this.edges ?? []) overlay.line(this.node(a), this.node(b), 1, [0.6, 0.6, 0.65, 0.5]);
