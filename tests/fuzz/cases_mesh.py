@@ -41,9 +41,10 @@ def case_fusion(d: Draw, device: str) -> None:
     camera = camera_of(d, width, height)
     values = on(device, *gaussians_of(d, 40, 0).tensors().values())
     good = camera_of(d, width, height, poisoned=0.0).to(device)
-    depth = depth_of(values, good, 0.0, 0.5)
+    depth = depth_of(values, good, 0.0, 0.5).cpu()
     if d.chance():
         d.poison(depth)
+    depth = depth.to(device)
     volume = Volume.empty(np.full(3, -1.0), np.full(3, 1.0), float(d.pick((0.3, 0.7))), 0.5, device)
     for _ in range(int(d.rng.integers(1, 4))):
         volume.add(depth, camera)
