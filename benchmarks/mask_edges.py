@@ -59,7 +59,7 @@ def guided(image: np.ndarray, mask: Mask) -> Mask:
 
 
 def weighted_median(image: np.ndarray, mask: Mask) -> Mask:
-    return cv2.ximgproc.weightedMedianFilter(image, mask.astype(np.uint8) * 255, 10, 10.0) > 127
+    return cv2.ximgproc.weightedMedianFilter(image, mask.astype(np.uint8) * 255, 10, sigma=25.5) > 127
 
 
 def grab_cut(image: np.ndarray, mask: Mask) -> Mask:
