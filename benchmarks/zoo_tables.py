@@ -99,3 +99,12 @@ def gallery(source: Source) -> str:
         lines.append([scene, *cells, thousands(run["gaussians"], 1), f"{run['step']:,}"])
     source.label("run", "")
     return table(["run", "PSNR", "worst image", "SSIM", "Gaussians", "steps"], lines)
+
+
+def exposure(source: Source) -> str:
+    """Write what affine colours per frame do for a film whose exposure changes."""
+    keys, lines = ("psnr", "psnr_fitted", "psnr_interpolated"), []
+    for row in ("clean", "without", "with"):
+        run = source.run(row, "handheld")
+        lines.append([source.label(row, run["label"]), *(number(run.get(key), 2) for key in keys)])
+    return table(["handheld", "PSNR", "fitted colour", "interpolated colour"], lines)
