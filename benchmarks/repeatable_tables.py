@@ -1,5 +1,5 @@
-"""Writers of the tables in docs/scaling.md, docs/editing.md and docs/mesh.md whose results can be measured again with
-committed scripts (for those on parts and poses, see ``posing_tables.py``).
+"""Writers of the tables in docs/scaling.md, docs/editing.md, docs/mesh.md and docs/capture.md whose results can be
+measured again with committed scripts (for those on parts and poses, see ``posing_tables.py``).
 
 Until all results of a table are there, the reported table stands in its place. A column NAME of the tables of sharing
 comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharing-NAME-alone.json``:
@@ -9,7 +9,8 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
     python benchmarks/sharing.py --size 400 --steps 25 --threads 1 --json benchmarks/results/sharing-400-alone.json
 
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
-and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``).
+and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
+of masks from ``results/mask-edges.json`` (``mask_edges.py``).
 """
 
 from __future__ import annotations
@@ -86,6 +87,21 @@ def mesh_distance(results: Results) -> str:
     return table(["subject", "mesh", "time", "triangles", "from the true surface", "from the mesh"], lines)
 
 
+def mask_edges(results: Results) -> str:
+    """Write how far masks agree with true ones, before and after filters that follow the edges of the image."""
+    rows = results["mask-edges"]["rows"]
+    kinds = {
+        "found": "found by the capture", "coarse": "true, drawn at an eighth of the size",
+        "outside": "true, outline 4 pixels outside", "inside": "true, outline 4 pixels inside",
+    }  # fmt: skip
+    filters = {
+        "none": "as it is", "guided": "guided filter", "weighted-median": "weighted median", "grab-cut": "grabCut"
+    }  # fmt: skip
+    shares = {(row["masks"], row["filter"]): row["overlap"] for row in rows}
+    lines = [[text, *(f"{100 * shares[kind, name]:.0f} %" for name in filters)] for kind, text in kinds.items()]
+    return table(["mask", *filters.values()], lines)
+
+
 class Repeatable(NamedTuple):
     """A table, the names of its results, and the folders with the code that they measure."""
 
@@ -102,6 +118,7 @@ REPEATABLE = {
         sharing_memory, (*(f"sharing-{n}" for n in ALONE), *(f"sharing-{n}-alone" for n in ALONE)), TRAINING
     ),
     "mesh-distance": Repeatable(mesh_distance, ("mesh-distance",), MESHES),
+    "capture-mask-edges": Repeatable(mask_edges, ("mask-edges",), ("scgs_warp/capture/moving.py",)),
     "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-man"), EDITING),
     "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
     "posing-pictures": Repeatable(pictures, ("posing-pictures",), EDITING),
