@@ -133,9 +133,17 @@ def test_a_limb_is_pulled_keyed_undone_and_kept(browser, editor):
     window.page.mouse.move(x, y)
     until(lambda: window.ask("player.tools.lit") == part)
     azimuth = window.ask("player.orbit.azimuth")
+    window.ask(
+        """(() => { const { link } = studio, tell = link.tell.bind(link);
+        link.tell = (what, fields) => { if (what === "drag") window.dragged = fields; tell(what, fields); }; })()"""
+    )
     window.drag((x, y), (25, -45))
     until(lambda: not window.ask("studio.link.state.unedited"))
     window.still()
+    sent, script = window.page.evaluate("window.dragged"), EditSession(editor.session.scene)
+    script.pull(window.ask("studio.link.state.part"), sent["to"], 0.0, sent["grip"])
+    for name, target in script.edit.targets.items():
+        np.testing.assert_allclose(editor.session.edit.targets[name].rotation, target.rotation, atol=1e-6)
     moved = np.array(window.part_on_screen(part)) - (x, y)
     assert np.linalg.norm(moved - (25, -45)) < 25, "the part follows the pointer"
     assert window.ask("player.orbit.azimuth") == azimuth and window.ask("studio.link.state.part")

@@ -60,7 +60,10 @@ class Timeline {
     place.replaceChildren(...lanes.flat());
     this.head = document.createElement("div");
     this.head.id = "head";
+    this.head.style.height = `${place.scrollHeight}px`;
     this.place.append(this.head);
+    if (state.active !== this.active) place.querySelector(".lane.tall")?.scrollIntoView({ block: "nearest" });
+    this.active = state.active;
     this.tick();
   }
 
