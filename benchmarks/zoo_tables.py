@@ -95,6 +95,8 @@ def gallery(source: Source) -> str:
     lines = []
     for scene in (*DNERF, "handheld", "man", "figure"):
         run = source.run("run", scene)
+        if not run:
+            continue
         cells = [number(run["psnr"], 2), number(run["psnr_worst"], 2), number(run["ssim"], 3)]
         lines.append([scene, *cells, thousands(run["gaussians"], 1), f"{run['step']:,}"])
     source.label("run", "")
@@ -106,5 +108,5 @@ def exposure(source: Source) -> str:
     keys, lines = ("psnr", "psnr_fitted", "psnr_interpolated"), []
     for row in ("clean", "without", "with"):
         run = source.run(row, "handheld")
-        lines.append([source.label(row, run["label"]), *(number(run.get(key), 2) for key in keys)])
+        lines.append([source.label(row, run.get("label", row)), *(number(run.get(key), 2) for key in keys)])
     return table(["handheld", "PSNR", "fitted colour", "interpolated colour"], lines)
