@@ -160,4 +160,4 @@ def test_no_order_of_actions_loses_anything():
 
 @pytest.mark.slow
 def test_two_thousand_actions():
-    run(40, 50)
+    run(80, 50)
