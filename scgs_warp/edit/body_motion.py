@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ import numpy as np
 
 from ..data.gltf.scene import GltfScene, read_scene
 from ..errors import UserError
-from .rotations import IDENTITY, from_matrix, rigid_fit, rotate
+from .rotations import IDENTITY, conjugate, from_matrix, least_turn, multiply, rigid_fit, rotate
 
 if TYPE_CHECKING:
     from .session import EditSession
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 FPS = 12.0
 """Instants per second at which a motion is sampled; playing interpolates between them."""
 MAX_INSTANTS = 2000
+UP = (0.0, 0.0, 1.0)
+"""Up direction of motions of bodies."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,16 @@ class BodyMotion:
             raise UserError(f"the motion has no part {name!r}; there is {', '.join(self.names)}")
         return self.names.index(name)
 
+    def turned(self, quat: np.ndarray) -> BodyMotion:
+        """Return the same motion in axes that a rotation [4] takes the present ones to."""
+        return dataclasses.replace(
+            self,
+            joints=rotate(quat, self.joints),
+            centres=rotate(quat, self.centres),
+            turns=multiply(multiply(quat, self.turns), conjugate(quat)),
+            shifts=rotate(quat, self.shifts),
+        )
+
 
 def motion_of_session(session: EditSession, seconds: float) -> BodyMotion:
     """Take the motion of a trained scene's parts, as the session's edit shows it.
@@ -71,8 +84,10 @@ def motion_of_session(session: EditSession, seconds: float) -> BodyMotion:
             turns[index, row] = quat
             shifts[index, row] = after - before + rotate(quat, joints[row] - before) - (joints[row] - before)
     parents = tuple(-1 if part.parent is None else rows[part.parent] for part in skeleton.parts)
-    height = float(np.ptp(tracks[0, :, 2]))
-    return BodyMotion(skeleton.names, parents, joints, centres, times, turns, shifts, height)
+    up = np.array(session.scene.overview.up)
+    height = float(np.ptp(tracks[0] @ up))
+    motion = BodyMotion(skeleton.names, parents, joints, centres, times, turns, shifts, height)
+    return motion.turned(least_turn(up, np.array(UP)))
 
 
 def motion_of_gltf(path: str | Path, clip: str | None = None) -> BodyMotion:

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import UserError
-from .body_motion import BodyMotion
+from .body_motion import UP, BodyMotion
 from .document import Edit
 from .field_reader import one_line, read_object, show_value
 from .handles import Handle, Target
 from .keyframes import Keyframe
 from .playback import Playback
-from .rotations import IDENTITY, conjugate, multiply
-from .skeleton import Skeleton
+from .rotations import IDENTITY, conjugate, least_turn, multiply
+from .skeleton import AUTOMATIC, Skeleton
 
 if TYPE_CHECKING:
     from .session import EditSession
@@ -39,12 +39,16 @@ class Stance:
     """[P, 3] as in ``BodyMotion``, at that moment."""
     centres: np.ndarray
     """[P, 3]"""
+    up: np.ndarray
+    """[3] unit vector"""
     height: float
+    """Extent along ``up``."""
 
 
 def match_names(skeleton: Skeleton, motion: BodyMotion) -> dict[str, str]:
-    """Return the parts of both bodies that have the same name but for case."""
-    known = {name.casefold(): name for name in motion.names}
+    """Return the parts of both bodies that have the same name but for case. Names that nobody gave (``part-3``) say
+    nothing of another body's parts."""
+    known = {name.casefold(): name for name in motion.names if not AUTOMATIC.fullmatch(name)}
     return {name: known[name.casefold()] for name in skeleton.names if name.casefold() in known}
 
 
@@ -63,8 +67,9 @@ def retargeted(edit: Edit, stance: Stance, motion: BodyMotion, match: Mapping[st
     if not match:
         raise UserError(
             f"no part of the motion is matched: its parts are {', '.join(motion.names)}, those of the scene are "
-            f"{', '.join(skeleton.names)}; say which belong together"
+            f"{', '.join(skeleton.names)}; say which belong together (--match)"
         )
+    motion = motion.turned(least_turn(np.array(UP), stance.up))
     source = {skeleton.part(name).name: motion.row(other) for name, other in match.items()}
     rows = {name: row for row, name in enumerate(skeleton.names)}
     order = [name for part in skeleton.parts if part.parent is None for name in skeleton.branch(part.name)]
@@ -107,7 +112,7 @@ def _alignment(
         there = motion.joints[source[below[0]]] - motion.joints[other]
     else:
         here, there = stance.centres[own] - stance.joints[own], motion.centres[other] - motion.joints[other]
-    return _least_turn(here, there)
+    return least_turn(here, there)
 
 
 def _next_matched(skeleton: Skeleton, name: str, source: Mapping[str, int]) -> list[str]:
@@ -118,17 +123,6 @@ def _next_matched(skeleton: Skeleton, name: str, source: Mapping[str, int]) -> l
     return found
 
 
-def _least_turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the least rotation [4] between two directions; the identity if one is 0 or they are opposite."""
-    a, b = np.linalg.norm(first), np.linalg.norm(second)
-    if not min(a, b) > 1e-9:
-        return IDENTITY.copy()
-    u, v = first / a, second / b
-    half = np.array([1.0 + u @ v, *np.cross(u, v)])
-    size = np.linalg.norm(half)
-    return half / size if size > 1e-6 else IDENTITY.copy()
-
-
 def stance_of(session: EditSession, time: float) -> Stance:
     """Describe the parts of a scene at a moment of its motion, without handles."""
     skeleton, places = session.skeleton, session.engine.to_world(session.engine.motion_at(time).positions)
@@ -136,7 +130,8 @@ def stance_of(session: EditSession, time: float) -> Stance:
     plain.edit = Edit(skeleton=skeleton)
     joints = np.array([plain.joint_of(name, time) for name in skeleton.names])
     centres = np.array([places[list(part.nodes)].mean(0) for part in skeleton.parts])
-    return Stance(time, skeleton, joints, centres, float(np.ptp(places[:, 2])))
+    up = np.array(session.scene.overview.up)
+    return Stance(time, skeleton, joints, centres, up, float(np.ptp(places @ up)))
 
 
 def retarget(

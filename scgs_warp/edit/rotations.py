@@ -79,6 +79,23 @@ def from_axis(axis: ArrayLike, degrees: float) -> np.ndarray:
     return np.concatenate([[math.cos(half)], math.sin(half) * axis / norm])
 
 
+def least_turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the least rotation [4] that takes one direction [3] to another; the identity if one of them is 0.
+
+    Between opposite directions it is half a turn about an axis across them.
+    """
+    a, b = np.linalg.norm(first), np.linalg.norm(second)
+    if not min(a, b) > 1e-9:
+        return IDENTITY.copy()
+    u, v = first / a, second / b
+    half = np.array([1.0 + u @ v, *np.cross(u, v)])
+    size = np.linalg.norm(half)
+    if size > 1e-6:
+        return half / size
+    across = np.cross(u, np.eye(3)[np.abs(u).argmin()])
+    return np.array([0.0, *(across / np.linalg.norm(across))])
+
+
 def rotate(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Turn vectors [..., 3] by unit quaternions [..., 4]; they broadcast."""
     quats, vectors = np.asarray(quats, np.float64), np.asarray(vectors, np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -14,6 +15,8 @@ from .field_reader import FieldReader
 from .handles import Vector3
 
 Source = Literal["motion", "geometry", "edited"]
+AUTOMATIC = re.compile(r"part-\d+")
+"""Names of parts that nobody has named."""
 
 BRANCH_SHARE = 0.5
 """Number of control points of a side branch, relative to the pulled branch, from which on a pull does not pass it. A

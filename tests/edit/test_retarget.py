@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import os
 from pathlib import Path
@@ -13,9 +14,9 @@ from helpers.edit_scenes import bone_skeleton, figure_scene
 from helpers.gltf_files import bar, box
 from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession, motion_of_gltf, motion_of_session, retarget
-from scgs_warp.edit.body_motion import BodyMotion
+from scgs_warp.edit.body_motion import UP, BodyMotion
 from scgs_warp.edit.retarget import match_names, read_match
-from scgs_warp.edit.rotations import IDENTITY, from_axis, multiply, rotate, to_matrix
+from scgs_warp.edit.rotations import IDENTITY, from_axis, least_turn, multiply, rotate, to_matrix
 from scgs_warp.errors import UserError
 
 ARM = ("shoulder_left", "elbow_left")
@@ -99,6 +100,54 @@ def test_a_matched_root_travels_by_the_ratio_of_the_heights(session):
     )
 
 
+def upside(session: EditSession, up: tuple[float, float, float]) -> EditSession:
+    """The same scene, of which another direction is up."""
+    scene = copy.copy(session.scene)
+    scene.overview = dataclasses.replace(scene.overview, up=up)
+    other = EditSession(scene)
+    other.edit = session.edit
+    return other
+
+
+@pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (0.6, 0.0, 0.8)])
+def test_what_is_up_in_the_motion_is_up_in_the_scene(session, up):
+    other = upside(session, up)
+    root = next(part.name for part in session.skeleton.parts if part.parent is None)
+    motion = arm_motion(30.0, 0.0)
+    motion.shifts[1] = [0.0, 0.0, 0.5]
+    before = other.node_positions(0.0, 0.0)
+    retarget(other, motion, {root: "torso"})
+    after = other.node_positions(0.0, 1.0)
+    height = np.ptp(before @ np.array(up))
+    np.testing.assert_allclose(after - before, np.tile(height / 8.0 * np.array(up), (len(after), 1)), atol=1e-6)
+
+
+def test_a_motion_is_the_same_whatever_is_up(session):
+    """What one scene gives and the same scene takes does not depend on the name of its axes."""
+    other = upside(session, (0.0, -1.0, 0.0))
+    motion = motion_of_session(other, 2.0)
+    wanted = session.node_positions(0.5)
+    retarget(other, motion)
+    found = other.node_positions(other.scene_time(1.0), 1.0)
+    assert np.median(np.linalg.norm(found - wanted, axis=1)) < 0.02
+    plain = motion_of_session(session, 2.0)
+    back = motion.turned(least_turn(np.array(UP), np.array([0.0, -1.0, 0.0])))
+    np.testing.assert_allclose(back.joints, plain.joints, atol=1e-9)
+    np.testing.assert_allclose(back.shifts, plain.shifts, atol=1e-9)
+    np.testing.assert_allclose(to_matrix(back.turns), to_matrix(plain.turns), atol=1e-9)
+
+
+def test_least_turns():
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        first, second = random.normal(size=(2, 3))
+        turned = rotate(least_turn(first, second), first)
+        np.testing.assert_allclose(np.cross(turned, second), 0.0, atol=1e-9)
+        assert turned @ second > 0
+        np.testing.assert_allclose(rotate(least_turn(first, -first), first), -first, atol=1e-9)
+    np.testing.assert_array_equal(least_turn(np.zeros(3), first), IDENTITY)
+
+
 def test_mistakes_get_one_line_and_change_nothing(session):
     before = session.edit
     motion = arm_motion(10.0, 10.0)
@@ -113,6 +162,18 @@ def test_mistakes_get_one_line_and_change_nothing(session):
     with pytest.raises(UserError, match="more than 0"):
         motion_of_session(session, 0.0)
     assert session.edit is before
+
+
+def test_names_that_nobody_gave_match_nothing(session):
+    motion = arm_motion(0.0, 0.0)
+    numbered = dataclasses.replace(motion, names=("part-1", "part-2", "elbow_left", "part-4"))
+    skeleton = dataclasses.replace(
+        session.skeleton, parts=tuple(dataclasses.replace(part, parent=None) for part in session.skeleton.parts)
+    )
+    skeleton = dataclasses.replace(
+        skeleton, parts=(dataclasses.replace(skeleton.parts[0], name="part-2"), *skeleton.parts[1:])
+    )
+    assert match_names(skeleton, numbered) == {"elbow_left": "elbow_left"}
 
 
 def test_names_match_but_for_case(session):
