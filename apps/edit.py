@@ -95,7 +95,9 @@ def check(options: Options) -> None:
         if getattr(options, name) is not None and options.motion is None:
             raise UserError(f"--{name}: belongs to --motion; give both, or neither")
     if options.clip is not None and options.motion is not None and options.motion.is_dir():
-        raise UserError(f"--clip {options.clip}: a run has no clips; leave it out, or give a glTF character to --motion")
+        raise UserError(
+            f"--clip {options.clip}: a run has no clips; leave it out, or give a glTF character to --motion"
+        )
     if options.output is not None:
         if options.script is None and options.motion is None:
             raise UserError(f"--output {options.output}: a film needs --script or --motion")

@@ -14,7 +14,8 @@ import numpy as np
 
 from ...data.dataset import spread
 from ...data.held_out import held_out
-from ...data.images import header_sizes, size_text
+from ...data.images import size_text
+from ...data.orientation import UPRIGHT, read_orientation
 from ...data.points import write_points
 from ...data.synthetic.renderer import write_folder_atomically
 from ...errors import UserError
@@ -145,7 +146,7 @@ def _write_image(folder: Path, frame: ImportedFrame, stem: str) -> tuple[np.ndar
     if isinstance(frame.image, Path):
         name = f"{stem}{frame.image.suffix.lower()}"
         image = read_rgb(frame.image)
-        if image.shape[1::-1] not in header_sizes(frame.image)[:1]:
+        if read_orientation(frame.image.read_bytes()) != UPRIGHT:
             raise UserError(f"{frame.image}: is turned by its EXIF tag, but its camera is not; export it upright")
         shutil.copyfile(frame.image, folder / name)
         return image, name

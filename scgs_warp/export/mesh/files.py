@@ -3,6 +3,7 @@ animations."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +50,16 @@ def write_mesh(
 
     shades = np.column_stack([np.rint(255.0 * colors), np.full(len(colors), 255)]).astype(np.uint8)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=shades, process=False)
-    content: Any = mesh.export(file_type=path.suffix.lower()[1:])
+    kind = path.suffix.lower()[1:]
+    options = {"digits": _decimals(surface.vertices)} if kind == "obj" else {}
+    content: Any = mesh.export(file_type=kind, **options)
     write_atomically(path, content.encode() if isinstance(content, str) else content)
+
+
+def _decimals(vertices: np.ndarray) -> int:
+    """Return the number of decimals that hold coordinates of this size to nine digits, and colours to four."""
+    largest = float(np.abs(vertices).max(initial=0.0))
+    return max(9 - math.ceil(math.log10(largest)), 4) if largest > 0 else 9
 
 
 def _document(

@@ -37,6 +37,8 @@ REACH = 0.8
 """Radius of the region of a scene with surroundings, relative to the distance of the cameras from its centre."""
 ON_PLANE = 1e-4
 """Distance in voxels from a plane of the grid below which a vertex is on it."""
+MAX_VOXELS = 2**31 - 2**16
+"""Kernels count in 32 bits with a sign; a launch rounds up to whole blocks."""
 BYTES_PER_VOXEL = 24
 """Bytes that the sums, the weights, the distances and marching cubes' indices take."""
 
@@ -123,11 +125,13 @@ def reconstruct(
 
     Raises:
         NotEnoughMemory: the volume does not fit into memory.
-        UserError: there is no surface.
+        UserError: there is no surface, or the volume has too many voxels.
     """
     voxel = region.side / resolution
     count = int(np.prod(grid_shape(region.lower, region.upper, voxel), dtype=np.int64))
     what = f"a volume of {count:,} voxels"
+    if count > MAX_VOXELS:
+        raise UserError(f"{what} is more than the {MAX_VOXELS:,} that kernels can index; give a smaller --resolution")
     memory.require(BYTES_PER_VOXEL * count, gaussians.means.device, what, "give a smaller --resolution")
     volume = Volume.empty(region.lower, region.upper, voxel, TRUNCATION * voxel, gaussians.means.device)
     size = 2 * round(PIXELS_PER_VOXEL * resolution / 2)

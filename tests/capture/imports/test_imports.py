@@ -114,6 +114,20 @@ def refused(source: Path, tmp_path: Path, words: str) -> None:
     assert not list(tmp_path.glob(".out*"))
 
 
+@pytest.mark.parametrize("orientation", [3, 4, 6])
+def test_photos_that_a_tag_turns_are_refused(tmp_path, orientation):
+    """Their cameras describe the stored pixels, viewers and other readers show turned ones."""
+    from PIL import Image
+
+    source = write_scanner(tmp_path / "source")
+    for index, path in enumerate(sorted(source.glob("frame_*.png"))):
+        tag = Image.Exif()
+        tag[0x0112] = 1 if index < 3 else orientation
+        Image.open(path).save(path.with_suffix(".jpg"), exif=tag, quality=95)
+        path.unlink()
+    refused(source, tmp_path, "frame_00003.jpg: is turned by its EXIF tag")
+
+
 def with_arrays(path: Path, **changed) -> Path:
     """Replace arrays of an .npz, or leave one out (None)."""
     with np.load(path, allow_pickle=True) as old:

@@ -57,6 +57,15 @@ def test_trimesh_reads_what_was_written(tmp_path, suffix):
         np.testing.assert_allclose(found.visual.vertex_colors[:, :3] / 255.0, colors, atol=0.51 / 255)
 
 
+@pytest.mark.parametrize("size", [1e-5, 1.0, 1e6])
+def test_text_keeps_coordinates_of_any_size(tmp_path, size):
+    surface, colors = sample()
+    write_mesh(tmp_path / "a.obj", surface._replace(vertices=size * surface.vertices), colors, UP)
+    found = trimesh.load(tmp_path / "a.obj", force="mesh", process=False)
+    assert isinstance(found, trimesh.Trimesh)
+    np.testing.assert_allclose(found.vertices, size * surface.vertices, atol=1e-7 * size)
+
+
 def test_colours_of_a_glb_are_linear(tmp_path):
     surface, colors = sample()
     write_mesh(tmp_path / "a.glb", surface, colors, UP)

@@ -70,6 +70,12 @@ def test_a_volume_that_does_not_fit_is_refused_before_it_is_made(monkeypatch):
         made(ball_gaussians(count=60))
 
 
+def test_more_voxels_than_kernels_can_count_are_refused(monkeypatch):
+    monkeypatch.setattr(memory, "fits", lambda need, device: True)
+    with pytest.raises(UserError, match=r"voxels is more than .* smaller --resolution"):
+        made(ball_gaussians(count=60), 2000)
+
+
 def slab(closed: bool) -> Surface:
     """A wall across a volume, of which one half was seen."""
     volume = Volume.empty(np.zeros(3), np.full(3, 1.0), 0.1, 0.3)
