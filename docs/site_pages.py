@@ -31,8 +31,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **known: Any) -> str:
-    """Link to the page of examples instead of the folder."""
-    return markdown.replace("](../examples/)", "](examples.md)")
+    """Link to the site's pages of what the repository keeps outside ``docs/``."""
+    return markdown.replace("](../examples/)", "](examples.md)").replace("](../CONTRIBUTING.md)", "](contributing.md)")
 
 
 def on_page_content(html: str, **known: Any) -> str:

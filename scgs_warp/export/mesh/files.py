@@ -51,7 +51,7 @@ def write_mesh(
     shades = np.column_stack([np.rint(255.0 * colors), np.full(len(colors), 255)]).astype(np.uint8)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=shades, process=False)
     kind = path.suffix.lower()[1:]
-    options = {"digits": _decimals(surface.vertices)} if kind == "obj" else {}
+    options: dict[str, Any] = {"digits": _decimals(surface.vertices)} if kind == "obj" else {}
     content: Any = mesh.export(file_type=kind, **options)
     write_atomically(path, content.encode() if isinstance(content, str) else content)
 
