@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import nn
@@ -71,3 +73,17 @@ def test_tensors_come_back():
     fresh.load_tensors("a", saved)
     again = fresh.tensors("a")
     assert again.keys() == saved.keys() and all(torch.equal(again[k], saved[k]) for k in saved)
+
+
+def test_bias_correction_counts_the_steps():
+    """Adam by its definition, in float64: after three steps the averages are divided by 1 - beta^3."""
+    owner = Owner()
+    optimizer = Adam({"other": owner.other}, {"other": 0.1})
+    value, first, second = 1.0, 0.0, 0.0
+    for count, slope in enumerate((1.0, -3.0, 0.5), start=1):
+        owner.other.grad = torch.full((3,), slope)
+        optimizer.step()
+        first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
+        value -= 0.1 * (first / (1 - 0.9**count)) / math.sqrt(second / (1 - 0.999**count))
+        assert owner.other.tolist() == pytest.approx([value] * 3, rel=1e-5)
+    assert optimizer.groups["other"].steps == 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import pytest
@@ -77,3 +78,36 @@ def test_presets_begin_at_rest_for_as_long_as_the_published_ones():
     for config in (C.preset("best"), C.preset("cpu"), C.preset("quick"), C.with_steps(C.preset("cpu"), 900)):
         assert 0.07 <= config.coarse / config.steps <= 0.13
         assert config.rest_steps == config.freeze
+
+
+@pytest.mark.parametrize("name", C.PRESETS)
+def test_no_milestone_falls_to_step_0_in_a_short_run(name):
+    """A milestone of 0 means never or from the start; no other may come to mean that."""
+
+    def milestones(config, prefix=""):
+        for item in dataclasses.fields(config):
+            value = getattr(config, item.name)
+            if dataclasses.is_dataclass(value):
+                yield from milestones(value, f"{prefix}{item.name}.")
+            elif item.metadata.get("milestone"):
+                yield f"{prefix}{item.name}", value
+
+    given = C.preset(name)
+    made = dict(milestones(C.with_steps(given, 10)))
+    assert len(made) > 10 and min(value for _, value in milestones(given)) >= 0
+    assert {label for label, value in milestones(given) if value > 0} == {k for k, value in made.items() if value > 0}
+
+
+@pytest.mark.parametrize("name", ["steps", "preset"])
+def test_fields_that_stand_for_many_are_no_single_fields(name):
+    config = C.preset("cpu")
+    with pytest.raises(UserError, match=f"give --{name} instead"):
+        C.with_field(config, name, getattr(config, name), "test")
+
+
+def test_settings_that_change_no_bit_do_not_last():
+    made = C.preset("cpu")
+    values = C.lasting(C.to_dict(made))
+    assert not {"evaluate_every", "checkpoint_seconds"} & values.keys() and "cache_mib" not in values["data"]
+    assert values["steps"] == made.steps and values["data"]["downscale"] == made.data.downscale
+    assert values["motion"] == dataclasses.asdict(made.motion)

@@ -121,3 +121,10 @@ def test_rules_name_the_field_and_the_remedy(name, value, message):
 def test_a_configuration_that_can_run_comes_back():
     config = tiny_config()
     assert check(config) is config
+
+
+def test_a_run_has_a_main_stage():
+    steps = C.preset("cpu").steps
+    assert check(C.with_field(C.preset("cpu"), "pretrain.steps", steps - 1, "test")).main_steps == 1
+    with pytest.raises(UserError, match=f"steps {steps} leave nothing after {steps} pre-training steps"):
+        check(C.with_field(C.preset("cpu"), "pretrain.steps", steps, "test"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from helpers.tiny import tiny_config, trained_pose
 from scgs_warp.benchmark import scenes
 from scgs_warp.motion import ControlPoints
 from scgs_warp.scene.scene import scene_from
@@ -229,3 +230,34 @@ def test_a_scene_from_before_correctives_still_opens(scene):
     assert opened.gaussians.correctives.shape == (len(scene.gaussians), 0)
     assert not opened.config.motion.correctives
     torch.testing.assert_close(opened.gaussians_at(0.3).means, scene.gaussians_at(0.3).means, rtol=1e-5, atol=1e-6)
+
+
+def test_neighbours_for_rigidity_are_found_anew_now_and_then():
+    """At the first step, and at the first step with the term after each multiple of ``arap_refresh``."""
+    motion = scenes.synthetic_scene("control-points", 60, 20, "cpu").motion
+    assert isinstance(motion, ControlPoints)
+    loss = {"arap": 1e-2, "arap_every": 5, "arap_refresh": 17, "arap_until": 60}
+    config = tiny_config(60, freeze=0, loss=loss)
+    motion.graph = None
+    assert motion.refresh_due(0, config) and not motion.refresh_due(1, config)
+    motion.refresh_graph(0, config.loss)
+    assert motion.graph is not None
+    before = motion.graph.neighbors.clone()
+    assert [step for step in range(60) if motion.refresh_due(step, config)] == [0, 20, 35, 55]
+    with torch.no_grad():
+        motion.positions.copy_(motion.positions.flip(0) ** 3)
+    motion.refresh_graph(15, config.loss)
+    assert torch.equal(motion.graph.neighbors, before)
+    motion.refresh_graph(20, config.loss)
+    assert not torch.equal(motion.graph.neighbors, before)
+
+
+def test_control_points_rest_until_the_gaussians_have_settled():
+    scene = scenes.synthetic_scene("control-points", 60, 20, "cpu")
+    motion, config = scene.motion, tiny_config(60, freeze=3)
+    for step, learns in ((0, False), (2, False), (3, True)):
+        pose = trained_pose(motion, scene.gaussians, 0.3, step, config)
+        motion.zero_grad()
+        pose.gaussians.means.square().sum().backward()
+        for name in ("positions", "log_radii", "network.head.weight"):
+            assert (dict(motion.named_parameters())[name].grad is not None) == learns, (step, name)

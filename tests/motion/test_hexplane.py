@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from helpers.tiny import trained_pose
+from helpers.tiny import tiny_config, trained_pose
 from scgs_warp.config.presets import LossConfig, MotionConfig, TrainConfig
 from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.motion import build_motion
@@ -128,3 +128,37 @@ def test_same_bits_on_any_number_of_threads(all_threads):
         results.append([*posed, *torch.autograd.grad(posed, parameters, v)])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+@torch.no_grad()
+def test_planes_reach_as_far_as_in_4d_gs():
+    """Features change up to 1.6 on every axis, and are those of the border beyond."""
+    model, _ = model_and_gaussians(7, 9)
+    for axis in range(3):
+        points = torch.zeros(4, 3)
+        points[:, axis] = torch.tensor([1.5, 1.59, 1.6, 9.0])
+        features = model.features(points, 0.4)
+        torch.testing.assert_close(features[2], features[3], rtol=1e-4, atol=1e-6)
+        assert not torch.allclose(features[0], features[2], rtol=1e-2)
+        assert not torch.allclose(features[1], features[2], rtol=1e-3)
+
+
+@torch.no_grad()
+def test_a_new_scene_is_at_rest_and_differs_from_place_to_place():
+    model = HexPlane(8)
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(8)) * 2.0 - 1.0
+    first, second = model.features(points, 0.1), model.features(points, 0.83)
+    torch.testing.assert_close(first, second, rtol=1e-5, atol=0.0)
+    assert float(first.std(0).min()) > 1e-3
+
+
+def test_rates_fall_to_a_hundredth_once_the_scene_moves():
+    config = tiny_config(30, motion={"model": "hexplane"}, coarse=6, optim={"network_until": 10})
+    model, optim = HexPlane(9), config.optim
+    factors = []
+    for step in (0, 6, 11, 16, 25):
+        rates = model.rates(step, config)
+        assert rates.keys() == dict(model.named_parameters()).keys()
+        factors.append(rates["planes.0"] / optim.planes)
+        assert rates["trunk.weight"] / optim.network == pytest.approx(factors[-1])
+    assert factors == pytest.approx([1.0, 1.0, 0.1, 0.01, 0.01])

@@ -24,7 +24,7 @@ def motion_and_gaussians(counts: list[int]):
     return motion, optimizer, gaussians, torch.ones(len(points))
 
 
-@pytest.mark.parametrize(("least_impact", "left"), [(0.0, 9), (1.0, 8), (2.0, 7), (3.5, 6), (100.0, 5)])
+@pytest.mark.parametrize(("least_impact", "left"), [(0.0, 9), (1.0, 8), (2.0, 7), (3.5, 6), (8.5, 5), (100.0, 5)])
 def test_control_points_that_move_too_few_gaussians_go(least_impact, left):
     """Their weights sum to the number of Gaussians beside them; K + 1 stay in any case."""
     motion, optimizer, gaussians, gradient = motion_and_gaussians([0, 1, 3, 4, 5, 6, 7, 8, 9])
@@ -56,3 +56,13 @@ def test_control_points_clone_where_the_image_pulls_and_idle_ones_go(device):
     assert (cloned, pruned) == (1, 1)
     assert len(motion) == 7 and motion.log_radii.shape == (7,) and motion.hyper.shape[0] == 7
     assert torch.allclose(motion.positions[6], gaussians.means[2], atol=1e-3)
+
+
+def test_no_clone_at_a_place_that_is_not_finite():
+    """Gaussians at infinity are pruned only after this: whatever they pull has no mean place."""
+    motion, optimizer, gaussians, gradient = motion_and_gaussians([2] * 6)
+    with torch.no_grad():
+        gaussians.means[4] = float("inf")
+    changed = adapt_control_points(motion, optimizer, gaussians, gradient, grad_threshold=0.5, growth=1.0)
+    assert changed == (2, 0)
+    assert motion.positions[:, 0].tolist() == pytest.approx([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 40.0, 50.0])

@@ -52,3 +52,13 @@ def test_only_bending_costs_energy(device):
 
 def test_no_graph_of_one_control_point():
     assert build_graph(lambda times: torch.zeros(len(times), 1, 3), LossConfig()) is None
+
+
+def test_the_energy_is_between_the_last_two_instants():
+    """The first of three is the view's own; the regulariser has drawn the others."""
+    rest = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
+    graph = build_graph(lambda times: rest.expand(len(times), -1, -1), LossConfig(arap_neighbors=6))
+    assert graph is not None
+    bent = rest * torch.tensor([1.5, 1.0, 1.0])
+    assert float(rigidity([bent, rest, rest + 0.5], graph)) < 1e-6
+    assert torch.equal(rigidity([rest + 0.5, rest, bent], graph), rigidity([rest, bent], graph))

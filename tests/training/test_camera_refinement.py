@@ -54,6 +54,17 @@ def test_a_twist_is_a_screw():
     torch.testing.assert_close(matrix, expected, atol=1e-6, rtol=0)
 
 
+def test_a_correction_moves_the_scene_before_the_camera():
+    """Its axes are those of the scene, whichever way the camera looks."""
+    made, camera = refinement(torch.tensor([[0.0] * 6, [0.3, -0.2, 0.5, 0.4, 0.1, -0.3]])), tiny_camera(1, 3, SIZE)
+    points = torch.randn(4, 9, generator=torch.Generator().manual_seed(0))
+    points[3] = 1.0
+    corrected = made.apply(camera, 1)
+    torch.testing.assert_close(corrected.viewmat @ points, camera.viewmat @ (made.matrices([1])[0] @ points))
+    assert torch.equal(made.apply(camera, 0).viewmat, camera.viewmat)
+    assert torch.equal(corrected.K, camera.K) and (corrected.width, corrected.height) == (SIZE, SIZE)
+
+
 def test_the_mean_is_taken_out():
     made = refinement(torch.arange(12.0).view(2, 6))
     made.centre()

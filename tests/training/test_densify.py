@@ -52,3 +52,16 @@ def test_opacity_reset(device):
     reset_opacities(gaussians, optimizer)
     assert float(gaussians.opacities().detach().max()) <= RESET_OPACITY + 1e-6
     assert not moments(optimizer, "opacity_logits")[1].any()
+
+
+def test_halves_lie_along_the_axis_of_their_parent(device):
+    """A long one along its own x, turned by 90 degrees about z: its halves differ in y."""
+    gaussians, optimizer = make(1, device)
+    before = gaussians.means.detach().clone()
+    with torch.no_grad():
+        gaussians.log_scales.copy_(torch.tensor([[1.0, 1e-4, 1e-4]]).log())
+        gaussians.quats.copy_(torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]]))
+    split = torch.tensor([True], device=device)
+    clone_and_split(gaussians, optimizer, ~split, split, generator(0, 1))
+    offsets = (gaussians.means.detach() - before).abs()
+    assert float(offsets[:, [0, 2]].max()) < 1e-2 < float(offsets[:, 1].min())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -271,3 +273,28 @@ def test_large_gaussians_stay_until_the_first_reset(when, monkeypatch):
     later = {done: when == "always" for done in range(25, 41, 5)}
     assert state.config.densify.opacity_reset_every == 20
     assert seen == {**dict.fromkeys(range(5, 21, 5), False), **later}, "nothing after densification ends at 40"
+
+
+def test_size_is_measured_by_the_cameras(device):
+    """Of the same size, one is small among far cameras and large among near ones: cloned there, split here."""
+    for extent, sizes in ((10.0, [0.05] * 3), (1.0, [0.05, 0.05 / 1.6, 0.05 / 1.6])):
+        gaussians, optimizer = make(2, device)
+        with torch.no_grad():
+            gaussians.log_scales.fill_(0.05).log_()
+        gradient = torch.tensor([1.0, 0.0], device=device)
+        run_round(gaussians, optimizer, gradient, DensifyConfig(percent_dense=0.01), extent=extent)
+        assert gaussians.scales()[:, 0].tolist() == pytest.approx(sizes)
+
+
+def test_halves_are_not_judged_by_the_size_of_their_parent_on_screen():
+    gaussians, optimizer = make(2, "cpu")
+    with torch.no_grad():
+        gaussians.log_scales.fill_(-4.0)
+    stats = Stats.zeros(2, "cpu")
+    stats.count.fill_(1.0)
+    stats.grad_norm[0] = 1.0
+    stats.max_radii[:] = 0.9
+    options = {"grad_threshold": 0.5, "extent": 1.0, "prune_large": True, "random": generator(0, 1)}
+    config = DensifyConfig(max_screen=0.4, percent_dense=0.01, max_scale=0.5)
+    grow_and_prune(gaussians, optimizer, stats, config, **options)
+    assert gaussians.log_scales[:, 0].tolist() == pytest.approx([-4.0 - math.log(1.6)] * 2), "the other one is gone"

@@ -93,3 +93,29 @@ def test_random_backgrounds_over_data_on_white():
     expected = alone + (1 - given[1].alpha) * background[:, None, None]
     assert torch.allclose(truth, expected, atol=1e-6) and not torch.allclose(background, torch.ones(3))
     assert torch.equal(made.view(1, 7, False, False).background, torch.ones(3))
+
+
+def test_random_data_has_another_background_at_every_step():
+    """Data whose background is ``random`` asks for it itself, also in stage 2."""
+    made = frames()
+    data = Dataset(list(made.frames), folder=made.frames.folder, split="train", background="random")
+    made = Frames(data, Normalisation.identity(), tiny_config(100), "cpu")
+    seen = [made.view(3, step, False, False) for step in (7, 8)]
+    for view in seen:
+        expected = data[3].image.permute(2, 0, 1) + (1 - data[3].alpha) * view.background[:, None, None]
+        assert torch.allclose(view.truth, expected, atol=1e-6) and float(view.background.std()) > 1e-3
+    assert not torch.equal(seen[0].background, seen[1].background)
+
+
+def test_progressive_by_frame_adds_them_one_by_one():
+    """Of ten frames one more every 25 steps; steps with odd numbers look at the newest fifth, the others at all."""
+    made = frames(pretrain={"progressive_every": 50})
+    times = sorted(frame.time for frame in made.frames)
+
+    def seen(steps: range) -> set[float]:
+        return {made.frames[made.index_at(step, True)].time for step in steps}
+
+    for start, count in ((14, 3), (40, 4), (64, 5), (90, 6), (114, 7)):
+        even, odd = seen(range(start, start + 22, 2)), seen(range(start + 1, start + 22, 2))
+        assert even <= set(times[:count]) and even - odd, "earlier ones, too"
+        assert odd == set(times[count - 2 : count])

@@ -12,6 +12,7 @@ from scgs_warp.training.pretrain import (
     control_points_from_spheres,
     densify_spheres,
     densify_spheres_by_gradient,
+    initial_gaussians,
     initial_spheres,
     thin_spheres,
 )
@@ -149,3 +150,61 @@ def test_progressive_by_fifths_begins_like_all_frames():
     )
     assert torch.equal(whole[0].means, fifth[0].means) and torch.equal(whole[1].log_radius, fifth[1].log_radius)
     assert not torch.equal(whole[0].means, frame[0].means)
+
+
+def round_by_share(opacities: torch.Tensor, gradient: torch.Tensor, step: int, **pretrain):
+    """One round over spheres in a row, far from each other; returns them, and their former places."""
+    config, count = tiny_config(pretrain=pretrain), len(opacities)
+    places = torch.arange(float(count))[:, None].repeat(1, 3)
+    gaussians, spheres = initial_spheres(config, places, places, "cpu")
+    assert len(gaussians) == count
+    optimizer = Adam(dict(gaussians.named_parameters()), RATES)
+    with torch.no_grad():
+        gaussians.means.copy_(places)
+        gaussians.opacity_logits.copy_(opacities.logit())
+        spheres.log_radius.fill_(0.01).log_()
+    stats = Stats.zeros(count, "cpu")
+    stats.grad_norm += gradient
+    stats.count += 1.0
+    densify_spheres(gaussians, optimizer, spheres, stats, config, step)
+    return gaussians.means.detach(), places
+
+
+def test_transparent_spheres_go_and_the_largest_gradients_are_cloned():
+    opacities, gradient = torch.full((40,), 0.011), torch.arange(40.0) % 13
+    opacities[:10] = 0.009
+    gradient[[3, 21, 30]] = torch.tensor([60.0, 50.0, 40.0])
+    means, places = round_by_share(opacities, gradient, 3, clone_share=2 / 30)
+    assert torch.equal(means[:30], places[10:]) and len(means) == 32
+    torch.testing.assert_close(means[30:], places[[21, 30]], rtol=0.0, atol=0.1)
+
+
+@pytest.mark.parametrize(("step", "left"), [(2, 300), (3, 256)])
+def test_the_cap_holds_once_spheres_move(step, left):
+    """A dense start may have more of them; the most opaque ones stay when warm-up ends."""
+    opacities = torch.linspace(0.9, 0.1, 300)
+    means, places = round_by_share(opacities, torch.zeros(300), step, warm_up=4, max_ratio=1.0, start_ratio=2.0)
+    assert torch.equal(means, places[:left])
+
+
+@pytest.mark.parametrize("nodes", [40, 41])
+def test_no_more_spheres_than_control_points_stay_as_they_are(nodes):
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(4))
+    gaussians, spheres = initial_spheres(tiny_config(), points, points, "cpu")
+    before = gaussians.means.detach().clone()
+    thin_spheres(gaussians, Adam(dict(gaussians.named_parameters()), RATES), spheres, nodes)
+    assert torch.equal(gaussians.means, before)
+
+
+@pytest.mark.parametrize(("opacity", "solid"), [(0.09, False), (0.11, True)])
+def test_gaussians_of_stage_2_begin_around_solid_spheres(opacity, solid):
+    """The first half of the spheres shows nothing, far away; without any solid one they begin around all."""
+    config = tiny_config(init_from="spheres", pretrain={"solid_opacity": 0.1})
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(5))
+    spheres = initial_spheres(config, points, points, "cpu")
+    with torch.no_grad():
+        spheres[0].means[:20] += 90.0
+        spheres[0].opacity_logits.copy_(torch.tensor([0.08] * 20 + [opacity] * 20).logit())
+    made = initial_gaussians(config, points, points, spheres)
+    assert len(made) == config.init_points
+    assert bool((made.means[:, 0] < 45.0).all()) == solid

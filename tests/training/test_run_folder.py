@@ -98,3 +98,17 @@ def test_the_curve_is_the_mean_of_images_from_the_whole_split(tmp_path):
     logged = json.loads((tmp_path / "run/log.jsonl").read_text())
     expected = sum(-20 * math.log10(0.1 * (1 + k / 7)) for k in rendered) / 4
     assert logged["step"] == 30 and logged["test_psnr"] == pytest.approx(expected, abs=0.01)  # colours end at 1
+
+
+def test_the_curve_counts_valid_pixels(tmp_path):
+    """The error is 0.1 where the pixel is valid, 0.6 elsewhere."""
+    mask = torch.zeros(48, 48, dtype=torch.bool)
+    mask[5:40, :20] = True
+    frame = dataclasses.replace(tiny_dataset(1)[0], image=torch.full((48, 48, 3), 0.3), mask=mask)
+    data = type(tiny_dataset(1))([frame], folder=Path("masked"), split="test")
+    shown = frame.image + torch.where(mask, 0.1, 0.6)[..., None]
+    motion = SimpleNamespace(eval=lambda: None, train=lambda: None)
+    scene = SimpleNamespace(render=lambda camera, time: SimpleNamespace(rgb=shown), motion=motion)
+    with RunFolder(tmp_path / "run", tiny_config(50), None, resume=False) as folder:
+        folder.log_test_psnr(scene, data, 30)
+    assert json.loads((tmp_path / "run/log.jsonl").read_text())["test_psnr"] == pytest.approx(20.0, abs=1e-3)

@@ -10,6 +10,7 @@ import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.errors import UserError
+from scgs_warp.geometry.normalisation import FEWEST_POINTS
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
 from scgs_warp.training.initial_points import HALF_SIZE
@@ -130,3 +131,11 @@ def test_resume_counts_dropped_steps_on(tmp_path):
     state.failures = 7
     state.save(tmp_path)
     assert TrainState.resume(tmp_path, config, data, "cpu").failures == 7
+
+
+@pytest.mark.parametrize(("neighbors", "fewest"), [(4, FEWEST_POINTS), (FEWEST_POINTS, FEWEST_POINTS + 1)])
+def test_a_handful_of_points_is_noise(neighbors, fewest):
+    data, config = tiny_dataset(3), tiny_config(20, motion={"neighbors": neighbors, "nodes": 64})
+    for count in (1, fewest - 1, fewest):
+        data.points = torch.zeros(count, 3)
+        assert has_initial_points(data, config) == (count == fewest)

@@ -151,3 +151,17 @@ def test_the_motion_rests_through_the_coarse_steps(model):
         state.step += 1
         same = [torch.equal(old, new) for old, new in zip(before, state.motion.parameters())]
         assert all(same) if step < config.coarse else not all(same), step
+
+
+def test_rates_of_a_long_stage_1_do_not_settle():
+    """Constant rates settle from step 10 of the 20 main steps on; stage 1 has 30 steps."""
+    schedule = {**SCHEDULE, "pretrain": {"steps": 30, "warm_up": 4}}
+    state = TrainState.begin(tiny_config(50, **schedule), tiny_dataset(3), "cpu")
+    for stage, step, factor in (("pretrain", 9, 1.0), ("pretrain", 25, 1.0), ("main", 35, 1.0), ("main", 45, None)):
+        if stage == "main" and state.stage == "pretrain":
+            state.begin_main()
+        state.step = step
+        set_rates(state)
+        rates, base = state.gaussian_optimizer.groups, state.gaussian_rates()
+        wanted = SETTLED**0.5 if factor is None else factor
+        assert rates["sh_dc"].rate == pytest.approx(base["sh_dc"] * wanted), step
