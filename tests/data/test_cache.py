@@ -138,3 +138,11 @@ def test_memory_is_bounded_by_the_cache(tmp_path, monkeypatch):
     assert count == 53 and data.cache.used // size == 8 * 2**20 // size
     assert len(decoded) == count + 2 * (count - data.cache.used // size), "each once, then what is not kept"
     assert peak < 8 * 2**20 + 12 * size, "numpy's part of it: torch shares its memory"
+
+
+def test_what_is_kept_is_not_read_again_ahead():
+    cache = ImageCache(1)
+    cache.offer("a", pixels(3))
+    cache.expect("a", lambda: pytest.fail("read twice"))
+    assert cache.read_ahead == 0
+    assert cache.get("a", lambda: pytest.fail("read twice")).image[0, 0, 0] == 3

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from helpers.nerfstudio_files import write
+from helpers.tiny import tiny_dataset
 from scgs_warp.data import load
-from scgs_warp.data.dataset import spread
+from scgs_warp.data.dataset import Dataset, spread
 from scgs_warp.errors import UserError
 
 
@@ -26,3 +29,25 @@ def test_spread_takes_no_more_than_it_may(count, most):
     assert chosen == sorted(chosen) and all(0 <= index < count for index in chosen)
     if count and most > 1:
         assert chosen[0] == 0 and chosen[-1] == count - 1
+
+
+def test_other_data_has_another_fingerprint():
+    """Names, times, sizes and the background count; what the images show does not."""
+    data = tiny_dataset(3)
+    first, *others = data
+
+    def print_of(background: str = "black", **changes) -> str:
+        frames = [dataclasses.replace(first, **changes), *others]
+        return Dataset(frames, folder=data.folder, split="train", background=background).fingerprint
+
+    camera = first.camera
+    same = [data.fingerprint, print_of(image=first.image * 0.5), print_of(alpha=None)]
+    different = [
+        print_of("white"),
+        print_of(time=0.01),
+        print_of(name="other"),
+        print_of(camera=dataclasses.replace(camera, width=camera.width + 1)),
+        print_of(camera=dataclasses.replace(camera, height=camera.height + 1)),
+        Dataset(others, folder=data.folder, split="train").fingerprint,
+    ]
+    assert len(set(same)) == 1 and len({*same, *different}) == 7

@@ -99,3 +99,11 @@ def test_truncated_images_are_told(tmp_path, suffix):
             images.decode(path)
         if suffix == ".jpg":
             assert not images.is_complete(np.fromfile(path, np.uint8))
+
+
+def test_a_mask_hides_what_is_black(tmp_path):
+    """The darkest grey is valid already, and so is a pixel of a single colour."""
+    mask = np.array([[[0, 0, 0], [1, 1, 1], [0, 0, 2]], [[127, 127, 127], [255, 255, 255], [0, 0, 0]]], np.uint8)
+    PillowImage.fromarray(mask).save(tmp_path / "mask.png")
+    found = images.read_mask(tmp_path / "mask.png", tmp_path / "image.png", (3, 2))
+    assert found.tolist() == [[False, True, True], [True, True, False]]

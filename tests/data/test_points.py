@@ -12,7 +12,7 @@ import torch
 from helpers.nerfstudio_files import COLORS, POINTS, rewrite, save, write, write_ply
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.data import load
-from scgs_warp.data.points import read_ply
+from scgs_warp.data.points import read_ply, unit_colors
 from scgs_warp.errors import UserError
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.training.frames import Frames
@@ -58,6 +58,15 @@ def test_points_beyond_float32_are_left_out(tmp_path):
 def test_colours_of_points_are_shares(tmp_path, kind, rows, expected):
     path = raw_ply(tmp_path / "a.ply", rows, f"float float float {kind} {kind} {kind}")
     np.testing.assert_allclose(read_ply(path)[1], expected, rtol=1e-6)
+
+
+def test_colours_of_gaussians_are_those_of_degree_0():
+    """c = 1/2 + f / (2 sqrt(pi)), and grey where f is none."""
+    vertices = np.zeros(2, [(f"f_dc_{channel}", np.float32) for channel in range(3)])
+    vertices[0], vertices[1] = (0.0, 1.0, -1.0), (np.nan, 9.0, -9.0)
+    found = unit_colors(vertices)
+    share = 0.5 / np.sqrt(np.pi)
+    np.testing.assert_allclose(found, [[0.5, 0.5 + share, 0.5 - share], [0.5, 1.0, 0.0]], rtol=1e-6)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])

@@ -14,7 +14,7 @@ from helpers.fake_scene import FakeScene, fake_dataset, install
 from scgs_warp import data
 from scgs_warp.apps import evaluate as app
 from scgs_warp.data import Dataset
-from scgs_warp.evaluation.coverage import compare_alpha, coverage_line
+from scgs_warp.evaluation.coverage import Region, compare_alpha, coverage_line
 from scgs_warp.evaluation.evaluate import evaluate, metrics_of, write_metrics
 from scgs_warp.training.run import summary
 from scgs_warp.types import Camera, Frame, Image
@@ -49,6 +49,14 @@ def test_a_thin_structure_that_is_transparent(width: int, opacity: float) -> Non
         assert 0.3 * lost < found.missing_region.pixels <= found.missing * total < lost
     assert (found.missing_region.x, found.missing_region.y) == pytest.approx((80.0, 40 + width / 2))
     assert found.extra == 0 and found.extra_region is None
+
+
+@pytest.mark.parametrize(
+    ("share", "pixels", "large"), [(0.005, 8.0, True), (0.5, 7.9, False), (0.0049, 800.0, False), (0.5, 800.0, True)]
+)
+def test_a_region_is_large_by_its_share_and_by_its_pixels(share: float, pixels: float, large: bool) -> None:
+    """Half of a subject of a dozen pixels is no finding, nor is a speck on a large one."""
+    assert Region(share, pixels, 1.0, 2.0).large == large
 
 
 @pytest.mark.parametrize("shift", [(0, 1), (1, 0), (1, 1)])

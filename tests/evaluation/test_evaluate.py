@@ -72,6 +72,30 @@ def test_masked_pixels_do_not_count() -> None:
     assert abs(found["ssim"] - float(ssim_map(image, truth).mean())) > 1e-2
 
 
+def test_lpips_sees_no_difference_where_nothing_is_known() -> None:
+    """It has no mask of its own: the truth is shown in both images there."""
+    scene, seen = FakeScene(), []
+    frame = fake_dataset(scene, 1, error=0.1)[0]
+    mask = torch.zeros(40, 40, dtype=torch.bool)
+    mask[:, :20] = True
+    masked = type(frame)(frame.camera, frame.time, frame.image, frame.alpha, mask, "a")
+    evaluate(
+        scene,
+        Dataset([masked], folder=Path("x"), split="test"),
+        lpips=lambda image, truth: seen.append((truth - image).abs()) or 0.0,
+    )
+    assert torch.equal(seen[0][:, 20:], torch.zeros(40, 20, 3))
+    torch.testing.assert_close(seen[0][:, :20], torch.full((40, 20, 3), 0.1), rtol=0.0, atol=1e-5)
+
+
+def test_the_worst_image_is_named_by_its_time() -> None:
+    scene = FakeScene()
+    good, bad = fake_dataset(scene, 3, error=0.01), fake_dataset(scene, 3, error=0.1)
+    found = evaluate(scene, Dataset([good[0], bad[1], good[2]], folder=Path("x"), split="test"))
+    assert found["psnr_worst"] == pytest.approx(20.0, abs=1e-3) and found["psnr_worst_time"] == bad[1].time == 0.5
+    assert found["psnr_median"] == pytest.approx(40.0, abs=1e-2)
+
+
 def test_the_sheet_shows_no_error_where_nothing_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, seen = FakeScene(), []
     frame = fake_dataset(scene, 1, error=0.1)[0]

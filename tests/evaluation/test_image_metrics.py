@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -132,6 +133,23 @@ def test_every_accepted_spelling(weights, weights_file, tmp_path):
     torch.save(spelled, tmp_path / "vgg.pth")
     image, truth = _images(3)
     assert LPIPS(tmp_path / "vgg.pth")(image, truth) == LPIPS(weights_file)(image, truth)
+
+
+class Touch:
+    """An object whose unpickling makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_file_of_weights_runs_no_code(weights, tmp_path):
+    torch.save({**weights, "more": Touch(tmp_path / "touched")}, tmp_path / "vgg.pth")
+    with pytest.raises(UserError, match=r"vgg\.pth: not readable as LPIPS weights"):
+        LPIPS(tmp_path / "vgg.pth")
+    assert not (tmp_path / "touched").exists()
 
 
 def test_a_wrong_file_is_the_users_error_in_one_line(weights, tmp_path):

@@ -139,3 +139,23 @@ def test_turntable_sizes_and_ranges() -> None:
     np.testing.assert_allclose(turns, [0, 45, 90, 135], atol=1e-2)
     with pytest.raises(ValueError, match="frames"):
         cameras.turntable(view, 0, 64)
+
+
+@pytest.mark.parametrize(("elevation", "height"), [(0.0, 0.0), (30.0, 0.5), (-30.0, -0.5), (None, 0.5**0.5)])
+def test_orbit_cameras_stand_on_the_sphere_at_their_elevation(elevation, height) -> None:
+    overview = cameras.Overview((1.0, 2.0, 3.0), (0.0, 0.0, 1.0), 5.0, 40.0, 45.0, 10.0, 360.0, 1.5, 800.0)
+    camera = cameras.orbit_camera(overview, 75.0, 300, elevation)
+    offset = camera.position.double() - torch.tensor(overview.centre)
+    assert float(offset.norm()) == pytest.approx(5.0, rel=1e-5)
+    assert float(offset[2]) == pytest.approx(5.0 * height, abs=1e-5)
+    assert cameras.azimuth_of(overview, camera.position) == pytest.approx(75.0, abs=1e-3)
+
+
+def test_orbit_cameras_keep_off_the_poles() -> None:
+    """Above them the picture would turn by any angle."""
+    overview = cameras.Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 5.0, 40.0, 45.0, 10.0, 360.0, 1.5, 800.0)
+    for elevation in (90.0, 120.0, 1e9):
+        for sign in (1.0, -1.0):
+            eye = cameras.orbit_camera(overview, 75.0, 300, sign * elevation).position
+            assert float(eye[2]) == pytest.approx(sign * 5.0 * math.sin(math.radians(cameras.STEEPEST)), rel=1e-6)
+            assert cameras.azimuth_of(overview, eye) == pytest.approx(75.0, abs=0.01)

@@ -12,10 +12,12 @@ from torch import Tensor
 
 from helpers.splats import random_splats
 from reference.compositing import composite as composite_reference
+from scgs_warp.kernels import compositing as kernels
 from scgs_warp.kernels.types import STEP_FINE, STEP_HALTED, STEP_LOSS, STEP_REGULARISER
 from scgs_warp.ops.binning import bin_splats
 from scgs_warp.ops.compositing import composite
 from scgs_warp.runtime import environment
+from scgs_warp.runtime.launch import launch
 from scgs_warp.types import Splats, Stats, Tiles
 
 NAMES = ("means2d", "conics", "opacities", "channels", "background")
@@ -230,6 +232,7 @@ def backward_buffers(splats: Splats, channels: Tensor, form: str, absolute: bool
     own, found = leaves(splats, channels, torch.zeros(channels.shape[1], device=device), torch.float32)
     stats, absgrad = Stats.zeros(n, device, absolute), torch.full((n, 2), float("nan"), device=device)
     stats.grad_norm += 1.0
+    stats.count += 2.0
     stats.max_radii += 0.05
     tiles = bin_splats(splats)
     image, _ = composite(own, found[3], tiles, found[4], stats=stats, absgrad=absgrad, form=form)  # type: ignore[arg-type]
@@ -258,7 +261,7 @@ def test_stats_and_absgrad(device: str, absolute: bool, c: int):
         pixel = expected if absolute else signed
         norm = (pixel * torch.tensor([20.0, 12.0])).norm(dim=1)
         assert torch.allclose(stats.grad_norm.cpu().double(), 1.0 + torch.where(radii > 0, norm, 0.0), rtol=2e-3)
-        assert torch.equal(stats.count.cpu(), (radii > 0).float())
+        assert torch.equal(stats.count.cpu(), 2.0 + (radii > 0).float())
         assert torch.allclose(stats.max_radii.cpu(), torch.clamp(radii / 40.0, min=0.05))
 
 
@@ -273,6 +276,16 @@ def test_a_step_that_is_not_committed_adds_no_statistics(outcome: int, device: s
     for values, expected in zip(gated.sums, always.sums):
         assert torch.equal(values, expected if outcome == STEP_FINE else torch.zeros_like(expected))
         assert expected.any()
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.1])
+def test_the_depth_of_a_pixel_is_a_mean_over_its_alpha(unit: float, device: str):
+    """Of what was blended, in the caller's units; a pixel without alpha has depth 0."""
+    alpha = torch.tensor([0.0, 1e-3, 0.25, 0.5, 0.999], device=device)
+    true = torch.tensor([0.0, 4.0, 3.0, 0.7, 12.0], device=device)
+    found = torch.full_like(alpha, float("nan"))
+    launch(kernels.expected_depth, 5, true * alpha, alpha, unit, found)
+    torch.testing.assert_close(found.double(), true.double() / unit, rtol=1e-6, atol=0.0)
 
 
 def test_threads_change_nothing(all_threads: None):

@@ -61,6 +61,9 @@ def test_ties_go_to_the_lower_index(seed, n, m, d):
     expected_indices, expected = twin.nearest(points, nodes, k)
     assert torch.equal(indices.long(), expected_indices)
     assert torch.equal(distances.double(), expected)
+    plain = torch.empty_like(indices), torch.empty_like(distances)
+    launch(kernels.nearest, n, points, nodes, k, *plain)
+    assert torch.equal(plain[0], indices) and torch.equal(plain[1], distances)
 
 
 def test_poisoned_points_leave_the_others_alone(device):
