@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
 from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession, Keyframe, Target
@@ -95,3 +96,36 @@ def test_smooth_rotation_at_constant_speed_stays_constant():
         found = at(frames, moment)
         assert np.degrees(angle(np.array(found.rotation))) == pytest.approx(30 * moment, abs=1e-9)
         assert found.translation[0] == pytest.approx(moment, abs=1e-12)
+
+
+def along(times, values) -> list[Keyframe]:
+    return [Keyframe(float(t), {"a": Target((float(x), 0.0, 0.0))}) for t, x in zip(times, values)]
+
+
+@pytest.mark.parametrize("turning", [0.4, 1.0, -3.0])
+def test_smooth_motion_turns_back_at_the_keyframe(turning):
+    frames = along((0, 1, 3), (0.0, 1.0, turning))
+    shifts = np.array([at(frames, float(t)).translation[0] for t in np.linspace(0, 3, 601)])
+    assert shifts.max() <= 1.0 + 1e-12 and shifts.argmax() >= 200
+    assert (np.diff(shifts[:201]) >= 0).all() and (np.diff(shifts[200:]) <= 1e-15).all()
+
+
+def test_smooth_motion_is_the_monotone_cubic_where_keyframes_are_uneven():
+    """Against SciPy's, whose ends have another rule."""
+    times, values = (0.0, 1.0, 1.5, 4.0, 4.25, 7.0), (0.0, 0.5, 2.0, 3.0, 3.2, 9.0)
+    frames, reference = along(times, values), PchipInterpolator(times, values)
+    for moment in np.linspace(1.0, 4.25, 40):
+        assert at(frames, float(moment)).translation[0] == pytest.approx(float(reference(moment)), abs=1e-12)
+
+
+def test_signs_of_quaternions_change_no_number_between_keyframes():
+    """q and -q are one rotation, whichever of them a file holds."""
+    quats = [from_axis([0, 0, 1], 100 * k) for k in range(4)]
+
+    def moving(signs) -> list[Keyframe]:
+        targets = [Target((0.0, 0.0, 0.0), tuple((sign * quat).tolist())) for sign, quat in zip(signs, quats)]
+        return [Keyframe(float(k), {"a": target}) for k, target in enumerate(targets)]
+
+    for moment in (0.5, 1.5, 2.3):
+        found = [at(moving(signs), moment).rotation for signs in ((1, 1, 1, 1), (1, -1, 1, -1), (1, -1, -1, 1))]
+        assert found[1] == pytest.approx(found[0], abs=1e-12) and found[2] == pytest.approx(found[0], abs=1e-12)

@@ -57,6 +57,21 @@ def test_one_iteration_is_that_of_the_twin(seed, stretch, smooth):
     assert reversed_edges.any(), "some edges point the wrong way"
 
 
+def test_positions_from_turned_edges_are_those_of_the_twin():
+    """Each edge wants the mean of the rotations at its ends."""
+    rest = cloud(13, 40)
+    graph = graph_of(rest, 8)
+    assert len(np.unique(graph.component)) == 1
+    degrees = np.random.default_rng(13).uniform(-90, 90, 40)
+    quats = np.stack([from_axis((1, 2, 3), each) for each in degrees])
+    rotations = np.stack([rotate(quats, np.tile(axis, (40, 1))) for axis in np.eye(3)], axis=2)
+    held = np.arange(40) % 9 == 0
+    expected = twin.place_nodes(graph, rest, rest, rotations, held, np.zeros(40), rest, 0.0)
+    found = ArapSolver(graph).poisson(rest, rotations, held)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert np.abs(found - rest).max() > 0.1
+
+
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 10_000), st.integers(-180, 180), st.integers(-20, 20))
 def test_one_handle_without_pins_moves_everything_rigidly(seed, degrees, tenths):
@@ -75,13 +90,37 @@ def test_one_handle_without_pins_moves_everything_rigidly(seed, degrees, tenths)
                                   rest[~np.isin(graph.component, graph.component[:4])])  # fmt: skip
 
 
-def test_a_dragged_point_without_pins_shifts_everything():
+@pytest.mark.parametrize("stiffness", [{}, {"stiffness": 0.3}], ids=["hard", "soft"])
+def test_a_dragged_point_without_pins_shifts_everything(stiffness):
+    """A soft one, too: nothing holds the others back."""
     rest = cloud(3, 60)
     graph = graph_of(rest, 8)
-    found = solve(graph, rest, [turn([7], shift=(0.5, 0.2, 0), gives_rotation=False)], steps=4)
+    found = solve(graph, rest, [turn([7], shift=(0.5, 0.2, 0), gives_rotation=False, **stiffness)], steps=4)
     alive = graph.component == graph.component[7]
     moved = found.positions[alive] - rest[alive]
     np.testing.assert_allclose(moved, np.broadcast_to([0.5, 0.2, 0], moved.shape), atol=1e-3)
+
+
+@pytest.mark.parametrize("stiffness", [{}, {"stiffness": 0.3}], ids=["hard", "soft"])
+def test_the_first_guess_turns_everything_with_the_only_handle(stiffness):
+    """Before any iteration: turns spread harmonically, and one given turn spreads unchanged."""
+    rest = cloud(12, 60)
+    graph = graph_of(rest, 8)
+    alive = graph.component == graph.component[0]
+    nodes = np.flatnonzero(alive)[:4]
+    anchors = anchors_at([turn(nodes, 70, (1, 2, 3), pivot=rest[0], **stiffness)], np.array([], np.int64), rest, 1.0)
+    found = ArapSolver(graph).relax(rest, anchors, Shape.at_rest(rest), 0)
+    expected = np.broadcast_to(from_axis((1, 2, 3), 70), (alive.sum(), 4))
+    np.testing.assert_allclose(angle(from_matrix(found.rotations[alive])), angle(expected), atol=1e-6)
+    np.testing.assert_allclose(np.abs((from_matrix(found.rotations[alive]) * expected).sum(1)), 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "edges", "steps"),
+    [(0, 0, 1), (15, 0, 1), (15.1, 0, 2), (180, 0, 12), (0, 2, 1), (0, 2.1, 2), (90, 20, 10), (0, np.inf, 48)],
+)
+def test_a_handle_goes_in_steps_of_15_degrees_and_two_edges(degrees, edges, steps):
+    assert count_steps(np.radians(degrees), edges * 0.2, 0.2) == steps
 
 
 def test_rotations_are_rotations_and_pins_hold():
