@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from scgs_warp.edit.rotations import (
     conjugate,
@@ -27,7 +28,7 @@ def test_quaternions_and_matrices(seed):
     quats = random.normal(size=(5, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     back = from_matrix(to_matrix(quats))
-    np.testing.assert_allclose(np.abs((back * quats).sum(1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(back, np.where(quats[:, :1] < 0, -quats, quats), atol=1e-12)
     vectors = random.normal(size=(5, 3))
     np.testing.assert_allclose(rotate(quats, vectors), (to_matrix(quats) @ vectors[..., None])[..., 0], atol=1e-12)
 
@@ -47,3 +48,18 @@ def test_rotation_algebra(seed, percent):
     np.testing.assert_allclose(rotate(quat, points - before) + after, rotate(a, points) + b[:3], atol=1e-9)
     np.testing.assert_allclose(np.abs(mean(np.stack([a, -a])[:, None]) @ a), 1.0, atol=1e-12)
     assert from_matrix(np.eye(3)).tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("form", ["flat", "mirrored", "noisy"])
+def test_a_rigid_fit_is_the_best_rotation_and_no_reflection(seed, form):
+    """Against SciPy's, of flat pieces and of pieces turned inside out."""
+    random = np.random.default_rng(seed)
+    before = random.normal(size=(7, 3)) * (1.0, 0.7, 0.0 if form == "flat" else 0.4)
+    turn = from_axis(random.normal(size=3), random.uniform(-179, 179))
+    after = rotate(turn, before * (1.0, 1.0, -1.0 if form == "mirrored" else 1.0))
+    after = after + random.normal(size=(7, 3)) * (0.1 if form == "noisy" else 0.0)
+    found = rigid_fit(before, after)[0]
+    expected, _ = Rotation.align_vectors(after - after.mean(0), before - before.mean(0))
+    np.testing.assert_allclose(to_matrix(found), expected.as_matrix(), atol=1e-6)
+    assert form != "flat" or abs(found @ turn) == pytest.approx(1.0, abs=1e-9)
