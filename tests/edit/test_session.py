@@ -152,6 +152,21 @@ def test_results_do_not_depend_on_the_way(bent):
     assert other.node_positions(0.0).tobytes() == there
 
 
+def test_a_new_edit_ends_what_could_be_redone(session):
+    session.pin([5])
+    session.undo()
+    assert session.can_redo
+    session.pin([6])
+    assert not session.can_redo and not session.redo() and session.edit.pins == (6,)
+
+
+def test_an_edit_that_changes_nothing_is_no_step(session):
+    session.pin([5])
+    session.undo()
+    session.apply(session.edit)
+    assert not session.can_undo and session.can_redo, "nothing to undo, and the undone step can still be redone"
+
+
 def test_undo_and_redo(session):
     empty = session.edit
     assert not session.undo() and not session.redo()
