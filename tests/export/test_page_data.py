@@ -33,6 +33,12 @@ def test_differences_may_pass_zero():
     assert values["x"].tolist() == [5, 0, 1023, 1]
 
 
+def test_differences_are_stored_modulo_the_codes_range():
+    """5, -5, 1023, -1022 in ten bits, the lowest eight first; bits that no code has are 0."""
+    planes = Column("x", np.array([5, 0, 1023, 1], np.uint32), 10, delta=True).planes()
+    assert list(planes) == [5, 0xFB, 0xFF, 2, 0, 3, 3, 0]
+
+
 def test_scarce_codes_are_for_what_is_common():
     values = np.random.default_rng(1).normal(size=5000)
     for outlier in (1e4, -1e4):
