@@ -20,6 +20,7 @@ from ...data.points import write_points
 from ...data.synthetic.renderer import write_folder_atomically
 from ...errors import UserError
 from ...runtime.progress import progress
+from ...storage.files import read_bytes
 from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
@@ -146,7 +147,7 @@ def _write_image(folder: Path, frame: ImportedFrame, stem: str) -> tuple[np.ndar
     if isinstance(frame.image, Path):
         name = f"{stem}{frame.image.suffix.lower()}"
         image = read_rgb(frame.image)
-        if read_orientation(frame.image.read_bytes()) != UPRIGHT:
+        if read_orientation(read_bytes(frame.image, "export the scene again")) != UPRIGHT:
             raise UserError(f"{frame.image}: is turned by its EXIF tag, but its camera is not; export it upright")
         shutil.copyfile(frame.image, folder / name)
         return image, name

@@ -14,8 +14,8 @@ import numpy as np
 
 from ...data.natural_order import natural
 from ...errors import UserError
+from ...storage.files import read_text
 from ...storage.numpy_files import read_npy
-from ...storage.safe_paths import is_regular
 from .scene import ImportedFrame, ImportedScene, intrinsics, rigid, surer
 from .stacks import MAX_FRAMES
 
@@ -71,14 +71,12 @@ def read_table(path: Path, columns: int) -> np.ndarray:
         UserError: the file is missing, or no such table.
     """
     try:
-        if not is_regular(path) or path.stat().st_size > MAX_TEXT_BYTES:
-            raise UserError(f"{path}: is no text of a few megabytes; export the scene again")
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path, MAX_TEXT_BYTES).splitlines()
         rows = np.array([[float(word) for word in line.split()] for line in lines if line.strip()], np.float64)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; export the scene again") from None
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); make the file readable") from None
+        raise UserError(f"{path}: cannot be read ({error.strerror}); export the scene again") from None
     except ValueError:
         raise UserError(f"{path}: is no table of {columns} numbers a row; export the scene again") from None
     if rows.ndim != 2 or rows.shape[1] != columns or len(rows) > MAX_FRAMES or not np.isfinite(rows).all():
