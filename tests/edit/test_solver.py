@@ -57,6 +57,25 @@ def test_one_iteration_is_that_of_the_twin(seed, stretch, smooth):
     assert reversed_edges.any(), "some edges point the wrong way"
 
 
+@pytest.mark.parametrize("weight", [0.05, 0.7, 20.0])
+def test_a_rotation_pulls_as_much_as_it_weighs(weight):
+    """One iteration from the guess, against the twin."""
+    rest = cloud(14, 40)
+    graph, solver = graph_of(rest), ArapSolver(graph_of(rest))
+    random = np.random.default_rng(14)
+    posed, some = rest + 0.3 * random.normal(size=rest.shape), np.arange(40)
+    quats = np.stack([from_axis(random.normal(size=3), random.uniform(-60, 60)) for _ in some])
+    asked = np.stack([rotate(quats, np.tile(axis, (40, 1))) for axis in np.eye(3)], axis=2)
+    leaning = np.where(some % 5 == 4, weight, 0.0)
+    anchors = Anchors(some < 10, np.zeros(40), np.zeros(40, bool), posed, asked, leaning, RigidGroups.none(40))
+    guess, found = (solver.relax(rest, anchors, Shape.at_rest(rest), count) for count in (0, 1))
+    square = graph.edge_length**2
+    pull = leaning * np.diff(graph.begin) * square
+    expected = twin.turn_nodes(graph, rest, guess.positions, guess.rotations, solver.smoothness * square, pull, asked)
+    np.testing.assert_allclose(found.rotations, expected, atol=1e-6)
+    assert np.abs(expected - guess.rotations).max() > 0.05
+
+
 def test_positions_from_turned_edges_are_those_of_the_twin():
     """Each edge wants the mean of the rotations at its ends."""
     rest = cloud(13, 40)

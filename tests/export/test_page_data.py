@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from scgs_warp.errors import UserError
 from scgs_warp.export.page_data import Column, integers, pack, quantise, unpack
 
 
@@ -37,6 +39,12 @@ def test_differences_are_stored_modulo_the_codes_range():
     """5, -5, 1023, -1022 in ten bits, the lowest eight first; bits that no code has are 0."""
     planes = Column("x", np.array([5, 0, 1023, 1], np.uint32), 10, delta=True).planes()
     assert list(planes) == [5, 0xFB, 0xFF, 2, 0, 3, 3, 0]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_refused_by_name(value):
+    with pytest.raises(UserError, match="web page: scale2 is not finite"):
+        quantise("scale2", np.array([0.0, value, 1.0]), 1e-3)
 
 
 def test_scarce_codes_are_for_what_is_common():

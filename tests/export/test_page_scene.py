@@ -12,6 +12,8 @@ from scgs_warp.edit import EditSession
 from scgs_warp.errors import UserError
 from scgs_warp.export import page, page_scene
 from scgs_warp.export.page_data import pack, unpack
+from scgs_warp.export.page_scene import gaussian_columns
+from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.motion import build_motion
 from scgs_warp.types import Pose
@@ -99,3 +101,21 @@ def test_motions_without_control_points_are_refused(name, tmp_path):
     with pytest.raises(UserError, match=f"{name} has no control points"):
         page.write_page(scene, tmp_path / "page.html")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_quaternions_of_either_sign_are_the_same_rotations(sign):
+    """Three components are stored, and the reader takes the fourth, the largest, for positive."""
+    count = 40
+    points = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=0)
+    quats = torch.randn(count, 4, generator=torch.Generator().manual_seed(1))
+    gaussians.quats.data[:] = sign * quats
+    _, values = unpack(pack({}, gaussian_columns(gaussians, torch.arange(count), 0)))
+    others = np.stack([values[f"quat{k}"] for k in range(3)], axis=1)
+    found = np.zeros((count, 4))
+    for row, largest in enumerate(values["quat_largest"].astype(int)):
+        found[row, largest] = np.sqrt(1.0 - (others[row] ** 2).sum())
+        found[row, [(largest + 1 + k) % 4 for k in range(3)]] = others[row]
+    expected = torch.nn.functional.normalize(quats, dim=1).numpy()
+    np.testing.assert_allclose(np.abs((found * expected).sum(1)), 1.0, atol=1e-4)

@@ -7,13 +7,16 @@ import numpy as np
 from scgs_warp.edit.graph import ControlGraph
 
 
-def turn_nodes(graph: ControlGraph, rest, posed, rotations, smooth: float) -> np.ndarray:
+def turn_nodes(graph: ControlGraph, rest, posed, rotations, smooth: float, leaning=None, asked=None) -> np.ndarray:
+    """Maximises, node by node, tr(R^T S); ``leaning`` [M] weighs the rotations ``asked`` [M, 3, 3] for."""
     found = []
     for i in range(len(graph)):
         S = np.zeros((3, 3))
         for at in range(graph.begin[i], graph.begin[i + 1]):
             j = graph.neighbors[at]
             S += graph.weights[at] * (np.outer(posed[j] - posed[i], rest[j] - rest[i]) + smooth * rotations[j])
+        if leaning is not None and asked is not None:
+            S += leaning[i] * asked[i]
         U, _, Vt = np.linalg.svd(S)
         U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
         found.append(U @ Vt)
