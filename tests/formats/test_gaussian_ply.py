@@ -18,7 +18,7 @@ from scgs_warp.edit.rotations import from_axis
 from scgs_warp.errors import UserError
 from scgs_warp.export.run import write_still
 from scgs_warp.formats.gaussian_files import read_gaussians
-from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from scgs_warp.formats.gaussian_ply import OPAQUE_LOGIT, read_gaussian_ply, write_gaussian_ply
 from scgs_warp.geometry import cameras
 from scgs_warp.scene.from_gaussians import open_gaussians
 
@@ -51,6 +51,19 @@ def test_there_and_back(tmp_path, degree):
     again = tmp_path / "again.ply"
     write_gaussian_ply(again, found.activate())
     assert again.stat().st_size == path.stat().st_size
+
+
+def test_infinite_logits_are_opaque_or_clear(tmp_path):
+    """Some programs write them for an opacity of 1 or 0; the Gaussians stay, and the others' values do not change."""
+    path = make(tmp_path, 0, 5)
+    expected = read_gaussian_ply(path).opacity_logits.detach().clone()
+    file = PlyData.read(str(path), mmap=False)
+    file["vertex"].data["opacity"][1], file["vertex"].data["opacity"][3] = np.inf, -np.inf
+    file.write(str(tmp_path / "infinite.ply"))
+    found = read_gaussian_ply(tmp_path / "infinite.ply")
+    assert len(found) == 5 and found.opacities().tolist()[1::2] == [1.0, pytest.approx(0.0, abs=1e-30)]
+    expected[1], expected[3] = OPAQUE_LOGIT, -OPAQUE_LOGIT
+    assert torch.equal(found.opacity_logits, expected)
 
 
 def test_a_file_is_edited_and_exported(tmp_path):
