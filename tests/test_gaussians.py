@@ -20,12 +20,21 @@ def test_neighbor_distance_of_few():
     assert float(neighbor_distance(torch.tensor([[0.0, 0, 0], [2.0, 0, 0]]))[0]) == pytest.approx(2.0)
 
 
+def test_neighbor_distance_is_that_of_three():
+    """The root of the mean square of the three least distances, not of more or fewer."""
+    points = torch.tensor([0.0, 1.0, 3.0, 7.0, 20.0])[:, None] * torch.tensor([0.6, 0.0, 0.8])
+    expected = [((1 + 9 + 49) / 3) ** 0.5, ((1 + 4 + 36) / 3) ** 0.5, ((9 + 4 + 16) / 3) ** 0.5]
+    expected += [((16 + 36 + 49) / 3) ** 0.5, ((169 + 289 + 361) / 3) ** 0.5]
+    torch.testing.assert_close(neighbor_distance(points), torch.tensor(expected))
+
+
 def test_gaussians_from_points_activate_to_what_was_given():
     points = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     colors = torch.tensor([[0.2, 0.5, 0.9], [0.0, 1.0, 0.5]])
     made = gaussians_from_points(points, colors, sh_degree=2, hyper_dim=4, scale=0.5).activate()
     assert torch.equal(made.means, points) and made.sh_rest.shape == (2, 8, 3) and not made.sh_rest.any()
     torch.testing.assert_close(made.scales, torch.ones(2, 3))
+    assert made.quats.tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2
     torch.testing.assert_close(made.opacities, torch.full((2,), 0.1))
     torch.testing.assert_close(0.5 + SH_C0 * made.sh_dc, colors)
 
