@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 import zipfile
 
 import numpy as np
 import pytest
 
 from scgs_warp.errors import UserError
+from scgs_warp.storage import numpy_files
 from scgs_warp.storage.numpy_files import read_npy
 
 
@@ -25,3 +27,24 @@ def test_arrays_that_claim_more_than_they_hold(tmp_path):
     for array in (np.arange(6, dtype=np.int32).reshape(2, 3), np.asfortranarray(np.eye(3, dtype=np.float32)[:2])):
         np.save(tmp_path / "b.npy", array)
         np.testing.assert_array_equal(read_npy(tmp_path / "b.npy"), array)
+
+
+def test_what_a_header_claims_is_not_allocated(tmp_path, monkeypatch):
+    """25 million numbers, of which the file holds 30; and no more than an array may have."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (25_000_000,)})
+    (tmp_path / "a.npy").write_bytes(header.getvalue() + bytes(240))
+    tracemalloc.start()
+    with pytest.raises(UserError, match=r"a\.npy: no sound numpy file"):
+        read_npy(tmp_path / "a.npy")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10 * 2**20
+    np.save(tmp_path / "b.npy", np.arange(30.0))
+    for most, fits in ((240, True), (239, False)):
+        monkeypatch.setattr(numpy_files, "MAX_ARRAY_BYTES", most)
+        if fits:
+            assert read_npy(tmp_path / "b.npy").tolist() == list(range(30))
+        else:
+            with pytest.raises(UserError, match=r"b\.npy: no sound numpy file"):
+                read_npy(tmp_path / "b.npy")
