@@ -48,3 +48,24 @@ def test_what_a_header_claims_is_not_allocated(tmp_path, monkeypatch):
         else:
             with pytest.raises(UserError, match=r"b\.npy: no sound numpy file"):
                 read_npy(tmp_path / "b.npy")
+
+
+ARRAYS = {
+    "numbers": np.array([1.5, 2.5]),
+    "flags": np.array([True, False]),
+    "texts": np.array(["1", "2"]),
+    "complex": np.array([1j, 2.0]),
+    "dates": np.array(["2020-01-01"], "M8[D]"),
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+@pytest.mark.parametrize("content", ["numbers", "flags", "texts"])
+def test_other_content_is_refused(tmp_path, content, kind):
+    """Text that could be read as numbers is none, and numbers are no flags."""
+    np.save(tmp_path / "a.npy", ARRAYS[kind])
+    if content == kind:
+        np.testing.assert_array_equal(read_npy(tmp_path / "a.npy", content=content), ARRAYS[kind])
+    else:
+        with pytest.raises(UserError, match=r"a\.npy: no sound numpy file"):
+            read_npy(tmp_path / "a.npy", content=content)
