@@ -9,25 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.edit_scenes import bone_skeleton, figure_scene
-from scgs_warp.edit import EditSession
 from scgs_warp.edit.graph import build_graph
 from scgs_warp.edit.part_skin import LITTLE, part_skin, stretches_of
 from scgs_warp.edit.rotations import IDENTITY, from_axis, rotate
 from scgs_warp.errors import UserError
-
-
-@pytest.fixture(scope="module")
-def figure() -> EditSession:
-    scene, _, _ = figure_scene(256)
-    session = EditSession(scene)
-    session.edit = dataclasses.replace(session.edit, skeleton=bone_skeleton(scene.motion.bones))
-    return session
-
-
-@pytest.fixture
-def session(figure) -> EditSession:
-    return figure.fork()
 
 
 def cloud(seed: int = 0, count: int = 60):

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from helpers.edit_scenes import bar_scene, bone_skeleton, figure_scene
 from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.handles import STAY
@@ -21,20 +17,6 @@ from scgs_warp.edit.skeleton import Part, Skeleton, strongest
 from scgs_warp.errors import UserError
 
 ARM = ("shoulder_left", "elbow_left")
-
-
-@pytest.fixture(scope="module")
-def figure() -> EditSession:
-    scene, _, _ = figure_scene(256)
-    session = EditSession(scene)
-    session.edit = dataclasses.replace(session.edit, skeleton=bone_skeleton(scene.motion.bones))
-    return session
-
-
-@pytest.fixture
-def session(figure) -> EditSession:
-    """A session on the figure whose skeleton is that of its bones."""
-    return figure.fork()
 
 
 def matrix(quat: np.ndarray, point: np.ndarray, shift: np.ndarray | float = 0.0) -> np.ndarray:
@@ -338,83 +320,6 @@ def test_a_side_branch_of_equal_size_ends_a_chain():
     assert skeleton.chain("hand") == ("hand", "forearm", "arm")
     assert skeleton.chain("leg") == ("leg",) and skeleton.chain("trunk") == ("trunk",)
     assert skeleton.branch("arm") == ("arm", "fleck", "forearm", "hand", "index", "thumb")
-
-
-# Files
-
-
-def test_an_edit_of_parts_is_read_as_it_was_written(session, tmp_path):
-    session.turn("shoulder_left", 45, (0, 1, 0))
-    session.add_keyframe(1.0)
-    session.save(tmp_path / "edit.json")
-    content = json.loads((tmp_path / "edit.json").read_text())
-    assert "nodes" not in content["handles"][0] and content["handles"][0]["part"] == "shoulder_left"
-    other = session.fork()
-    other.reset()
-    other.load(tmp_path / "edit.json")
-    assert other.edit == session.edit
-    assert np.array_equal(other.node_positions(0.3, at=1.0), session.node_positions(0.3, at=1.0))
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"handles": [{"part": "tail"}]}, 'handles[0].part is "tail"; there is part-1'),
-        ({"handles": [{"part": "part-1", "nodes": [1]}]}, "give one of them"),
-        ({"handles": [{}]}, "name is missing"),
-        ({"skeleton": {"parts": []}}, "skeleton.parts do not hold each of the 60"),
-        ({"skeleton": {"parts": [{"name": "a", "nodes": [99], "joint": [0, 0, 0]}]}}, "names control point 99"),
-        ({"skeleton": {"parts": [{"name": "a", "nodes": [0]}]}}, "joint is missing"),
-    ],
-)
-def test_a_script_that_names_parts_is_checked(change, message, tmp_path):
-    path = tmp_path / "edit.json"
-    path.write_text(json.dumps({"format": "scgs-warp edit", "version": 2, **change}))
-    session = EditSession(bar_scene())
-    with pytest.raises(UserError) as raised:
-        session.load(path)
-    assert message in str(raised.value) and str(path) in str(raised.value)
-
-
-def test_a_script_may_name_a_part_alone(tmp_path):
-    path = tmp_path / "edit.json"
-    entry = {"part": "part-2", "time": 0.5}
-    turn = {"axis": [0, 1, 0], "degrees": 30}
-    content = {"format": "scgs-warp edit", "version": 2, "handles": [entry], "targets": {"part-2": turn}}
-    path.write_text(json.dumps(content))
-    session = EditSession(bar_scene())
-    session.load(path)
-    assert session.edit.skeleton == session.skeleton
-    assert session.edit.handles[0].nodes == session.skeleton.part("part-2").nodes
-    assert not np.array_equal(session.node_positions(0.5), EditSession(bar_scene()).node_positions(0.5))
-
-
-def test_a_run_keeps_its_skeleton(tmp_path):
-    def opened() -> EditSession:
-        scene = bar_scene()
-        scene.folder = tmp_path
-        return EditSession(scene)
-
-    session = opened()
-    names = session.skeleton.names
-    file = tmp_path / "skeleton.json"
-    assert file.is_file()
-    session.rename_part(names[0], "left half")
-    assert opened().skeleton.names == names, "the edit's skeleton is its own until it is saved"
-    session.save_skeleton()
-    assert opened().skeleton == session.skeleton
-    content = json.loads(file.read_text())
-    file.write_text(json.dumps({**content, "scene": {**content["scene"], "fingerprint": "00000000"}}))
-    assert opened().skeleton.names == names, "a skeleton of other control points is found anew"
-    file.write_text("{")
-    with pytest.raises(UserError, match=r"skeleton\.json: not valid JSON"):
-        _ = opened().skeleton
-
-
-def test_a_folder_that_cannot_be_written_is_read_only(tmp_path):
-    scene = bar_scene()
-    scene.folder = tmp_path / "missing"
-    assert len(EditSession(scene).skeleton.parts) >= 2
 
 
 def test_a_number_of_parts_replaces_the_skeleton(figure):

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.edit_scenes import bone_skeleton, figure_scene
 from helpers.gltf_files import bar, box
 from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession, motion_of_gltf, motion_of_session, retarget
@@ -20,19 +19,6 @@ from scgs_warp.edit.rotations import IDENTITY, from_axis, least_turn, multiply, 
 from scgs_warp.errors import UserError
 
 ARM = ("shoulder_left", "elbow_left")
-
-
-@pytest.fixture(scope="module")
-def figure() -> EditSession:
-    scene, _, _ = figure_scene(256)
-    session = EditSession(scene)
-    session.edit = dataclasses.replace(session.edit, skeleton=bone_skeleton(scene.motion.bones))
-    return session
-
-
-@pytest.fixture
-def session(figure) -> EditSession:
-    return figure.fork()
 
 
 def arm_motion(upper: float, lower: float, flip: bool = False) -> BodyMotion:
