@@ -15,9 +15,13 @@ from .types import ALPHA_MIN
 wp.set_module_options({"enable_backward": False})
 
 
+FURTHEST = wp.constant(1.0e18)
+"""Largest u. Without sharpness, an infinite one gives ``inf * 0``, and the limit of alpha then takes NaN for opaque."""
+
+
 @wp.func
 def falloff(q: float, sharpness: float) -> float:
-    u = 0.5 * q
+    u = wp.min(0.5 * q, FURTHEST)
     return wp.exp(-u * (1.0 + sharpness * u))
 
 

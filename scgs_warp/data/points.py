@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import UserError
 from ..formats.gaussian_compressed_ply import is_packed
 from ..formats.gaussian_files import READERS, gaussian_points
-from ..formats.ply_header import check_ply_counts
+from ..formats.ply_header import parse_ply
 from ..gaussians import SH_C0
 from ..storage.safe_paths import is_regular
 from ..storage.suffixes import longest_suffix
@@ -63,14 +63,12 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     Raises:
         UserError: the file is missing, is not a PLY, lacks x, y or z, or announces more points than fit into memory.
     """
-    from plyfile import PlyData, PlyParseError
+    from plyfile import PlyParseError
 
     try:
         if not is_regular(path):
             raise UserError(f"{path}: is not a regular file; give a PLY of points")
-        with np.errstate(over="ignore"):  # Numbers in text may overflow to infinity; such points are left out.
-            check_ply_counts(path)
-            elements = PlyData.read(str(path))
+        elements = parse_ply(path)  # numbers in text may overflow to infinity; such points are left out
         if is_packed(elements):
             return gaussian_points(path)
         vertices = elements["vertex"].data

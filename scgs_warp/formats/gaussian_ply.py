@@ -15,7 +15,7 @@ from ..storage.suffixes import longest_suffix
 from ..types import Gaussians
 from .gaussian_compressed_ply import SUFFIX, is_packed, unpack
 from .gaussian_parameters import to_parameters
-from .ply_header import ANTIALIASED_COMMENT, check_ply_counts
+from .ply_header import ANTIALIASED_COMMENT, parse_ply
 
 if TYPE_CHECKING:
     from plyfile import PlyData
@@ -72,14 +72,12 @@ def read_gaussian_ply(path: str | Path) -> GaussianParameters:
 
 def _elements(path: Path) -> PlyData:
     """Parse a file, and make sure that it has vertices."""
-    from plyfile import PlyData, PlyParseError
+    from plyfile import PlyParseError
 
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a .ply of 3D Gaussian splatting")
     try:
-        with np.errstate(over="ignore"):  # Numbers in text may overflow to infinity; such Gaussians are left out.
-            check_ply_counts(path)
-            elements = PlyData.read(str(path))
+        elements = parse_ply(path)  # numbers in text may overflow to infinity; such Gaussians are left out
         data = np.asarray(elements["vertex"].data)
     except (PlyParseError, KeyError, ValueError, OverflowError, OSError, MemoryError) as error:
         raise UserError(f"{path}: no PLY file with vertices ({type(error).__name__}); export it again") from None

@@ -227,6 +227,28 @@ def test_poison_is_left_out(device: str, field: str, value: float):
             assert torch.isfinite(gradient).all(), f"{form}: {name}"
 
 
+@pytest.mark.parametrize("broken", [False, True])
+@pytest.mark.parametrize("sharpness", [0.0, 0.5])
+@pytest.mark.parametrize("c", [4, 11])
+def test_a_distance_beyond_float32_shows_nothing(device: str, c: int, sharpness: float, broken: bool):
+    """Splats so narrow that the squared distance of a pixel overflows, with and without a channel to be left out."""
+    splats, channels = random_splats(8, 60, 30, 30, device, sharpness=sharpness), random_channels(8, 60, c, device)
+    narrow = torch.arange(60, device=device) % 3 == 0
+    conics = torch.where(narrow[:, None], torch.tensor([3.4e38, 0.0, 3e-3], device=device), splats.conics)
+    if broken:
+        channels = torch.where(narrow[:, None], torch.full_like(channels, -torch.inf), channels)
+    background = torch.full((c,), 0.5, device=device)
+    without = replace(splats, radii=splats.radii * (~narrow)[:, None].int())
+    poisoned = replace(splats, conics=conics)
+    for form in forms(device):
+        expected = composite(without, channels, bin_splats(without), background, form=form)  # type: ignore[arg-type]
+        got = composite(poisoned, channels, bin_splats(poisoned), background, form=form)  # type: ignore[arg-type]
+        for ours, other in zip(got, expected):
+            assert torch.equal(ours, other), form
+        for name, gradient in zip(NAMES, gradients(poisoned, channels, background, 8, form)):
+            assert torch.isfinite(gradient).all(), f"{form}: {name}"
+
+
 def backward_buffers(splats: Splats, channels: Tensor, form: str, absolute: bool) -> tuple[list[Tensor], Stats, Tensor]:
     n, device = len(channels), channels.device
     own, found = leaves(splats, channels, torch.zeros(channels.shape[1], device=device), torch.float32)
