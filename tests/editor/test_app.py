@@ -137,6 +137,23 @@ def test_the_camera_of_the_film_and_curves(editor, page):
     assert "no view at second 3" in page.ask("change_view", what="move", to=1.0, **{"from": 3.0})["problem"]
 
 
+def test_one_page_drags_at_a_time(editor, page):
+    """Another page can neither take over a drag nor end it."""
+    pull(editor, page)
+    other = Page(editor)
+    try:
+        assert "problem" not in page.ask("grab", at=0.0)
+        page.until(lambda: editor.model.dragging)
+        for what in ("cancel", "release", "grab"):
+            other.send({"do": what, "at": 0.0})
+        other.ask("tool", parts_first=True)  # answered after them
+        assert editor.model.dragging
+        page.ask("release", at=0.0)
+        assert not editor.model.dragging
+    finally:
+        other.close()
+
+
 def test_escape_restores_the_edit(editor, page):
     page.ask("tool", parts_first=False)
     grip = end_of_bar(editor)

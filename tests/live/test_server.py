@@ -197,6 +197,28 @@ def test_strangers_are_not_waited_for_without_end(server, monkeypatch):
     kept.close()
 
 
+def test_of_too_many_strangers_the_oldest_go(server, monkeypatch):
+    monkeypatch.setattr(module, "MAX_STRANGERS", 2)
+    wires = []
+    for _ in range(4):
+        wires.append(socket.create_connection(("127.0.0.1", server.port)))
+        time.sleep(1.2)  # seen by a sweep, one after the other
+    try:
+        open_still = []
+        for wire in wires:
+            wire.settimeout(0.2)
+            try:
+                open_still.append(wire.recv(1) != b"")
+            except TimeoutError:
+                open_still.append(True)
+            except ConnectionError:
+                open_still.append(False)
+        assert open_still == [False, False, True, True]
+    finally:
+        for wire in wires:
+            wire.close()
+
+
 def test_a_port_that_is_taken(monkeypatch):
     monkeypatch.setattr(module, "EVERYWHERE", "127.0.0.1")
     first = Recorded()

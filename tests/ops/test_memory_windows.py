@@ -51,6 +51,21 @@ def test_a_window_lists_what_the_whole_image_does(window: tuple[int, int], radix
     assert torch.equal(part.offsets.diff(), torch.bincount(part.splats, minlength=400))
 
 
+def test_lists_longer_than_can_be_indexed_do_not_fit(monkeypatch):
+    monkeypatch.setattr(memory, "fits", lambda need, device: need <= 1000)
+
+    class Counted:
+        max_entries, list_bytes, scratch_bytes, pairs = 100, 400, 0, 0
+
+        def __init__(self, entries: int) -> None:
+            self.entries = entries
+
+    def fits(entries: int, fixed: int) -> bool:
+        return memory_windows.fits(Counted(entries), Demand(fixed), torch.device("cpu"))
+
+    assert fits(100, 600) and not fits(101, 600) and not fits(100, 601)
+
+
 def test_windows_follow_each_other_and_are_rows_or_in_one():
     class Counted:
         max_entries, list_bytes, entries = 10**9, 0, 1
