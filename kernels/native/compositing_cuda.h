@@ -100,14 +100,12 @@ static inline __device__ unsigned parts_reached(
 }
 
 // Return a value of a conic, 1e24 at most; NaN stays.
-static inline __device__ float at_most(float value) {
-    return value > 1.0e24f ? 1.0e24f : value;
-}
+static inline __device__ float at_most(float value) { return value > 1.0e24f ? 1.0e24f : value; }
 
 // Store the geometry of a splat for ``blend_at``: the mean and the first two values of the scaled conic, then its third
 // value, the logarithm of the opacity, and the inverse opacity. Splats lie 48 bytes apart, so that neither eight
-// threads that store them nor a warp that reads one meet in a bank. The conic is limited so that no distance on an image
-// overflows: with a bend of 0, infinity times 0 would be NaN, and the clamp of alpha would take it for opaque.
+// threads that store them nor a warp that reads one meet in a bank. The conic is limited so that no distance on an
+// image overflows: with a bend of 0, infinity times 0 would be NaN, and the clamp of alpha would take it for opaque.
 static inline __device__ void stage(float4* splat, float mx, float my, float a, float b, float c, float opacity) {
     splat[0] = make_float4(mx, my, -0.5f * LOG2_E * at_most(a), -LOG2_E * at_most(b));
     splat[1] = make_float4(-0.5f * LOG2_E * at_most(c), logarithm_of_two(opacity), inverse_of(opacity), 0.0f);
