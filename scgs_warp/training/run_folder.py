@@ -32,6 +32,9 @@ LOG_EVERY = 50
 """Number of steps between two log lines."""
 PREVIEW_SECONDS = 15.0
 LOCK = ".lock"
+PREVIEWS = "previews"
+BEFORE_SETTINGS = {PREVIEWS, LOCK}
+"""What a run directory holds before ``config.json``."""
 TEST_IMAGES = 4
 """Approximate number of held-out images on which the curve is measured."""
 BOARD_IMAGES = 20
@@ -95,7 +98,7 @@ class RunFolder:
         if self.resume and not self.path.is_dir():
             raise UserError(f"{self.path}: no such run directory; give one that apps/train.py wrote, or no --resume")
         try:
-            (self.path / "previews").mkdir(parents=True, exist_ok=True)
+            (self.path / PREVIEWS).mkdir(parents=True, exist_ok=True)
             self._lock()
         except OSError as error:
             raise UserError(f"{self.path}: cannot be written ({error.strerror}); choose another --output") from error
@@ -137,9 +140,15 @@ class RunFolder:
 
     @property
     def has_no_checkpoint(self) -> bool:
-        """True if a run has begun but has not written a checkpoint."""
-        names = (FILE, PREVIOUS)
-        return (self.path / "config.json").is_file() and not any((self.path / name).exists() for name in names)
+        """True if a run has begun but has not written a checkpoint.
+
+        A trainer that ends before its configuration is written, as on a full disk, leaves only what it makes first.
+        """
+        if any((self.path / name).exists() for name in (FILE, PREVIOUS)):
+            return False
+        if (self.path / "config.json").is_file():
+            return True
+        return all(entry.name in BEFORE_SETTINGS or entry.match(".*.tmp") for entry in self.path.iterdir())
 
     def start(self, step: int) -> None:
         """Write the configuration; drop the log lines after ``step``, which a resumed run writes again; remove partial
@@ -247,7 +256,7 @@ class RunFolder:
         pixels = (pair.permute(1, 2, 0).cpu() * 255.0 + 0.5).to(torch.uint8).numpy()[:, :, ::-1]
         done, content = cv2.imencode(".png", pixels)
         if done:
-            write_atomically(self.path / "previews" / "latest.png", content.tobytes())
+            write_atomically(self.path / PREVIEWS / "latest.png", content.tobytes())
 
     def log_test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
         """Log the PSNR of a few test images after ``step`` steps."""

@@ -51,6 +51,21 @@ def test_the_psnr_of_training_is_that_of_valid_pixels(masked, tmp_path, device):
     assert logged == pytest.approx(scores[0 if masked else 1], abs=1e-3)
 
 
+@pytest.mark.parametrize("left", [(), ("previews",), ("previews", ".lock", ".config.json.1.tmp")])
+def test_a_trainer_that_ended_before_its_settings_has_no_checkpoint_yet(tmp_path, left):
+    """A full disk or a kill at the first file leaves a directory, and --resume must begin there, not refuse."""
+    for name in left:
+        (tmp_path / name).mkdir() if name == "previews" else (tmp_path / name).touch()
+    with RunFolder(tmp_path, tiny_config(50), None, resume=True) as folder:
+        assert folder.has_no_checkpoint
+
+
+def test_a_directory_of_something_else_is_no_run(tmp_path):
+    (tmp_path / "photo.jpg").touch()
+    with RunFolder(tmp_path, tiny_config(50), None, resume=True) as folder:
+        assert not folder.has_no_checkpoint  # so that reading the checkpoint refuses, in one line
+
+
 def test_a_resumed_log_drops_later_and_damaged_lines(tmp_path):
     config = tiny_config(50)
     with RunFolder(tmp_path / "run", config, None, resume=False) as folder:
