@@ -14,20 +14,22 @@ from typing import Any
 
 from scgs_warp.edit import EditSession, Target, edit_file, render_film
 from scgs_warp.edit.handles import STAY
-from scgs_warp.edit.rotations import from_matrix
-from scgs_warp.editor import gizmo_pose
-from scgs_warp.editor.frame_image import take_picture
 from scgs_warp.editor.jobs import Jobs
-from scgs_warp.editor.model import EditorModel, Region
-from scgs_warp.editor.views import FULL, ClientCamera, PictureSchedule
+from scgs_warp.editor.model import EditorModel, Moment, Region
+from scgs_warp.editor.parts_tool import Hit, PartsTool, hit
+from scgs_warp.editor.pictures import scene_jpeg
+from scgs_warp.editor.pose_schedule import PoseSchedule, Wanted
+from scgs_warp.editor.poses import picture_message, pose_message, pose_table
 from scgs_warp.editor.worker import Worker
 from scgs_warp.errors import UserError
 from scgs_warp.geometry.cameras import orbit_camera
-from scgs_warp.visualization.video import write_png
+from scgs_warp.types import Camera
 
 SIZE = 96
 """Longer side of a picture in pixels."""
 CLIENTS = 2
+AHEAD = 24
+"""Largest number of frames that a page asks for at once."""
 
 
 class RandomUser:
@@ -43,19 +45,20 @@ class RandomUser:
         folder.mkdir(parents=True, exist_ok=True)
         self.done: Counter[str] = Counter()
         self.refused = 0
-        self.schedule = PictureSchedule()
-        self.worker = Worker(self.schedule, self._draw, lambda: self.model.busy)
+        self.schedule = PoseSchedule()
+        self.worker = Worker(self.schedule, self._send_pose, self._pose_failed)
         self.model = EditorModel(session, self._changed)
+        self.parts = PartsTool(self.model)
+        self.sent = 0
+        """Bytes of poses and pictures so far."""
         self.jobs = Jobs(lambda progress: None, lambda *ended: None)
         film = dataclasses.replace(session.edit.film, seconds=0.5, fps=10.0, size=SIZE)
         self.model.replace(film=film)
         self.worker.start()
-        for client in range(CLIENTS):
-            self._look_from(client)
         self.actions: list[tuple[int, Callable[[], Any]]] = [
             (12, self.click), (12, self.drag), (4, self.undo), (3, self.redo), (4, self.keyframe), (4, self.seek),
-            (2, self.play), (3, self.look_around), (2, self.handle), (2, self.settings), (2, self.film), (2, self.save),
-            (2, self.load), (1, self.export_film), (1, self.export_ply), (1, self.screenshot), (1, self.nonsense),
+            (3, self.play), (2, self.put), (2, self.handle), (2, self.settings), (2, self.film), (2, self.save),
+            (2, self.load), (1, self.export_film), (1, self.export_ply), (3, self.picture), (1, self.nonsense),
             (1, self.reset), (1, self.arrive_and_leave),
         ]  # fmt: skip
 
@@ -69,11 +72,10 @@ class RandomUser:
         self.done[action.__name__] += 1
         self.worker.call(lambda: None)
         if self.random.random() < 0.1:
-            self._wait(lambda: self.worker.idle or self.model.playing)
+            self._wait(lambda: self.worker.idle)
 
     def rest(self) -> None:
         """Wait until nothing runs."""
-        self.model.play(False)
         self.jobs.wait(60.0)
         self._wait(lambda: self.worker.idle)
 
@@ -89,27 +91,31 @@ class RandomUser:
     # The page's part.
 
     def _changed(self) -> None:
-        with self.worker.changing() as schedule:
-            schedule.change(time.monotonic())
+        if self.model.dragging:
+            with self.worker.changing() as schedule:
+                schedule.ask_live()
 
-    def _draw(self, client: int, quality: str) -> None:
-        with self.worker.changing() as schedule:
-            camera = schedule.camera(client)
-        if camera is not None:
-            moment = self.model.moment()
-            take_picture(self.model.session, moment, camera, SIZE if quality == FULL else SIZE // 2)
-            self.model.session.node_positions(moment.time, moment.at, live=moment.live)
+    def _send_pose(self, client: int, wanted: Wanted | None) -> None:
+        model, session = self.model, self.model.session
+        moment, version, frame = model.moment(), 0, -1
+        if wanted is not None:
+            version, frame = wanted
+            at = frame / session.edit.film.fps
+            moment = Moment(session.scene_time(at), at if model.following else None, False)
+        self.sent += len(pose_message(pose_table(session, moment), version, frame))
 
-    def _camera(self) -> ClientCamera:
-        camera = orbit_camera(self.model.session.scene.overview, self.random.uniform(0, 360), SIZE)
-        wxyz = from_matrix(camera.viewmat[:3, :3].double().numpy().T)
-        fov = 2 * math.atan(camera.height / (2 * float(camera.K[1, 1])))
-        return ClientCamera(tuple(wxyz.tolist()), tuple(camera.position.tolist()), fov, camera.width, camera.height)
+    def _pose_failed(self, client: int, error: Exception) -> None:
+        raise error
 
-    def _look_from(self, client: int) -> None:
-        camera = self._camera()
+    def _ask_frames(self, client: int) -> None:
+        frames = self.model.session.edit.film.frames
+        first = self.random.randrange(frames)
+        wanted = [(first + k) % frames for k in range(self.random.randint(1, AHEAD))]
         with self.worker.changing() as schedule:
-            schedule.move(client, camera, time.monotonic())
+            schedule.ask_frames(client, self.random.randint(1, 2), wanted)
+
+    def _camera(self) -> Camera:
+        return orbit_camera(self.model.session.scene.overview, self.random.uniform(0, 360), SIZE)
 
     # Actions of the user.
 
@@ -120,20 +126,43 @@ class RandomUser:
 
     def click(self) -> None:
         model, camera, moment = self.model, self._camera(), self.model.moment()
-        screen = (self.random.uniform(0.2, 0.8), self.random.uniform(0.2, 0.8))
+        x, y = (self.random.uniform(0.2, 0.8) * size for size in (camera.width, camera.height))
 
-        def find() -> tuple[int, ...]:
-            point = gizmo_pose.surface_point(model.session, camera, screen, moment)
-            return () if point is None else gizmo_pose.region_at(model.session, point, model.region, moment)
+        def find() -> Hit | None:
+            point = model.session.pick(camera, x, y, moment.time, moment.at)
+            return None if point is None else hit(model.session, point, model.region, moment)
 
-        model.select(self.worker.call(find), self.random.choice(("replace", "add", "subtract")))
+        self.parts.click(self.worker.call(find), self.random.choice(("replace", "add", "subtract")))
 
     def drag(self) -> None:
-        self.model.grab(STAY)
+        part = self.parts.part is not None
+        if part:
+            self.parts.grab()
+        else:
+            self.model.grab(STAY)
+        grip = self.model.session.node_positions(0.0)[self.model.selection[0]] if part else None
         for _ in range(self.random.randint(0, 8)):
-            self.model.drag(self._target())
+            target = self._target()
+            if grip is None:
+                self.model.drag(target)
+            elif self.random.random() < 0.5:
+                self.parts.pull(grip + target.translation, grip)
+            else:
+                self.parts.turn(target.rotation)
             self.worker.call(lambda: None)
-        self.model.release()
+        if self.random.random() < 0.1:
+            self.model.cancel()
+        else:
+            self.model.release()
+
+    def put(self) -> None:
+        """Set a target in the panel."""
+        if self.parts.part is not None:
+            self.parts.put(self._target())
+        else:
+            self.model.grab(STAY)
+            self.model.drag(self._target())
+            self.model.release()
 
     def undo(self) -> None:
         for _ in range(self.random.randint(1, 5)):
@@ -146,16 +175,13 @@ class RandomUser:
         self.model.add_keyframe(self.random.choice(("smooth", "linear", "ease", "step")))
 
     def seek(self) -> None:
-        self.model.seek(self.random.uniform(0.0, self.model.seconds))
+        self.model.look(self.random.uniform(0.0, self.model.seconds))
 
     def play(self) -> None:
-        self.model.play(not self.model.playing)
-
-    def look_around(self) -> None:
-        self._look_from(self.random.randrange(CLIENTS))
+        self._ask_frames(self.random.randrange(CLIENTS))
 
     def arrive_and_leave(self) -> None:
-        self._look_from(CLIENTS)
+        self._ask_frames(CLIENTS)
         self.worker.call(lambda: None)
         with self.worker.changing() as schedule:
             schedule.drop(CLIENTS)
@@ -171,8 +197,8 @@ class RandomUser:
         self.model.set(
             region=Region(kind, self.random.randint(0, 3), self.random.uniform(0.05, 0.5)),
             pin_rings=self.random.choice((None, 1, 3)),
-            show=self.random.choice(("edited", "edited", "original", "side by side", "split")),
         )
+        self.parts.set(self.random.random() < 0.5)
 
     def film(self) -> None:
         edit = self.model.session.edit
@@ -189,7 +215,7 @@ class RandomUser:
 
     def nonsense(self) -> None:
         """Send values that only a broken page would send."""
-        self.model.seek(math.nan)
+        self.model.look(math.nan)
         self.model.drag(Target((math.nan, 0.0, 0.0)))
 
     def _path(self, suffix: str) -> Path:
@@ -224,7 +250,8 @@ class RandomUser:
             session = self.model.session.fork()
         self.worker.call(lambda: session.export_ply(path, moment.time, moment.at), patient=True)
 
-    def screenshot(self) -> None:
+    def picture(self) -> None:
+        """Look from elsewhere with a page that cannot draw the scene."""
         camera, moment = self._camera(), self.model.moment()
-        picture = self.worker.call(lambda: take_picture(self.model.session, moment, camera, SIZE))
-        write_png(self._path(".png"), picture.rgb)
+        jpeg = self.worker.call(lambda: scene_jpeg(self.model.session, moment, camera))
+        self.sent += len(picture_message(jpeg, 1))

@@ -87,11 +87,8 @@ def select(editor: Host, fields: FieldReader) -> None:
 
 
 def choose_part(editor: Host, fields: FieldReader) -> None:
-    """Choose a part by name, held at the mean of its control points."""
-    name, moment = short_text(fields, "name"), editor.model.moment()
-    places = editor.session.node_positions(moment.time, moment.at)
-    nodes = list(editor.session.skeleton.part(name).nodes)
-    editor.parts.choose(name, places[nodes].mean(0), places)
+    """Choose a part by name."""
+    editor.parts.choose(short_text(fields, "name"))
 
 
 def activate(editor: Host, fields: FieldReader) -> None:

@@ -19,6 +19,7 @@ from ..export.page_edit import own_motion
 from ..export.page_pose import with_parts
 from ..export.page_scene import page_scene
 from ..live.server import Client, PageServer
+from ..live.viewer import WIRE
 from ..storage.json_files import as_number
 from . import files
 from .actions import ACTIONS
@@ -89,7 +90,7 @@ class Editor:
         self.schedule = PoseSchedule()
         self.model = EditorModel(session, self._changed)
         self.parts = PartsTool(self.model)
-        self.worker = Worker(self.schedule, self._send_pose, lambda: self.model.dragging, failed=self._pose_failed)
+        self.worker = Worker(self.schedule, self._send_pose, self._pose_failed)
         self.jobs = Jobs(lambda progress: self._show_job(progress), self._job_ended)
         self.held: tuple[GizmoFrame, tuple[Any, Any]] | None = None
         self.latency: list[float] = []
@@ -298,7 +299,7 @@ class Editor:
         if client is None or wanted.version != self._version:
             return
         at = wanted.frame / self.session.edit.film.fps
-        moment = Moment(self.session.scene_time(at), at if self.model.following else None, False, "edited")
+        moment = Moment(self.session.scene_time(at), at if self.model.following else None, False)
         client.send(pose_message(pose_table(self.session, moment), wanted.version, wanted.frame))
 
     def _draw_pictures(self) -> None:
@@ -363,7 +364,7 @@ def number_of(message: dict[str, Any]) -> int | None:
 
 def page_of(title: str) -> bytes:
     """Return the editor's page for a scene."""
-    scripts = [read_web(f"{name}.js", WEB) for name in OWN_SCRIPTS]
+    scripts = [WIRE, *(read_web(f"{name}.js", WEB) for name in OWN_SCRIPTS)]
     shaders = {name: read_web(f"{name}.glsl", WEB) for name in SHADERS}
     program = program_text((*SCRIPTS, "rotations"), scripts, shaders)
     template, style = read_web("editor.html", WEB), read_web("editor.css", WEB)

@@ -13,9 +13,7 @@ from ..edit import EditSession, Handle, Target
 from ..edit.handles import STAY, carried_goal
 from ..edit.rotations import IDENTITY, conjugate, from_matrix, multiply, rigid_fit, rotate, unit
 from .model import Moment, Region
-from .views import ClientCamera
 
-PICK_SIZE = 512
 NOISE = 1e-7
 """Half the angle, in radians, of the smallest turn that counts. While a handle is only shifted, the browser reports
 smaller turns, which are rounding errors."""
@@ -84,19 +82,6 @@ def frame_of_selection(session: EditSession, nodes: tuple[int, ...], moment: Mom
     turn, before, after = rigid_fit(base, now)
     turn = IDENTITY if len(chosen) < 3 else turn
     return GizmoFrame(base.mean(0), IDENTITY, turn), Target.of((after - before).tolist())
-
-
-def surface_point(
-    session: EditSession, camera: ClientCamera, screen: tuple[float, float], moment: Moment
-) -> np.ndarray | None:
-    """Return the surface point [3] seen at a point of the canvas (0 to 1 from the upper left); None: background."""
-    x, y = screen
-    share = 1.0
-    if moment.show == "side by side":
-        x, share = 2 * x - (x >= 0.5), 0.5
-    seen = camera.at_size(PICK_SIZE, share)
-    column, row = (min(max(z * n, 0.0), n - 1e-3) for z, n in ((x, seen.width), (y, seen.height)))
-    return session.pick(seen, column, row, moment.time, moment.at)
 
 
 def region_at(session: EditSession, point: np.ndarray, region: Region, moment: Moment) -> tuple[int, ...]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,20 +17,19 @@ from ..edit.handles import STAY
 from ..errors import UserError
 from .keys import keyed
 
-Show = Literal["edited", "original", "side by side", "split"]
 Combine = Literal["replace", "add", "subtract"]
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Content of a picture."""
+    """Instant of the edited scene."""
 
     time: float
     """Scene time."""
     at: float | None
     """Second of the film at which keyframes place the handles; None: present targets."""
     live: bool
-    show: Show
+    """True if the edit is previewed, as during a drag."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +63,6 @@ class EditorModel:
         self.window = 0.1
         self.stiffness: float | None = None
         self.combine: Combine = "replace"
-        self.through = False
-        """True if overlays are drawn in front of the surface."""
-        self.show: Show = "edited"
         self.at = 0.0
         self.dragging = False
         self._dragged: bool | None = None
@@ -80,22 +75,12 @@ class EditorModel:
         """Sets of pins that ``grab`` made automatically."""
         self._following = bool(session.edit.keyframes)
         """True if keyframes place the handles: always, once there are any, but during a drag."""
-        self._played_from: tuple[float, float] | None = None
 
     # Time
 
     @property
     def seconds(self) -> float:
         return self.session.edit.film.seconds
-
-    @property
-    def playing(self) -> bool:
-        return self._played_from is not None
-
-    @property
-    def busy(self) -> bool:
-        """True if pictures should be fast rather than large."""
-        return self.dragging or self.playing
 
     @property
     def time(self) -> float:
@@ -107,36 +92,10 @@ class EditorModel:
         with self.lock:
             self.at = min(max(float(at), 0.0), self.seconds) if np.isfinite(at) else self.at
 
-    def seek(self, at: float) -> None:
-        """Show a second of the film."""
-        with self.lock:
-            self.look(at)
-            if self._played_from is not None:
-                self._played_from = (time.monotonic(), self.at)
-        self.changed()
-
-    def play(self, on: bool, now: float | None = None) -> None:
-        with self.lock:
-            self._played_from = (time.monotonic() if now is None else now, self.at) if on else None
-        self.changed()
-
-    def tick(self, now: float | None = None) -> None:
-        """Advance to the film's frame that is due, if playing."""
-        with self.lock:
-            if self._played_from is None:
-                return
-            start, begin = self._played_from
-            now = time.monotonic() if now is None else now
-            fps = self.session.edit.film.fps
-            length = max(self.seconds, 1.0 / fps)
-            self.at = int((begin + now - start) % length * fps + 1e-6) / fps
-
     def moment(self) -> Moment:
         with self.lock:
-            self.tick()
-            live = self.dragging and not self.playing
-            at = self.at if self._following and not live else None
-            return Moment(self.time, at, live, self.show)
+            at = self.at if self._following and not self.dragging else None
+            return Moment(self.time, at, self.dragging)
 
     # The edit
 
@@ -175,7 +134,7 @@ class EditorModel:
             session.reset()
 
     def set(self, **fields: Any) -> None:
-        """Set attributes of this model that are no part of the edit, such as region, pin_rings and show."""
+        """Set attributes of this model that are no part of the edit, such as region and pin_rings."""
         with self.lock:
             for name, value in fields.items():
                 setattr(self, name, value)
@@ -275,7 +234,7 @@ class EditorModel:
             self._dragged, self._led = False, self._following
             self._take_over()
             self._start = dict(self.session.edit.targets)
-            self.dragging, self._played_from = True, None
+            self.dragging = True
             return self.session.edit
 
     def dragged(self) -> None:

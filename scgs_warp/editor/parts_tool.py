@@ -7,73 +7,38 @@ A click takes the part under it, a second click on the same part its control poi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from ..edit import EditSession, Target
-from ..edit.rotations import rigid_fit, rotate
 from ..errors import UserError
-from .gizmo_pose import NOISE, region_at
+from .gizmo_pose import region_at
 from .model import Combine, EditorModel, Moment, Region
 
 
 class Hit(NamedTuple):
-    """What a click at a surface point means; world units."""
+    """What a click at a surface point means."""
 
-    point: np.ndarray
-    """[3]"""
     part: str | None
     """None: the scene has a single part, which nobody wants to pose."""
     nodes: tuple[int, ...]
     """Control points that a click on the surface selects."""
-    places: np.ndarray
-    """[M, 3] control points at the moment of the click."""
 
 
-class Shown(NamedTuple):
-    """Control points to be coloured while a part is chosen."""
-
-    chosen: tuple[int, ...]
-    moving: tuple[int, ...]
-    """Of the parts that turn when the chosen one is pulled, and all that hangs on them."""
-    still: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class _Grip:
-    """Point by which a part is held, given at the moment when it was clicked; world units."""
+class _Chosen(NamedTuple):
+    """A part as it was when it was chosen."""
 
     part: str
     nodes: tuple[int, ...]
-    point: np.ndarray
-    """[3]"""
-    places: np.ndarray
-    """[M, 3] control points at that moment."""
-
-    def carried(self, places: np.ndarray) -> np.ndarray:
-        """Return the point when the control points [M, 3] are elsewhere, [3]."""
-        rows = list(self.nodes)
-        turn, before, after = rigid_fit(self.places[rows], places[rows])
-        return rotate(turn, self.point - before) + after
-
-
-@dataclass(frozen=True)
-class PartFrame:
-    """Gizmo of a part before a drag, world units: at the point by which it is held, with the axes of the world."""
-
-    point: np.ndarray
-    """[3]"""
 
 
 def hit(session: EditSession, point: np.ndarray, region: Region, moment: Moment) -> Hit:
-    """Say what a click at a surface point [3] means. This may solve, and find the skeleton: call it on the worker's
+    """Say what a click at a surface point [3], world units, means. This may solve, and find the skeleton: call it on the worker's
     thread."""
     single = len(session.parts()) < 2
     part = None if single else session.part_at(point.tolist(), moment.time, moment.at)
-    places = session.node_positions(moment.time, moment.at)
-    return Hit(np.asarray(point, np.float64), part, region_at(session, point, region, moment), places)
+    return Hit(part, region_at(session, point, region, moment))
 
 
 class PartsTool:
@@ -88,7 +53,7 @@ class PartsTool:
     def __init__(self, model: EditorModel) -> None:
         self.model = model
         self.on = True
-        self._grip: _Grip | None = None
+        self._chosen: _Chosen | None = None
         self._inside: str | None = None
         """Part whose control points a second click has selected; further clicks on it select control points."""
         self._since = model.session.edit
@@ -97,11 +62,11 @@ class PartsTool:
     @property
     def part(self) -> str | None:
         """The chosen part; None: none is chosen. Selecting anything else, and changes of the skeleton, unchoose it."""
-        grip = self._grip
-        if grip is None or grip.nodes != self.model.selection:
+        chosen = self._chosen
+        if chosen is None or chosen.nodes != self.model.selection:
             return None
-        there = any(part.name == grip.part and part.nodes == grip.nodes for part in self.model.session.skeleton.parts)
-        return grip.part if there else None
+        there = any((part.name, part.nodes) == chosen for part in self.model.session.skeleton.parts)
+        return chosen.part if there else None
 
     def click(self, hit: Hit | None, how: Combine = "replace") -> None:
         """Choose what a click means.
@@ -117,7 +82,7 @@ class PartsTool:
                 if how == "replace":
                     model.select(())
             elif self.on and how == "replace" and hit.part is not None and hit.part not in (part, inside):
-                self.choose(hit.part, hit.point, hit.places)
+                self.choose(hit.part)
             else:
                 self._inside = hit.part
                 self._take_points(hit, how)
@@ -130,36 +95,30 @@ class PartsTool:
         else:
             self.model.select(hit.nodes, how)
 
-    def choose(self, part: str, point: Sequence[float] | np.ndarray, places: np.ndarray) -> None:
-        """Choose a part, held at a point.
+    def choose(self, part: str) -> None:
+        """Choose a part.
 
-        Args:
-            point: [3]
-            places: [M, 3] control points at the moment to which the point refers.
+        Raises:
+            UserError: there is no such part.
         """
         with self.model.lock:
             nodes = self.model.session.skeleton.part(part).nodes
-            self._grip = _Grip(part, nodes, np.asarray(point, np.float64), places)
+            self._chosen = _Chosen(part, nodes)
             self._inside = None
             self.model.select(nodes)
 
-    def frame(self, places: np.ndarray) -> PartFrame | None:
-        """Return the gizmo of the chosen part for the present control points [M, 3]; None: no part is chosen."""
-        with self.model.lock:
-            return None if self.part is None or self._grip is None else PartFrame(self._grip.carried(places))
-
-    def shown(self) -> Shown | None:
-        """Return which control points move when the chosen part is pulled; None: no part is chosen."""
+    @property
+    def moving(self) -> tuple[int, ...]:
+        """Control points that move with the chosen part when it is pulled, other than its own: those of the parts that
+        turn, and of all that hangs on them."""
         with self.model.lock:
             part = self.part
             if part is None:
-                return None
+                return ()
             skeleton = self.model.session.skeleton
             top = skeleton.chain(part)[-1]
-            moving = {node for name in skeleton.branch(top) for node in skeleton.part(name).nodes}
-            chosen = skeleton.part(part).nodes
-            still = tuple(node for node in range(len(self.model.session)) if node not in moving)
-            return Shown(chosen, tuple(sorted(moving - set(chosen))), still)
+            nodes = {node for name in skeleton.branch(top) for node in skeleton.part(name).nodes}
+            return tuple(sorted(nodes - set(skeleton.part(part).nodes)))
 
     def set(self, on: bool) -> None:
         """Set whether clicks take parts."""
@@ -182,25 +141,12 @@ class PartsTool:
             self._since = model.begin_drag()
         model.changed()
 
-    def drag(self, frame: PartFrame, position: np.ndarray, wxyz: np.ndarray) -> None:
-        """Pose the chosen part for a pose of the gizmo: turn it if the gizmo is turned, else pull it.
-
-        Args:
-            frame: gizmo before the drag.
-            position: [3]
-            wxyz: [4] turn since the beginning of the drag.
+    def pull(self, to: Sequence[float] | np.ndarray, grip: Sequence[float] | np.ndarray) -> None:
+        """Pull the chosen part, as part of a drag: take the point ``grip`` [3], as it was before, to ``to`` [3].
 
         Raises:
             UserError: a number is not finite.
         """
-        quat = np.asarray(wxyz, np.float64)
-        if all(abs(x) < NOISE for x in quat[1:]):
-            self.pull(position, frame.point)
-        else:
-            self.turn(quat)
-
-    def pull(self, to: Sequence[float] | np.ndarray, grip: Sequence[float] | np.ndarray) -> None:
-        """Pull the chosen part, as part of a drag: take the point ``grip`` [3], as it was before, to ``to`` [3]."""
         with self.model.lock:
             if self.part is not None and self.model.dragging:
                 at = np.asarray(to).tolist(), self.model.time, np.asarray(grip).tolist()
@@ -209,7 +155,11 @@ class PartsTool:
         self.model.changed()
 
     def turn(self, rotation: Sequence[float] | np.ndarray) -> None:
-        """Turn the chosen part about its joint, as part of a drag, by a rotation [4] wxyz since its beginning."""
+        """Turn the chosen part about its joint, as part of a drag, by a rotation [4] wxyz since its beginning.
+
+        Raises:
+            UserError: a number is not finite.
+        """
         with self.model.lock:
             if self.part is not None and self.model.dragging:
                 quat = np.asarray(rotation, np.float64).tolist()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 
+import numpy as np
 import torch
 from PIL import Image
 
@@ -41,6 +42,11 @@ def scene_jpeg(session: EditSession, moment: Moment, camera: Camera) -> bytes:
     background = session.edit.film.background
     view = camera.to(session.scene.device)
     image = session.render(view, moment.time, moment.at, background, live=moment.live)
+    return _jpeg(to_bytes(image.rgb))
+
+
+def _jpeg(rgb: np.ndarray) -> bytes:
+    """Encode a picture [H, W, 3] uint8."""
     file = io.BytesIO()
-    Image.fromarray(to_bytes(image.rgb)).save(file, "JPEG", quality=QUALITY)
+    Image.fromarray(rgb).save(file, "JPEG", quality=QUALITY)
     return file.getvalue()

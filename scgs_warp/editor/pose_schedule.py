@@ -1,5 +1,4 @@
-"""Schedule of the poses and pictures that pages wait for. The pose of a drag comes first; of it only the newest is
-computed."""
+"""Schedule of the poses that pages wait for. The pose of a drag comes first; of it only the newest is computed."""
 
 from __future__ import annotations
 
@@ -42,7 +41,7 @@ class PoseSchedule:
     def drop(self, client: int) -> None:
         self._frames.pop(client, None)
 
-    def next(self, now: float, busy: bool) -> tuple[int, Wanted | None] | None:
+    def next(self) -> tuple[int, Wanted | None] | None:
         """Return a page with the frame that it is to get, None for the live pose of all pages; clients take turns."""
         if self._live:
             self._live = False
@@ -54,9 +53,7 @@ class PoseSchedule:
         self._last = min(later or waiting)
         return self._last, self._frames[self._last].popitem(last=False)[0]
 
-    def settled(self, now: float, busy: bool) -> bool:
+    @property
+    def settled(self) -> bool:
+        """True if nothing is due."""
         return not self._live and not any(self._frames.values())
-
-    def wait(self, now: float, busy: bool) -> float | None:
-        """Return the seconds until something is due without further changes: None, never."""
-        return None

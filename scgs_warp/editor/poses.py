@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -23,7 +24,11 @@ def pose_table(session: EditSession, moment: Moment) -> np.ndarray:
     """Return the poses of all control points at a moment, [M, 28] float32, normalised units. Call it on the worker's
     thread."""
     pose = edited_pose(session, min(max(moment.time, 0.0), 1.0), moment.at, live=moment.live)
-    rest = session.engine.rig.positions.detach().cpu().double().numpy()
+    return _table(pose, session.engine.rig.positions.detach().cpu().double().numpy())
+
+
+def _table(pose: Mapping[str, np.ndarray], rest: np.ndarray) -> np.ndarray:
+    """Put the poses of control points at ``rest`` [M, 3] into one table."""
     rotation = unit(pose["rotation"])
     table = np.zeros((len(rest), WIDTH))
     rows = table[:, :12].reshape(-1, 3, 4)

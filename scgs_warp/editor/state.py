@@ -48,7 +48,6 @@ def page_state(
     """Return what changes while a scene is edited. Poses, curves and the path of the camera are not part of it."""
     with model.lock:
         session, edit = model.session, model.session.edit
-        shown = parts.shown()
         return {
             "version": version,
             "unedited": _unedited(edit),
@@ -64,7 +63,7 @@ def page_state(
             "pins": list(edit.pins),
             "selection": list(model.selection),
             "part": parts.part,
-            "moving": [] if shown is None else list(shown.moving),
+            "moving": list(parts.moving),
             "active": model.active,
             "target": _target(model),
             "following": model.following,

@@ -1,7 +1,7 @@
-"""Worker thread that does all computation: calls of callbacks, pictures for every client, and pieces of jobs.
+"""Worker thread that does all computation: calls of callbacks, poses for every page, and pieces of jobs.
 
 Solving and rendering share caches and use every core, and so run one after another, in this order of priority: calls,
-pictures, pieces of jobs.
+poses, pieces of jobs.
 """
 
 from __future__ import annotations
@@ -12,45 +12,36 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
+from .pose_schedule import PoseSchedule, Wanted
+
 Result = TypeVar("Result")
 PATIENCE = 1.0
-"""Seconds after which a piece of a job takes precedence over pictures."""
-
-
-class Schedule(Protocol):
-    """Order of the work that pages wait for; the worker's lock guards it."""
-
-    def next(self, now: float, busy: bool) -> tuple[int, Any] | None: ...
-    def settled(self, now: float, busy: bool) -> bool: ...
-    def wait(self, now: float, busy: bool) -> float | None: ...
+"""Seconds after which a piece of a job takes precedence over poses."""
 
 
 class Worker:
-    """Thread that runs calls and draws the pictures that ``schedule`` says are due.
+    """Thread that runs calls and computes the poses that ``schedule`` says are due.
 
     Args:
-        schedule: pictures that are due; guarded by this worker's lock.
-        draw: called with (client, quality) without the lock, from this thread only.
-        busy: returns whether something is being dragged or played.
-        failed: called with the client and the error if ``draw`` raises, inside the ``except`` block.
+        schedule: poses that are due; guarded by this worker's lock.
+        pose: called with (client, wanted) without the lock, from this thread only.
+        failed: called with the client and the error if ``pose`` raises, inside the ``except`` block.
     """
 
     def __init__(
         self,
-        schedule: Any,
-        draw: Callable[[int, Any], None],
-        busy: Callable[[], bool],
+        schedule: PoseSchedule,
+        pose: Callable[[int, Wanted | None], None],
+        failed: Callable[[int, Exception], None],
         clock: Callable[[], float] = time.monotonic,
-        failed: Callable[[int, Exception], None] | None = None,
     ) -> None:
-        self._failed = failed
-        self.schedule, self._draw, self._busy, self._clock = schedule, draw, busy, clock
+        self.schedule, self._pose, self._failed, self._clock = schedule, pose, failed, clock
         self._condition = threading.Condition()
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._patient: deque[tuple[float, Future[Any], Callable[[], Any]]] = deque()
@@ -67,7 +58,7 @@ class Worker:
         with self._condition:
             if self._working or self._calls or self._patient:
                 return False
-            return self.schedule.settled(self._clock(), self._busy())
+            return self.schedule.settled
 
     @property
     def backlog(self) -> int:
@@ -89,8 +80,8 @@ class Worker:
             self._thread.join(timeout=30)
 
     @contextlib.contextmanager
-    def changing(self):
-        """Yield the schedule for changes, under the lock; then draw what is due."""
+    def changing(self) -> Iterator[PoseSchedule]:
+        """Yield the schedule for changes, under the lock; then compute what is due."""
         with self._condition:
             yield self.schedule
             self._condition.notify_all()
@@ -99,7 +90,7 @@ class Worker:
         """Run ``action`` on the worker's thread and return its result.
 
         Args:
-            patient: let pictures go first, for at most ``PATIENCE`` seconds.
+            patient: let poses go first, for at most ``PATIENCE`` seconds.
 
         Raises:
             concurrent.futures.CancelledError: the worker was stopped; or whatever ``action`` raises.
@@ -137,7 +128,7 @@ class Worker:
                     if self._stopped:
                         return
                     self._working = False
-                    self._condition.wait(self.schedule.wait(self._clock(), self._busy()))
+                    self._condition.wait()
                     task = self.next_task()
                 self._working = True
             task()
@@ -150,23 +141,20 @@ class Worker:
             if self._calls:
                 future, action = self._calls.popleft()
                 return lambda: _fulfil(future, action)
-            now = self._clock()
-            due = self.schedule.next(now, self._busy())
-            if self._patient and (due is None or now - self._patient[0][0] > PATIENCE):
+            overdue = bool(self._patient) and self._clock() - self._patient[0][0] > PATIENCE
+            due = None if overdue else self.schedule.next()  # what is taken from the schedule must be sent
+            if due is not None:
+                client, wanted = due
+                return lambda: self._send(client, wanted)
+            if self._patient:
                 _, future, action = self._patient.popleft()
                 return lambda: _fulfil(future, action)
-            if due is None:
-                return None
-            client, quality = due
-            return lambda: self._picture(client, quality)
+            return None
 
-    def _picture(self, client: int, quality: Any) -> None:
+    def _send(self, client: int, wanted: Wanted | None) -> None:
         try:
-            self._draw(client, quality)
-        except Exception as error:  # a failed picture must not end the editor
-            if self._failed is None:
-                traceback.print_exc(file=sys.stderr)
-                return
+            self._pose(client, wanted)
+        except Exception as error:  # a failed pose must not end the editor
             try:
                 self._failed(client, error)
             except Exception:

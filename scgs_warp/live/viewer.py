@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from aiohttp import web
 
 WEB = Path(__file__).parent / "web"
+WIRE = read_web("wire.js", WEB)
+"""Script of a page's connection to its ``PageServer``."""
 
 
 class SceneView:
@@ -30,7 +32,7 @@ class SceneView:
     """
 
     def __init__(self, title: str, *, port: int = 0, shared: bool = False) -> None:
-        program = program_text(SCRIPTS, [read_web("live.js", WEB)])
+        program = program_text(SCRIPTS, [WIRE, read_web("live.js", WEB)])
         self._page = document(program, title, network="'self'")
         self._content, self._version, self._status = b"", 0, "waiting for the scene"
         self._lock = threading.Lock()

@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from helpers.editor_models import LEFT, chosen, client, new_model
+from helpers.editor_models import LEFT, chosen, new_model
 from scgs_warp.edit import Target
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import angle, from_axis, multiply
-from scgs_warp.editor.frame_image import take_picture
-from scgs_warp.editor.gizmo_pose import frame_of_handle, frame_of_selection, region_at, surface_point
+from scgs_warp.editor.gizmo_pose import frame_of_handle, frame_of_selection, region_at
 from scgs_warp.editor.model import EditorModel, Region
+from scgs_warp.geometry.cameras import orbit_camera
 
 
 @pytest.fixture
@@ -24,16 +24,14 @@ def model() -> EditorModel:
 
 def test_clicks_meet_the_surface(model):
     session, moment = model.session, model.moment()
-    camera = client(session)
-    picture = take_picture(session, moment, camera, 96)
-    assert picture.rgb.shape == (camera.height, camera.width, 3) == (*picture.depth.shape, 3)
-    rows, columns = np.nonzero(np.isfinite(picture.depth))
+    camera = orbit_camera(session.scene.overview, 40.0, 96)
+    solid = session.render(camera, moment.time).alpha >= 0.5
+    rows, columns = np.nonzero(solid.numpy())
     middle = len(rows) // 2
-    screen = (columns[middle] + 0.5) / camera.width, (rows[middle] + 0.5) / camera.height
-    point = surface_point(session, camera, screen, moment)
+    point = session.pick(camera, columns[middle] + 0.5, rows[middle] + 0.5, moment.time, moment.at)
     assert point is not None and np.linalg.norm(point - session.node_positions(0.0), axis=1).min() < 0.2
-    assert surface_point(session, camera, (0.0, 0.0), moment) is None
-    assert surface_point(session, camera, (-3.0, 7.0), moment) is None, "beside the canvas"
+    for beside in ((0.5, 0.5), (-3.0, 700.0)):
+        assert session.pick(camera, *beside, moment.time, moment.at) is None
     rings = region_at(session, point, Region("rings", 1), moment)
     assert rings == session.ring([session.nearest(point.tolist(), 0.0)], 1)
     assert len(region_at(session, point, Region("brush", radius=1e-6), moment)) == 1, "never none"

@@ -10,14 +10,14 @@ import pytest
 
 from helpers.edit_scenes import figure_scene
 from scgs_warp.edit import EditSession, Film, Target
-from scgs_warp.edit.rotations import IDENTITY, from_axis, rotate
+from scgs_warp.edit.rotations import from_axis, rigid_fit, rotate
 from scgs_warp.edit.skeleton import Skeleton
 from scgs_warp.editor.model import EditorModel, Region
 from scgs_warp.editor.parts_tool import PartsTool, hit
 from scgs_warp.errors import UserError
 
 AWAY = np.array([0.05, -0.1, 0.2])
-HAND, CHEST = (0.55, -0.1, -0.2), (0.0, -0.3, 0.2)
+HAND, CHEST = np.array([0.55, -0.1, -0.2]), (0.0, -0.3, 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +38,13 @@ def tool(model) -> PartsTool:
 def click(tool: PartsTool, point=HAND, how="replace", rings: int = 1) -> None:
     model = tool.model
     tool.click(hit(model.session, np.array(point), Region("rings", rings), model.moment()), how)
+
+
+def carried(tool: PartsTool, before: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Return where the chosen part takes ``HAND`` when control points [M, 3] go from ``before`` to ``now``."""
+    rows = list(tool.model.selection)
+    turn, old, new = rigid_fit(before[rows], now[rows])
+    return rotate(turn, HAND - old) + new
 
 
 def test_a_click_takes_the_part_and_a_second_one_its_points(tool):
@@ -80,39 +87,36 @@ def test_a_scene_of_one_part_has_points_only(tool):
     assert tool.part is None and 0 < len(tool.model.selection) < 20
 
 
-def test_what_moves_and_what_holds_still_is_shown(tool):
-    assert tool.shown() is None
+def test_what_moves_is_shown(tool):
+    assert tool.moving == ()
     click(tool)
-    session, shown = tool.model.session, tool.shown()
-    assert shown is not None and tool.part is not None
+    session, moving = tool.model.session, tool.moving
+    assert tool.part is not None
     chain = session.chain(tool.part)
     assert len(chain) > 1 and session.skeleton.chain(tool.part)[0] == tool.part
-    assert shown.chosen == session.skeleton.part(tool.part).nodes
-    assert set(session.skeleton.part(chain[-1]).nodes) <= set(shown.moving)
-    assert sorted([*shown.chosen, *shown.moving, *shown.still]) == list(range(len(session)))
+    assert set(session.skeleton.part(chain[-1]).nodes) <= set(moving)
+    assert list(moving) == sorted(set(moving)) and max(moving) < len(session)
+    assert not set(moving) & set(session.skeleton.part(tool.part).nodes)
     trunk = session.skeleton.part(session.part_at(CHEST, 0.0)).nodes
-    assert set(trunk) <= set(shown.still)
+    assert not set(moving) & set(trunk)
 
 
 def test_a_drag_pulls_and_is_one_step(tool):
     model, session = tool.model, tool.model.session
     click(tool)
     start, before = session.node_positions(0.0), session.edit
-    frame = tool.frame(start)
-    assert frame is not None
-    np.testing.assert_allclose(frame.point, HAND, atol=1e-9)
     tool.grab()
     for share in (0.2, 0.5, 1.0):
-        tool.drag(frame, frame.point + share * AWAY, IDENTITY)
+        tool.pull(HAND + share * AWAY, HAND)
         assert model.moment().live
     tool.release()
     assert not model.moment().live and tool.part is not None
     once = session.fork()
     once.apply(before)
-    once.pull(tool.part, (frame.point + AWAY).tolist(), grip=frame.point.tolist())
+    once.pull(tool.part, (HAND + AWAY).tolist(), grip=list(HAND))
     assert once.edit == session.edit, "the way of the drag does not matter"
-    after = tool.frame(session.node_positions(0.0))
-    assert after is not None and np.linalg.norm(after.point - frame.point - AWAY) < 0.03
+    after = carried(tool, start, session.node_positions(0.0))
+    assert np.linalg.norm(after - HAND - AWAY) < 0.03
     assert model.active == session.edit.handles[0].name and session.edit.handles[0].part == tool.part
     assert model.undo() and session.edit == before and not model.undo()
 
@@ -126,14 +130,12 @@ def test_an_arc_turns_the_joint_as_it_is_seen(tool):
     above = session.skeleton.part(part).parent
     session.turn(above, 60, (0, -1, 0))
     session.turn(part, 20, (1, 0, 0))
-    before, places = session.edit, session.node_positions(0.0)
+    before = session.edit
     joint, motion = session.joint_of(part, 0.0), session._motion_of(session.edit, part, 0.0, None)[0]
     tool.grab()
-    frame = tool.frame(places)
-    assert frame is not None
     quat = from_axis((0.3, 0.5, -0.8), 40)
-    tool.drag(frame, frame.point, from_axis((0.3, 0.5, -0.8), 10))
-    tool.drag(frame, frame.point, quat)
+    tool.turn(from_axis((0.3, 0.5, -0.8), 10))
+    tool.turn(quat)
     tool.release()
     now = session._motion_of(session.edit, part, 0.0, None)[0]
     point = session.engine.motion_at(0.0).positions[session.skeleton.part(part).nodes[0]]
@@ -157,19 +159,17 @@ def test_a_drag_starts_where_keyframes_put_the_part(tool):
     model, session = tool.model, tool.model.session
     model.replace(film=Film(seconds=2.0, fps=10))
     click(tool)
-    part = tool.part
+    part, start = tool.part, session.node_positions(0.0)
     assert part is not None
     tool.put(Target.of(None, from_axis((0, -1, 0), 0)))
     model.add_keyframe()
-    model.seek(2.0)
+    model.look(2.0)
     tool.put(Target.of(None, from_axis((0, -1, 0), 60)))
     model.add_keyframe("linear")
-    model.seek(1.0)
-    places = session.node_positions(0.0, 1.0)
-    frame = tool.frame(places)
-    assert frame is not None
+    model.look(1.0)
+    point = carried(tool, start, session.node_positions(0.0, 1.0))
     tool.grab()
-    tool.pull(frame.point, frame.point)
+    tool.pull(point, point)
     tool.release()
     angle = math.degrees(2 * math.acos(session.edit.targets[part].rotation[0]))
     assert angle == pytest.approx(30, abs=1.0)
@@ -182,15 +182,13 @@ def test_broken_numbers_leave_the_edit(tool, broken):
     with pytest.raises(UserError, match="no part is chosen"):
         tool.grab()
     click(tool)
-    frame = tool.frame(tool.model.session.node_positions(0.0))
-    assert frame is not None
     tool.grab()
-    tool.drag(frame, frame.point + 0.1, IDENTITY)
+    tool.pull(HAND + 0.1, HAND)
     before = tool.model.session.edit
     with pytest.raises(UserError, match="finite"):
-        tool.drag(frame, np.array([broken, 0, 0]), IDENTITY)
+        tool.pull(np.array([broken, 0, 0]), HAND)
     with pytest.raises(UserError, match="finite"):
-        tool.drag(frame, frame.point, np.array([1.0, broken, 0, 0]))
+        tool.turn(np.array([1.0, broken, 0, 0]))
     assert tool.model.session.edit is before
     tool.release()
 
@@ -201,5 +199,5 @@ def test_a_changed_skeleton_unchooses_the_part(tool):
     assert part is not None
     with tool.model.changing() as session:
         session.merge_parts(session.skeleton.part(part).parent, part)
-    assert tool.part is None and tool.shown() is None
+    assert tool.part is None and tool.moving == ()
     assert tool.model.undo() and tool.part == part

@@ -7,9 +7,9 @@ from scgs_warp.editor.pose_schedule import MAX_WANTED, PoseSchedule, Wanted
 
 def drained(schedule: PoseSchedule) -> list[tuple[int, Wanted | None]]:
     found = []
-    while (item := schedule.next(0.0, False)) is not None:
+    while (item := schedule.next()) is not None:
         found.append(item)
-    assert schedule.settled(0.0, False)
+    assert schedule.settled
     return found
 
 
@@ -18,7 +18,7 @@ def test_the_pose_of_a_drag_comes_first_and_once():
     schedule.ask_frames(1, 5, [3])
     for _ in range(9):
         schedule.ask_live()
-    assert not schedule.settled(0.0, False)
+    assert not schedule.settled
     assert drained(schedule) == [(0, None), (1, Wanted(5, 3))]
 
 

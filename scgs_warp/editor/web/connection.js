@@ -1,6 +1,5 @@
 // The server's state and poses, and what is asked of it.
 
-const RETRY = 1000; // milliseconds, doubled up to eight times as long
 const AHEAD = 24; // frames that are asked for while the film plays
 const KINDS = { pose: 1, picture: 2 };
 
@@ -13,32 +12,20 @@ class Link {
     this.asked = new Set();
     this.waiting = new Map();
     this.count = 0;
-    this.delay = RETRY;
-    this.open = false;
     this.first = new Promise((resolve) => { this.arrived = resolve; });
-    this.connect();
+    const heard = (data) => (typeof data === "string" ? this.hear(JSON.parse(data)) : this.take(data));
+    this.wire = new Wire(heard, () => this.gone());
   }
 
-  connect() {
-    const address = new URL("socket", location.href);
-    address.protocol = address.protocol.replace("http", "ws");
-    address.search = "";
-    this.wire = new WebSocket(address);
-    this.wire.binaryType = "arraybuffer";
-    this.wire.onopen = () => {
-      this.open = true;
-      this.delay = RETRY;
-    };
-    this.wire.onmessage = ({ data }) => (typeof data === "string" ? this.hear(JSON.parse(data)) : this.take(data));
-    this.wire.onclose = () => {
-      this.open = false;
-      this.forget();
-      for (const answer of this.waiting.values()) answer({ problem: "the server has gone" });
-      this.waiting.clear();
-      this.listener.gone();
-      setTimeout(() => this.connect(), this.delay);
-      this.delay = Math.min(8 * RETRY, 2 * this.delay);
-    };
+  get open() {
+    return this.wire.open;
+  }
+
+  gone() {
+    this.forget();
+    for (const answer of this.waiting.values()) answer({ problem: "the server has gone" });
+    this.waiting.clear();
+    this.listener.gone();
   }
 
   forget() {
@@ -84,13 +71,13 @@ class Link {
   ask(what, fields = {}) {
     if (!this.open) return Promise.resolve({ problem: "the server has gone" });
     const id = ++this.count;
-    this.wire.send(JSON.stringify({ do: what, id, ...fields }));
+    this.wire.send({ do: what, id, ...fields });
     return new Promise((resolve) => this.waiting.set(id, resolve));
   }
 
   // Without an answer, for what is sent many times a second.
   tell(what, fields) {
-    if (this.open) this.wire.send(JSON.stringify({ do: what, ...fields }));
+    if (this.open) this.wire.send({ do: what, ...fields });
   }
 
   // The pose of a frame, or null until it comes; frames ahead are asked for as well.

@@ -1,36 +1,24 @@
 // A page whose scene comes from a server, and changes while the page is open.
 
-const RETRY = 1000; // milliseconds, doubled up to eight times as long
-
 class Updates {
   constructor() {
     this.version = 0;
     this.shown = 0;
-    this.delay = RETRY;
     this.first = new Promise((resolve) => { this.arrived = resolve; });
-    this.connect();
+    new Wire((data) => this.hear(JSON.parse(data)), () => this.gone());
   }
 
-  connect() {
-    const address = new URL("socket", location.href);
-    address.protocol = address.protocol.replace("http", "ws");
-    address.search = "";
-    const wire = new WebSocket(address);
-    wire.onmessage = ({ data }) => {
-      this.delay = RETRY;
-      const { version, status } = JSON.parse(data);
-      this.version = version;
-      if (!this.player && !version) say(status);
-      else this.tell(status);
-      if (version) this.arrived();
-      this.refresh();
-    };
-    wire.onclose = () => {
-      this.tell("The server has gone. The page shows what it has, and waits for it.");
-      this.shown = 0; // another server begins to count again
-      setTimeout(() => this.connect(), this.delay);
-      this.delay = Math.min(8 * RETRY, 2 * this.delay);
-    };
+  hear({ version, status }) {
+    this.version = version;
+    if (!this.player && !version) say(status);
+    else this.tell(status);
+    if (version) this.arrived();
+    this.refresh();
+  }
+
+  gone() {
+    this.tell("The server has gone. The page shows what it has, and waits for it.");
+    this.shown = 0; // another server begins to count again
   }
 
   tell(text) {
