@@ -174,7 +174,7 @@ def speed_overview(results: Path) -> str:
         ("rasterising, forward", "raster-cpu", "raster/forward"),
         ("rasterising, forward and all gradients", "raster-cpu", "raster/both"),
         ("a training step, 40,000 Gaussians, 400 x 400", "step-cpu", "step"),
-        ("editing, from a drag to a picture of 512 x 512", "edit-cpu", "edit/drag"),
+        ("editing, from a drag to the pose that a page draws", "edit-cpu", "edit/drag"),
         ("a dynamic frame of 1,000,000 Gaussians at 1920 x 1080", "million-cpu", "frame"),
     ):
         path = results / f"{name}.json"

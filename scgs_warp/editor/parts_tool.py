@@ -34,8 +34,10 @@ class _Chosen(NamedTuple):
 
 
 def hit(session: EditSession, point: np.ndarray, region: Region, moment: Moment) -> Hit:
-    """Say what a click at a surface point [3], world units, means. This may solve, and find the skeleton: call it on the worker's
-    thread."""
+    """Say what a click at a surface point [3], world units, means.
+
+    This may solve, and find the skeleton: call it on the worker's thread.
+    """
     single = len(session.parts()) < 2
     part = None if single else session.part_at(point.tolist(), moment.time, moment.at)
     return Hit(part, region_at(session, point, region, moment))

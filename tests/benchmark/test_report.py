@@ -143,7 +143,7 @@ def test_repeated_measurements_replace_the_reported_table(report, tmp_path):
     origin["machine"].update(torch="2", warp="1")
     parts = {"view": 50.0, "exchange": 6.0, "join": 5.0, "step": 90.0}
     rows = [{"name": name, "ms": 1.0, "cpu_ms": time} for name, time in parts.items()]
-    drag = {"edit/drag": 40.0, "edit/drag/solve": 6.0, "edit/drag/skin": 14.0}
+    drag = {"edit/drag": 14.0, "edit/drag/solve": 6.0, "edit/picture": 40.0}
     edits = [{"name": name, "ms_median": time, "threads": 1, "control_points": 512} for name, time in drag.items()]
     for name in ("sharing-200", "sharing-400", "sharing-800", "sharing-400-300k"):
         assert "†" in report.section("scaling-step", tmp_path)
@@ -161,7 +161,7 @@ def test_repeated_measurements_replace_the_reported_table(report, tmp_path):
     texts = [report.section(name, tmp_path) for name in known]
     assert all("†" not in text and "x, 2 cores; torch 2" in text for text in texts)
     assert "| 11 ms | 11 ms | 11 ms | 11 ms |" in texts[0] and "| 29 ms |" in texts[0]
-    assert "| 706 MiB | 700 MiB |" in texts[1] and "| 512 | 20.0 ms | 6.0 ms | 40.0 ms |" in texts[2]
+    assert "| 706 MiB | 700 MiB |" in texts[1] and "| 512 | 14.0 ms | 6.0 ms | 40.0 ms |" in texts[2]
 
 
 def test_scores_of_a_run_are_recorded(report, tmp_path, capsys):
