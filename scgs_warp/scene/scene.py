@@ -20,6 +20,7 @@ from ..geometry.cameras import Overview
 from ..geometry.normalisation import Normalisation
 from ..motion import build_motion
 from ..motion.base import Motion
+from ..motion.control_points import ControlPoints
 from ..motion.spheres import Spheres
 from ..rendering.render import render
 from ..storage import checkpoint
@@ -101,7 +102,7 @@ class Scene:
                 "show; continue it with apps/train.py --resume"
             )
         scene.freeze_binding()
-        check_motion(scene.gaussians_at, str(folder / checkpoint.FILE))
+        check_motion(scene, str(folder / checkpoint.FILE))
         return scene
 
     def freeze_binding(self) -> None:
@@ -275,6 +276,9 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
             count, rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, corrected, "cpu", sharpness
         )
         gaussians.load_state_dict(rows)
+        columns = config.motion.hyper_dim + config.motion.mask
+        if metadata["motion"] == ControlPoints.name and gaussians.hyper.shape[1] != columns:
+            raise ValueError(f"gaussians.hyper has {gaussians.hyper.shape[1]} columns, not {columns}")
         state = checkpoint.strip(tensors, "motion.")
         motion = build_motion(metadata["motion"], config, state)
         motion.load_state_dict(state)

@@ -6,8 +6,8 @@ kernel read or write foreign memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -118,21 +118,28 @@ def _vector(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 3 and all(_number(x, -MAX_MAGNITUDE, MAX_MAGNITUDE) for x in value)
 
 
-def check_motion(gaussians_at: Callable[[float], Gaussians], source: str) -> None:
-    """Check that the Gaussians are finite at the beginning, the middle and the end of the motion: finite parameters
-    may lead to non-finite poses.
+class Moving(Protocol):
+    """Scene, as far as its motion is checked."""
 
-    Args:
-        gaussians_at: time in [0, 1] -> posed Gaussians.
+    def gaussians_at(self, time: float) -> Gaussians: ...
+
+    def control_points_at(self, time: float) -> Tensor: ...
+
+
+def check_motion(scene: Moving, source: str) -> None:
+    """Check that the Gaussians and the control points are finite at the beginning, the middle and the end of the
+    motion: finite parameters may lead to non-finite poses.
 
     Raises:
         UserError: naming the time and the attribute.
     """
     for time in CHECKED_TIMES:
-        posed = gaussians_at(time)
+        posed = scene.gaussians_at(time)
         for name in ("means", "quats", "scales", "sh_dc"):
             if not bool(torch.isfinite(getattr(posed, name)).all()):
                 raise _unusable(source, f"at time {time:g} the Gaussians' {name} are not finite")
+        if not bool(torch.isfinite(scene.control_points_at(time)).all()):
+            raise _unusable(source, f"at time {time:g} the control points are not finite")
 
 
 def check_resumed(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], source: str) -> None:

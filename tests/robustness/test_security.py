@@ -100,6 +100,13 @@ def tensor(name: str, make: Any) -> Any:
     return change
 
 
+def far_control_point(tensors: dict[str, torch.Tensor], metadata: dict[str, Any]) -> None:
+    """A control point that no Gaussian follows, and a network that moves everything by a third of float32's range."""
+    metadata.pop("crc32", None)
+    tensors["motion.positions"][0, 0] = 3e38
+    tensors["motion.network.head.bias"][7:] = 1e38
+
+
 CHECKPOINTS = {
     "a network of terabytes": (put("config", "motion", "width", value=10**9), "motion.width"),
     "layers without end": (put("config", "motion", "layers", value=10**8), "motion.layers"),
@@ -113,6 +120,11 @@ CHECKPOINTS = {
     "other rows": (tensor("gaussians.opacity_logits", lambda old: old[:3]), "gaussians.opacity_logits"),
     "other harmonics": (tensor("gaussians.sh_rest", lambda old: old[:, :2]), "gaussians.sh_rest"),
     "whole numbers": (tensor("gaussians.means", lambda old: old.to(torch.int64)), "gaussians.means"),
+    "hyper-coordinates of another size": (
+        tensor("gaussians.hyper", lambda old: old[:, :1]),
+        "gaussians.hyper has 1 columns, not 9",
+    ),
+    "a control point that overflows": (far_control_point, "the control points are not finite"),
     "scales that overflow": (tensor("gaussians.log_scales", lambda old: old + 1e6), "scales are not finite"),
 }
 
