@@ -53,6 +53,10 @@ class Rigid(NamedTuple):
     def apply(self, points: np.ndarray) -> np.ndarray:
         return rotate(self.quat, points) + self.shift
 
+    def undo(self, points: np.ndarray) -> np.ndarray:
+        """Return the points that this motion takes to ``points``."""
+        return rotate(conjugate(self.quat), points - self.shift)
+
 
 class PartMove(NamedTuple):
     """Handle of a part with its target at one instant."""

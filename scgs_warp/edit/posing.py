@@ -15,7 +15,7 @@ from . import edit_file, skeleton_file
 from .document import Edit
 from .engine import Engine
 from .handles import STAY, Handle, Target
-from .part_pose import PartMove, Rigid
+from .part_pose import JointFrame, PartMove, Rigid
 from .reach import Link, reach
 from .rotations import conjugate, from_axis, multiply, rigid_fit, rotate
 from .skeleton import Part, Skeleton, strongest
@@ -249,7 +249,7 @@ class Posing:
         if grip is None:
             held = now[list(skeleton.part(part).nodes)].mean(0)
         else:
-            held = _inverse(motion, (_point("grip", grip) - centre) * scale)
+            held = motion.undo((_point("grip", grip) - centre) * scale)
         place = (place - centre) * scale
         if skeleton.part(part).parent is None:
             targets = {handles[0].name: self._shifted(edit, skeleton, handles[0], time, place - motion.apply(held))}
@@ -267,6 +267,7 @@ class Posing:
         rotation: Sequence[float],
         time: float = 0.0,
         *,
+        about: Sequence[float] | None = None,
         live: bool = False,
         since: Edit | None = None,
     ) -> Target:
@@ -275,6 +276,7 @@ class Posing:
 
         Args:
             rotation: [4] wxyz, world.
+            about: [3] world point that stays where it is seen; None: the part's joint.
             time, live, since: as in ``pull``.
 
         Raises:
@@ -285,12 +287,17 @@ class Posing:
         edit, handle = _with_handle(before, before.skeleton or self._run_skeleton(), part, time)
         skeleton = edit.skeleton or self._run_skeleton()
         above = skeleton.part(part).parent
+        lead = Rigid.none() if above is None else self._motion_of(edit, above, time, None)[0]
         if above is not None:
-            turned = self._motion_of(edit, above, time, None)[0].quat
-            asked = multiply(multiply(conjugate(turned), asked), turned)
+            asked = multiply(multiply(conjugate(lead.quat), asked), lead.quat)
         old = edit.targets.get(handle.name, STAY)
+        shift = old.translation
+        if about is not None:
+            centre, scale = self.engine.units
+            fixed = lead.undo((_point("about", about) - centre) * scale)
+            shift = self._shift_about(skeleton, handle, time, old, asked, fixed)
         further = self._into_frame(skeleton, handle, asked, time)
-        target = Target.of(old.translation, multiply(further, np.array(old.rotation)).tolist())
+        target = Target.of(shift, multiply(further, np.array(old.rotation)).tolist())
         self.preview(dataclasses.replace(edit, targets={**edit.targets, handle.name: target}))
         if not live:
             self.release()
@@ -329,18 +336,28 @@ class Posing:
     def _shifted(self, edit: Edit, skeleton: Skeleton, handle: Handle, time: float, shift: np.ndarray) -> Target:
         """Return the target of a root's handle after a further shift, normalised units."""
         old = edit.targets.get(handle.name, STAY)
-        frame = self._frame(skeleton, handle, time)
+        frame = self._joint_frame(skeleton, handle, time).frame
         further = rotate(conjugate(frame), shift) / self.engine.units[1]
         return Target.of((np.array(old.translation) + further).tolist(), old.rotation)
 
-    def _frame(self, skeleton: Skeleton, handle: Handle, time: float) -> np.ndarray:
-        """Return the rotation of the part's parent from the handle's time to another time, [4]."""
+    def _shift_about(
+        self, skeleton: Skeleton, handle: Handle, time: float, old: Target, quat: np.ndarray, fixed: np.ndarray
+    ) -> list[float]:
+        """Return the translation with which a further turn leaves a point, [3] in the frame of the parent, in place."""
+        joint, frame = self._joint_frame(skeleton, handle, time)
+        scale = self.engine.units[1]
+        place = joint + rotate(frame, scale * np.array(old.translation))
+        moved = fixed + rotate(quat, place - fixed) - joint
+        return (rotate(conjugate(frame), moved) / scale).tolist()
+
+    def _joint_frame(self, skeleton: Skeleton, handle: Handle, time: float) -> JointFrame:
+        """Return a part's joint at a time, and the rotation of its parent from the handle's time to then."""
         now = self.engine.base_at(self.edit, time).positions
         then = now if handle.time == time else self.engine.base_at(self.edit, handle.time).positions
-        return self.engine.poser(skeleton).joint_frame(handle, then, now).frame
+        return self.engine.poser(skeleton).joint_frame(handle, then, now)
 
     def _into_frame(self, skeleton: Skeleton, handle: Handle, quat: np.ndarray, time: float) -> np.ndarray:
-        frame = self._frame(skeleton, handle, time)
+        frame = self._joint_frame(skeleton, handle, time).frame
         return quat if not frame[1:].any() else multiply(multiply(conjugate(frame), quat), frame)
 
     def _motion_of(self, edit: Edit, part: str, time: float, at: float | None) -> tuple[Rigid, np.ndarray]:
@@ -377,7 +394,3 @@ def _point(name: str, value: Sequence[float]) -> np.ndarray:
     if point.shape != (3,) or not np.isfinite(point).all() or np.abs(point).max() > 1e9:
         raise UserError(f"{name} {list(value)}: give 3 finite numbers")
     return point
-
-
-def _inverse(motion: Rigid, point: np.ndarray) -> np.ndarray:
-    return rotate(conjugate(motion.quat), point - motion.shift)

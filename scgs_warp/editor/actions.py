@@ -15,8 +15,9 @@ from ..edit.field_reader import FieldReader
 from ..edit.handles import STAY
 from ..edit.keyframes import Easing
 from ..edit.playback import Exaggerate, Hold
-from ..edit.rotations import exponential
+from ..edit.rotations import exponential, multiply, rotate
 from ..errors import UserError
+from ..geometry.axes import Axis, direction
 from . import keys
 from .host import Host
 from .model import Combine
@@ -119,21 +120,22 @@ def grab(editor: Host, fields: FieldReader) -> None:
 
 
 def drag(editor: Host, fields: FieldReader) -> None:
-    """Pull what is held by a point to a place, or turn it. Both are given since the beginning of the drag."""
+    """Pull what is held by a point to a place, or turn it, about its own pivot or another point. All are given since
+    the beginning of the drag."""
     if not editor.model.dragging:
         return
-    rotation = fields.vector("rotation", 4)
+    rotation, about = fields.vector("rotation", 4), fields.vector("about", 3)
     if editor.held is None:
         if rotation is not None:
-            editor.parts.turn(rotation)
+            editor.parts.turn(rotation, about)
         else:
             editor.parts.pull(_point(fields, "to"), _point(fields, "grip"))
         return
     frame, (position, quat) = editor.held
     if rotation is not None:
-        from ..edit.rotations import multiply
-
-        editor.model.drag(frame.target(position, multiply(np.array(rotation), quat)))
+        turned = np.array(Target.of(None, rotation).rotation)
+        place = position if about is None else about + rotate(turned, position - np.array(about))
+        editor.model.drag(frame.target(place, multiply(turned, quat)))
     else:
         shift = np.subtract(_point(fields, "to"), _point(fields, "grip"))
         editor.model.drag(frame.target(position + shift, quat))
@@ -289,6 +291,10 @@ def film(editor: Host, fields: FieldReader) -> None:
         changes["size"] = fields.integer("size", 512, 16, 8192)
     if "background" in fields:
         changes["background"] = fields.vector("background", 3)
+    if "up" in fields:
+        up = fields.choice("up", ("scene", *get_args(Axis)), "scene")
+        upright = None if up == "scene" else direction(up)
+        changes["shot"] = dataclasses.replace(editor.session.edit.film.shot, up=upright)
     editor.model.replace(film=dataclasses.replace(editor.session.edit.film, **changes))
 
 

@@ -43,6 +43,7 @@ OWN_SCRIPTS = (
     "connection",
     "overlay",
     "gizmo",
+    "pivot",
     "areas",
     "tools",
     "pictures",

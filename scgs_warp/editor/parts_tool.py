@@ -156,8 +156,11 @@ class PartsTool:
                 self._moved()
         self.model.changed()
 
-    def turn(self, rotation: Sequence[float] | np.ndarray) -> None:
+    def turn(self, rotation: Sequence[float] | np.ndarray, about: Sequence[float] | None = None) -> None:
         """Turn the chosen part about its joint, as part of a drag, by a rotation [4] wxyz since its beginning.
+
+        Args:
+            about: [3] world point about which it turns instead.
 
         Raises:
             UserError: a number is not finite.
@@ -165,7 +168,7 @@ class PartsTool:
         with self.model.lock:
             if self.part is not None and self.model.dragging:
                 quat = np.asarray(rotation, np.float64).tolist()
-                self.model.session.rotate(self.part, quat, self.model.time, live=True, since=self._since)
+                self.model.session.rotate(self.part, quat, self.model.time, about=about, live=True, since=self._since)
                 self._moved()
         self.model.changed()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from ..edit.filming import film_view
 from ..edit.handles import STAY
 from ..edit.rotations import logarithm
 from ..export.page_edit import camera_path
+from ..geometry.axes import Axis, direction
 from .autosave import Autosave
 from .jobs import JobProgress
 from .model import EditorModel
@@ -97,10 +98,11 @@ def _unedited(edit: Edit) -> bool:
 
 def _film(edit: Edit) -> dict[str, Any]:
     film = edit.film
-    background = None if film.background is None else list(film.background)
+    background, up = None if film.background is None else list(film.background), film.shot.up
     return {
         "seconds": film.seconds, "fps": film.fps, "size": film.size, "background": background, "shot": film.shot.kind,
         "views": [view.at for view in film.shot.views] if film.shot.kind == "orbit" else [],
+        "up": "scene" if up is None else next((axis for axis in get_args(Axis) if direction(axis) == up), "other"),
     }  # fmt: skip
 
 

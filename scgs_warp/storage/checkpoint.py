@@ -124,7 +124,7 @@ def read(
     if not path.is_file():
         if spare:
             raise DamagedCheckpoint(f"{path}: is missing; {remedy}")
-        raise UserError(f"{folder}: no {name} here; give a folder that apps/train.py wrote")
+        raise UserError(f"{folder}: no {name} here; give with --run a folder that apps/train.py wrote")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = parse_json((file.metadata() or {})[METADATA_KEY])

@@ -20,7 +20,7 @@ from helpers.studios import Page
 from helpers.web_clients import get, key, opens
 from scgs_warp.edit import EditSession, edit_file
 from scgs_warp.edit.filming import film_view
-from scgs_warp.edit.rotations import to_matrix
+from scgs_warp.edit.rotations import from_axis, rotate, to_matrix
 from scgs_warp.editor import Editor
 from scgs_warp.editor.app import MAX_WAITING
 from scgs_warp.editor.autosave import Autosave
@@ -71,7 +71,7 @@ def test_a_drag_is_posed_kept_and_undone(editor, page, tmp_path):
     state = page.state
     assert not state["unedited"] and not state["dragging"] and len(state["handles"]) == 1 and state["undo"]
     page.until(lambda: -1 in page.poses)
-    assert editor.latency, "the pose of the drag was sent"
+    page.until(lambda: editor.latency)  # noted just after the pose is sent
     assert editor.autosave.flush() and edit_file.read(tmp_path / "autosave.json", editor.session.engine) == (
         editor.session.edit
     )
@@ -137,6 +137,32 @@ def test_the_camera_of_the_film_and_curves(editor, page):
     assert "no view at second 3" in page.ask("change_view", what="move", to=1.0, **{"from": 3.0})["problem"]
 
 
+def test_a_handle_turns_about_the_point_that_a_page_gives(editor, page):
+    tip = end_of_bar(editor)
+    page.ask("tool", parts_first=False)
+    page.ask("pick", point=tip, how="replace", at=0.0)
+    nodes = page.state["selection"]
+    before = editor.session.node_positions(0.0)[nodes].mean(0)
+    quat, about = from_axis([0, 1, 0], 30), np.add(tip, (0.0, 0.3, 0.1))
+    page.ask("grab", at=0.0)
+    page.send({"do": "drag", "rotation": quat.tolist(), "about": about.tolist()})
+    page.ask("release", at=0.0)
+    target = editor.session.edit.targets[page.state["active"]]
+    np.testing.assert_allclose(target.rotation, quat, atol=1e-9)
+    np.testing.assert_allclose(before + target.translation, rotate(quat, before - about) + about, atol=1e-9)
+
+
+def test_what_is_up_is_chosen_for_view_and_film(editor, page):
+    assert page.state["film"]["up"] == "scene"
+    page.ask("film", up="-z")
+    assert page.state["film"]["up"] == "-z" and film_view(editor.session, 0.0)[0].up == (0.0, 0.0, -1.0)
+    assert [m["camera"] for m in page.heard if "camera" in m][-1]["overview"]["up"] == [0.0, 0.0, -1.0]
+    page.ask("shot", kind="fixed", azimuth=10.0, elevation=0.0, distance=4.0, target=[0, 0, 0])
+    assert page.state["film"]["up"] == "-z", "another path keeps it"
+    page.ask("film", up="scene")
+    assert page.state["film"]["up"] == "scene" and editor.session.edit.film.shot.up is None
+
+
 def test_one_page_drags_at_a_time(editor, page):
     """Another page cannot end a drag."""
     pull(editor, page)
@@ -181,6 +207,7 @@ REQUESTS = [
     ("choose_part", {"name": "nobody"}, "no part is called"), ("activate", {"name": 3}, "name"),
     ("grab", {}, "nothing is chosen"), ("handle", {"lasts": "never"}, "lasts"), ("handle", {"window": -1}, "window"),
     ("film", {"seconds": 1e9}, "seconds"), ("film", {"background": [1, 2]}, "background"),
+    ("film", {"up": "w"}, "up"),
     ("film", {"size": 1e6}, "size"), ("playback", {"speed": "fast"}, "speed"), ("hold", {}, "nothing is chosen"),
     ("unhold", {"index": 7}, "index"), ("change_key", {"what": "move", "from": 1.0, "to": 2.0}, "no keyframe"),
     ("key", {}, "needs a handle"), ("load", {"name": "../x"}, "file name"), ("load", {"name": "none"}, "none.json"),

@@ -210,6 +210,56 @@ def test_rings_turn_a_part_about_its_joint(browser, editor):
     window.close()
 
 
+def test_the_pivot_of_the_rings_is_dragged_to_another_point(browser, editor):
+    """The rings turn the part about the point of the surface on which the dot was dropped; "." puts it back."""
+    window = Window(browser, editor)
+    window.still()
+    part = window.lowest_limb()
+    name = editor.session.parts()[part].name
+    middle = window.part_on_screen(part)
+    window.page.mouse.click(*middle)
+    until(lambda: window.ask("studio.link.state.part") == name)
+    window.page.keyboard.press("2")
+    window.still()
+    seen = """(() => { const g = player.tools.gizmo, b = player.canvas.getBoundingClientRect();
+        const on = (p) => { const [x, y] = g.seen(p); return [x + b.left, y + b.top]; };
+        return [on(g.pivot), on(g.ring(0)[8]), on(g.ring(0)[14])]; })()"""
+    joint, *_ = window.ask(seen)
+    window.drag(tuple(joint), (middle[0] - joint[0], middle[1] - joint[1]))
+    pivot, start, end = window.ask(seen)
+    assert window.ask("studio.link.state.unedited"), "only the pivot has moved"
+    assert np.hypot(pivot[0] - middle[0], pivot[1] - middle[1]) < 1.5
+    about = np.array(window.ask("player.tools.world(player.tools.pivot.place())"))
+    session = editor.session
+    before = session.node_positions(0.0)[list(session.skeleton.part(name).nodes)]
+    window.drag(tuple(start), (end[0] - start[0], end[1] - start[1]))
+    until(lambda: not window.ask("studio.link.state.unedited"))
+    turned = session._motion_of(session.edit, name, 0.0, None)[0]
+    centre, scale = session.engine.units
+    fixed = session.engine.to_world(turned.apply((about - centre) * scale))
+    assert np.linalg.norm(fixed - about) < 1e-6 * np.ptp(before)
+    assert (
+        np.linalg.norm(session.engine.to_world(turned.apply((before - centre) * scale)) - before, axis=1).max() > 0.02
+    )
+    pivot, *_ = window.ask(seen)
+    assert np.hypot(pivot[0] - middle[0], pivot[1] - middle[1]) < 4, "it stays on the surface"
+    window.page.keyboard.press(".")
+    assert window.ask("player.tools.pivot.place()") is None
+    window.page.keyboard.press("Escape")
+    until(lambda: window.ask("studio.link.state.part") is None)
+    window.close()
+
+
+def test_the_upright_axis_turns_the_view(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    window.page.locator("summary", has_text="View").click()
+    window.page.get_by_label("Upright axis").select_option("x")
+    until(lambda: editor.session.edit.film.shot.up == (1.0, 0.0, 0.0))
+    until(lambda: window.ask("player.view().rows[1]")[0] < -0.8)  # the image's down is against x
+    window.close()
+
+
 def test_a_point_drawn_on_the_tip_stays_there_while_the_view_turns(browser, tmp_path):
     """The tip's Gaussians are magenta; centroids of the canvas' pixels at 10 views."""
     scene = bar_scene(nodes=30, gaussians=600)
@@ -284,6 +334,7 @@ def test_points_are_chosen_by_lasso_and_brush(browser, editor):
     window.page.keyboard.press("Escape")
     until(lambda: window.ask("studio.link.state.selection.length") == 0)
     window.ask("studio.link.ask('tool', { region: 'brush', radius: 0.15 })")
+    until(lambda: window.ask("studio.link.state.tool.region") == "brush")
     window.page.keyboard.down("Shift")
     window.drag((x, y), (4, 4))
     window.page.keyboard.up("Shift")
@@ -354,6 +405,17 @@ def test_every_control_can_be_named_reached_and_read(browser, editor, size):
         told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in found]
         assert told == [], name
     assert window.page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    if window.page.evaluate("document.body.classList.contains('folded')"):
+        window.page.get_by_role("button", name="Panel", exact=True).click()
+    for label in ("It lasts", "A click takes", "Hold stays on"):
+        window.page.get_by_role("button", name=f"About: {label}").click()
+        assert window.page.get_by_role("heading", name=label).is_visible()
+        width, height = window.page.evaluate(
+            "(({ width, height }) => [width, height])(document.querySelector('#help use').getBBox())"
+        )
+        assert width > 100 and height > 50, "a picture explains it"
+        assert window.page.evaluate("axe.run('#help').then((r) => r.violations.map((v) => v.id))") == []
+        window.page.keyboard.press("Escape")
     assert window.page.title() == "figure - scgs_warp editor"
     window.page.keyboard.press("Control+k")
     window.page.locator("#sought").fill("trajec")

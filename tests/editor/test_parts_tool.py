@@ -146,6 +146,31 @@ def test_an_arc_turns_the_joint_as_it_is_seen(tool):
     assert model.undo() and session.edit == before
 
 
+def test_an_arc_turns_a_part_about_another_point(tool):
+    """Below a turned and shifted upper arm, all of the forearm moves about a point of the hand, at any time."""
+    model, session = tool.model, tool.model.session
+    click(tool)
+    part = tool.part
+    assert part is not None
+    session.turn(session.skeleton.part(part).parent, 60, (0, -1, 0))
+    session.turn(part, 20, (1, 0, 0))
+    session.move(part, (0.02, 0.01, 0.0))
+    model.look(1.3)
+    before, time = session.edit, model.time
+    motion = session._motion_of(before, part, time, None)[0]
+    points = session.engine.motion_at(time).positions[list(session.skeleton.part(part).nodes)]
+    seen = session.engine.to_world(motion.apply(points))
+    quat, about = from_axis((0.3, 0.5, -0.8), 40), seen[0]
+    tool.grab()
+    tool.turn(from_axis((0.3, 0.5, -0.8), 10), about.tolist())
+    tool.turn(quat, about.tolist())
+    tool.release()
+    now = session._motion_of(session.edit, part, time, None)[0]
+    wanted = rotate(quat, seen - about) + about
+    np.testing.assert_allclose(session.engine.to_world(now.apply(points)), wanted, atol=1e-9)
+    assert model.undo() and session.edit == before
+
+
 def test_a_drag_without_movement_changes_nothing(tool):
     click(tool)
     before = tool.model.session.edit

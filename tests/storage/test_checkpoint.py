@@ -42,7 +42,7 @@ def test_shared_memory_is_written_twice(tmp_path: Path):
 
 
 def test_missing_checkpoint_names_the_folder(tmp_path: Path):
-    with pytest.raises(UserError, match=r"no checkpoint\.safetensors here; give a folder"):
+    with pytest.raises(UserError, match=r"no checkpoint\.safetensors here; give with --run a folder"):
         checkpoint.read(tmp_path)
 
 

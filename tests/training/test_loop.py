@@ -178,6 +178,7 @@ def test_refusals(tmp_path):
         fit(config, data, output=tmp_path / "new", resume=True)
     assert not (tmp_path / "new").exists()
     (tmp_path / "other").mkdir()
+    (tmp_path / "other/photo.jpg").touch()
     with pytest.raises(UserError, match="no checkpoint"):
         fit(config, data, output=tmp_path / "other", resume=True)
     path = tmp_path / "run/checkpoint.safetensors"

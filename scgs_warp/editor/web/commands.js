@@ -18,6 +18,7 @@ function commandTable(studio) {
     ["tool-turn", "Tool: turn parts about their joints", "2", () => studio.use("turn")],
     ["rotate", "Rotate: turn parts", "r", () => studio.use("turn")],
     ["tool-points", "Tool: choose control points", "3", () => studio.use("points")],
+    ["pivot", "Put the pivot of the rings back", ".", () => tools.pivot.reset(), () => Boolean(tools.pivot?.place())],
     ["hold", "Hold the selection as it is now", "h", () => ask("hold", { frame: studio.holdFrame }), chosen],
     ["frame", "Frame the scene", "f", () => studio.frame()],
     ["cancel", "Cancel, or choose nothing", "Escape", () => tools.cancel()],

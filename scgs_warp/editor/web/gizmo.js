@@ -45,6 +45,12 @@ class Gizmo {
     return place && [place[0] / overlay.scale, place[1] / overlay.scale];
   }
 
+  // Whether a place of the canvas in CSS pixels is on the dot in the middle.
+  onPivot(x, y) {
+    const seen = this.pivot && this.seen(this.pivot);
+    return Boolean(seen) && Math.hypot(x - seen[0], y - seen[1]) < GRAB;
+  }
+
   // The ring at a place of the canvas in CSS pixels, -1: none.
   hit(x, y) {
     if (!this.pivot) return -1;

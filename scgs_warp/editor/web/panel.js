@@ -71,7 +71,24 @@ class Panel {
       else if (input.value !== String(value)) input.value = row.type === "number" ? tidy(value) : value;
     });
     label.append(text, input);
-    return label;
+    return row.picture ? this.explained(label, row) : label;
+  }
+
+  // A control with a button that explains it by a picture.
+  explained(label, row) {
+    const line = document.createElement("div"), button = document.createElement("button");
+    line.className = "helped";
+    button.type = "button";
+    button.textContent = "?";
+    button.setAttribute("aria-label", `About: ${row.label}`);
+    button.addEventListener("click", () => {
+      element("helped").textContent = row.label;
+      element("explained").textContent = row.title;
+      document.querySelector("#help use").setAttribute("href", `#picture-${row.picture}`);
+      element("help").showModal();
+    });
+    line.append(label, button);
+    return line;
   }
 
   // Three numbers of one thing.
@@ -125,7 +142,7 @@ function panelSections(studio) {
       { type: "triple", label: "Turn, degrees", step: 1, when: (s) => active(s) || chosen(s), get: (s) => s.target.degrees,
         set: (degrees) => ask("put", { degrees }) },
       { type: "choice", label: "It lasts", options: [["motion", "the whole motion"], ["frame", "one frame"], ["fade", "and fades"]],
-        title: "How long a handle acts: always, in the frame at which it was moved, or fading out around it",
+        title: "How long a handle acts: always, in the frame at which it was moved, or fading out around it", picture: "lasts",
         get: (s) => (s.handles.find((h) => h.name === s.active) ?? s.tool).lasts, set: (lasts) => ask("handle", { lasts }) },
       { type: "number", label: "Fades over, of the motion", min: 0.001, max: 10, step: 0.01,
         when: (s) => (s.handles.find((h) => h.name === s.active) ?? s.tool).lasts === "fade",
@@ -140,7 +157,7 @@ function panelSections(studio) {
     { title: "Control points", rows: [
       { type: "text", get: (s) => `${s.selection.length} chosen, ${s.pins.length} pinned` },
       { type: "choice", label: "A click takes", options: [["rings", "rings"], ["brush", "what a brush covers"]],
-        title: "Rings: the nearest control point and its neighbours, theirs, and so on", get: (s) => s.tool.region,
+        title: "Rings: the nearest control point and its neighbours, theirs, and so on", picture: "rings", get: (s) => s.tool.region,
         set: (region) => ask("tool", { region }) },
       { type: "number", label: "Rings", min: 0, max: 12, step: 1, when: (s) => s.tool.region === "rings",
         get: (s) => s.tool.rings, set: (rings) => ask("tool", { rings }) },
@@ -166,7 +183,7 @@ function panelSections(studio) {
     ] },
     { title: "Motion", rows: [
       { type: "choice", label: "Hold stays on", options: [["body", "its body"], ["world", "its place"]],
-        title: "A held region keeps its pose while the rest moves: carried by the body, or fixed in place",
+        title: "A held region keeps its pose while the rest moves: carried by the body, or fixed in place", picture: "holds",
         get: () => studio.holdFrame, set: (frame) => { studio.holdFrame = frame; } },
       { type: "buttons", items: [
         { label: "Hold as it is now", when: chosen, press: () => ask("hold", { frame: studio.holdFrame }) },
@@ -206,6 +223,9 @@ function panelSections(studio) {
         set: (on) => studio.display(name, on) })),
       { type: "checkbox", label: "Rings along the part", title: "Axes of the turning rings: the part's instead of the world's",
         get: () => tools.local, set: (on) => { tools.local = on; player.changed(); } },
+      { type: "choice", label: "Upright axis", title: "What is up in the view and in the film",
+        options: (s) => [["scene", "the scene's"], ...["x", "y", "z", "-x", "-y", "-z"].map((axis) => [axis, axis]),
+          ...(s.film.up === "other" ? [["other", "another"]] : [])], get: (s) => s.film.up, set: (up) => ask("film", { up }) },
       { type: "color", label: "Background", get: () => hex(player.background), set: (value) => studio.paint(numbers(value)) },
       { type: "choice", label: "Colours of the page", options: [["dark", "dark"], ["light", "light"]],
         get: () => (document.body.classList.contains("light") ? "light" : "dark"), set: (theme) => studio.theme(theme) },

@@ -18,6 +18,11 @@ class PicturePlayer {
     canvas.addEventListener("pointerup", (event) => this.click(event));
   }
 
+  film({ overview }) {
+    this.orbit.overview = { ...this.facts.overview, up: overview.up };
+    this.changed();
+  }
+
   get seconds() {
     return this.link.state?.film.seconds ?? SECONDS;
   }

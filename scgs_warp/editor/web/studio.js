@@ -2,7 +2,7 @@
 
 const HINTS = {
   pull: "Drag a part to pull it; drag beside the scene to turn the view. ? shows all keys.",
-  turn: "Click a part, then drag a ring to turn it about its joint.",
+  turn: "Click a part, then drag a ring to turn it about its joint, or drag the dot in the middle to turn it about another point.",
   points: "Click to choose control points; Shift and drag: lasso or brush, with Ctrl to remove; drag chosen ones to move them.",
 };
 
@@ -126,10 +126,10 @@ class Studio {
       const report = (share) => say(`Loading ${Math.round(100 * share)} %`, share);
       this.player = new StudioPlayer(canvas, await readModel(await fetchedScene("scene", report)));
       this.player.link = this.link;
-      this.player.film(this.camera);
       this.tools = new Tools(this.player, this.link);
       this.tools.edges = this.edges;
     }
+    this.player.film(this.camera);
     this.player.clock = new FilmClock(this.player);
     return this.player.clock;
   }

@@ -7,11 +7,12 @@ class StudioPlayer extends Player {
   film({ path, overview }) {
     this.model.facts.path = path;
     this.filmed = overview;
-    if (this.follows) this.changed();
+    this.free = { ...this.model.facts.overview, up: overview.up };
+    this.changed();
   }
 
   view() {
-    this.orbit.overview = this.follows ? this.filmed : this.model.facts.overview;
+    this.orbit.overview = this.follows ? this.filmed : this.free ?? this.model.facts.overview;
     return super.view();
   }
 
@@ -68,6 +69,7 @@ class Tools {
     this.lit = -1; // row of the part under the pointer
     this.show = { points: false, graph: false, bones: true, ribbons: false };
     this.local = false; // axes of the rings
+    this.pivot = new Pivot(this);
     this.drag = null;
     player.tools = this;
     player.hand = this; // the player's own handlers ask it first
@@ -155,8 +157,11 @@ class Tools {
       this.drag = { pointer: event.pointerId, from: event, moved: false, ...drag };
       return true;
     };
+    if (this.kind === "turn" && !event.shiftKey && this.gizmo.onPivot(...spot)) return begin({ kind: "pivot" });
     const axis = this.gizmo.hit(...spot);
-    if (axis >= 0 && !event.shiftKey) return begin({ kind: "turn", turn: this.gizmo.turn(axis, ...spot) });
+    if (axis >= 0 && !event.shiftKey) {
+      return begin({ kind: "turn", turn: this.gizmo.turn(axis, ...spot), about: this.pivot.place() });
+    }
     if (this.kind === "points" && event.shiftKey) {
       const area = this.state.tool.region === "brush" ? new Brush(this, event) : new Lasso(this, event);
       return begin({ kind: "area", area, how: event.ctrlKey || event.metaKey ? "subtract" : "add" });
@@ -183,10 +188,11 @@ class Tools {
       if (Math.hypot(event.clientX - drag.from.clientX, event.clientY - drag.from.clientY) <= CLICK) return;
       drag.moved = true;
       player.clock.hold(true);
-      this.grab(drag);
+      if (drag.kind !== "pivot") this.grab(drag);
     }
     drag.latest = event;
-    if (drag.area) drag.area.move(event);
+    if (drag.kind === "pivot") this.pivot.put(event);
+    else if (drag.area) drag.area.move(event);
     else if (drag.held) this.send(drag);
   }
 
@@ -212,7 +218,10 @@ class Tools {
   }
 
   send(drag) {
-    if (drag.kind === "turn") this.link.tell("drag", { rotation: drag.turn(...this.spot(drag.latest)) });
+    if (drag.kind === "turn") {
+      const about = drag.about ? { about: this.world(drag.about) } : {};
+      this.link.tell("drag", { rotation: drag.turn(...this.spot(drag.latest)), ...about });
+    }
     else {
       const place = this.lift(this.pixel(drag.latest), drag.depth);
       this.link.tell("drag", { grip: this.world(drag.point), to: this.world(place) });
@@ -229,7 +238,8 @@ class Tools {
       return;
     }
     if (event.pointerId !== drag.pointer) return;
-    if (drag.area) {
+    if (drag.kind === "pivot") this.stop();
+    else if (drag.area) {
       const nodes = drag.area.take(event);
       if (nodes.length) this.link.ask("select", { at: this.player.at, what: "nodes", nodes, how: drag.how });
       this.stop();
@@ -269,7 +279,9 @@ class Tools {
     this.drag?.area?.tick?.();
     showFilmed(this.player);
     if (!this.wanted || this.drag || this.player.stale || !this.state) return;
-    const event = this.wanted, ring = this.gizmo.hit(...this.spot(event));
+    const event = this.wanted, onPivot = this.kind === "turn" && this.gizmo.onPivot(...this.spot(event));
+    const ring = onPivot ? -1 : this.gizmo.hit(...this.spot(event));
+    this.player.canvas.title = onPivot ? "Drag the pivot to where the rings should turn" : "";
     this.wanted = null;
     if (ring !== this.gizmo.lit) {
       this.gizmo.lit = ring;
@@ -360,7 +372,9 @@ class Tools {
     const { gizmo, kind } = this;
     gizmo.pivot = null;
     if (kind === "pull" || (row < 0 && !chosen.size)) return;
-    if (row >= 0) gizmo.pivot = this.joint(row);
+    const moved = this.pivot.place();
+    if (moved) gizmo.pivot = moved;
+    else if (row >= 0) gizmo.pivot = this.joint(row);
     else {
       const nodes = [...chosen];
       gizmo.pivot = nodes.reduce((sum, m) => plus(sum, this.node(m), 1 / nodes.length), [0, 0, 0]);

@@ -1,0 +1,38 @@
+// The point about which the rings turn, when it was moved from the joint or the middle of the selection.
+
+class Pivot {
+  constructor(tools) {
+    this.tools = tools;
+    this.moved = null; // { of, node, local }: what it belongs to; a control point, in whose frame it lies
+  }
+
+  // What the rings turn.
+  get turned() {
+    const { state } = this.tools;
+    return state.part ?? state.selection.join();
+  }
+
+  // Put it on the surface under the pointer, where it stays on the nearest control point.
+  put(event) {
+    const { tools } = this, { player } = tools, point = tools.surface(event);
+    if (!point) return;
+    const node = tools.nearest(point), row = 28 * node, table = player.shown;
+    const away = [0, 1, 2].map((r) => point[r] - table[row + 4 * r + 3]);
+    const local = [0, 1, 2].map((c) => away.reduce((sum, value, r) => sum + table[row + 4 * r + c] * value, 0));
+    this.moved = { of: this.turned, node, local };
+    player.stale = true;
+  }
+
+  // Where it is, in the units of the page; null: it was not moved.
+  place() {
+    const { moved, tools } = this, table = tools.player.shown;
+    if (!moved || !table || moved.of !== this.turned) return null;
+    const row = 28 * moved.node;
+    return [0, 1, 2].map((r) => dot(table.subarray(row + 4 * r, row + 4 * r + 3), moved.local) + table[row + 4 * r + 3]);
+  }
+
+  reset() {
+    this.moved = null;
+    this.tools.player.stale = true;
+  }
+}
