@@ -97,12 +97,15 @@ def import_scene(path: Path, folder: Path, show: ShowProgress = progress) -> Imp
     scene = read_scene(path)
     if len(scene.frames) < MIN_FRAMES:
         raise UserError(f"{path}: has {len(scene.frames)} frames with an image, but two are needed; export it again")
+    latest = max(abs(frame.moment) for frame in scene.frames)
+    if not latest < MAX_MOMENT:
+        raise UserError(f"{path}: a frame has the time {latest:g}; export the scene again")
     made: list[tuple[int, float | None]] = []
-    write_folder_atomically(folder, lambda work: made.append(_write(work, scene, show)))
+    write_folder_atomically(folder, lambda work: made.append(_write(work, path, scene, show)))
     return ImportResult(scene.program, len(scene.frames), *made[0])
 
 
-def _write(work: Path, scene: ImportedScene, show: ShowProgress) -> tuple[int, float | None]:
+def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> tuple[int, float | None]:
     """Write the folder; return the number of points and the error of the poses."""
     (work / "images").mkdir()
     frames = scene.frames
@@ -129,9 +132,7 @@ def _write(work: Path, scene: ImportedScene, show: ShowProgress) -> tuple[int, f
     moved = Similarity(1.0, np.eye(3), np.zeros(3)) if scene.gravity else upright(viewmats, points)
     viewmats, points = moved.viewmats(viewmats), moved.points(points)
     if not (np.abs(viewmats).max() < MAX_NUMBER and np.abs(points).max(initial=0.0) < MAX_NUMBER**2):
-        raise UserError(
-            f"the cameras of this scene of {scene.program} are too close together for its depth; export it again"
-        )
+        raise UserError(f"{path}: the cameras of this scene are too close together for its depth; export it again")
     if len(points):
         write_points(work / POINTS, points, colors)
     content = _transforms(work, frames, names, sizes, viewmats, bool(len(points)))
@@ -187,8 +188,6 @@ def _transforms(
 ) -> dict[str, Any]:  # fmt: skip
     """Make the content of ``transforms.json``."""
     moments = np.array([frame.moment for frame in frames])
-    if not np.abs(moments).max() < MAX_MOMENT:
-        raise UserError(f"a frame has the time {np.abs(moments).max():g}; export the scene again")
     first, last = float(moments.min()), float(moments.max())
     times = (moments - first) / (last - first) if last > first else np.linspace(0.0, 1.0, len(frames))
     entries = []

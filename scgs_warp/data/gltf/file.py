@@ -107,7 +107,8 @@ class GltfFile:
             raw = self._strided(accessor.bufferView, accessor.byteOffset or 0, np.dtype(dtype), count, width, where)
         if accessor.sparse is not None:
             raw = self._with_sparse(raw, accessor.sparse, where)
-        values: np.ndarray = raw.astype(np.float64) if dtype is np.float32 else raw
+        with np.errstate(invalid="ignore"):  # a signalling NaN; it is refused below, without a warning
+            values: np.ndarray = raw.astype(np.float64) if dtype is np.float32 else raw
         if accessor.normalized and dtype is not np.float32:
             largest = 2 ** (8 * raw.dtype.itemsize - (raw.dtype.kind == "i")) - 1
             values = np.maximum(raw / float(largest), -1.0)

@@ -128,6 +128,14 @@ def test_photos_that_a_tag_turns_are_refused(tmp_path, orientation):
     refused(source, tmp_path, "frame_00003.jpg: is turned by its EXIF tag")
 
 
+def test_a_time_beyond_all_clocks_is_refused(tmp_path):
+    source = write_monst3r(tmp_path / "source")
+    track = source / "pred_traj.txt"
+    rows = track.read_text().splitlines()
+    track.write_text("\n".join([*rows[:-1], "2e19 " + rows[-1].split(" ", 1)[1]]))
+    refused(source, tmp_path, "source: a frame has the time 2e.19")
+
+
 def with_arrays(path: Path, **changed) -> Path:
     """Replace arrays of an .npz, or leave one out (None)."""
     with np.load(path, allow_pickle=True) as old:

@@ -114,6 +114,16 @@ def test_unnormalised_weights_are_normalised_and_idle_vertices_follow_the_first_
     assert np.abs(found[-1] - upright(arrays["positions"][-1:])).max() < 1e-6
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_signalling_nan_is_refused_without_a_warning(tmp_path):
+    glb, arrays = bar()
+    weights = arrays["weights"].astype(np.float32)
+    weights.view(np.uint32)[0, 0] = 0x7FA00000
+    glb.document["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"] = glb.array(weights)
+    with pytest.raises(UserError, match=r"WEIGHTS_0\) holds values that are not finite"):
+        read(glb, tmp_path)
+
+
 @pytest.mark.parametrize("normals", ["given", "none"])
 def test_normals_follow(tmp_path, normals):
     glb = Glb()
