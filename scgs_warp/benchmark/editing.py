@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
 from ..edit import EditSession, Target, engine
 from ..edit.handles import STAY
 from ..editor import pictures, poses
@@ -60,10 +63,13 @@ def edit_rows(case: BenchCase) -> list[dict[str, Any]]:
 
 
 def hold(model: EditorModel) -> None:
-    """Set three handles far from each other, and grab the first one."""
+    """Set three handles far from each other, and grab the first one. They lie on the largest connected piece of the
+    graph: a handle on a piece of its own would move nothing else."""
     session = model.session
-    points = session.scene.gaussians.means.new_tensor(session.node_positions(0.0))
-    ends = farthest_points(points, min(HANDLES, len(points))).tolist()
+    pieces = connected_components(session.graph.matrix, directed=False)[1]
+    largest = np.flatnonzero(pieces == np.bincount(pieces).argmax())
+    points = session.scene.gaussians.means.new_tensor(session.node_positions(0.0)[largest])
+    ends = largest[farthest_points(points, min(HANDLES, len(points))).cpu().numpy()].tolist()
     for end in reversed(ends):
         model.select(session.ring([end], 1))
         model.grab(STAY)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pytest
+from scipy.sparse.csgraph import connected_components
 
 from helpers.bench_rows import TINY, check_rows, rows_of
 from helpers.edit_scenes import bar_scene
 from scgs_warp.apps import bench as app
 from scgs_warp.benchmark import editing
-from scgs_warp.edit import EditSession
+from scgs_warp.benchmark.scenes import synthetic_scene
+from scgs_warp.edit import EditSession, Target
 from scgs_warp.editor import pictures, poses
 from scgs_warp.editor.model import EditorModel
 
@@ -44,6 +47,21 @@ def test_three_handles_are_held_and_one_is_in_hand():
     editing.hold(model)
     assert len(model.session.edit.handles) == editing.HANDLES == 3
     assert model.dragging and model.active == model.session.edit.handles[-1].name
+
+
+def test_a_drag_moves_the_body_though_pieces_of_the_graph_lie_apart():
+    """Of this figure, the control point furthest from all others has no neighbours."""
+    session = EditSession(synthetic_scene("control-points", 3000, 1500, "cpu"))
+    pieces = connected_components(session.graph.matrix, directed=False)[1]
+    assert pieces.max() > 0, "the scene is one that can fail"
+    model = EditorModel(session)
+    model.pin_rings = None
+    editing.hold(model)
+    before = session.node_positions(0.0)
+    model.drag(Target((0.0, session.graph.edge_length / session.engine.units[1], 0.0)))
+    model.release()
+    moved = np.linalg.norm(session.node_positions(0.0) - before, axis=1) > 1e-6
+    assert moved[pieces == np.bincount(pieces).argmax()].all()
 
 
 def test_what_cannot_be_dragged_is_said(tmp_path, capsys):
