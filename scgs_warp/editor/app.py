@@ -237,13 +237,16 @@ class Editor:
 
     def _act(self, client: Client, what: str, message: dict[str, Any]) -> None:
         """Do what a page asks for, on the worker's thread, and answer it."""
+        answer: dict[str, Any] = {"id": number_of(message), "done": what}
         if what in ("grab", "release", "cancel"):
-            if self._dragger not in (None, client.number):
-                return  # one page drags at a time
+            if self._dragger not in (None, client.number):  # one page drags at a time
+                if what == "grab":
+                    answer["problem"] = "another page drags at present; try again when it has let go"
+                client.send(answer)
+                return
             self._apply_drag()
             self._dragger = client.number if what == "grab" else None
         fields = FieldReader({key: value for key, value in message.items() if key not in ("do", "id")}, "the page")
-        answer: dict[str, Any] = {"id": number_of(message), "done": what}
         try:
             self._seek(message.get("at"))
             result = REQUESTS[what](self, fields)

@@ -171,9 +171,10 @@ def test_one_page_drags_at_a_time(editor, page):
         assert "problem" not in page.ask("grab", at=0.0)
         page.until(lambda: editor.model.dragging)
         for what in ("release", "cancel"):
-            other.send({"do": what, "at": 0.0})
-            other.ask("tool", parts_first=True)  # answered after it
+            assert "problem" not in other.ask(what, at=0.0)
             assert editor.model.dragging, what
+        assert "another page drags" in other.ask("grab", at=0.0)["problem"], "an answer: the page waits for it"
+        assert editor.model.dragging
         page.ask("release", at=0.0)
         assert not editor.model.dragging
     finally:

@@ -31,7 +31,7 @@ class Layout(NamedTuple):
 
     program: str
     poses: str
-    """The name by which the program is known."""
+    """Name of the array of poses, which no other program writes."""
     camera_to_world: bool
     images: str
     depth: str
