@@ -109,19 +109,6 @@ class PartsTool:
             self._inside = None
             self.model.select(nodes)
 
-    @property
-    def moving(self) -> tuple[int, ...]:
-        """Control points that move with the chosen part when it is pulled, other than its own: those of the parts that
-        turn, and of all that hangs on them."""
-        with self.model.lock:
-            part = self.part
-            if part is None:
-                return ()
-            skeleton = self.model.session.skeleton
-            top = skeleton.chain(part)[-1]
-            nodes = {node for name in skeleton.branch(top) for node in skeleton.part(name).nodes}
-            return tuple(sorted(nodes - set(skeleton.part(part).nodes)))
-
     def set(self, on: bool) -> None:
         """Set whether clicks take parts."""
         with self.model.lock:

@@ -64,7 +64,6 @@ def page_state(
             "pins": list(edit.pins),
             "selection": list(model.selection),
             "part": parts.part,
-            "moving": list(parts.moving),
             "active": model.active,
             "target": _target(model),
             "following": model.following,

@@ -3,126 +3,18 @@
 from __future__ import annotations
 
 import io
-import time
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from helpers.chromium import chromium
-from helpers.edit_scenes import bar_scene, figure_scene
+from helpers.edit_scenes import bar_scene
+from helpers.editor_windows import Window, serve, until
 from helpers.node_packages import package
 from scgs_warp.edit import EditSession
-from scgs_warp.editor import Editor
-from scgs_warp.editor.autosave import Autosave
-from scgs_warp.scene.scene import Scene
 
 pytest.importorskip("aiohttp", reason="the package aiohttp is not installed")
-PATIENCE = 120.0
-SIZE = {"width": 900, "height": 700}
-
-
-def until(condition: Callable[[], Any]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as started:
-        yield started
-
-
-@pytest.fixture(scope="module")
-def figure() -> Scene:
-    return figure_scene(nodes=200, points=4000)[0]
-
-
-def serve(scene: Scene, folder: Any) -> Editor:
-    session = EditSession(scene)
-    session.parts()
-    keeper = Autosave(session, folder)
-    keeper.start(restore=True)
-    return Editor(session, folder, title="figure", port=0, autosave=keeper)
-
-
-@pytest.fixture
-def editor(figure, tmp_path) -> Iterator[Editor]:
-    made = serve(figure, tmp_path)
-    yield made
-    made.stop()
-
-
-class Window:
-    """One window with the editor in it."""
-
-    def __init__(self, browser: Any, editor: Editor, query: str = "", size: dict[str, int] = SIZE) -> None:
-        self.editor, self.problems = editor, []
-        self.context = browser.new_context(viewport=size)
-        self.page = self.context.new_page()
-        self.page.set_default_timeout(1e3 * PATIENCE)
-        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
-        self.page.on("console", lambda m: self.problems.append(m.text) if m.type == "error" else None)
-        self.page.goto(editor.url + query)
-        self.page.evaluate("window.scgs.ready.then(() => 1)")
-
-    def ask(self, expression: str, argument: Any = None) -> Any:
-        """Value of an expression in ``player``, ``clock``, ``studio`` and ``argument``."""
-        return self.page.evaluate(
-            f"(argument) => window.scgs.ready.then(({{ player, clock, studio }}) => ({expression}))", argument
-        )
-
-    def still(self) -> None:
-        def settled() -> bool:
-            idle = "!player.stale && !player.unsorted && !player.sorting && !player.moving && !player.tools.drag"
-            return self.editor.worker.idle and self.ask(f"{idle} && !studio.link.state.dragging")
-
-        until(settled)
-
-    def part_on_screen(self, part: int) -> tuple[float, float]:
-        x, y = self.ask(
-            """(() => { const { tools } = player, v = player.view(), n = tools.members[argument], s = [0, 0, 0];
-            for (const m of n) for (let k = 0; k < 3; k++) s[k] += player.places[3 * m + k] / n.length;
-            const [x, y, z] = v.rows.map((r, k) => r[0] * s[0] + r[1] * s[1] + r[2] * s[2] + v.shift[k]);
-            const b = player.canvas.getBoundingClientRect(), { width, height } = player.canvas;
-            return [(v.lens[0] * x / z + v.lens[2]) * b.width / width + b.left,
-              (v.lens[1] * y / z + v.lens[3]) * b.height / height + b.top]; })()""",
-            part,
-        )
-        return x, y
-
-    def lowest_limb(self) -> int:
-        """The foot that nothing hides."""
-        session = self.editor.session
-        names = [part.name for part in session.parts()]
-        found = []
-        for name in names:
-            x, y = self.part_on_screen(names.index(name))
-            event = {"clientX": x, "clientY": y}
-            seen = self.ask(
-                "(() => { const p = player.tools.surface(argument); return p ? player.tools.nearest(p) : -1; })()",
-                event,
-            )
-            if len(session.chain(name)) > 1 and seen in session.skeleton.part(name).nodes:
-                found.append((y, names.index(name)))
-        return max(found)[1]
-
-    def drag(self, start: tuple[float, float], shift: tuple[float, float]) -> None:
-        mouse = self.page.mouse
-        mouse.move(*start)
-        mouse.down()
-        mouse.move(start[0] + shift[0], start[1] + shift[1], steps=5)
-        mouse.up()
-        self.still()
-
-    def close(self) -> None:
-        assert self.problems == []
-        self.context.close()
 
 
 def test_a_limb_is_pulled_keyed_undone_and_kept(browser, editor):
@@ -181,82 +73,6 @@ def test_a_limb_is_pulled_keyed_undone_and_kept(browser, editor):
     window.page.evaluate("window.scgs.ready.then(() => 1)")
     assert window.ask("player.time") > 0.05, "the moment and the view survive a reload"
     assert not window.ask("studio.link.state.unedited")
-    window.close()
-
-
-def test_rings_turn_a_part_about_its_joint(browser, editor):
-    window = Window(browser, editor)
-    window.still()
-    part = window.lowest_limb()
-    name = editor.session.parts()[part].name
-    window.page.mouse.click(*window.part_on_screen(part))
-    until(lambda: window.ask("studio.link.state.part") == name)
-    window.page.keyboard.press("2")
-    window.still()
-    start, end = window.ask(
-        """(() => { const g = player.tools.gizmo, b = player.canvas.getBoundingClientRect();
-        const on = (k) => { const [x, y] = g.overlay.project(g.ring(0)[k]), s = b.width / player.canvas.width;
-          return [x * s + b.left, y * s + b.top]; };
-        return [on(8), on(14)]; })()"""
-    )
-    window.drag(tuple(start), (end[0] - start[0], end[1] - start[1]))
-    until(lambda: not window.ask("studio.link.state.unedited"))
-    target = editor.session.edit.targets[editor.session.edit.handles[-1].name]
-    angle = np.degrees(2 * np.arccos(min(1.0, abs(target.rotation[0]))))
-    assert abs(angle - 6 * 360 / 64) < 5, "six of the ring's 64 steps, seen from the side as well"
-    assert editor.session.edit.handles[-1].part == name
-    window.page.keyboard.press("Escape")
-    until(lambda: window.ask("studio.link.state.part") is None)
-    window.close()
-
-
-def test_the_pivot_of_the_rings_is_dragged_to_another_point(browser, editor):
-    """The rings turn the part about the point of the surface on which the dot was dropped; "." puts it back."""
-    window = Window(browser, editor)
-    window.still()
-    part = window.lowest_limb()
-    name = editor.session.parts()[part].name
-    middle = window.part_on_screen(part)
-    window.page.mouse.click(*middle)
-    until(lambda: window.ask("studio.link.state.part") == name)
-    window.page.keyboard.press("2")
-    window.still()
-    seen = """(() => { const g = player.tools.gizmo, b = player.canvas.getBoundingClientRect();
-        const on = (p) => { const [x, y] = g.seen(p); return [x + b.left, y + b.top]; };
-        return [on(g.pivot), on(g.ring(0)[8]), on(g.ring(0)[14])]; })()"""
-    joint, *_ = window.ask(seen)
-    window.drag(tuple(joint), (middle[0] - joint[0], middle[1] - joint[1]))
-    pivot, start, end = window.ask(seen)
-    assert window.ask("studio.link.state.unedited"), "only the pivot has moved"
-    assert np.hypot(pivot[0] - middle[0], pivot[1] - middle[1]) < 1.5
-    about = np.array(window.ask("player.tools.world(player.tools.pivot.place())"))
-    session = editor.session
-    before = session.node_positions(0.0)[list(session.skeleton.part(name).nodes)]
-    window.drag(tuple(start), (end[0] - start[0], end[1] - start[1]))
-    until(lambda: not window.ask("studio.link.state.unedited"))
-    turned = session._motion_of(session.edit, name, 0.0, None)[0]
-    centre, scale = session.engine.units
-    fixed = session.engine.to_world(turned.apply((about - centre) * scale))
-    assert np.linalg.norm(fixed - about) < 1e-6 * np.ptp(before)
-    assert (
-        np.linalg.norm(session.engine.to_world(turned.apply((before - centre) * scale)) - before, axis=1).max() > 0.02
-    )
-    pivot, *_ = window.ask(seen)
-    assert np.hypot(pivot[0] - middle[0], pivot[1] - middle[1]) < 4, "it stays on the surface"
-    window.page.keyboard.press(".")
-    assert window.ask("player.tools.pivot.place()") is None
-    window.page.keyboard.press("Escape")
-    until(lambda: window.ask("studio.link.state.part") is None)
-    window.close()
-
-
-def test_the_upright_axis_turns_the_view(browser, editor):
-    window = Window(browser, editor)
-    window.still()
-    window.page.locator("summary", has_text="View").click()
-    window.page.get_by_label("Upright axis").select_option("x")
-    until(lambda: editor.session.edit.film.shot.up == (1.0, 0.0, 0.0))
-    until(lambda: window.ask("player.view().rows[1]")[0] < -0.8)  # the image's down is against x
     window.close()
 
 
