@@ -29,6 +29,8 @@ neighbors    neighbors    neighbors         neighbors           kernels/test_nei
 skinning     skinning     skinning          node_sums           kernels/test_skinning
                           skinning_adjoint                      kernels/cuda/test_node_sums
                           skinning_palette
+correctives  correctives  correctives                           kernels/test_correctives
+shading      shading      shading                               kernels/test_shading
 harmonics    harmonics    harmonics                             kernels/test_harmonics
 ssim         ssim         ssim              ssim                kernels/test_ssim
                                                                 kernels/cuda/test_ssim

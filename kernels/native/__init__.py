@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import binning, harmonics, neighbors, projection, ssim, types
+from .. import binning, correctives, harmonics, neighbors, projection, shading, ssim, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -60,6 +60,13 @@ CONSTANTS: dict[str, int | float] = {
     "GRADIENT_MAX": types.GRADIENT_MAX,
     "POSITION_MAX": types.POSITION_MAX,
     "RADIUS_MAX": projection.RADIUS_MAX,
+    # Correctives and shading.
+    "CORRECTIVE_SCALE": correctives.SCALE,
+    "SHADING_BEND": shading.BEND,
+    "SHADING_GAIN_MAX": shading.GAIN_MAX,
+    "SHADING_GREY": shading.GREY,
+    "SHADING_TINT_MAX": shading.TINT_MAX,
+    "SHADING_TINT_MIN": shading.TINT_MIN,
 }
 """Values of the shared macros by name; a header gets those that occur in its text."""
 

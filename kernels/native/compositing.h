@@ -6,6 +6,8 @@
 enum {
     GEOMETRY = PACKED_GEOMETRY,  // leading columns of a packed splat
     GROUP = CHANNEL_GROUP,       // its channels are padded to a multiple of this
+    AHEAD = 32,                  // pairs from the request of a packed splat to its use: it seldom lies in a near cache
+    AHEAD_ADJOINT = 8,           // the same in the adjoint, which takes longer over a pair
 };
 
 // log2(1 / 255): the exponent below which a splat is skipped at a pixel.
@@ -89,6 +91,9 @@ static inline void composite_tile(
     const vf LANE = lane_numbers(), ZERO = vf{};
     const float curvature = LN_2 * sharpness;
 
+    struct Three {
+        enum { value = 3 };
+    };
     struct Four {
         enum { value = 4 };
     };
@@ -124,6 +129,8 @@ static inline void composite_tile(
             const int n = end - p0 < 32 ? end - p0 : 32;
             for (int k = 0; k < n; ++k) {
                 const float* s = packed.data + (long long)splats.data[p0 + k] * stride;
+                if (p0 + k + AHEAD < end)
+                    __builtin_prefetch(packed.data + (long long)splats.data[p0 + k + AHEAD] * stride);
                 chunk[k] = read_splat(s, place, curvature);
                 reached[k] = (short)reached_rows(chunk[k], s[7]);
                 for (int c = 0; c < C; ++c) channel[k][c] = s[GEOMETRY + c0 + c];
@@ -174,7 +181,9 @@ static inline void composite_tile(
     for (int c0 = 0; c0 == 0 || c0 < channels; c0 += GROUP) {
         const int count = channels - c0 < GROUP ? channels - c0 : GROUP;
         const bool first_pass = keep && c0 == 0;
-        if (count <= 4)
+        if (count <= 3)
+            first_pass ? pass(Three(), Yes(), c0, count) : pass(Three(), No(), c0, count);
+        else if (count <= 4)
             first_pass ? pass(Four(), Yes(), c0, count) : pass(Four(), No(), c0, count);
         else
             first_pass ? pass(Eight(), Yes(), c0, count) : pass(Eight(), No(), c0, count);
@@ -191,6 +200,7 @@ static inline void composite_tile_adjoint(
     FUSE_WITHIN_EXPRESSIONS
     const Tile place = Tile(tile, ranges, width, height, columns);
     const int begin = place.begin, end = place.end, wide = place.wide, tall = place.tall;
+    if (begin == end) return;
     const long long plane = place.plane, corner = place.corner;
     const int stride = packed.shape.dims[1];
     const vf LANE = lane_numbers(), ZERO = vf{};
@@ -198,6 +208,9 @@ static inline void composite_tile_adjoint(
 
     struct Any {
         enum { value = 0 };
+    };
+    struct Three {
+        enum { value = 3 };
     };
     struct Four {
         enum { value = 4 };
@@ -231,12 +244,24 @@ static inline void composite_tile_adjoint(
             for (int k = 0; k < 16; ++k) row_ends[r] = ends[r][k] > row_ends[r] ? ends[r][k] : row_ends[r];
             last_pair = row_ends[r] > last_pair ? row_ends[r] : last_pair;
         }
+        for (int r = 0; r < 16; ++r) {  // the next tile's pixels
+            const long long next = corner + (long long)r * width + 16;
+            if (next >= plane) break;
+            __builtin_prefetch(transmittance.data + next);
+            __builtin_prefetch(last.data + next);
+            __builtin_prefetch(v_alpha.data + next);
+            for (int c = 0; c < C; ++c) __builtin_prefetch(v_image.data + c * plane + next);
+        }
         for (int p = last_pair; p < end; ++p)
             __builtin_memset(v_slots.data + (long long)slots.data[p] * row_size, 0, row_size * sizeof(float));
 
         for (int p = last_pair - 1; p >= begin; --p) {
             const float* s = packed.data + (long long)splats.data[p] * stride;
             float* out = v_slots.data + (long long)slots.data[p] * row_size;
+            if (p - AHEAD_ADJOINT >= begin) {
+                __builtin_prefetch(packed.data + (long long)splats.data[p - AHEAD_ADJOINT] * stride);
+                __builtin_prefetch(v_slots.data + (long long)slots.data[p - AHEAD_ADJOINT] * row_size, 1);
+            }
             const Splat g = read_splat(s, place, curvature);
             unsigned rows = reached_rows(g, s[7]) & bits(row_ends > p);
             const unsigned visited = rows;
@@ -316,7 +341,9 @@ static inline void composite_tile_adjoint(
             }
         }
     };
-    if (channels <= 4)
+    if (channels <= 3)
+        absolute ? pass(Three(), Yes()) : pass(Three(), No());
+    else if (channels <= 4)
         absolute ? pass(Four(), Yes()) : pass(Four(), No());
     else
         absolute ? pass(Any(), Yes()) : pass(Any(), No());

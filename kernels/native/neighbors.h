@@ -207,6 +207,11 @@ static inline void nearest_listed(
     };
     int rows[16];
     for (int lane = 0; lane < 16; ++lane) rows[lane] = order.data[16 * block + (lane < count ? lane : count - 1)];
+    for (int at = 16 * (block + 1); at < 16 * (block + 2) && at < N; ++at) {  // the next block's, scattered in memory
+        const char* point = (const char*)(points.data + (long long)order.data[at] * D);
+        for (int byte = 0; byte < 4 * D; byte += 64) __builtin_prefetch(point + byte);
+        __builtin_prefetch(indices.data + (long long)order.data[at] * K, 1);
+    }
     const bool proven = search(K, points, nodes, rows, count, &list, indices.data, nullptr);
     failed.data[block] = list.count >= 0 && !proven;
 }

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from ..kernels import correctives as kernels
+from ..kernels.cpu import correctives as cpu_kernels
+from ..kernels.types import LANES
 from ..runtime.launch import launch
+
+Form = Literal["auto", "plain", "cpu"]
 
 COLUMNS = 27
 """Number of corrective parameters per Gaussian: a 3 x 9 matrix."""
@@ -16,23 +20,42 @@ COLUMNS = 27
 
 class _Correct(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means: Tensor, correctives: Tensor, quats: Tensor, quats_t: Tensor, quats_own: Tensor):
-        corrected = torch.empty_like(means)
-        launch(kernels.correct, means.shape[0], means, correctives, quats, quats_t, quats_own, corrected)
-        ctx.save_for_backward(correctives, quats, quats_t, quats_own)
+    def forward(ctx: Any, means: Tensor, correctives: Tensor, quats: Tensor, quats_t: Tensor, own, form: Form):
+        corrected, count = torch.empty_like(means), means.shape[0]
+        if form == "cpu":
+            turns = quats, quats_t, own, int(own is not None)
+            launch(cpu_kernels.correct, -(-count // LANES), means, correctives, *turns, corrected, grain=32)
+        else:
+            turns = quats, quats_t, quats_t if own is None else own
+            launch(kernels.correct, count, means, correctives, *turns, corrected)
+        ctx.save_for_backward(correctives, quats, quats_t, own)
+        ctx.form = form
         return corrected
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_corrected: Tensor):  # type: ignore[override]
-        correctives, *quats = ctx.saved_tensors
+        correctives, quats, quats_t, own = ctx.saved_tensors
         v_corrected, v_correctives = v_corrected.contiguous(), torch.empty_like(correctives)
-        launch(kernels.correct_adjoint, len(correctives), correctives, *quats, v_corrected, v_correctives)
-        return v_corrected, v_correctives, None, None, None
+        count = len(correctives)
+        if ctx.form == "cpu":
+            turns = quats, quats_t, own, int(own is not None)
+            gradients = v_corrected, v_correctives
+            launch(cpu_kernels.correct_adjoint, -(-count // LANES), correctives, *turns, *gradients, grain=32)
+        else:
+            turns = quats, quats_t, quats_t if own is None else own
+            launch(kernels.correct_adjoint, count, correctives, *turns, v_corrected, v_correctives)
+        return v_corrected, v_correctives, None, None, None, None
 
 
 def correct(
-    means: Tensor, correctives: Tensor, quats: Tensor, quats_t: Tensor, quats_own: Tensor | None = None
+    means: Tensor,
+    correctives: Tensor,
+    quats: Tensor,
+    quats_t: Tensor,
+    quats_own: Tensor | None = None,
+    *,
+    form: Form = "auto",
 ) -> Tensor:
     """Move skinned means by ``0.1 R C vec(R - I)``, where R turns ``quats`` to ``quats_t``.
 
@@ -43,6 +66,7 @@ def correct(
         quats_t: [N, 4] wxyz at the rendered instant, any norm.
         quats_own: [N, 4] wxyz that take the place of ``quats_t`` in R - I: those of the motion, where ``quats_t``
             includes an edit. None: ``quats_t``.
+        form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
         [N, 3] means. Gradients reach ``means`` and ``correctives``, but not the rotations, so that training does not
@@ -51,17 +75,18 @@ def correct(
     Raises:
         ValueError: a shape is wrong.
     """
-    quats_own = quats_t if quats_own is None else quats_own
     count = means.shape[0]
     expected = {
         "means": (means, 3),
         "correctives": (correctives, COLUMNS),
         "quats": (quats, 4),
         "quats_t": (quats_t, 4),
-        "quats_own": (quats_own, 4),
+        "quats_own": (quats_t if quats_own is None else quats_own, 4),
     }
     for name, (value, width) in expected.items():
         if tuple(value.shape) != (count, width):
             raise ValueError(f"{name} must be [{count}, {width}], got {tuple(value.shape)}")
-    rotations = (value.detach().contiguous() for value in (quats, quats_t, quats_own))
-    return _Correct.apply(means.contiguous(), correctives.contiguous(), *rotations)  # type: ignore[return-value]
+    if form == "auto":
+        form = "cpu" if means.device.type == "cpu" else "plain"
+    turns = (None if value is None else value.detach().contiguous() for value in (quats, quats_t, quats_own))
+    return _Correct.apply(means.contiguous(), correctives.contiguous(), *turns, form)  # type: ignore[return-value]

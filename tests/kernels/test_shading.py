@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import pytest
@@ -12,7 +13,24 @@ from hypothesis import strategies as st
 from helpers.gradients import value_and_gradients
 from reference.shading import shade as shade_reference
 from reference.shading import tint as tint_reference
-from scgs_warp.ops.shading import shade, tint
+from scgs_warp.ops import shading as ops
+from scgs_warp.runtime import environment
+
+
+def form_of(request, device, op):
+    if request.param == "cpu" and device != "cpu":
+        pytest.skip("SIMD is for the CPU")
+    return functools.partial(op, form=request.param)
+
+
+@pytest.fixture(params=["plain", "cpu"])
+def shade(request, device):
+    return form_of(request, device, ops.shade)
+
+
+@pytest.fixture(params=["plain", "cpu"])
+def tint(request, device):
+    return form_of(request, device, ops.tint)
 
 
 def draw(seed, n, device="cpu", spread=0.8):
@@ -22,9 +40,9 @@ def draw(seed, n, device="cpu", spread=0.8):
     return [x.to(device) for x in (*values, *turns)]
 
 
-@pytest.mark.parametrize("n", [0, 1, 2, 257])
+@pytest.mark.parametrize("n", [0, 1, 2, 16, 257])
 @pytest.mark.parametrize("seed", range(3))
-def test_values_and_gradients(seed, n, device):
+def test_values_and_gradients(seed, n, device, shade):
     inputs = draw(seed, n, device)
     weights = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed))
     ours, ours_grad = value_and_gradients(shade, inputs, weights, learnt=2)
@@ -38,12 +56,12 @@ def test_values_and_gradients(seed, n, device):
         assert (gain < 1e-4).any() and (gain > 3.999).any()
 
 
-def test_nothing_changes_at_rest_whatever_the_norm(device):
+def test_nothing_changes_at_rest_whatever_the_norm(device, shade):
     sh_dc, shading, quats, _ = draw(5, 50, device)
     torch.testing.assert_close(shade(sh_dc, shading, quats, -3.0 * quats), sh_dc, rtol=1e-5, atol=1e-5)
 
 
-def test_a_lambertian_surface_under_one_lamp(device):
+def test_a_lambertian_surface_under_one_lamp(device, shade):
     """G = e n^T / (c + e.n) is exactly a surface with normal n in ambient light c and a distant lamp e."""
     normal, lamp, ambient = torch.tensor([0.0, 0.6, 0.8]), torch.tensor([0.3, 0.0, 0.5]), 0.7
     angle = 0.9
@@ -73,13 +91,13 @@ def test_a_common_turn_of_both_changes_nothing_but_the_frame(values, matrix):
     moved = (Q @ G @ Q.transpose(1, 2)).reshape(1, 9)
     bend = torch.full((1, 1), 0.1)
     still, moved = (torch.cat([x.reshape(1, 9).float(), bend], 1) for x in (G, moved))
-    plain = shade(sh_dc.float(), still, quats.float(), quats_t.float())
-    both = shade(sh_dc.float(), moved, multiply(q, quats).float(), multiply(q, quats_t).float())
+    plain = ops.shade(sh_dc.float(), still, quats.float(), quats_t.float())
+    both = ops.shade(sh_dc.float(), moved, multiply(q, quats).float(), multiply(q, quats_t).float())
     torch.testing.assert_close(both, plain, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 3e38])
-def test_what_is_not_finite_shades_nothing_and_passes_no_gradient_to_the_matrix(bad, device):
+def test_what_is_not_finite_shades_nothing_and_passes_no_gradient_to_the_matrix(bad, device, shade):
     sh_dc, shading, quats, quats_t = draw(2, 4, device)
     shading[0, 3] = bad
     quats_t[1, 2] = bad
@@ -92,7 +110,7 @@ def test_what_is_not_finite_shades_nothing_and_passes_no_gradient_to_the_matrix(
 
 
 @pytest.mark.parametrize("bend", [1e10, -1e10, 3e38])
-def test_a_gain_beyond_float32_is_one_and_learns_nothing(bend, device):
+def test_a_gain_beyond_float32_is_one_and_learns_nothing(bend, device, shade):
     """x and x^2 are finite; only their product with b is not."""
     sh_dc, shading, quats, quats_t = draw(4, 3, device, spread=0.05)
     shading[1, :9] = 1e15
@@ -110,11 +128,11 @@ def test_wrong_shapes_are_named(which):
     inputs = draw(0, 3)
     inputs[which] = inputs[which][:, :-1]
     with pytest.raises(ValueError, match=("sh_dc", "shading", "quats", "quats_t")[which]):
-        shade(*inputs)
+        ops.shade(*inputs)
 
 
-@pytest.mark.parametrize("n", [0, 1, 2, 257])
-def test_tints_and_their_gradients(n, device):
+@pytest.mark.parametrize("n", [0, 1, 2, 16, 257])
+def test_tints_and_their_gradients(n, device, tint):
     g = torch.Generator().manual_seed(n)
     inputs = [torch.randn(n, 3, generator=g).to(device), (2.0 * torch.randn(n, 3, generator=g)).to(device)]
     weights = torch.randn(n, 3, generator=g)
@@ -130,7 +148,7 @@ def test_tints_and_their_gradients(n, device):
         assert not ours_grad[1][outside].any() and ours_grad[1][~outside].all()
 
 
-def test_a_tint_of_zero_and_a_non_finite_one_change_nothing(device):
+def test_a_tint_of_zero_and_a_non_finite_one_change_nothing(device, tint):
     sh_dc = torch.randn(4, 3, generator=torch.Generator().manual_seed(1)).to(device)
     tints = torch.tensor([0.0, math.nan, math.inf, -math.inf])[:, None].repeat(1, 3).to(device).requires_grad_()
     out = tint(sh_dc, tints)
@@ -144,4 +162,45 @@ def test_wrong_shapes_of_tints_are_named(which):
     inputs = [torch.zeros(3, 3), torch.zeros(3, 3)]
     inputs[which] = inputs[which][:, :-1]
     with pytest.raises(ValueError, match=("sh_dc", "tints")[which]):
-        tint(*inputs)
+        ops.tint(*inputs)
+
+
+def test_forms_agree_on_what_to_leave_out():
+    """Extreme and non-finite values, one kind in each row: the SIMD form limits the gains and gradients that the
+    portable form does, and no others."""
+    sh_dc, shading, quats, quats_t = draw(3, 60)
+    tints = torch.randn(60, 3, generator=torch.Generator().manual_seed(4))
+    extremes = (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e30, 0.0)
+    for row, value in enumerate(extremes):
+        for offset, tensor in enumerate((sh_dc, shading, quats, quats_t, tints)):
+            tensor[5 * row + offset, 2] = value
+    shading[36, 9], shading[37, 9] = math.inf, 3e38
+    weights = torch.randn(60, 3, generator=torch.Generator().manual_seed(3))
+    weights[40], weights[41, 1] = 3e38, math.nan
+    for op, inputs in ((ops.shade, [sh_dc, shading, quats, quats_t]), (ops.tint, [sh_dc, tints])):
+        (plain, plain_grad), (lanes, lanes_grad) = (
+            value_and_gradients(functools.partial(op, form=form), inputs, weights, learnt=2)
+            for form in ("plain", "cpu")
+        )
+        torch.testing.assert_close(lanes, plain, rtol=1e-5, atol=2e-5, equal_nan=True)
+        for a, b in zip(lanes_grad, plain_grad, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-4, atol=2e-5, equal_nan=True)
+
+
+def test_the_cpu_takes_the_simd_form():
+    sh_dc, shading, quats, quats_t = draw(6, 50)
+    for op, inputs in ((ops.shade, (sh_dc, shading, quats, quats_t)), (ops.tint, (sh_dc, sh_dc))):
+        torch.testing.assert_close(op(*inputs), op(*inputs, form="cpu"), rtol=0, atol=0)
+        assert not torch.equal(op(*inputs), op(*inputs, form="plain")), "the forms round differently"
+
+
+def test_same_bits_for_any_thread_count(all_threads):
+    inputs, weights = draw(4, 5000), torch.randn(5000, 3, generator=torch.Generator().manual_seed(0))
+    results = []
+    for threads in (1, 2, 3):
+        environment.configure(threads=threads)
+        shaded, of_shade = value_and_gradients(ops.shade, inputs, weights, learnt=2)
+        tinted, of_tint = value_and_gradients(ops.tint, [inputs[0], inputs[1][:, :3]], weights)
+        results.append([shaded, *of_shade, tinted, *of_tint])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))

@@ -1,0 +1,86 @@
+// Correctives of 16 Gaussians, one per lane, by the formulas of kernels/correctives.py, and their adjoint.
+#pragma once
+#include "turn_block.h"
+
+// The rotations of a block: `turn`, less the identity, determines the displacement, and `rotation` carries it along.
+struct Turns {
+    vf turn[9], rotation[9];
+
+    __attribute__((always_inline)) Turns(
+        int begin, int rows, const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t,
+        const wp::array_t<wp::vec4>& quats_own, int has_own
+    ) {
+        vf rest[4], posed[4];
+        read_vectors(quats.data, begin, rows, 4, rest);
+        read_vectors(quats_t.data, begin, rows, 4, posed);
+        rotation_between(rest, posed, rotation);
+        for (int k = 0; k < 9; ++k) turn[k] = rotation[k];
+        if (has_own) {
+            read_vectors(quats_own.data, begin, rows, 4, posed);
+            rotation_between(rest, posed, turn);
+        }
+        subtract_identity(turn);
+    }
+};
+
+// Read the 27 columns of the matrices C as two sixteens that overlap.
+ALWAYS_INLINE void read_matrix(const wp::array_t<float>& correctives, int begin, int rows, vf* C) {
+    const long long size = 27ll * correctives.shape[0];
+    vf right[16];
+    read_columns(correctives.data, size, begin, rows, 27, 0, C);
+    read_columns(correctives.data, size, begin, rows, 27, 11, right);
+    for (int k = 5; k < 16; ++k) C[11 + k] = right[k];
+}
+
+static inline void correct_block(
+    int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<float>& correctives,
+    const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t, const wp::array_t<wp::vec4>& quats_own,
+    int has_own, wp::array_t<wp::vec3>& means_t
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    const int rows = means.shape[0] - begin < 16 ? means.shape[0] - begin : 16;
+    const Turns turns = Turns(begin, rows, quats, quats_t, quats_own, has_own);
+    vf C[27], mean[3], shift[3], moved[3];
+    read_matrix(correctives, begin, rows, C);
+    read_vectors(means.data, begin, rows, 3, mean);
+    for (int a = 0; a < 3; ++a) {
+        shift[a] = C[9 * a] * turns.turn[0];
+        for (int k = 1; k < 9; ++k) shift[a] = shift[a] + C[9 * a + k] * turns.turn[k];
+    }
+    vf change = {};
+    for (int a = 0; a < 3; ++a) {
+        const vf* R = turns.rotation + 3 * a;
+        moved[a] = mean[a] + CORRECTIVE_SCALE * (R[0] * shift[0] + R[1] * shift[1] + R[2] * shift[2]);
+        change = change + (moved[a] - mean[a]);
+    }
+    const vi valid = finite(change);
+    for (int a = 0; a < 3; ++a) moved[a] = valid ? moved[a] : mean[a];
+    write_vectors(means_t.data, begin, rows, 3, moved);
+}
+
+static inline void correct_block_adjoint(
+    int begin, const wp::array_t<float>& correctives, const wp::array_t<wp::vec4>& quats,
+    const wp::array_t<wp::vec4>& quats_t, const wp::array_t<wp::vec4>& quats_own, int has_own,
+    const wp::array_t<wp::vec3>& v_means_t, wp::array_t<float>& v_correctives
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    const int total_rows = correctives.shape[0];
+    const int rows = total_rows - begin < 16 ? total_rows - begin : 16;
+    const Turns turns = Turns(begin, rows, quats, quats_t, quats_own, has_own);
+    vf C[27], v_mean[3], v_shift[3], v_C[27], right[16], total = {};
+    read_matrix(correctives, begin, rows, C);
+    read_vectors(v_means_t.data, begin, rows, 3, v_mean);
+    for (int a = 0; a < 3; ++a) {
+        const vf* R = turns.rotation + a;
+        v_shift[a] = CORRECTIVE_SCALE * (R[0] * v_mean[0] + R[3] * v_mean[1] + R[6] * v_mean[2]);
+        for (int k = 0; k < 9; ++k) {
+            v_C[9 * a + k] = v_shift[a] * turns.turn[k];
+            total = total + (C[9 * a + k] * turns.turn[k] + v_C[9 * a + k]);
+        }
+    }
+    const vi valid = finite(total);
+    for (int k = 0; k < 27; ++k) v_C[k] = valid ? v_C[k] : vf{};
+    for (int k = 0; k < 16; ++k) right[k] = v_C[11 + k];
+    write_columns(v_correctives.data, begin, rows, 27, 0, 16, v_C);
+    write_columns(v_correctives.data, begin, rows, 27, 11, 16, right);
+}

@@ -1,0 +1,110 @@
+// Shading and tints of 16 Gaussians, one per lane, by the formulas of kernels/shading.py, and their adjoints.
+#pragma once
+#include "exponential.h"
+#include "turn_block.h"
+
+// What the gain of a block's Gaussians depends on.
+struct Gain {
+    vf turn[9], x, bend, free;
+
+    __attribute__((always_inline)) Gain(
+        int begin, int rows, const wp::array_t<float>& shading, const wp::array_t<wp::vec4>& quats,
+        const wp::array_t<wp::vec4>& quats_t
+    ) {
+        FUSE_WITHIN_EXPRESSIONS
+        vf rest[4], posed[4], G[16];
+        read_vectors(quats.data, begin, rows, 4, rest);
+        read_vectors(quats_t.data, begin, rows, 4, posed);
+        rotation_between(rest, posed, turn);
+        subtract_identity(turn);
+        read_columns(shading.data, 10ll * shading.shape[0], begin, rows, 10, 0, G);
+        x = G[0] * turn[0];
+        for (int k = 1; k < 9; ++k) x = x + G[k] * turn[k];
+        bend = G[9];
+        free = 1.0f + x + SHADING_BEND * bend * x * x;
+    }
+
+    // Return the gain within its limits, and 1 where it is non-finite.
+    __attribute__((always_inline)) vf limited() const {
+        const vf low = free < 0.0f ? vf{} : free;
+        const vf within = low > SHADING_GAIN_MAX ? vf{} + SHADING_GAIN_MAX : low;
+        return finite(free) ? within : vf{} + 1.0f;
+    }
+};
+
+static inline void shade_block(
+    int begin, const wp::array_t<wp::vec3>& sh_dc, const wp::array_t<float>& shading,
+    const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& shaded
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    const int rows = sh_dc.shape[0] - begin < 16 ? sh_dc.shape[0] - begin : 16;
+    const vf factor = Gain(begin, rows, shading, quats, quats_t).limited();
+    vf color[3];
+    read_vectors(sh_dc.data, begin, rows, 3, color);
+    for (int c = 0; c < 3; ++c) color[c] = factor * (color[c] + SHADING_GREY) - SHADING_GREY;
+    write_vectors(shaded.data, begin, rows, 3, color);
+}
+
+static inline void shade_block_adjoint(
+    int begin, const wp::array_t<wp::vec3>& sh_dc, const wp::array_t<float>& shading,
+    const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t, const wp::array_t<wp::vec3>& v_shaded,
+    wp::array_t<wp::vec3>& v_sh_dc, wp::array_t<float>& v_shading
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    const int rows = sh_dc.shape[0] - begin < 16 ? sh_dc.shape[0] - begin : 16;
+    const Gain gain = Gain(begin, rows, shading, quats, quats_t);
+    const vf factor = gain.limited();
+    vf color[3], v[3], v_color[3], v_factor = {}, v_G[16] = {};
+    read_vectors(sh_dc.data, begin, rows, 3, color);
+    read_vectors(v_shaded.data, begin, rows, 3, v);
+    for (int c = 0; c < 3; ++c) {
+        v_color[c] = factor * v[c];
+        v_factor = v_factor + v[c] * (color[c] + SHADING_GREY);
+    }
+    write_vectors(v_sh_dc.data, begin, rows, 3, v_color);
+    v_factor = (finite(gain.free) & (gain.free == factor)) ? v_factor : vf{};
+    const vf v_x = v_factor * (1.0f + 2.0f * SHADING_BEND * gain.bend * gain.x);
+    const vf v_bend = v_factor * SHADING_BEND * gain.x * gain.x;
+    const vi valid = finite(v_x * (gain.turn[0] + gain.turn[4] + gain.turn[8]) + v_bend);
+    for (int k = 0; k < 9; ++k) v_G[k] = valid ? v_x * gain.turn[k] : vf{};
+    v_G[9] = valid ? v_bend : vf{};
+    write_columns(v_shading.data, begin, rows, 10, 0, 10, v_G);
+}
+
+// Return the factor on a colour, within its limits; 1 where the tint is non-finite.
+ALWAYS_INLINE vf tint_factor(vf tint) {
+    const vf low = tint < SHADING_TINT_MIN ? vf{} + SHADING_TINT_MIN : tint;
+    const vf within = low > SHADING_TINT_MAX ? vf{} + SHADING_TINT_MAX : low;
+    return finite(tint) ? exponential(within) : vf{} + 1.0f;
+}
+
+static inline void tint_block(
+    int begin, const wp::array_t<wp::vec3>& sh_dc, const wp::array_t<wp::vec3>& tints, wp::array_t<wp::vec3>& tinted
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    const int rows = sh_dc.shape[0] - begin < 16 ? sh_dc.shape[0] - begin : 16;
+    vf color[3], tint[3];
+    read_vectors(sh_dc.data, begin, rows, 3, color);
+    read_vectors(tints.data, begin, rows, 3, tint);
+    for (int c = 0; c < 3; ++c) color[c] = tint_factor(tint[c]) * (color[c] + SHADING_GREY) - SHADING_GREY;
+    write_vectors(tinted.data, begin, rows, 3, color);
+}
+
+static inline void tint_block_adjoint(
+    int begin, const wp::array_t<wp::vec3>& sh_dc, const wp::array_t<wp::vec3>& tints,
+    const wp::array_t<wp::vec3>& v_tinted, wp::array_t<wp::vec3>& v_sh_dc, wp::array_t<wp::vec3>& v_tints
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    const int rows = sh_dc.shape[0] - begin < 16 ? sh_dc.shape[0] - begin : 16;
+    vf color[3], tint[3], v_color[3], v_tint[3];
+    read_vectors(sh_dc.data, begin, rows, 3, color);
+    read_vectors(tints.data, begin, rows, 3, tint);
+    read_vectors(v_tinted.data, begin, rows, 3, v_color);
+    for (int c = 0; c < 3; ++c) {
+        v_color[c] = tint_factor(tint[c]) * v_color[c];
+        const vf v = v_color[c] * (color[c] + SHADING_GREY);
+        v_tint[c] = ((tint[c] > SHADING_TINT_MIN) & (tint[c] < SHADING_TINT_MAX) & finite(v)) ? v : vf{};
+    }
+    write_vectors(v_sh_dc.data, begin, rows, 3, v_color);
+    write_vectors(v_tints.data, begin, rows, 3, v_tint);
+}
