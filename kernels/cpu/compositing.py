@@ -18,47 +18,21 @@ from __future__ import annotations
 import warp as wp
 
 from ..native import native_function
-from ..types import CHANNEL_MAX, LOG2_E, PACKED_GEOMETRY
+from ..types import LANES
 
 wp.set_module_options({"enable_backward": False})
 
-
-@wp.kernel
-def pack_splats(
-    first: int,
-    # In:
-    means2d_in: wp.array[wp.vec2],  # [N]
-    conics_in: wp.array[wp.vec3],  # [N]
-    opacities_in: wp.array[float],  # [N]
-    channels_in: wp.array2d[float],  # [N, C]
-    # Out:
-    packed_out: wp.array2d[float],  # [N, 8 + C padded to a multiple of 8]
-):
-    i = first + wp.tid()
-    conic = conics_in[i]
-    opacity = opacities_in[i]
-    factor = float(-0.5 * LOG2_E)
-    count = channels_in.shape[1]
-    for c in range(count):
-        if not wp.abs(channels_in[i, c]) <= CHANNEL_MAX:
-            opacity = float(0.0)  # never added: see compositing.finite_opacities
-        packed_out[i, PACKED_GEOMETRY + c] = channels_in[i, c]
-    for c in range(PACKED_GEOMETRY + count, packed_out.shape[1]):
-        packed_out[i, c] = 0.0
-    packed_out[i, 0] = means2d_in[i][0]
-    packed_out[i, 1] = means2d_in[i][1]
-    packed_out[i, 2] = factor * conic[0]
-    packed_out[i, 3] = 2.0 * factor * conic[1]
-    packed_out[i, 4] = factor * conic[2]
-    packed_out[i, 5] = -1.0e30
-    packed_out[i, 6] = 0.0
-    packed_out[i, 7] = -conic[1] / conic[0]
-    if opacity > 0.0:
-        packed_out[i, 5] = wp.log2(opacity)
-        packed_out[i, 6] = 1.0 / opacity
+_LANES = wp.constant(LANES)
 
 
 # fmt: off
+@native_function("packing.h")
+def pack_block(
+    begin: int, means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], opacities: wp.array[float],
+    channels: wp.array2d[float], packed: wp.array2d[float],
+): ...
+
+
 @native_function("compositing.h")
 def composite_tile(
     tile: int, packed: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i],
@@ -75,6 +49,22 @@ def composite_tile_adjoint(
     absolute: int, v_slots: wp.array2d[float],
 ): ...
 # fmt: on
+
+
+@wp.kernel
+def pack_splats(
+    first: int,
+    # In:
+    means2d_in: wp.array[wp.vec2],  # [N]
+    conics_in: wp.array[wp.vec3],  # [N]
+    opacities_in: wp.array[float],  # [N]
+    channels_in: wp.array2d[float],  # [N, C]
+    # Out:
+    packed_out: wp.array2d[float],  # [N, 8 + C padded to a multiple of 8]
+):
+    """Pack 16 splats. Grid: ceil(N / 16)."""
+    begin = (first + wp.tid()) * _LANES
+    pack_block(begin, means2d_in, conics_in, opacities_in, channels_in, packed_out)
 
 
 @wp.kernel

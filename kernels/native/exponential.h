@@ -1,4 +1,4 @@
-// The exponential function of 16 floats.
+// The exponential function and the logarithm of 16 floats.
 #pragma once
 #include "simd.h"
 
@@ -13,4 +13,16 @@ ALWAYS_INLINE vf exponential(vf x) {
            f * (1.0f + f * (0.5f + f * (0.16666667f + f * (4.16666667e-2f + f * (8.3333333e-3f + f * 1.3888889e-3f)))));
     vi exponent = (__builtin_convertvector(n, vi) + 127) << 23;
     return x < -87.0f ? vf{} : p * (vf)exponent;
+}
+
+// Return log2 of positive normal numbers, to 2e-7 of the result or of 1, whichever is larger. With the mantissa m in
+// [0.707, 1.414), log m is a series in (m - 1) / (m + 1).
+ALWAYS_INLINE vf logarithm2(vf x) {
+    FUSE_WITHIN_EXPRESSIONS
+    const vi shifted = (vi)x - 0x3f3504f3;
+    const vf exponent = __builtin_convertvector(shifted >> 23, vf);
+    const vf m = (vf)((shifted & 0x7fffff) + 0x3f3504f3);
+    const vf s = (m - 1.0f) / (m + 1.0f), z = s * s;
+    const vf series = 2.88539008f + z * (0.961796694f + z * (0.577078016f + z * (0.412198583f + z * 0.320598898f)));
+    return exponent + s * series;
 }

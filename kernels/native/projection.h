@@ -18,7 +18,6 @@ ALWAYS_INLINE void scatter_rows(float* to, int n, int C, const vf* from) {
 }
 
 static inline vf root(vf v) { return __builtin_elementwise_sqrt(v); }
-static inline vi finite(vf v) { return __builtin_elementwise_abs(v) < __builtin_inff(); }
 static inline vi usable(vf v) { return __builtin_elementwise_abs(v) <= GRADIENT_MAX; }
 
 static inline vf clamp(vf v, float low, float high) {

@@ -5,6 +5,12 @@
 #define EVEN_QUARTERS 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27
 #define ODD_QUARTERS 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31
 
+// Turn 16 rows of two floats, in two registers, into two columns.
+ALWAYS_INLINE void split2(const vf* a, vf* to) {
+    to[0] = __builtin_shufflevector(a[0], a[1], 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    to[1] = __builtin_shufflevector(a[0], a[1], 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+}
+
 // Turn 16 rows of three floats, in three registers, into three columns.
 ALWAYS_INLINE void split3(const vf* a, vf* to) {
     to[0] = __builtin_shufflevector(

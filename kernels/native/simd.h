@@ -9,6 +9,10 @@ typedef short vs __attribute__((vector_size(64)));
 typedef bool vb __attribute__((ext_vector_type(16)));
 typedef bool vb32 __attribute__((ext_vector_type(32)));
 
+// Attribute for functions that loop up to one of their arguments, such as a number of columns: inlined calls unroll the
+// loop.
+#define ALWAYS_INLINE __attribute__((always_inline)) static inline
+
 // First statement of every function that computes. Multiplications and additions are fused within an expression only,
 // so that the same source rounds alike everywhere.
 #define FUSE_WITHIN_EXPRESSIONS _Pragma("clang fp contract(on)")
@@ -21,6 +25,8 @@ static inline vf lane_numbers() { return vf{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
 
 // Return one bit for each lane of a comparison's result.
 static inline unsigned bits(vi mask) { return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask, vb)); }
+
+ALWAYS_INLINE vi finite(vf v) { return __builtin_elementwise_abs(v) < __builtin_inff(); }
 
 // Load the first n floats, with zeros behind them.
 static inline vf load(const float* from, int n) {
@@ -53,7 +59,3 @@ static inline vf exp2v(vf e) {
     r = r * f + 1.0f;
     return (vf)((vu)r + ((vu)t << 23));
 }
-
-// Attribute for functions that loop up to one of their arguments, such as a number of columns: inlined calls unroll the
-// loop.
-#define ALWAYS_INLINE __attribute__((always_inline)) static inline

@@ -3,41 +3,9 @@
 // Control points (nodes) are the rows of cpu/skinning_palette.py: two tables, `motion` and `reach`, with 16 floats per
 // node. `pick` holds node indices, [16, K]. Lanes past the last Gaussian are zero and refer to node 0.
 #pragma once
-#include "shuffles.h"
+#include "columns.h"
 
 typedef float v4 __attribute__((vector_size(16), aligned(4)));
-
-ALWAYS_INLINE vf load16(const float* from) { return load(from, 16); }
-
-// Return the rows themselves if there are 16 of them; else copy them to `spare`, with zeros behind them.
-ALWAYS_INLINE const void* read_rows(const void* from, int rows, int row_bytes, void* spare) {
-    if (rows == 16) return from;
-    __builtin_memset(spare, 0, 16 * row_bytes);
-    __builtin_memcpy(spare, from, row_bytes * rows);
-    return spare;
-}
-
-// Load rows begin to begin + rows - 1 of an array of vectors of `width` floats (3 or 4) as columns.
-ALWAYS_INLINE void read_vectors(const void* data, int begin, int rows, int width, vf* to) {
-    float spare[64];
-    const float* first = (const float*)data + (long long)begin * width;
-    const float* from = (const float*)read_rows(first, rows, 4 * width, spare);
-    vf a[4];
-    for (int i = 0; i < width; ++i) a[i] = load16(from + 16 * i);
-    if (width == 4)
-        split4(a, to);
-    else
-        split3(a, to);
-}
-
-ALWAYS_INLINE void write_vectors(void* data, int begin, int rows, int width, const vf* from) {
-    vf a[4];
-    if (width == 4)
-        join4(from, a);
-    else
-        join3(from, a);
-    __builtin_memcpy((float*)data + (long long)begin * width, a, rows == 16 ? 64 * width : 4 * width * rows);
-}
 
 // Load one column for each hyper-coordinate, with zeros behind the last.
 ALWAYS_INLINE void read_hyper(const wp::array_t<float>& hyper, int H, int begin, int rows, vf* to) {

@@ -1,4 +1,4 @@
-// Rotations of 16 Gaussians since rest, one Gaussian per lane, and rows of parameters as columns.
+// Rotations of 16 Gaussians since rest, one Gaussian per lane.
 #pragma once
 #include "skinning_block.h"
 
@@ -27,29 +27,4 @@ ALWAYS_INLINE void rotation_between(const vf* rest, const vf* posed, vf* to) {
 // Subtract the identity.
 ALWAYS_INLINE void subtract_identity(vf* matrix) {
     for (int k = 0; k < 9; k += 4) matrix[k] = matrix[k] - 1.0f;
-}
-
-ALWAYS_INLINE vi finite(vf v) { return __builtin_elementwise_abs(v) < __builtin_inff(); }
-
-// Read 16 columns, from column `from` on, of the rows of an array of `size` floats. Lanes past the last row are zeros;
-// columns past the width hold whatever follows.
-ALWAYS_INLINE void read_columns(const float* data, long long size, int begin, int rows, int width, int from, vf* to) {
-    for (int l = 0; l < 16; ++l) {
-        const long long at = (long long)(begin + l) * width + from;
-        if (at + 16 <= size && l < rows)
-            to[l] = load16(data + at);
-        else {
-            float spare[16] = {};
-            for (int k = 0; at + k < size && l < rows; ++k) spare[k] = data[at + k];
-            to[l] = load16(spare);
-        }
-    }
-    transpose(to);
-}
-
-// Write `count` columns, from column `from` on. Changes `columns`, which are 16.
-ALWAYS_INLINE void write_columns(float* data, int begin, int rows, int width, int from, int count, vf* columns) {
-    transpose(columns);
-    for (int l = 0; l < rows; ++l)
-        __builtin_memcpy(data + (long long)(begin + l) * width + from, &columns[l], 4 * count);
 }

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..kernels import compositing as kernels
 from ..kernels.cpu import compositing as cpu_kernels
-from ..kernels.types import CHANNEL_GROUP, PACKED_GEOMETRY, SLOT_GEOMETRY, TILE_SIZE
+from ..kernels.types import CHANNEL_GROUP, LANES, PACKED_GEOMETRY, SLOT_GEOMETRY, TILE_SIZE
 from ..runtime import debug, memory
 from ..runtime.launch import launch
 from ..types import Splats, Stats, Tiles
@@ -252,7 +252,8 @@ def _slot_width(channels: int) -> int:
 
 def _pack(means2d: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor) -> Tensor:
     packed = torch.empty(len(means2d), PACKED_GEOMETRY + _padded(channels.shape[1]))
-    launch(cpu_kernels.pack_splats, len(means2d), means2d, conics, opacities, channels, packed)
+    splats = means2d, conics, opacities, channels
+    launch(cpu_kernels.pack_splats, -(-len(means2d) // LANES), *splats, packed, grain=32)
     return packed
 
 
