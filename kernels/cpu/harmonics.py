@@ -21,6 +21,13 @@ def harmonics_block(
 
 
 @native_function("harmonics.h")
+def harmonics_block_with_depth(
+    begin: int, sh_dc: wp.array[wp.vec3], sh_rest: wp.array[wp.vec3], rest: int, means: wp.array[wp.vec3],
+    camera: wp.array[wp.vec3], depths: wp.array[float], degree: int, channels: wp.array[wp.vec4],
+): ...
+
+
+@native_function("harmonics.h")
 def harmonics_block_adjoint(
     begin: int, sh_rest: wp.array[wp.vec3], rest: int, means: wp.array[wp.vec3], camera: wp.array[wp.vec3],
     degree: int, colors: wp.array[wp.vec3], v_colors: wp.array[wp.vec3], has_rest: int, has_means: int,
@@ -45,6 +52,27 @@ def spherical_harmonics(
     """Compute the colours of 16 Gaussians. Grid: ceil(N / 16)."""
     begin = (first + wp.tid()) * _LANES
     harmonics_block(begin, sh_dc_in, sh_rest_in, rest, means_in, camera_in, degree, colors_out)
+
+
+@wp.kernel
+def channels_with_depth(
+    first: int,
+    # In:
+    sh_dc_in: wp.array[wp.vec3],  # [N]
+    sh_rest_in: wp.array[wp.vec3],  # [N * R]
+    rest: int,  # R
+    means_in: wp.array[wp.vec3],  # [N]
+    camera_in: wp.array[wp.vec3],  # [1] centre of projection
+    depths_in: wp.array[float],  # [N]
+    degree: int,
+    # Out:
+    channels_out: wp.array[wp.vec4],  # [N] colour as of spherical_harmonics, and depth
+):
+    """Compute the colours of 16 Gaussians, and copy their depths beside them. Grid: ceil(N / 16)."""
+    begin = (first + wp.tid()) * _LANES
+    harmonics_block_with_depth(
+        begin, sh_dc_in, sh_rest_in, rest, means_in, camera_in, depths_in, degree, channels_out
+    )  # fmt: skip
 
 
 @wp.kernel

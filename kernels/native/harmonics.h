@@ -98,16 +98,12 @@ ALWAYS_INLINE vf triples(vf b, int v) {
 
 static inline vi usable(vf v) { return __builtin_elementwise_abs(v) <= GRADIENT_MAX; }
 
-static inline void harmonics_block(
-    int begin, const wp::array_t<wp::vec_t<3, float>>& sh_dc, const wp::array_t<wp::vec_t<3, float>>& sh_rest, int rest,
-    const wp::array_t<wp::vec_t<3, float>>& means, const wp::array_t<wp::vec_t<3, float>>& camera, int degree,
-    wp::array_t<wp::vec_t<3, float>>& colors
-) {
+// Compute the colours of a block.
+ALWAYS_INLINE void colors_of(const wp::array_t<wp::vec_t<3, float>>& sh_dc, Basis& basis, vf* color) {
     FUSE_WITHIN_EXPRESSIONS
     const vf ZERO = {};
     const vi number = __builtin_convertvector(lane_numbers(), vi);
-    Basis basis = Basis(begin, sh_rest, rest, means, camera, degree);
-    vf color[3], sums[16];
+    vf sums[16];
     basis.read(sh_dc.data, color);
     for (int c = 0; c < 3; ++c) color[c] = SH_C0 * color[c] + 0.5f;
     if (basis.used) {
@@ -124,7 +120,31 @@ static inline void harmonics_block(
         for (int c = 0; c < 3; ++c) color[c] += sums[c] + sums[3 + c] + sums[6 + c] + sums[9 + c] + sums[12 + c];
     }
     for (int c = 0; c < 3; ++c) color[c] = color[c] > 0.0f ? color[c] : color[c] - color[c];  // 0, or NaN for NaN
+}
+
+static inline void harmonics_block(
+    int begin, const wp::array_t<wp::vec_t<3, float>>& sh_dc, const wp::array_t<wp::vec_t<3, float>>& sh_rest, int rest,
+    const wp::array_t<wp::vec_t<3, float>>& means, const wp::array_t<wp::vec_t<3, float>>& camera, int degree,
+    wp::array_t<wp::vec_t<3, float>>& colors
+) {
+    Basis basis = Basis(begin, sh_rest, rest, means, camera, degree);
+    vf color[3];
+    colors_of(sh_dc, basis, color);
     basis.write(colors.data, color);
+}
+
+// Write colours and depths side by side.
+static inline void harmonics_block_with_depth(
+    int begin, const wp::array_t<wp::vec_t<3, float>>& sh_dc, const wp::array_t<wp::vec_t<3, float>>& sh_rest, int rest,
+    const wp::array_t<wp::vec_t<3, float>>& means, const wp::array_t<wp::vec_t<3, float>>& camera,
+    const wp::array_t<float>& depths, int degree, wp::array_t<wp::vec_t<4, float>>& channels
+) {
+    Basis basis = Basis(begin, sh_rest, rest, means, camera, degree);
+    vf row[4], joined[4];
+    colors_of(sh_dc, basis, row);
+    row[3] = load(depths.data + begin, basis.n);
+    join4(row, joined);
+    __builtin_memcpy((float*)channels.data + 4ll * begin, joined, 16 * basis.n);
 }
 
 static inline void harmonics_block_adjoint(

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..config.presets import LossConfig, MotionConfig, TrainConfig
-from ..gaussians import GaussianParameters, fixed_exp
+from ..gaussians import GaussianParameters, fixed_exp, version_of
 from ..ops.correctives import correct
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.posing import pose_gaussians, unit_pose
@@ -221,9 +221,7 @@ class ControlPoints(Motion):
         """Identify the inputs of :meth:`binding`: the result stays equal as long as no tensor is replaced or changed in
         place."""
         own = self.positions, self.log_radii, self.hyper, self.strength_logits
-        return [
-            (x, x.data_ptr(), 0 if x.is_inference() else x._version) for x in (gaussians.means, gaussians.hyper, *own)
-        ]
+        return [(x, x.data_ptr(), version_of(x)) for x in (gaussians.means, gaussians.hyper, *own)]
 
     def _cache_holds(self, gaussians: GaussianParameters) -> bool:
         if self._cached_for is None:

@@ -151,6 +151,11 @@ def colors_and_depths(
         raise ValueError(f"viewmat must be [4, 4] and depths [{count}], got {[*viewmat.shape]} and {[*depths.shape]}")
     channels = sh_dc.new_empty(count, 4)
     tensors = sh_dc.contiguous(), sh_rest.contiguous().view(count * rest, 3), rest, means.contiguous()
+    if sh_dc.device.type == "cpu":
+        position = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        rows = position[None], depths.contiguous(), degree, channels
+        launch(cpu_kernels.channels_with_depth, -(-count // LANES), *tensors, *rows, grain=32)
+        return channels
     launch(kernels.channels_with_depth, count, *tensors, viewmat.contiguous(), depths.contiguous(), degree, channels)
     return channels
 

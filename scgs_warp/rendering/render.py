@@ -82,7 +82,7 @@ def draw(
         means, *shape, camera.viewmat, camera.K, *size, antialiased=antialiased, sharpness=gaussians.sharpness
     )
     harmonics = gaussians.sh_dc, gaussians.sh_rest, means
-    if depth and means.is_cuda and not torch.is_grad_enabled():
+    if depth and not torch.is_grad_enabled():
         channels = colors_and_depths(*harmonics, camera.viewmat, splats.depths, sh_degree)
     else:
         channels = spherical_harmonics(*harmonics, centre_of(camera), sh_degree)
@@ -120,7 +120,7 @@ def expected_depth(accumulated: Tensor, alpha: Tensor, unit: float = 1.0) -> Ten
     Args:
         unit: divisor of the result, the number of the Gaussians' units in a unit of the caller's.
     """
-    if accumulated.is_cuda and not torch.is_grad_enabled():
+    if not torch.is_grad_enabled():
         depth = torch.empty_like(alpha)
         pixels = accumulated.contiguous().flatten(), alpha.contiguous().flatten()
         launch(kernels.expected_depth, depth.numel(), *pixels, unit, depth.view(-1))

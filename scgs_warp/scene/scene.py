@@ -106,7 +106,8 @@ class Scene:
         return scene
 
     def freeze_binding(self) -> None:
-        """Compute every Gaussian's control points once, since they do not depend on time."""
+        """Compute once what does not depend on time: every Gaussian's control points, scales and opacities."""
+        self.gaussians.keep_activations(True)
         cache = getattr(self.motion, "cache_binding", None)
         if cache is not None:
             cache(self.gaussians)
