@@ -120,7 +120,7 @@ def expected_depth(accumulated: Tensor, alpha: Tensor, unit: float = 1.0) -> Ten
     Args:
         unit: divisor of the result, the number of the Gaussians' units in a unit of the caller's.
     """
-    if not torch.is_grad_enabled():
+    if accumulated.is_cuda and not torch.is_grad_enabled():
         depth = torch.empty_like(alpha)
         pixels = accumulated.contiguous().flatten(), alpha.contiguous().flatten()
         launch(kernels.expected_depth, depth.numel(), *pixels, unit, depth.view(-1))
