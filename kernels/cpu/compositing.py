@@ -48,6 +48,10 @@ def composite_tile_adjoint(
     v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int, sharpness: float,
     absolute: int, v_slots: wp.array2d[float],
 ): ...
+@native_function("depth.h")
+def expected_depth_block(
+    begin: int, accumulated: wp.array[float], alpha: wp.array[float], unit: wp.float64, depth: wp.array[float],
+): ...
 # fmt: on
 
 
@@ -141,3 +145,17 @@ def composite_adjoint(
         absolute,
         v_slots_out,
     )
+
+
+@wp.kernel
+def expected_depth(
+    first: int,
+    # In:
+    accumulated_in: wp.array[float],  # [H W] depth times alpha
+    alpha_in: wp.array[float],  # [H W]
+    unit: wp.float64,
+    # Out:
+    depth_out: wp.array[float],  # [H W]
+):
+    """Divide the accumulated depths of 16 pixels by alpha, then by the unit. Grid: ceil(H W / 16)."""
+    expected_depth_block((first + wp.tid()) * _LANES, accumulated_in, alpha_in, unit, depth_out)

@@ -4,8 +4,6 @@
 #pragma once
 #include "simd.h"
 
-typedef double vd __attribute__((vector_size(128)));
-
 // Ellipses of 16 splats; the fields of kernels/binning.py's Ellipse.
 struct Ellipse {
     vf x, y, shear, half_width, half_height, tip, spread, steepness;

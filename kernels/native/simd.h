@@ -3,6 +3,7 @@
 #pragma once
 
 typedef float vf __attribute__((vector_size(64)));
+typedef double vd __attribute__((vector_size(128)));
 typedef int vi __attribute__((vector_size(64)));
 typedef unsigned vu __attribute__((vector_size(64)));
 typedef short vs __attribute__((vector_size(64)));

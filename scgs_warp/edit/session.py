@@ -343,8 +343,8 @@ class EditSession(Posing):
         color = torch.as_tensor(scene.background_color if background is None else background, dtype=torch.float32)
         view = scene.normalisation.apply_camera(camera).to(scene.device)
         posed = self.engine.normalised(time, bent)
-        image = render(posed, view, color.to(scene.device), antialiased=scene.config.antialiased)
-        return Image(image.rgb, image.alpha, scene.normalisation.undo_scale(image.depth))
+        drawn = posed, view, color.to(scene.device)
+        return render(*drawn, antialiased=scene.config.antialiased, depth_unit=scene.normalisation.scale)
 
     # Files
 

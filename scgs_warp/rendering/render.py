@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from ..kernels import compositing as kernels
+from ..kernels.cpu import compositing as cpu_kernels
+from ..kernels.types import LANES
 from ..ops.binning import bin_splats
 from ..ops.compositing import composite, demand
 from ..ops.harmonics import MAX_DEGREE, colors_and_depths, spherical_harmonics
@@ -26,6 +28,7 @@ def render(
     sh_degree: int | None = None,
     stats: Stats | None = None,
     antialiased: bool = False,
+    depth_unit: float = 1.0,
 ) -> Image:
     """Render colour and expected depth in one pass (3D Gaussian Splatting, Kerbl et al. 2023, section 4).
 
@@ -36,10 +39,11 @@ def render(
         sh_degree: degree of the harmonics used. None: the highest one present.
         stats: statistics to which the backward pass adds. None: they are not collected.
         antialiased: Mip-Splatting's opacity compensation.
+        depth_unit: number of the Gaussians' units in a unit of the resulting depth.
 
     Returns:
-        Image: ``rgb`` [H, W, 3] (its planar permutation is contiguous), ``alpha`` [H, W], ``depth`` [H, W] in world
-        units along the camera's z. Gradients reach ``gaussians``, ``camera.viewmat`` and ``background``.
+        Image: ``rgb`` [H, W, 3] (its planar permutation is contiguous), ``alpha`` [H, W], ``depth`` [H, W] along the
+        camera's z. Gradients reach ``gaussians``, ``camera.viewmat`` and ``background``.
 
     Raises:
         ValueError: a shape, a size or the degree is wrong.
@@ -47,7 +51,7 @@ def render(
     image, alpha = draw(
         gaussians, camera, background, sh_degree=sh_degree, stats=stats, antialiased=antialiased, depth=True
     )
-    return Image(image[:3].permute(1, 2, 0), alpha, expected_depth(image[3], alpha))
+    return Image(image[:3].permute(1, 2, 0), alpha, expected_depth(image[3], alpha, depth_unit))
 
 
 def draw(
@@ -120,10 +124,13 @@ def expected_depth(accumulated: Tensor, alpha: Tensor, unit: float = 1.0) -> Ten
     Args:
         unit: divisor of the result, the number of the Gaussians' units in a unit of the caller's.
     """
-    if accumulated.is_cuda and not torch.is_grad_enabled():
-        depth = torch.empty_like(alpha)
-        pixels = accumulated.contiguous().flatten(), alpha.contiguous().flatten()
-        launch(kernels.expected_depth, depth.numel(), *pixels, unit, depth.view(-1))
-        return depth
-    depth = accumulated / alpha.clamp_min(1e-10)
-    return depth if unit == 1.0 else (depth.double() / unit).to(depth.dtype)
+    if torch.is_grad_enabled():
+        depth = accumulated / alpha.clamp_min(1e-10)
+        return depth if unit == 1.0 else (depth.double() / unit).to(depth.dtype)
+    depth = torch.empty_like(alpha)
+    pixels = accumulated.contiguous().flatten(), alpha.contiguous().flatten(), unit, depth.view(-1)
+    if accumulated.is_cuda:
+        launch(kernels.expected_depth, depth.numel(), *pixels)
+    else:
+        launch(cpu_kernels.expected_depth, -(-depth.numel() // LANES), *pixels, grain=1024)
+    return depth

@@ -194,8 +194,8 @@ class Scene:
         if self.device.type == "cuda" and self.motion.takes_time_tensor:
             return self.frame_graph().render(view, time, color)
         posed = self.motion.gaussians_at(self.gaussians, time)
-        image = render(posed, view.to(self.device), color.to(self.device), antialiased=self.config.antialiased)
-        return Image(image.rgb, image.alpha, self.normalisation.undo_scale(image.depth))
+        drawn = posed, view.to(self.device), color.to(self.device)
+        return render(*drawn, antialiased=self.config.antialiased, depth_unit=self.normalisation.scale)
 
     def turntable(self, path: str | Path, **options: Any) -> Path:
         """Write a film in which the camera goes round the moving scene.

@@ -16,6 +16,7 @@ from scgs_warp.kernels import compositing as kernels
 from scgs_warp.kernels.types import STEP_FINE, STEP_HALTED, STEP_LOSS, STEP_REGULARISER
 from scgs_warp.ops.binning import bin_splats
 from scgs_warp.ops.compositing import composite
+from scgs_warp.rendering.render import expected_depth
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.launch import launch
 from scgs_warp.types import Splats, Stats, Tiles
@@ -308,6 +309,19 @@ def test_the_depth_of_a_pixel_is_a_mean_over_its_alpha(unit: float, device: str)
     found = torch.full_like(alpha, float("nan"))
     launch(kernels.expected_depth, 5, true * alpha, alpha, unit, found)
     torch.testing.assert_close(found.double(), true.double() / unit, rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.parametrize("pixels", [1, 5, 16, 1000])
+@pytest.mark.parametrize("unit", [1.0, 0.1])
+def test_depths_are_the_same_with_and_without_gradients(unit: float, pixels: int, device: str):
+    random = torch.Generator().manual_seed(pixels)
+    alpha = (torch.rand(pixels, generator=random) - 0.2).clamp_min(0.0).to(device)
+    accumulated = (5.0 * torch.rand(pixels, generator=random)).to(device) * alpha
+    expected = accumulated.double() / alpha.double().clamp_min(1e-10) / unit
+    torch.testing.assert_close(expected_depth(accumulated, alpha, unit).double(), expected, rtol=1e-6, atol=0.0)
+    with torch.no_grad():
+        found = expected_depth(accumulated, alpha, unit)
+    torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=0.0)
 
 
 def test_threads_change_nothing(all_threads: None):
