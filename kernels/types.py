@@ -35,12 +35,12 @@ POSITION_MAX = wp.constant(1.0e18)
 SLOT_GEOMETRY = 8
 """Number of columns before the channels in a gradient slot: 2D mean (2), conic (3), opacity, absolute 2D mean (2)."""
 
-PACKED_GEOMETRY = 8
+PACKED_GEOMETRY = 9
 """Number of columns before the channels in a splat packed for the CPU: mean (2), scaled conic (3), log2 of the opacity,
-its inverse, -B / A."""
+its inverse, -B / A, and the power without sharpness at which alpha is ALPHA_MIN."""
 
 CHANNEL_GROUP = 8
-"""A packed splat's channels on the CPU are padded with zeros to a multiple of this number."""
+"""More than four channels of a packed splat on the CPU are padded with zeros to a multiple of this number."""
 
 ADAM_CHUNK = 4096
 """Number of elements in a chunk, the part of a tensor that one grid index of the CPU's Adam updates."""

@@ -29,7 +29,7 @@ _LANES = wp.constant(LANES)
 @native_function("packing.h")
 def pack_block(
     begin: int, means2d: wp.array[wp.vec2], conics: wp.array[wp.vec3], opacities: wp.array[float],
-    channels: wp.array2d[float], packed: wp.array2d[float],
+    channels: wp.array2d[float], sharpness: float, packed: wp.array2d[float],
 ): ...
 
 
@@ -63,12 +63,13 @@ def pack_splats(
     conics_in: wp.array[wp.vec3],  # [N]
     opacities_in: wp.array[float],  # [N]
     channels_in: wp.array2d[float],  # [N, C]
+    sharpness: float,
     # Out:
-    packed_out: wp.array2d[float],  # [N, 8 + C padded to a multiple of 8]
+    packed_out: wp.array2d[float],  # [N, 16], or [N, 9 + C or more] with more than 4 channels
 ):
     """Pack 16 splats. Grid: ceil(N / 16)."""
     begin = (first + wp.tid()) * _LANES
-    pack_block(begin, means2d_in, conics_in, opacities_in, channels_in, packed_out)
+    pack_block(begin, means2d_in, conics_in, opacities_in, channels_in, sharpness, packed_out)
 
 
 @wp.kernel

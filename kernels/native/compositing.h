@@ -10,9 +10,6 @@ enum {
     AHEAD_ADJOINT = 8,           // the same in the adjoint, which takes longer over a pair
 };
 
-// log2(1 / 255): the exponent below which a splat is skipped at a pixel.
-static inline float log2_alpha_min() { return -7.994353436858858f; }
-
 // A splat as seen from the tile's first pixel; the lanes of the last three are the tile's rows.
 struct Splat {
     float mx, a, log2_opacity, floor;
@@ -42,18 +39,13 @@ struct Tile {
     }
 };
 
-// Return the power without sharpness at which a splat's alpha is 1/255, from the power at which a Gaussian's is.
-static inline float sharp_floor(float floor, float curvature) {
-    return 2.0f * floor / (1.0f + __builtin_sqrtf(1.0f - 4.0f * curvature * floor));
-}
-
-static inline Splat read_splat(const float* s, const Tile& tile, float curvature) {
+static inline Splat read_splat(const float* s, const Tile& tile) {
     FUSE_WITHIN_EXPRESSIONS
     Splat g;
     g.mx = s[0] - tile.x;
     g.a = s[2];
     g.log2_opacity = s[5];
-    g.floor = sharp_floor(log2_alpha_min() - s[5], curvature);
+    g.floor = s[8];
     g.dy = lane_numbers() - (s[1] - tile.y);
     g.bdy = s[3] * g.dy;
     g.cdy2 = s[4] * g.dy * g.dy;
@@ -131,7 +123,7 @@ static inline void composite_tile(
                 const float* s = packed.data + (long long)splats.data[p0 + k] * stride;
                 if (p0 + k + AHEAD < end)
                     __builtin_prefetch(packed.data + (long long)splats.data[p0 + k + AHEAD] * stride);
-                chunk[k] = read_splat(s, place, curvature);
+                chunk[k] = read_splat(s, place);
                 reached[k] = (short)reached_rows(chunk[k], s[7]);
                 for (int c = 0; c < C; ++c) channel[k][c] = s[GEOMETRY + c0 + c];
             }
@@ -262,7 +254,7 @@ static inline void composite_tile_adjoint(
                 __builtin_prefetch(packed.data + (long long)splats.data[p - AHEAD_ADJOINT] * stride);
                 __builtin_prefetch(v_slots.data + (long long)slots.data[p - AHEAD_ADJOINT] * row_size, 1);
             }
-            const Splat g = read_splat(s, place, curvature);
+            const Splat g = read_splat(s, place);
             unsigned rows = reached_rows(g, s[7]) & bits(row_ends > p);
             const unsigned visited = rows;
             if (!rows) {

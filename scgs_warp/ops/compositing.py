@@ -38,7 +38,7 @@ class _Job:
 def demand(splats: Splats, channels: Tensor, background: Tensor | None = None) -> Demand:
     """Estimate the memory that :func:`composite` and later uses of its image take, without the lists of splats."""
     count, width = channels.shape
-    packed = 4 * (PACKED_GEOMETRY + _padded(width)) if channels.device.type == "cpu" else 4
+    packed = 4 * _packed_width(width) if channels.device.type == "cpu" else 4
     tensors = (splats.means2d, splats.conics, splats.opacities, channels)
     per_pair = slot_bytes(tensors if background is None else (*tensors, background), _slot_width(width))
     gradients = 4 * (8 + width) if per_pair else 0
@@ -183,7 +183,7 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
     last = torch.empty(alpha.shape, dtype=torch.int32, device=device) if keep or checked else None
     outputs = (image, alpha, transmittance, last)
     if job.form == "cpu":
-        source = _pack(means2d, conics, opacities, channels)
+        source = _pack(means2d, conics, opacities, channels, job.splats.sharpness)
     else:
         source = torch.empty_like(opacities)  # opacities, with 0 for splats that are left out
         launch(kernels.finite_opacities, len(opacities), opacities, channels, source)
@@ -240,9 +240,11 @@ def _load(tiles: Tiles, window: Window) -> Tensor:
     return ends + torch.arange(EMPTY_TILE, (len(ends) + 1) * EMPTY_TILE, EMPTY_TILE)
 
 
-def _padded(channels: int) -> int:
-    """Return the number of columns of a packed splat's channels."""
-    return -(-channels // CHANNEL_GROUP) * CHANNEL_GROUP
+def _packed_width(channels: int) -> int:
+    """Return the number of columns of a packed splat: whole groups of channels, one cache line for up to 4 channels."""
+    if channels <= 4:
+        return LANES
+    return -(-(PACKED_GEOMETRY + -(-channels // CHANNEL_GROUP) * CHANNEL_GROUP) // 8) * 8
 
 
 def _slot_width(channels: int) -> int:
@@ -250,9 +252,9 @@ def _slot_width(channels: int) -> int:
     return max(kernels.SLOT_WIDTH, SLOT_GEOMETRY + channels)
 
 
-def _pack(means2d: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor) -> Tensor:
-    packed = torch.empty(len(means2d), PACKED_GEOMETRY + _padded(channels.shape[1]))
-    splats = means2d, conics, opacities, channels
+def _pack(means2d: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor, sharpness: float) -> Tensor:
+    packed = torch.empty(len(means2d), _packed_width(channels.shape[1]))
+    splats = means2d, conics, opacities, channels, sharpness
     launch(cpu_kernels.pack_splats, -(-len(means2d) // LANES), *splats, packed, grain=32)
     return packed
 
