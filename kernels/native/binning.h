@@ -216,6 +216,7 @@ static inline void sort_band(
 
     for (int k = 0; k < n; ++k) {
         const int* stretch = stretches.data + 4ll * (unsigned)from[k];
+        if (k + 16 < n) __builtin_prefetch(stretches.data + 4ll * (unsigned)from[k + 16]);
         int slot = stretch[1];
         for (int column = stretch[2]; column < stretch[3]; ++column, ++slot) {
             const int at = cursor[column]++;
