@@ -220,7 +220,8 @@ static inline void composite_tile_adjoint(
         constexpr int C = decltype(group)::value;  // 0: any number of channels, read where they lie
         constexpr bool ABSOLUTE = decltype(absolute_sums)::value;
         constexpr int K = C > 0 ? C : 1;
-        vf T[16], behind[16], v[16][K], w[16];
+        vf T[16], v[16][K], w[16];
+        vf behind[16];  // what shines through from behind, times its gradient, per unit of transmittance
         vi ends[16];
         vi row_ends = {};
         int last_pair = begin;
@@ -231,7 +232,7 @@ static inline void composite_tile_adjoint(
             ends[r] = (vi)load((const float*)last.data + at, n);
             vf total = ZERO - load(v_alpha.data + at, n);
             for (int c = 0; c < channels; ++c) total += load(v_image.data + c * plane + at, n) * background.data[c];
-            behind[r] = total * T[r];
+            behind[r] = total;
             for (int c = 0; c < C; ++c) v[r][c] = c < channels ? load(v_image.data + c * plane + at, n) : ZERO;
             for (int k = 0; k < 16; ++k) row_ends[r] = ends[r][k] > row_ends[r] ? ends[r][k] : row_ends[r];
             last_pair = row_ends[r] > last_pair ? row_ends[r] : last_pair;
@@ -276,8 +277,7 @@ static inline void composite_tile_adjoint(
                 const vf raw = exp2v(power * (1.0f - curvature * power) + g.log2_opacity);
                 vf alpha = raw > ALPHA_MAX ? ZERO + ALPHA_MAX : raw;
                 alpha = skip ? ZERO : alpha;
-                const vf inverse = 1.0f / (1.0f - alpha);
-                const vf t = T[r] * inverse;
+                const vf t = T[r] / (1.0f - alpha);
                 const vf weight = alpha * t;
                 vf own = ZERO;
                 if (C > 0)
@@ -285,9 +285,10 @@ static inline void composite_tile_adjoint(
                 else
                     for (int c = 0; c < channels; ++c)
                         own += load(v_image.data + c * plane + corner + (long long)r * width, wide) * s[GEOMETRY + c];
-                vf grad = alpha * (own * t - behind[r] * inverse);
+                const vf ahead = own - behind[r];
+                vf grad = weight * ahead;
                 grad = raw > ALPHA_MAX ? ZERO : grad;
-                behind[r] += own * weight;
+                behind[r] += alpha * ahead;
                 T[r] = t;
                 g_opacity += grad;
                 grad = grad * (1.0f - 2.0f * curvature * power);
