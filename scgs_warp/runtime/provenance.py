@@ -18,12 +18,19 @@ import warp as wp
 from . import environment
 
 
-def processor() -> str:
-    """Return the processor's name as the system gives it."""
+def processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
+    """Return the processor's name as the system gives it.
+
+    A name without a number, as virtual machines have, is followed by family and model, which tell generations apart.
+    """
     with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
+        lines = cpuinfo.read_text(encoding="utf-8").partition("\n\n")[0].splitlines()
+        fields = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+        name = fields.get("model name")
+        if name and not any(sign.isdigit() for sign in name) and {"cpu family", "model"} <= fields.keys():
+            return f"{name}, family {fields['cpu family']} model {fields['model']}"
+        if name:
+            return name
     return platform.processor() or platform.machine()
 
 

@@ -17,10 +17,12 @@ SHORTEST = 1_000
 SLOWEST = 2.0
 """Largest usual ratio of the mean time of a step to that of the first steps, because Gaussians are added. On data of
 the zoo it was 0.6 to 2.3."""
+SLOWEST_FROM_HALF = 3.0
+"""The same where the first steps use the images at half their size."""
 
 
 class Pace:
-    """Estimate of the time to the last step, made once: from the first steps that use the images at full size."""
+    """Estimate of the time to the last step, made once, from the first steps."""
 
     def __init__(self, config: TrainConfig, now: Callable[[], float] = time.perf_counter) -> None:
         self.config, self._now = config, now
@@ -34,7 +36,7 @@ class Pace:
         Args:
             step: number of completed steps of the run.
         """
-        if self._done or step <= self.config.half_size:
+        if self._done:
             return None
         self._taken += 1
         if self._taken == SKIPPED:
@@ -44,7 +46,8 @@ class Pace:
         self._done = True
         each = (self._now() - self._began) / (MEASURED - SKIPPED)
         left = each * (self.config.steps - step)
+        slowest = SLOWEST if step > self.config.half_size else SLOWEST_FROM_HALF
         return (
             f"on this machine, {self.config.steps - step:,} more steps ({self.config.preset}) take {clock(left)} to "
-            f"{clock(SLOWEST * left)}: {1000 * each:.0f} ms each so far, more as Gaussians are added"
+            f"{clock(slowest * left)}: {1000 * each:.0f} ms each so far, more as Gaussians are added"
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from scgs_warp.runtime.provenance import command_line
+from scgs_warp.runtime.provenance import command_line, processor
 
 
 @pytest.mark.parametrize(
@@ -18,3 +18,21 @@ from scgs_warp.runtime.provenance import command_line
 )
 def test_command_line(words, text):
     assert command_line("apps/train.py", words) == text
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"model name": "AMD EPYC 9654"}, "AMD EPYC 9654"),
+        ({"model name": "AMD EPYC", "cpu family": "26", "model": "2"}, "AMD EPYC, family 26 model 2"),
+        ({"model name": "AMD EPYC"}, "AMD EPYC"),
+    ],
+)
+def test_a_vague_name_is_followed_by_the_generation(tmp_path, fields, text):
+    lines = "\n".join(f"{key}\t: {value}" for key, value in fields.items())
+    (tmp_path / "cpuinfo").write_text(f"processor\t: 0\n{lines}\n\nprocessor\t: 1\nmodel name\t: other\n")
+    assert processor(tmp_path / "cpuinfo") == text
+
+
+def test_a_system_without_that_file_names_its_machine(tmp_path):
+    assert processor(tmp_path / "missing")
