@@ -10,13 +10,14 @@ the same name in each, and the adjoint of kernel ``x`` is ``x_adjoint``. Other k
 example, the CPU's ``skin_rbf`` does in one pass what ``rbf_weights`` and ``skin`` do in two.
 
 A CPU runs the cpu form where there is one, and CUDA runs the cuda form where there is one; otherwise the portable form
-runs. The portable form of the network is torch. The torch op of a stage is in ``scgs_warp/ops/``, and its float64
-reference is in ``tests/reference/``. The last column names the tests, below ``tests/``, that compare the forms; all of
-them run on a CPU.
+runs. The portable form of the network and of activations is torch. The torch op of a stage is in ``scgs_warp/ops/``,
+and its float64 reference is in ``tests/reference/``. The last column names the tests, below ``tests/``, that compare
+the forms; all of them run on a CPU.
 
 ===========  ===========  ================  ==================  ========================================
 stage        portable     cpu               cuda                compared in
 ===========  ===========  ================  ==================  ========================================
+activations  torch        activations                           kernels/test_activations
 projection   projection   projection                            kernels/test_projection
 binning      binning      binning           binning             kernels/test_binning
                                                                 kernels/cuda/test_binning

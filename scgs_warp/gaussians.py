@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
+from .ops.activations import exponential, sigmoid
 from .ops.correctives import COLUMNS as CORRECTIVE_COLUMNS
 from .ops.shading import COLUMNS as SHADING_COLUMNS
 from .runtime.environment import one_piece
@@ -15,38 +14,6 @@ from .types import Gaussians
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh_dc."""
-
-
-def fixed_exp(values: Tensor) -> Tensor:
-    """Return exp of the values; the result is bit-identical for any number of threads."""
-    with one_piece():
-        return values.exp()
-
-
-def fixed_sigmoid(values: Tensor) -> Tensor:
-    """Return the sigmoid of the values; the result is bit-identical for any number of threads."""
-    with one_piece():
-        return values.sigmoid()
-
-
-def version_of(values: Tensor) -> int:
-    """Return a number that grows whenever torch changes the values in place; 0 where torch does not count."""
-    return 0 if values.is_inference() else values._version
-
-
-class _Kept:
-    """A result, and the state of the tensor that it was computed from."""
-
-    def __init__(self, source: Tensor, result: Tensor) -> None:
-        self.result, self._source = result, source
-        self._state = self._state_of(source)
-
-    def _state_of(self, source: Tensor) -> tuple[int, int, int]:
-        return source.data_ptr(), version_of(source), version_of(self.result)
-
-    def holds(self, source: Tensor) -> bool:
-        """Return whether the tensor is the same and unchanged, and nobody changed the result."""
-        return self._source is source and self._state == self._state_of(source)
 
 
 class GaussianParameters(nn.Module):
@@ -74,7 +41,6 @@ class GaussianParameters(nn.Module):
     ) -> None:
         super().__init__()
         self.sharpness = sharpness
-        self._kept: dict[str, _Kept] | None = None
         count, device = means.shape[0], means.device
         quats = torch.zeros(count, 4, device=device)
         quats[:, 0] = 1.0
@@ -116,28 +82,11 @@ class GaussianParameters(nn.Module):
 
     def scales(self) -> Tensor:
         """Return the standard deviations, [N, 3]."""
-        return self._activated("log_scales", fixed_exp)
+        return exponential(self.log_scales)
 
     def opacities(self) -> Tensor:
         """Return the opacities, [N] in (0, 1)."""
-        return self._activated("opacity_logits", fixed_sigmoid)
-
-    def keep_activations(self, keep: bool) -> None:
-        """Compute scales and opacities once for all frames that are drawn without gradients, or stop doing so.
-
-        They are computed anew where a parameter is replaced or changed by torch. Optimizers that write to its memory by
-        themselves, as the project's own do, must not run meanwhile.
-        """
-        self._kept = {} if keep else None
-
-    def _activated(self, name: str, activate: Callable[[Tensor], Tensor]) -> Tensor:
-        values, kept = getattr(self, name), self._kept
-        if kept is None or torch.is_grad_enabled():
-            return activate(values)
-        known = kept.get(name)
-        if known is None or not known.holds(values):
-            known = kept[name] = _Kept(values, activate(values))
-        return known.result
+        return sigmoid(self.opacity_logits)
 
     def rest(self) -> tuple[Tensor, ...]:
         """Return the raw parameters that posing reads, in the order of ``ops.posing.pose_gaussians``."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import pytest
 import torch
 
-from scgs_warp.benchmark.scenes import figure, synthetic_scene, training_state
+from scgs_warp.benchmark.scenes import figure
 from scgs_warp.gaussians import SH_C0, GaussianParameters, gaussians_from_points, neighbor_distance
 from scgs_warp.geometry.cameras import Overview, orbit_camera
 from scgs_warp.rendering.render import render
@@ -62,39 +61,3 @@ def test_sharpness_reaches_every_kind_of_gaussians():
     made = gaussians_from_points(torch.rand(5, 3), None, sh_degree=0, hyper_dim=0, sharpness=0.5)
     assert made.sharpness == made.activate().sharpness == 0.5
     assert GaussianParameters.empty(2, 0, 0, False, False, "cpu").sharpness == 0.0
-
-
-@torch.no_grad()
-def test_kept_activations_follow_every_change_of_a_parameter():
-    gaussians = figure(50)
-    gaussians.keep_activations(True)
-    scales, opacities = gaussians.scales(), gaussians.opacities()
-    assert gaussians.scales() is scales and gaussians.opacities() is opacities
-    gaussians.log_scales += 1.0
-    torch.testing.assert_close(gaussians.scales(), scales * math.e)
-    gaussians.opacity_logits = torch.nn.Parameter(gaussians.opacity_logits + 1.0)
-    assert (gaussians.opacities() > opacities).all()
-    given = gaussians.opacities()
-    given *= 0.5  # by somebody who has it from ``activate``
-    torch.testing.assert_close(gaussians.opacities(), 2.0 * given)
-    gaussians.keep_activations(False)
-    assert gaussians.scales() is not gaussians.scales()
-
-
-def test_activations_that_need_gradients_are_not_kept():
-    gaussians = figure(50)
-    gaussians.keep_activations(True)
-    with torch.no_grad():
-        kept = gaussians.scales()
-    gaussians.scales().sum().backward()
-    assert not kept.requires_grad and gaussians.log_scales.grad is not None and gaussians.log_scales.grad.all()
-
-
-def test_training_keeps_no_activations():
-    """The optimizers write to memory that torch does not watch."""
-    scene = synthetic_scene("control-points", 50, 4, "cpu")
-    with torch.no_grad():
-        assert scene.gaussians.scales() is scene.gaussians.scales()
-        state = training_state(scene, arap=False)
-        state.gaussians.log_scales.detach().numpy()[:] = 0.5
-        torch.testing.assert_close(state.gaussians.scales(), torch.full((50, 3), math.exp(0.5)))

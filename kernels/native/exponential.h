@@ -2,17 +2,22 @@
 #pragma once
 #include "simd.h"
 
+// Return e^(x - n ln 2) for the integer n nearest to x / ln 2, by its series.
+ALWAYS_INLINE vf exponential_series(vf x, vf n) {
+    FUSE_WITHIN_EXPRESSIONS
+    const vf f = x - n * 0.693359375f + n * 2.12194440e-4f;
+    return 1.0f +
+           f * (1.0f + f * (0.5f + f * (0.16666667f + f * (4.16666667e-2f + f * (8.3333333e-3f + f * 1.3888889e-3f)))));
+}
+
 // Return e^x for x <= 88; 0 below -87.
 ALWAYS_INLINE vf exponential(vf x) {
     FUSE_WITHIN_EXPRESSIONS
-    vf y = x < -87.0f ? vf{} - 87.0f : x;
-    vf shifted = y * 1.44269504f + 12582912.0f;
-    vf n = shifted - 12582912.0f;
-    vf f = y - n * 0.693359375f + n * 2.12194440e-4f;
-    vf p = 1.0f +
-           f * (1.0f + f * (0.5f + f * (0.16666667f + f * (4.16666667e-2f + f * (8.3333333e-3f + f * 1.3888889e-3f)))));
-    vi exponent = (__builtin_convertvector(n, vi) + 127) << 23;
-    return x < -87.0f ? vf{} : p * (vf)exponent;
+    const vf y = x < -87.0f ? vf{} - 87.0f : x;
+    const vf shifted = y * 1.44269504f + 12582912.0f;
+    const vf n = shifted - 12582912.0f;
+    const vi exponent = (__builtin_convertvector(n, vi) + 127) << 23;
+    return x < -87.0f ? vf{} : exponential_series(y, n) * (vf)exponent;
 }
 
 // Return log2 of positive normal numbers, to 2e-7 of the result or of 1, whichever is larger. With the mantissa m in

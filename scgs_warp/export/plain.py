@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..gaussians import fixed_exp
 from ..geometry.cameras import SWING_SHARE, Overview, orbit_camera
+from ..ops.activations import exponential
 from ..ops.ssim import photometric_loss
 from ..optim import Adam, log_linear
 from ..rendering.render import draw
@@ -112,5 +112,5 @@ def azimuth_of(overview: Overview, index: int) -> float:
 def _changed(posed: Gaussians, opacity_logits: Tensor, changes: dict[str, nn.Parameter]) -> Gaussians:
     with one_piece():
         opacities = (opacity_logits + changes["opacity_logits"]).sigmoid()
-    scales = posed.scales * fixed_exp(changes["log_scales"])
+    scales = posed.scales * exponential(changes["log_scales"])
     return replace(posed, scales=scales, opacities=opacities, sh_dc=posed.sh_dc + changes["sh_dc"], sharpness=0.0)

@@ -9,14 +9,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..config.presets import LossConfig, MotionConfig, TrainConfig
-from ..gaussians import GaussianParameters, fixed_exp, version_of
+from ..gaussians import GaussianParameters
+from ..ops.activations import exponential, sigmoid
 from ..ops.correctives import correct
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.posing import pose_gaussians, unit_pose
 from ..ops.shading import shade, tint
 from ..ops.skinning import skin, skin_rbf
 from ..runtime.device_copies import sent
-from ..runtime.environment import one_piece
 from ..seeding import generator
 from ..types import Gaussians, Pose
 from .base import Motion, MotionStep, TrainingPose, network_rate
@@ -83,8 +83,7 @@ def _posed(
     if gaussians.correctives.shape[1]:
         means = correct(means, gaussians.correctives, gaussians.quats, quats, own)
     if masked:
-        with one_piece():
-            share = gaussians.hyper[:, -1:].sigmoid()
+        share = sigmoid(gaussians.hyper[:, -1:])
         rest = F.normalize(gaussians.quats, dim=1)
         rest = torch.where((rest * quats).sum(1, keepdim=True) < 0, -rest, rest)
         means = gaussians.means + share * (means - gaussians.means)
@@ -93,7 +92,7 @@ def _posed(
             own = rest + share * (torch.where((rest * own).sum(1, keepdim=True) < 0, -own, own) - rest)
         extras = None if extras is None else share * extras
     log_scales, tints = (extras, None) if pose.tints is None else (None, extras)
-    scales = gaussians.scales() if log_scales is None else fixed_exp(gaussians.log_scales + log_scales)
+    scales = gaussians.scales() if log_scales is None else exponential(gaussians.log_scales + log_scales)
     sh_dc = gaussians.sh_dc if tints is None else tint(gaussians.sh_dc, tints)
     if gaussians.shading.shape[1]:
         sh_dc = shade(sh_dc, gaussians.shading, gaussians.quats, quats if own is None else own)
@@ -221,7 +220,9 @@ class ControlPoints(Motion):
         """Identify the inputs of :meth:`binding`: the result stays equal as long as no tensor is replaced or changed in
         place."""
         own = self.positions, self.log_radii, self.hyper, self.strength_logits
-        return [(x, x.data_ptr(), version_of(x)) for x in (gaussians.means, gaussians.hyper, *own)]
+        return [
+            (x, x.data_ptr(), 0 if x.is_inference() else x._version) for x in (gaussians.means, gaussians.hyper, *own)
+        ]
 
     def _cache_holds(self, gaussians: GaussianParameters) -> bool:
         if self._cached_for is None:

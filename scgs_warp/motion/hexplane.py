@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from ..config.presets import TrainConfig
-from ..gaussians import GaussianParameters, fixed_exp
+from ..gaussians import GaussianParameters
+from ..ops.activations import exponential
 from ..ops.network import Layers, PackedLayers, evaluate, network
 from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_variation
 from ..optim import log_linear
@@ -101,7 +102,7 @@ class HexPlane(Motion):
         return Gaussians(
             gaussians.means + means,
             gaussians.quats + quats,
-            fixed_exp(gaussians.log_scales + log_scales),
+            exponential(gaussians.log_scales + log_scales),
             gaussians.opacities(),
             gaussians.sh_dc,
             gaussians.sh_rest,

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from ..config.presets import TrainConfig
-from ..gaussians import GaussianParameters, fixed_exp
+from ..gaussians import GaussianParameters
+from ..ops.activations import exponential
 from ..runtime.device_copies import sent
 from ..types import Gaussians
 from .base import Motion, MotionStep, TrainingPose, network_rate
@@ -30,7 +31,7 @@ class PerGaussian(Motion):
         return Gaussians(
             gaussians.means + out["translations"][0],
             gaussians.quats + out["rotations"][0],
-            fixed_exp(gaussians.log_scales + out["log_scales"][0]),
+            exponential(gaussians.log_scales + out["log_scales"][0]),
             gaussians.opacities(),
             gaussians.sh_dc,
             gaussians.sh_rest,

@@ -106,8 +106,7 @@ class Scene:
         return scene
 
     def freeze_binding(self) -> None:
-        """Compute once what does not depend on time: every Gaussian's control points, scales and opacities."""
-        self.gaussians.keep_activations(True)
+        """Compute every Gaussian's control points once, since they do not depend on time."""
         cache = getattr(self.motion, "cache_binding", None)
         if cache is not None:
             cache(self.gaussians)

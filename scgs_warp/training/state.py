@@ -108,7 +108,6 @@ class TrainState:
     def enter(self, gaussians: GaussianParameters, motion: Motion) -> None:
         """Replace the models, with fresh optimisers and statistics."""
         self.gaussians, self.motion = gaussians, motion
-        gaussians.keep_activations(False)
         self.gaussian_optimizer = Adam(dict(gaussians.named_parameters()), self.gaussian_rates())
         self.motion_optimizer = motion.optimizer(self.config)
         self.reset_stats()
