@@ -59,6 +59,7 @@ def preset(name: PresetName) -> TrainConfig:
         steps=24_000,
         freeze=400,
         coarse=1_800,
+        half_size=6_000,
         init_points=10_000,
         evaluate_every=5_000,
         pretrain=PretrainConfig(steps=3_000, densify_until=2_000, warm_up=100, progressive_every=300),
@@ -91,7 +92,7 @@ def preset(name: PresetName) -> TrainConfig:
     # Rigidity to the end, neighbours by place alone, less sharpness: least error of motion on the built-in figure.
     motion = dataclasses.replace(quick.motion, hyper_dim=0, node_weight=False, correctives=False)
     loss = dataclasses.replace(quick.loss, arap=1e-2, arap_end=1e-2, arap_until=quick.steps)
-    changed = {"half_size": 1_800, "sharpness": 0.25, "pretrain": stage1, "motion": motion, "loss": loss}
+    changed = {"half_size": 3_500, "sharpness": 0.25, "pretrain": stage1, "motion": motion, "loss": loss}
     return dataclasses.replace(quick, preset="quick", **changed)
 
 

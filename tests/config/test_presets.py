@@ -80,6 +80,13 @@ def test_presets_begin_at_rest_for_as_long_as_the_published_ones():
         assert config.rest_steps == config.freeze
 
 
+@pytest.mark.parametrize("name", ["cpu", "quick"])
+def test_images_are_whole_while_gaussians_are_still_added(name):
+    """Gaussians that only whole images ask for must still be made."""
+    config = C.preset(name)
+    assert config.pretrain_steps < config.half_size < config.pretrain_steps + 0.6 * config.densify.until
+
+
 @pytest.mark.parametrize("name", C.PRESETS)
 def test_no_milestone_falls_to_step_0_in_a_short_run(name):
     """A milestone of 0 means never or from the start; no other may come to mean that."""

@@ -65,6 +65,7 @@ def tiny_config(steps: int = 60, **changes) -> TrainConfig:
     base = with_steps(preset("cpu"), steps)
     small = {
         "init_points": 300,
+        "half_size": 0,
         "checkpoint_seconds": 1e9,
         "motion": {"nodes": 16, "layers": 3, "width": 32, "skip": 2},
         "densify": {"every": 10, "start": 10, "opacity_reset_every": 10_000, "sh_every": 20},
