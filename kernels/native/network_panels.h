@@ -24,7 +24,9 @@ enum {
 
 enum { PANEL = NETWORK_PANEL };  // columns of a panel
 
-// Size of the tile of a result kept in registers: 16 accumulators hide the latency of a fused multiply-add.
+// Size of the tile of a result kept in registers, for the processor that the compiler was given. Of AVX-512's and
+// NEON's 32 registers 16 are accumulators, of AVX's 16 only 8, which just hide the latency of two multiply-adds a
+// cycle. There is no case for x86 without AVX, because Warp's own code needs F16C.
 #if defined(__AVX512F__)
 enum { LANES = 16, ROWS = 8, VECTORS = 2 };
 #elif defined(__AVX__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import shutil
 import subprocess
 import sys
@@ -15,23 +16,11 @@ import warp as wp
 from scgs_warp.kernels import native
 from scgs_warp.runtime.launch import launch
 
+from helpers.clang import compiler  # isort: skip
 from helpers.cuda_emulation import SHIM  # isort: skip
 
 HEADERS = sorted(path.name for path in native.FOLDER.glob("*.h"))
-COMPILERS = ("clang++", *(f"clang++-{version}" for version in range(25, 15, -1)))
 WARNINGS = ["-Wall", "-Wextra", "-Werror", "-Wno-psabi", "-Wno-unused-function"]
-
-
-def compiler() -> str:
-    """Return a Clang with vectors of bool (16 or newer); skip the test where there is none."""
-    for name in COMPILERS:
-        path = shutil.which(name)
-        if path is None:
-            continue
-        version = subprocess.run([path, "-dumpversion"], capture_output=True, text=True, check=True).stdout
-        if int(version.split(".")[0]) >= 16:
-            return path
-    pytest.skip("no Clang of version 16 or newer is installed")
 
 
 def write_unit(path: Path, names: list[str], *more: str) -> list[str]:
@@ -55,17 +44,54 @@ def test_compiles_by_itself(name, tmp_path):
     assert result.returncode == 0, result.stderr[-4000:]
 
 
+def network_assembly(folder: Path, *target: str) -> list[str]:
+    """Return the lines of assembly of the network's kernels for a target, given as words for Clang."""
+    functions = "network_block", "network_block_adjoint", "network_inputs_block_adjoint", "network_panel_adjoint"
+    kept = f"void* kept[] = {{{', '.join(f'(void*)&{name}' for name in functions)}}};"
+    command = write_unit(folder / "unit.cpp", ["network.h", "network_adjoint.h"], kept)
+    command += [*target, "-O2", "-S", "-o", str(folder / "unit.s")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert result.returncode == 0, result.stderr[-4000:]
+    return (folder / "unit.s").read_text(encoding="utf-8").splitlines()
+
+
 @pytest.mark.parametrize("processor", ["sapphirerapids", "znver4"])
 def test_the_network_uses_whole_registers(processor, tmp_path):
     """Where Clang tunes for an Intel CPU it cuts vectors of 512 bits into halves, at two thirds of the speed."""
-    functions = "network_block", "network_block_adjoint", "network_inputs_block_adjoint", "network_panel_adjoint"
-    kept = f"void* kept[] = {{{', '.join(f'(void*)&{name}' for name in functions)}}};"
-    command = write_unit(tmp_path / "unit.cpp", ["network.h", "network_adjoint.h"], kept)
-    command += ["--target=x86_64-linux-gnu", f"-march={processor}", "-O2", "-S", "-o", str(tmp_path / "unit.s")]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert result.returncode == 0, result.stderr[-4000:]
-    fused = [line for line in (tmp_path / "unit.s").read_text(encoding="utf-8").splitlines() if "vfmadd" in line]
+    lines = network_assembly(tmp_path, "--target=x86_64-linux-gnu", f"-march={processor}")
+    fused = [line for line in lines if "vfmadd" in line]
     assert len(fused) >= 4 * 16 and all("zmm" in line for line in fused)
+
+
+def innermost_loops(lines: list[str]) -> list[list[str]]:
+    """Return the loops of a function's assembly in which there is no other label."""
+    loops, begin, label = [], 0, ""
+    for index, line in enumerate(lines):
+        if found := re.match(r"(\.L\w+):", line):
+            begin, label = index, found[1]
+        elif re.match(rf"\s+(j|b\.|cbn?z|tbn?z).*{re.escape(label)}$", line) and label:
+            loops.append(lines[begin + 1 : index])
+    return loops
+
+
+@pytest.mark.parametrize(
+    ("target", "product", "register", "tile"),
+    [
+        (("--target=x86_64-linux-gnu", "-march=znver4"), "vfmadd", "zmm", 16),
+        (("--target=x86_64-linux-gnu", "-march=haswell"), "vfmadd", "ymm", 8),
+        (("--target=x86_64-linux-gnu", "-march=ivybridge"), "vmulps", "ymm", 8),
+        (("--target=aarch64-linux-gnu",), "fmla", "v", 16),
+    ],
+    ids=["avx512", "avx2", "avx", "neon"],
+)
+def test_the_networks_sums_stay_in_registers(target, product, register, tile, tmp_path):
+    """No innermost loop that multiplies a whole tile reads or writes the stack."""
+    loops = innermost_loops(network_assembly(tmp_path, *target))
+    products = [[line for line in loop if product in line] for loop in loops]
+    whole = [loop for loop, own in zip(loops, products) if len(own) == tile and all(register in line for line in own)]
+    assert len(whole) >= 4
+    for loop in whole:
+        assert not [line for line in loop if re.search(r"\(%r[sb]p|\[sp|\[x29", line)]
 
 
 def test_headers_include_only_their_neighbours():
