@@ -30,6 +30,11 @@ WANTS = (
     ),
     Want("clang", r"no Clang|clang-format", "apt-get install clang-19; pip install -e '.[dev]'"),
     Want("compiler", r"no C\+\+ compiler", "apt-get install g++ (Linux)"),
+    Want(
+        "emulator",
+        r"no qemu-aarch64",
+        "apt-get install qemu-user gcc-aarch64-linux-gnu libc6-dev-arm64-cross (Debian)",
+    ),
     Want("mount", r"small disk|mount cannot", "run as root outside of a container"),
     Want("players", r"Mono is not installed|names no Python with the package bpy", "see the reason of each test"),
     Want("packages", r"is not installed|could not import|cannot be imported", "pip install -e '.[dev]'"),

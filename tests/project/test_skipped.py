@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from other_processors import program
 
 from helpers import chromium, node_packages, skipped
 from helpers.paths import ROOT
@@ -43,8 +44,10 @@ def test_the_reasons_of_the_helpers_are_known(monkeypatch):
         pass
     with pytest.raises(pytest.skip.Exception) as no_node:
         node_packages.node("-v")
-    found = [skipped.wanted_by(str(error.value)) for error in (no_browser, no_node)]
-    assert [want.name for want in found if want is not None] == ["chromium", "npm"]
+    monkeypatch.setattr(program, "compiler_path", lambda: "clang++")
+    reasons = [str(no_browser.value), str(no_node.value), str(program.why_not("neon"))]
+    found = [skipped.wanted_by(reason) for reason in reasons]
+    assert [want.name for want in found if want is not None] == ["chromium", "npm", "emulator"]
 
 
 @pytest.mark.parametrize(

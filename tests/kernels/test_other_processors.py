@@ -1,0 +1,48 @@
+"""The SIMD forms on other processors: the tests of their stages pass there, and every module of them has run."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from other_processors.program import PROCESSORS, why_not
+
+from scgs_warp.kernels import cpu
+
+TESTS = Path(__file__).resolve().parents[1]
+STAGES = (
+    "adam", "binning", "compositing", "correctives", "harmonics", "neighbors", "network", "projection", "shading",
+    "skinning", "ssim",
+)  # fmt: skip
+LEFT_OUT = "gsplat or thread or wrong or any_scene or any_shape or many_splats or refus or not_fit or nothing_to_do"
+"""Tests that do not concern the processor, or that take long where it is emulated."""
+NOT_RUN = {"roofline"}
+"""Modules that compute nothing."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("processor", PROCESSORS)
+def test_all_stages(processor, tmp_path):
+    if reason := why_not(processor):
+        pytest.skip(reason)
+    environment = {
+        **os.environ,
+        "SCGS_PROCESSOR": processor,
+        "SCGS_PROCESSOR_LEDGER": str(tmp_path / "ledger.json"),
+        "PYTHONPATH": str(TESTS),
+        "SCGS_NEEDS": "",
+    }
+    files = [str(TESTS / "kernels" / f"test_{stage}.py") for stage in STAGES]
+    words = [sys.executable, "-m", "pytest", "-x", "-p", "other_processors.plugin", "-k", f"not ({LEFT_OUT})", *files]
+    result = subprocess.run(words, cwd=TESTS.parent, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout[-6000:] + result.stderr[-2000:]
+    ledger = json.loads((tmp_path / "ledger.json").read_text(encoding="utf-8"))
+    for kernel, row in ledger.items():
+        print(f"{processor} {kernel}: {row}")
+    modules = {path.stem for path in Path(cpu.__path__[0]).glob("*.py")} - {"__init__"} - NOT_RUN
+    assert {kernel.partition(".")[0] for kernel in ledger} == modules
