@@ -18,7 +18,7 @@ STAGES = (
     "adam", "binning", "compositing", "correctives", "harmonics", "neighbors", "network", "projection", "shading",
     "skinning", "ssim",
 )  # fmt: skip
-LEFT_OUT = "gsplat or thread or wrong or any_scene or any_shape or many_splats or refus or not_fit or nothing_to_do"
+LEFT_OUT = "gsplat or thread or wrong or any_s or many_splats or refus or not_fit or nothing_to_do or in_parts"
 """Tests that do not concern the processor, or that take long where it is emulated."""
 NOT_RUN = {"roofline"}
 """Modules that compute nothing."""
