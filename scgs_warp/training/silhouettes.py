@@ -28,6 +28,9 @@ FILLED = 0.95
 """Share of covered pixels above which an image is taken for a filled one with an alpha channel, without silhouette."""
 LONGEST_SIDE = 256
 """Silhouettes of larger images are reduced to at most this many pixels per side."""
+KEPT_MIB, KEPT_ON_GPU_MIB = 64, 1024
+"""Memory for the silhouettes of a run, so that a film of any length fits. On a CPU it holds 400 of 480 x 270 pixels;
+others are found again at each use, which takes a few milliseconds. On a GPU that would hold up the steps."""
 PIXELS = 512
 """Number of silhouette pixels that are compared in each step."""
 NEAREST_DEPTH = 1e-2
@@ -51,6 +54,10 @@ class Silhouette(NamedTuple):
     """[P, 2] centres (x, y) of the pixels inside, row by row, on the host."""
     size: Tensor
     """[2] width and height of ``distances``. Pixels of a reduced silhouette cover several of the image's."""
+
+    @property
+    def bytes(self) -> int:
+        return sum(tensor.numel() * tensor.element_size() for tensor in self)
 
     def sample(self, random: torch.Generator) -> SilhouetteSample:
         """Choose ``PIXELS`` of the pixels at random, with replacement."""
@@ -154,21 +161,28 @@ def _product(rows: Tensor, matrix: Tensor) -> Tensor:
 
 
 class Silhouettes:
-    """Silhouettes of the training images, each found at its first use."""
+    """Silhouettes of the training images, each found at its first use and kept if there is room."""
 
     def __init__(self, device: str) -> None:
         self.device = device
+        self.room = (KEPT_MIB if torch.device(device).type == "cpu" else KEPT_ON_GPU_MIB) * 2**20
+        """Bytes that further silhouettes may take."""
         self._found: dict[Hashable, Silhouette | None] = {}
 
     def of(self, key: Hashable, alpha: Callable[[], Tensor]) -> Silhouette | None:
         """Return the silhouette of an image, None if it has none; the same key must stand for the same image.
 
         Args:
-            alpha: returns the image's coverage [H, W]; called at the first use only.
+            alpha: returns the image's coverage [H, W]; called only if the silhouette is not kept.
         """
-        if key not in self._found:
-            self._found[key] = silhouette_of(alpha(), self.device)
-        return self._found[key]
+        if key in self._found:
+            return self._found[key]
+        found = silhouette_of(alpha(), self.device)
+        size = 0 if found is None else found.bytes
+        if size <= self.room:
+            self._found[key] = found
+            self.room -= size
+        return found
 
 
 def is_thin(data: Dataset) -> bool:

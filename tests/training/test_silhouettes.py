@@ -161,6 +161,20 @@ def test_a_silhouette_is_found_once_and_none_without_a_subject():
     assert first is not None and found.of(2, lambda: pytest.fail("read again")) is first
 
 
+def test_silhouettes_beyond_their_room_are_found_again(monkeypatch):
+    alphas = [alpha_of(slice(0, 4 + index), slice(0, 4)) for index in range(3)]
+    sizes = [found.bytes for found in map(silhouette_of, alphas) if found is not None]
+    monkeypatch.setattr(silhouettes, "KEPT_MIB", (sizes[0] + sizes[1]) / 2**20)
+    kept, read = Silhouettes("cpu"), []
+    for _ in range(2):
+        for index, alpha in enumerate(alphas):
+            found = kept.of(index, lambda index=index, alpha=alpha: read.append(index) or alpha)
+            expected = silhouette_of(alpha)
+            assert found is not None and expected is not None
+            assert all(torch.equal(*pair) for pair in zip(found, expected))
+    assert read == [0, 1, 2, 2]
+
+
 def strips(size: int, width: int, count: int = 1) -> Dataset:
     """Frames of a vertical strip ``width`` pixels wide."""
     alpha = alpha_of(slice(0, size), slice(20, 20 + width), size, size)
