@@ -62,6 +62,10 @@ class MotionConfig:
     """Number of frequencies by which positions are encoded."""
     time_frequencies: int = bounded(6, 1, 32)
     """Number of frequencies by which times are encoded."""
+    chunks: int = newer(1, before=1, least=1, most=64)
+    """Number of chunks of time, each with a network of its own over the same control points and Gaussians, for long
+    films: one for about 250 frames. Neighbouring networks are blended where chunks meet. For control points and
+    per-gaussian."""
     train_positions: bool = True
     """Learn the rest positions of the control points in stage 2 (paper); the official code never moves them."""
     hyper_dim: int = bounded(8, 0, 64)

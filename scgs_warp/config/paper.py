@@ -35,6 +35,7 @@ PAPER = TrainConfig(
         skip=4,
         position_frequencies=10,
         time_frequencies=6,
+        chunks=1,
         train_positions=True,
         hyper_dim=0,
         hyper_dim_filled=0,

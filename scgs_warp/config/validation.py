@@ -11,6 +11,9 @@ from ..errors import UserError
 from .bounds import MAGNITUDE
 from .presets import TrainConfig
 
+LARGEST_NETWORKS = 64 * 2_048**2
+"""Largest number of weights of all chunks' networks together: that of a single network of the largest size."""
+
 
 def check(config: TrainConfig) -> TrainConfig:
     """Refuse a configuration that cannot run.
@@ -39,6 +42,8 @@ def _check_rules(config: TrainConfig) -> None:
         raise UserError(f"motion.skip is {motion.skip}; choose 1 to {motion.layers - 1}, below motion.layers")
     if motion.plane_times != 0 and not 2 <= motion.plane_times <= 4096:
         raise UserError(f"motion.plane_times is {motion.plane_times}; choose 2 to 4096, or 0 for half of the times")
+    if motion.chunks > 1 and motion.model not in ("control-points", "per-gaussian"):
+        raise UserError(f"motion.chunks is {motion.chunks}; --motion {motion.model} has no network: leave it out")
     if motion.nodes < motion.neighbors + 1:
         raise UserError(f"--nodes {motion.nodes}: needs at least {motion.neighbors + 1}")
     if config.densify.max_gaussians < 100:
@@ -63,8 +68,11 @@ def check_sizes(config: TrainConfig, prefix: str = "") -> None:
     motion = config.motion
     if not 0 <= motion.skip < motion.layers or min(motion.width, motion.layers) < 1:
         raise UserError(f"{prefix}motion.skip is {motion.skip}; it must be below motion.layers, {motion.layers}")
-    if min(motion.time_frequencies, motion.position_frequencies) < 1 or motion.hyper_dim < 0:
-        raise UserError(f"{prefix}motion.time_frequencies, position_frequencies or hyper_dim are too small; restore it")
+    if motion.chunks > 1 and motion.chunks * motion.layers * motion.width**2 > LARGEST_NETWORKS:
+        raise UserError(f"{prefix}motion.chunks is {motion.chunks}; so many networks of this size are too large")
+    if min(motion.time_frequencies, motion.position_frequencies, motion.chunks) < 1 or motion.hyper_dim < 0:
+        names = "time_frequencies, position_frequencies, chunks or hyper_dim"
+        raise UserError(f"{prefix}motion.{names} are too small; restore it")
 
 
 def _numbers(config: Any, prefix: str = "") -> Iterator[tuple[str, int | float, Mapping[str, Any]]]:

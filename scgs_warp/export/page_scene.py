@@ -22,7 +22,8 @@ from .page_parts import part_columns
 from .skeleton import continuous
 
 MIN_SAMPLES, MAX_SAMPLES = 33, 257
-"""Smallest and largest number of times at which control points are sampled; see ``COARSE_ERROR``."""
+"""Smallest and largest number of times at which control points are sampled; see ``COARSE_ERROR``. A motion in chunks
+may take as many times for each chunk."""
 COARSE_ERROR = 8e-4
 """Acceptable error of interpolation halfway between two times (root mean square, normalised units and radians). The
 number of times is doubled until the error is below this, and then once more, which leaves about a quarter of the
@@ -242,9 +243,9 @@ def sample_poses(motion: ControlPoints) -> dict[str, np.ndarray]:
     Raises:
         UserError: a pose is not finite.
     """
-    count = MIN_SAMPLES
+    count, most = MIN_SAMPLES, (MAX_SAMPLES - 1) * motion.config.chunks + 1
     poses = poses_at(motion, even_times(count))
-    while count < MAX_SAMPLES:
+    while count < most:
         between = poses_at(motion, (torch.arange(count - 1) + 0.5) / (count - 1))
         errors = [(2.0 if name in QUATERNIONS else 1.0) * _error(poses[name], between[name]) for name in poses]
         poses = {name: _interleaved(poses[name], between[name]) for name in poses}

@@ -51,7 +51,7 @@ class Motion(nn.Module):
 
     name: ClassVar[str]
     moves: ClassVar[bool] = True
-    takes_time_tensor: ClassVar[bool] = False
+    takes_time_tensor: bool = False
     """True if :meth:`gaussians_at` also accepts the time as a tensor [1] on the model's device and then copies nothing
     between host and device. Such a frame can be recorded once and replayed (``FrameGraph``)."""
 

@@ -20,6 +20,7 @@ from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Gaussians, Pose
 from .base import Motion, MotionStep, TrainingPose, network_rate
+from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
 from .rigidity import Graph, arap_times, arap_weight, build_graph, rigidity
 
@@ -39,17 +40,22 @@ def heads_of(config: MotionConfig) -> dict[str, int]:
     return heads
 
 
-def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> DeformationNetwork:
-    return DeformationNetwork(
-        heads,
-        layers=config.layers,
-        width=config.width,
-        skip=config.skip,
-        position_frequencies=config.position_frequencies,
-        time_frequencies=config.time_frequencies,
-        bfloat16=config.bfloat16,
-        generator=generator(seed, 11),
-    )
+def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> DeformationNetwork | ChunkedNetwork:
+    """Make a network that does not move anything yet: one, or one per chunk of time."""
+
+    def make(chunk: int) -> DeformationNetwork:
+        return DeformationNetwork(
+            heads,
+            layers=config.layers,
+            width=config.width,
+            skip=config.skip,
+            position_frequencies=config.position_frequencies,
+            time_frequencies=config.time_frequencies,
+            bfloat16=config.bfloat16,
+            generator=generator(seed, 11, chunk) if chunk else generator(seed, 11),
+        )
+
+    return make(0) if config.chunks == 1 else ChunkedNetwork(make, config.chunks)
 
 
 def unit_rotations(raw: Tensor) -> Tensor:
@@ -103,9 +109,10 @@ class ControlPoints(Motion):
     """Positions [M, 3], radii [M], optional hyper-coordinates [M, H] and weights [M], and the network."""
 
     name = "control-points"
-    takes_time_tensor = True
 
-    def __init__(self, positions: Tensor, radii: Tensor, network: DeformationNetwork, config: MotionConfig) -> None:
+    def __init__(
+        self, positions: Tensor, radii: Tensor, network: DeformationNetwork | ChunkedNetwork, config: MotionConfig
+    ) -> None:
         super().__init__()
         count, device = positions.shape[0], positions.device
         self.config = config
@@ -114,6 +121,7 @@ class ControlPoints(Motion):
         self.hyper = nn.Parameter(torch.full((count, config.hyper_dim), 1e-2, device=device))
         self.strength_logits = nn.Parameter(torch.zeros(count if config.node_weight else 0, device=device))
         self.network = network
+        self.takes_time_tensor = isinstance(network, DeformationNetwork)
         self.graph: Graph | None = None
         self._cached: tuple[Tensor, Tensor] | None = None
         self._cached_for: list[tuple[Tensor, int, int]] | None = None

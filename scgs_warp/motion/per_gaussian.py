@@ -11,6 +11,7 @@ from ..ops.activations import exponential
 from ..runtime.device_copies import sent
 from ..types import Gaussians
 from .base import Motion, MotionStep, TrainingPose, network_rate
+from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
 
 
@@ -19,11 +20,11 @@ class PerGaussian(Motion):
     and the time."""
 
     name = "per-gaussian"
-    takes_time_tensor = True
 
-    def __init__(self, network: DeformationNetwork) -> None:
+    def __init__(self, network: DeformationNetwork | ChunkedNetwork) -> None:
         super().__init__()
         self.network = network
+        self.takes_time_tensor = isinstance(network, DeformationNetwork)
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         times = time if isinstance(time, Tensor) else torch.tensor([time])

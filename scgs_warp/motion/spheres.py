@@ -11,6 +11,7 @@ from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Gaussians
 from .base import Motion, MotionStep, TrainingPose, network_rate
+from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
 from .rigidity import Graph, arap_times, build_graph, rigidity
 
@@ -19,11 +20,11 @@ class Spheres(Motion):
     """The network and the radius shared by all spheres; the spheres' centres are the means of the Gaussians."""
 
     name = "spheres"
-    takes_time_tensor = True
 
-    def __init__(self, network: DeformationNetwork, radius: float) -> None:
+    def __init__(self, network: DeformationNetwork | ChunkedNetwork, radius: float) -> None:
         super().__init__()
         self.network = network
+        self.takes_time_tensor = isinstance(network, DeformationNetwork)
         self.log_radius = nn.Parameter(torch.tensor([[radius]]).log())
         self.graph: Graph | None = None
 

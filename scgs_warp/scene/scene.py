@@ -102,7 +102,7 @@ class Scene:
                 "show; continue it with apps/train.py --resume"
             )
         scene.freeze_binding()
-        check_motion(scene, str(folder / checkpoint.FILE))
+        check_motion(scene, str(folder / checkpoint.FILE), scene.config.motion.chunks)
         return scene
 
     def freeze_binding(self) -> None:

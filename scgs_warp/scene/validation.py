@@ -26,7 +26,7 @@ MIN_MOMENT = 1e-30
 INTEGER_TENSORS = ("extra.graph.neighbors",)
 """Names of the int32 tensors; all others are float32."""
 CHECKED_TIMES = (0.0, 0.5, 1.0)
-"""Times at which a loaded scene is checked."""
+"""Times at which a loaded scene is checked, of each chunk of its motion."""
 
 
 def _unusable(source: str, what: str) -> UserError:
@@ -126,14 +126,14 @@ class Moving(Protocol):
     def control_points_at(self, time: float) -> Tensor: ...
 
 
-def check_motion(scene: Moving, source: str) -> None:
+def check_motion(scene: Moving, source: str, chunks: int = 1) -> None:
     """Check that the Gaussians and the control points are finite at the beginning, the middle and the end of the
-    motion: finite parameters may lead to non-finite poses.
+    motion, or of each of its chunks: finite parameters may lead to non-finite poses.
 
     Raises:
         UserError: naming the time and the attribute.
     """
-    for time in CHECKED_TIMES:
+    for time in sorted({(chunk + share) / chunks for chunk in range(chunks) for share in CHECKED_TIMES}):
         posed = scene.gaussians_at(time)
         for name in ("means", "quats", "scales", "sh_dc"):
             if not bool(torch.isfinite(getattr(posed, name)).all()):

@@ -24,6 +24,7 @@ from ..storage import checkpoint
 from .density_control import control_density, density_due, visible_gaussians
 from .frames import Frames
 from .multi_view import check_replicas, check_share
+from .preflight import refuse_empty_chunks
 from .process_group import ProcessGroup, ProcessLost
 from .recorded_step import RecordedSteps
 from .run_folder import ReadOnlyRunFolder, RunFolder
@@ -85,6 +86,7 @@ def fit(
         raise UserError(f"{data.folder}: loaded on {data.background}, but data.background is {config.data.background}")
     if len(data) == 0:
         raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
+    refuse_empty_chunks(config, data.times.tolist())
 
     # 2. Open the run folder, and start or resume the state.
     folder_type = RunFolder if group is None or group.first else ReadOnlyRunFolder

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..config.presets import TrainConfig, to_dict
 from ..config.recorded import with_newer_fields
 from ..config.validation import check
 from ..errors import UserError
+from ..motion.chunks import empty_chunk
 from ..storage import checkpoint
 from ..storage.locks import AlreadyLocked, lock_file
 from .resuming import check_same_configuration, check_steps
@@ -55,6 +57,19 @@ def refuse_early(config: TrainConfig, output: Path, resume: bool) -> None:
         check_same_configuration(saved, to_dict(config), source, besides=CHOSEN_BY_THE_DATA)
     if isinstance(step, int):
         check_steps(step, config, source)
+
+
+def refuse_empty_chunks(config: TrainConfig, times: Sequence[float]) -> None:
+    """Refuse chunks of time in which no training frame lies: nothing would train their networks.
+
+    Raises:
+        UserError: names the first of them.
+    """
+    chunks = config.motion.chunks
+    empty = empty_chunk(times, chunks)
+    if empty is not None:
+        span = f"{empty / chunks:.3g} to {(empty + 1) / chunks:.3g}"
+        raise UserError(f"motion.chunks is {chunks}; no training frame lies at times {span}: give fewer chunks")
 
 
 def in_use(folder: Path) -> bool:

@@ -265,7 +265,7 @@ class TrainState:
         except (KeyError, IndexError, ValueError, RuntimeError, TypeError) as error:
             raise UserError(f"{source}: cannot be resumed ({reason(error)}); train again without --resume") from error
         state.motion.eval()
-        check_motion(state.scene(), source)
+        check_motion(state.scene(), source, config.motion.chunks)
         state.motion.train()
         return state
 

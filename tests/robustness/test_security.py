@@ -110,6 +110,10 @@ def far_control_point(tensors: dict[str, torch.Tensor], metadata: dict[str, Any]
 CHECKPOINTS = {
     "a network of terabytes": (put("config", "motion", "width", value=10**9), "motion.width"),
     "layers without end": (put("config", "motion", "layers", value=10**8), "motion.layers"),
+    "chunks without end": (put("config", "motion", "chunks", value=10**6), "motion.chunks"),
+    "chunks too large together": (put("config", "motion", value={"chunks": 64, "width": 2048}), "motion.chunks"),
+    "less than a chunk": (put("config", "motion", "chunks", value=0), "chunks"),
+    "chunks that are not there": (put("config", "motion", "chunks", value=3), "not a complete checkpoint"),
     "no number": (put("config", "motion", "width", value=float("nan")), "motion.width"),
     "another motion": (put("motion", value="__import__('os')"), "no motion model"),
     "a scale of 0": (put("normalisation", "scale", value=0.0), "normalisation.scale"),
