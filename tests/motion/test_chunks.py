@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from helpers.export_files import gltf_arrays
+from helpers.page_reader import pose_of, read_page
 from helpers.tiny import tiny_config, tiny_dataset, trained_pose
 from scgs_warp.config.presets import from_dict, to_dict
 from scgs_warp.config.validation import check
+from scgs_warp.edit import EditSession
 from scgs_warp.errors import UserError
 from scgs_warp.export import page_scene
+from scgs_warp.export.request import ExportRequest
+from scgs_warp.export.run import export
 from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.motion import ControlPoints, PerGaussian, Spheres, build_motion
 from scgs_warp.motion.chunks import OVERLAP, ChunkedNetwork, empty_chunk, shares_at
 from scgs_warp.motion.network import DeformationNetwork
 from scgs_warp.scene.scene import Scene
 from scgs_warp.scene.validation import check_motion
+from scgs_warp.storage import checkpoint
 from scgs_warp.training.loop import fit
 from scgs_warp.training.state import TrainState
 
@@ -145,9 +153,31 @@ def test_trained_in_chunks_saved_loaded_and_shown(tmp_path):
     scene = Scene.load(tmp_path / "run")
     assert isinstance(scene.motion, ControlPoints) and isinstance(scene.motion.network, ChunkedNetwork)
     assert all(network_of(scene.motion, chunk).head.bias.detach().any() for chunk in range(3)), "one was not trained"
-    content = page_scene.page_scene(scene, 0)
-    assert content.facts["samples"] >= page_scene.MIN_SAMPLES
     assert scene.render(tiny_dataset(1)[0].camera, 1 / 3).rgb.isfinite().all()
+
+
+def test_exported_and_edited_as_any_scene(tmp_path):
+    config = tiny_config(60, motion={"chunks": 3})
+    config = replace(config, pretrain=replace(config.pretrain, steps=0))
+    scene = TrainState.begin(config, tiny_dataset(6), "cpu").scene()
+    scene.motion = motion = chunked_motion(3)
+    scene.freeze_binding()
+    (tmp_path / "run").mkdir()
+    checkpoint.write(tmp_path / "run", scene.tensors(), {**scene.metadata(), "stage": "main"})
+    export(ExportRequest(tmp_path / "film.html", run=tmp_path / "run"))
+    facts, columns = read_page(tmp_path / "film.html")
+    for time in (0.0, 0.2, 1 / 3, 0.35, 0.8):
+        expected = motion.poses(torch.tensor([time]))[0].translations
+        torch.testing.assert_close(pose_of(facts, columns, time).translations, expected, rtol=0, atol=2e-2)
+    export(ExportRequest(tmp_path / "film.glb", run=tmp_path / "run", frames=31))
+    gltf = gltf_arrays(tmp_path / "film.glb")[1]["gltf"]
+    instants = {gltf.accessors[sampler.input].count for sampler in gltf.animations[0].samplers}
+    assert len(gltf.animations[0].channels) == 2 * len(motion) and instants == {31}
+    session = EditSession(Scene.load(tmp_path / "run"))
+    before = session.gaussians_at(1 / 3).means
+    session.add_handle(np.arange(4), 1 / 3, "end")
+    session.move("end", [0.0, 0.0, 0.4])
+    assert (session.gaussians_at(1 / 3).means - before).abs().max() > 0.1
 
 
 def test_a_page_may_take_as_many_times_for_each_chunk():
