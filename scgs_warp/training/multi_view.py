@@ -106,11 +106,18 @@ def _result(shown: StepResult, rows: list[list[float]], failed: str | None) -> S
 
 
 def check_share(config: TrainConfig, group: ProcessGroup | None) -> None:
-    """Refuse a batch that the processes cannot share evenly.
+    """Refuse a batch that the processes cannot share evenly, and a motion whose views train different networks: the
+    gradients of all processes must be of the same parameters.
 
     Raises:
-        UserError: the number of views is not a multiple of the number of processes; names both.
+        UserError: the number of views is not a multiple of the number of processes, and names both; or
+            ``motion.chunks`` is above 1.
     """
+    if group is not None and group.size > 1 and config.motion.chunks > 1:
+        raise UserError(
+            f"motion.chunks is {config.motion.chunks}, which {group.size} processes cannot share; "
+            "train without torchrun"
+        )
     if group is not None and config.batch % group.size:
         raise UserError(
             f"batch is {config.batch}, which {group.size} processes cannot share evenly; give --batch a multiple of "

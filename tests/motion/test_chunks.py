@@ -200,7 +200,7 @@ def test_every_chunk_is_checked_when_a_scene_is_loaded():
 
 
 def test_what_cannot_be_chunked_is_refused(tmp_path):
-    assert empty_chunk([0.0, 0.1, 0.6, 1.0], 4) == 1 and empty_chunk([0.0, 0.3, 0.6, 1.0], 4) is None
+    assert empty_chunk([0.0, 0.1, 0.6, 1.0], 4) == 1 and empty_chunk([0.2, 0.45, 0.7, 0.95], 4) is None
     with pytest.raises(UserError, match=r"motion\.chunks is 4; no training frame lies at times 0\.25 to 0\.5"):
         fit(tiny_config(60, motion={"chunks": 4}), tiny_dataset(3), output=tmp_path / "run")
     for changes, message in (

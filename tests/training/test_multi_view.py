@@ -70,3 +70,12 @@ def test_a_batch_is_shared_evenly_or_refused():
     check_share(config, None)
     with pytest.raises(UserError, match=r"batch is 6, which 4 processes .* --batch a multiple of 4"):
         check_share(config, SimpleNamespace(size=4))  # type: ignore[arg-type]
+
+
+def test_chunks_of_time_are_not_shared():
+    """Each process would have gradients of other networks."""
+    config = tiny_config(40, batch=2, motion={"chunks": 2})
+    check_share(config, None)
+    check_share(config, SimpleNamespace(size=1))  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"motion\.chunks is 2, which 2 processes cannot share"):
+        check_share(config, SimpleNamespace(size=2))  # type: ignore[arg-type]
