@@ -7,8 +7,8 @@ The film shows the built-in figure, which never repeats a pose (``long_film_data
 
 ``memory`` reads every frame once, as training does, in a process of its own: rows hold ``frames``; ``bounded``, with
 the cache of images at ``cache_mib`` and silhouettes kept within their room, or with the usual cache and all silhouettes
-kept; ``images_mib``, what the cache holds; ``before_mib`` and ``peak_mib``, the resident memory before the first frame
-and the peak. Its pictures repeat, which memory does not notice.
+kept; ``images_mib``, what the cache holds; ``before_mib`` and ``peak_mib``, the peak of resident memory after loading,
+which fills the cache, and in the end. Its pictures repeat, which memory does not notice.
 
 ``quality`` trains, each run in a process of its own: rows hold ``run``, ``frames``, ``chunks``, ``time_frequencies``,
 ``steps``, ``peak_mib``, ``cpu_seconds``; ``psnr``, the mean over held-out frames spread over the film; and

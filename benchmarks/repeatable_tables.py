@@ -10,7 +10,8 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
 
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
-of masks from ``results/mask-edges.json`` (``mask_edges.py``).
+of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of long films from
+``results/long-film-memory.json`` (``long_film.py memory``).
 """
 
 from __future__ import annotations
@@ -102,6 +103,16 @@ def mask_edges(results: Results) -> str:
     return table(["mask", *filters.values()], lines)
 
 
+def long_film_memory(results: Results) -> str:
+    """Write how much memory reading a film takes, by its length."""
+    lines = []
+    for row in results["long-film-memory"]["rows"]:
+        kept = f"up to {row['cache_mib']:,} MiB of images" + ("" if row["bounded"] else ", all silhouettes")
+        sizes = (f"{row[name]:,.0f} MiB" for name in ("images_mib", "peak_mib"))
+        lines.append([kept, f"{row['frames']:,}", *sizes])
+    return table(["kept", "frames", "images in the cache", "peak of memory"], lines)
+
+
 class Repeatable(NamedTuple):
     """A table, the names of its results, and the folders with the code that they measure."""
 
@@ -119,6 +130,9 @@ REPEATABLE = {
     ),
     "mesh-distance": Repeatable(mesh_distance, ("mesh-distance",), MESHES),
     "capture-mask-edges": Repeatable(mask_edges, ("mask-edges",), ("scgs_warp/capture/moving.py",)),
+    "capture-long-films": Repeatable(
+        long_film_memory, ("long-film-memory",), ("scgs_warp/training/silhouettes.py", "scgs_warp/data/cache.py")
+    ),
     "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-man"), EDITING),
     "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
     "posing-pictures": Repeatable(pictures, ("posing-pictures",), EDITING),
