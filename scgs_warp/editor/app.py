@@ -6,6 +6,7 @@ import re
 import sys
 import time
 import traceback
+from collections import deque
 from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,7 +101,7 @@ class Editor:
         """Edit and active handle, and the curve of its turns."""
         self._asked: float | None = None
         """Time of the latest message of a drag whose pose is not sent yet."""
-        self._drag: tuple[float, Client, dict[str, Any]] | None = None
+        self._drag: deque[tuple[float, Client, dict[str, Any]]] = deque(maxlen=1)
         """Time, page and latest message of the drag that is not yet applied."""
         self._dragger: int | None = None
         self._pictures: dict[int, dict[str, Any]] = {}
@@ -185,8 +186,11 @@ class Editor:
         self.tell()
 
     def tell(self) -> None:
-        """Send the state to all pages."""
-        self.server.broadcast({"state": self._state()}, latest="state")
+        """Send the state to all pages, on the worker's thread: two threads could send an older state after a newer."""
+        if self.worker.here:
+            self.server.broadcast({"state": self._state()}, latest="state")
+        else:
+            self.worker.post(self.tell, once=True)
 
     def say(self, client: Client | None, text: str, kind: str = "error") -> None:
         """Show a message on one page or, with None, on all of them."""
@@ -215,7 +219,7 @@ class Editor:
             self.worker.post(self._draw_pictures, once=True)
         elif what == "drag":
             if self._dragger == client.number:
-                self._drag = time.monotonic(), client, message
+                self._drag.append((time.monotonic(), client, message))
                 self.worker.post(self._apply_drag, once=True)
         elif isinstance(what, str) and what in REQUESTS:
             self._queue(client, what, message)
@@ -263,8 +267,8 @@ class Editor:
             answer["problem"] = f"internal error: {type(error).__name__}: {error}"
         if what == "grab" and "problem" in answer:
             self._dragger = None
-        client.send(answer)
         self.tell()
+        client.send(answer)
 
     def _seek(self, at: Any) -> None:
         """Set the moment that the page shows: requests refer to it."""
@@ -273,10 +277,11 @@ class Editor:
             self.model.look(second)
 
     def _apply_drag(self) -> None:
-        drag, self._drag = self._drag, None
-        if drag is None or not self.model.dragging:
+        if not self._drag:
             return
-        asked, client, message = drag
+        asked, client, message = self._drag.pop()
+        if not self.model.dragging:
+            return
         fields = FieldReader({key: value for key, value in message.items() if key not in ("do", "id")}, "the page")
         try:
             ACTIONS["drag"](self, fields)
@@ -308,9 +313,8 @@ class Editor:
 
     def _draw_pictures(self) -> None:
         """Draw the newest view of each page that cannot draw itself, on the worker's thread."""
-        wanted, self._pictures = self._pictures, {}
-        for number, message in wanted.items():
-            client = self.server.clients.get(number)
+        for number in list(self._pictures):
+            message, client = self._pictures.pop(number), self.server.clients.get(number)
             if client is None:
                 continue
             try:

@@ -53,6 +53,11 @@ class Worker:
         self._thread.start()
 
     @property
+    def here(self) -> bool:
+        """True on the worker's own thread."""
+        return threading.current_thread() is self._thread
+
+    @property
     def idle(self) -> bool:
         """True if there is no work now, nor later unless something changes."""
         with self._condition:
@@ -76,7 +81,7 @@ class Worker:
             self._condition.notify_all()
         for future in waiting:
             future.cancel()
-        if self._thread.is_alive() and threading.current_thread() is not self._thread:
+        if self._thread.is_alive() and not self.here:
             self._thread.join(timeout=30)
 
     @contextlib.contextmanager
@@ -95,7 +100,7 @@ class Worker:
         Raises:
             concurrent.futures.CancelledError: the worker was stopped; or whatever ``action`` raises.
         """
-        if threading.current_thread() is self._thread:
+        if self.here:
             return action()
         future: Future[Result] = Future()
         with self._condition:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import socket
 import threading
@@ -64,10 +65,12 @@ class Client:
         transport: asyncio.Transport | None = None,
     ) -> None:
         self.number, self._wire, self._loop, self._transport = number, wire, loop, transport
-        self._waiting: list[str | bytes] = []
-        self._latest: dict[str, str | bytes] = {}
+        self._waiting: dict[str | int, str | bytes] = {}
+        """Messages in the order in which they are sent: by kind those of which only the newest counts, others by
+        number."""
         self._backlog = 0
-        """Bytes of ``_waiting``."""
+        """Bytes of numbered messages."""
+        self._numbers = itertools.count()
         self._ready = asyncio.Event()
         self._lock = threading.Lock()
         self._allowance, self._refilled = BURST, time.monotonic()
@@ -76,15 +79,15 @@ class Client:
         """Send a JSON object or bytes. A page that leaves ``MAX_BACKLOG`` unread is cut off.
 
         Args:
-            latest: kind of the message. A later one of the same kind replaces it while it waits, so that a slow page
-                gets the newest state instead of all states.
+            latest: kind of the message. A later one of the same kind takes its place while it waits, so that a slow
+                page gets the newest state instead of all states. What is sent after a state does not overtake it.
         """
         content = message if isinstance(message, bytes) else json.dumps(message, allow_nan=False)
         with self._lock:
             if latest is not None:
-                self._latest[latest] = content
+                self._waiting[latest] = content
             elif self._backlog <= MAX_BACKLOG:
-                self._waiting.append(content)
+                self._waiting[next(self._numbers)] = content
                 self._backlog += len(content)
             full = self._backlog > MAX_BACKLOG
         if not self._loop.is_closed():
@@ -100,13 +103,11 @@ class Client:
             await self._ready.wait()
             self._ready.clear()
             with self._lock:
-                messages, self._waiting = self._waiting, []
-                messages += [*self._latest.values()]
-                self._latest = {}
-            for message in messages:
+                messages, self._waiting = self._waiting, {}
+            for message in messages.values():
                 await (self._wire.send_bytes(message) if isinstance(message, bytes) else self._wire.send_str(message))
             with self._lock:
-                self._backlog = sum(map(len, self._waiting))
+                self._backlog = sum(len(content) for key, content in self._waiting.items() if isinstance(key, int))
 
     def allows(self) -> bool:
         """Count a message of the page; return False if there are too many."""

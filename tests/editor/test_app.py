@@ -49,8 +49,13 @@ def page(editor) -> Iterator[Page]:
     made.close()
 
 
+def places_of(editor: Editor, *moment: float) -> np.ndarray:
+    """Control points, computed where the editor computes: two threads may not use one session."""
+    return editor.worker.call(lambda: editor.session.node_positions(*moment))
+
+
 def end_of_bar(editor: Editor) -> list[float]:
-    places = editor.session.node_positions(0.0)
+    places = places_of(editor, 0.0)
     return places[places[:, 0].argmin()].tolist()
 
 
@@ -101,7 +106,7 @@ def test_frames_are_those_of_the_session(editor, page):
         table = page.poses[frame].astype(np.float64)
         rows = table[:, :12].reshape(-1, 3, 4)
         places = np.einsum("mij,mj->mi", rows[:, :, :3], rest) + rows[:, :, 3]
-        wanted = editor.session.node_positions(editor.session.scene_time(at), at)
+        wanted = places_of(editor, editor.session.scene_time(at), at)
         np.testing.assert_allclose(editor.session.engine.to_world(places), wanted, atol=1e-5)
         if not editor.session.engine.motion_at(0.0).pose.shape_rotations:
             np.testing.assert_allclose(to_matrix(table[:, 12:16]), rows[:, :, :3], atol=1e-5)
@@ -142,7 +147,7 @@ def test_a_handle_turns_about_the_point_that_a_page_gives(editor, page):
     page.ask("tool", parts_first=False)
     page.ask("pick", point=tip, how="replace", at=0.0)
     nodes = page.state["selection"]
-    before = editor.session.node_positions(0.0)[nodes].mean(0)
+    before = places_of(editor, 0.0)[nodes].mean(0)
     quat, about = from_axis([0, 1, 0], 30), np.add(tip, (0.0, 0.3, 0.1))
     page.ask("grab", at=0.0)
     page.send({"do": "drag", "rotation": quat.tolist(), "about": about.tolist()})
@@ -293,6 +298,17 @@ def test_a_random_session_returns_to_the_same_bytes(editor, page):
     for state in different[1:]:
         page.ask("redo")
         assert edit_file.to_json(editor.session.edit, editor.session.engine) == state
+
+
+def test_an_older_state_does_not_follow_a_newer(editor, page, tmp_path, monkeypatch):
+    """Autosave and exports have threads of their own, but states are made and sent by one."""
+    threads, state = set(), editor._state
+    monkeypatch.setattr(editor, "_state", lambda: threads.add(threading.current_thread().name) or state())
+    pull(editor, page)
+    page.until(lambda: page.state["saved"])
+    page.ask("export_ply", name="out")
+    page.until(lambda: any(m.get("file") == "out.ply" for m in page.heard) and page.state["job"] is None)
+    assert threads == {"editor"}
 
 
 def test_files_are_written_offered_and_read(editor, page, tmp_path):

@@ -79,16 +79,12 @@ class Page:
         asyncio.run_coroutine_threadsafe(self._wire._writer.send_frame(content, kind), self._loop).result(PATIENCE)
 
     def ask(self, what: str, /, **fields: Any) -> dict[str, Any]:
-        """The answer, once the state that follows from it has come, too."""
+        """The answer; the state that follows from it comes before it."""
         self._count += 1
         number = self._count
         self.send({"do": what, "id": number, **fields})
         self.until(lambda: any(message.get("id") == number for message in self.heard))
-        answer = next(message for message in self.heard if message.get("id") == number)
-        self.editor.worker.call(lambda: None)
-        want = self.editor._state()["version"]
-        self.until(lambda: self.state["version"] >= want)
-        return answer
+        return next(message for message in self.heard if message.get("id") == number)
 
     def close(self) -> None:
         asyncio.run_coroutine_threadsafe(self._wire.close(), self._loop).result(PATIENCE)

@@ -12,7 +12,8 @@ class Link {
     this.asked = new Set();
     this.waiting = new Map();
     this.count = 0;
-    this.first = new Promise((resolve) => { this.arrived = resolve; });
+    this.missing = new Set(["hello", "camera", "state"]);
+    this.first = new Promise((resolve) => { this.arrived = resolve; }); // all of these have come
     const heard = (data) => (typeof data === "string" ? this.hear(JSON.parse(data)) : this.take(data));
     this.wire = new Wire(heard, () => this.gone());
   }
@@ -40,10 +41,11 @@ class Link {
       this.state = message.state;
       if (!before || before.version !== this.state.version) this.forget();
       if (!this.state.dragging) this.live = null;
-      this.arrived();
       this.listener.state(this.state, before);
     }
     if (message.camera) this.listener.camera(message.camera);
+    for (const kind of [...this.missing]) if (message[kind]) this.missing.delete(kind);
+    if (!this.missing.size) this.arrived();
     if (message.said) this.listener.said(message.said);
     if (message.file) this.listener.file(message);
     if (message.done) {
