@@ -4,7 +4,7 @@ const SECONDS = 4; // a scene's whole time at speed 1, unless its facts say othe
 const SLOW = 50; // milliseconds a frame: slower machines draw fewer pixels while something moves ...
 const COARSEST = 0.4; // ... but not fewer than so many of each side's
 const REST = 250; // milliseconds of stillness after which a frame is drawn in full
-const BREAK = 3000; // milliseconds between two frames that do not belong to one movement
+const BREAK = 3000; // milliseconds of rest between two movements
 
 class Player {
   constructor(canvas, model) {
@@ -19,6 +19,7 @@ class Player {
     this.adaptive = true;
     this.coarse = 1; // share of each side's pixels that is drawn while something moves
     this.moving = false;
+    this.rested = true; // nothing was to be drawn at the latest tick
     this.interval = SLOW / 2; // milliseconds between frames, of late
     this.drawn = 0;
     this.take(model);
@@ -109,7 +110,8 @@ class Player {
     this.hand?.tick();
     if (this.stale) {
       const passed = now - this.drawn;
-      this.moving = passed < BREAK;
+      this.moving = !this.rested || passed < BREAK; // a frame may take longer than a break
+      this.rested = false;
       if (this.moving) this.interval += 0.2 * (Math.min(passed, 1.6 * SLOW) - this.interval); // one hitch is no trend
       if (this.adaptive && this.interval > SLOW && this.coarse > COARSEST) {
         this.coarse = Math.max(COARSEST, 0.8 * this.coarse);
@@ -118,9 +120,12 @@ class Player {
       this.drawn = now;
       this.resize();
       this.frame();
-    } else if (this.moving && now - this.drawn > Math.max(REST, 3 * this.interval)) {
-      this.moving = false;
-      this.resize();
+    } else {
+      this.rested = true;
+      if (this.moving && now - this.drawn > Math.max(REST, 3 * this.interval)) {
+        this.moving = false;
+        this.resize();
+      }
     }
   }
 

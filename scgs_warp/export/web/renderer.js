@@ -167,8 +167,12 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0);
   }
 
+  // Nothing is done if only the order of the Gaussians is another than in the previous frame.
   project(view, table) {
     const { gl, model, splat } = this;
+    const seen = [view.rows, view.shift, view.eye, view.lens, view.width, view.height].flat(2).join();
+    if (seen === this.seen && table.every((value, k) => value === this.table[k])) return;
+    this.seen = seen;
     this.table.set(table);
     gl.bindTexture(gl.TEXTURE_2D, this.data.u_nodes);
     const height = this.table.length / (4 * WIDTH);
