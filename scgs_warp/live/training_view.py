@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -43,20 +44,21 @@ class TrainingView:
     Args:
         view: server of the page.
         steps: number of steps of the whole training.
+        clock: returns seconds.
     """
 
-    def __init__(self, view: SceneView, steps: int) -> None:
-        self._view, self._steps = view, steps
+    def __init__(self, view: SceneView, steps: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._view, self._steps, self._clock = view, steps, clock
         self._next = -math.inf
         view.say("waiting for the first steps")
 
     def due(self) -> bool:
         """Return whether the state after the next step is to be shown."""
-        return self._view.wanted.is_set() and time.monotonic() >= self._next
+        return self._view.wanted.is_set() and self._clock() >= self._next
 
     def show(self, state: TrainState) -> None:
         """Publish the present scene."""
-        began = time.monotonic()
+        began = self._clock()
         scene = state.scene()
         try:
             content = training_page(scene)
@@ -64,7 +66,7 @@ class TrainingView:
             self._view.publish(pack(content.facts, content.columns, COMPRESSION), status)
         except UserError as error:  # a scene that no page can show is trained all the same
             self._view.say(str(error))
-        now = time.monotonic()
+        now = self._clock()
         self._next = now + max(LEAST_PAUSE, (now - began) / COST)
 
 

@@ -61,8 +61,7 @@ def test_it_shows_both_stages_and_changes_no_bit(model, tmp_path, monkeypatch):
 
 def test_it_costs_nothing_without_a_page_and_little_with_one(monkeypatch):
     shown, now = Shown(), [100.0]
-    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    view = TrainingView(shown, 10)
+    view = TrainingView(shown, 10, clock=lambda: now[0])
 
     def draw(scene: Any) -> Any:
         now[0] += 0.5
