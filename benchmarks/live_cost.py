@@ -239,21 +239,22 @@ def ratios(alone: list[dict[str, float]], watched: list[dict[str, float]], name:
         "of_sums": round(whole, 4),
         "alone_s": round(sum(a[name] for a in alone), 2),
         "watched_s": round(sum(b[name] for b in watched), 2),
+        "each": [round(ratio, 3) for ratio in each],
     }
 
 
-def measure(words: list[str]) -> dict[str, Any]:
+def measure(words: list[str], opened: bool) -> dict[str, Any]:
     """Train both, in turns; the order of the two changes from pair to pair."""
     trainers: list[Trainer] = []
     try:
         for kind in ("alone", "watched"):
             trainers.append(Trainer(kind, words))
         alone, watched = trainers
-        page, running, pair = Follower(watched.url), True, 0
-        settles = {"alone": lambda: None, "watched": page.settle}
+        page = Follower(watched.url) if opened else None
+        settles, running, pair = {"watched": page.settle} if page else {}, True, 0
         while running:
             for trainer in trainers if pair % 2 == 0 else trainers[::-1]:
-                running = trainer.take_block(settles[trainer.kind])
+                running = trainer.take_block(settles.get(trainer.kind, lambda: None))
             pair += 1
             if running and sys.stderr.isatty():
                 print(f"\r{pair} pairs", end="", file=sys.stderr)
@@ -269,9 +270,9 @@ def measure(words: list[str]) -> dict[str, Any]:
         "pictures": made["pictures"],
         "ms_per_picture": round(1e3 * made["wall"] / max(made["pictures"], 1), 1),
         "server_s": round(made["server"], 3),
-        "scenes_fetched": page.scenes,
-        "mib_fetched": round(page.bytes / 2**20, 2),
-        "gaussians_at_the_end": page.gaussians,
+        "scenes_fetched": page.scenes if page else 0,
+        "mib_fetched": round(page.bytes / 2**20, 2) if page else 0.0,
+        "gaussians_of_the_last": page.gaussians if page else 0,
         "same_bits": alone.end["bits"] == watched.end["bits"],
     }
 
@@ -282,6 +283,7 @@ def main(arguments: list[str] | None) -> None:
     parser.add_argument("--preset", choices=PRESETS, default="quick")
     parser.add_argument("--steps", type=int, help="length of the run; default: the preset's")
     parser.add_argument("--block", type=int, default=250, help="steps of a block")
+    parser.add_argument("--no-page", action="store_true", help="a control: nobody opens the page")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--json", type=Path)
@@ -302,7 +304,7 @@ def main(arguments: list[str] | None) -> None:
         "steps": configuration(options).steps,
         "block": options.block,
         "threads": environment.thread_count(),
-        **measure(words),
+        **measure(words, not options.no_page),
         **provenance(device),
     }
     print(json.dumps(result, indent=1))

@@ -6,9 +6,10 @@ Importing the package is cheap: torch and Warp are loaded when one of its names 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .runtime.environment import prepare_environment as _prepare_environment
+from .scene import page_maker as _page_maker
 
 __version__ = "0.1.0"
 
@@ -37,6 +38,14 @@ _EXPORTS = {
     "train": "training.one_call",
 }
 __all__ = ["Camera", "Frame", "Gaussians", "Image", "Pose", "Scene", "__version__", "fit", "rasterization", "train"]
+
+
+def _framed_page(scene: Any) -> str | None:
+    """Return what a notebook shows of a scene."""
+    return importlib.import_module(".export.notebook", __name__).framed_page(scene)
+
+
+_page_maker.register(_framed_page)
 
 
 def __getattr__(name: str):

@@ -96,7 +96,7 @@ def write_page(scene: Scene, path: Path, options: PageOptions | None = None, **f
     if options.max_mib is not None and not options.max_mib > 0:
         raise UserError(f"--max-mib (max_mib) is {options.max_mib:g}; give a size in MiB above 0, or none")
     picture = options.picture or functools.partial(poster, scene)
-    page, count = _fitting(scene, path, options, picture)
+    page, count = fitting_page(scene, path, options, picture)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -107,8 +107,15 @@ def write_page(scene: Scene, path: Path, options: PageOptions | None = None, **f
     return count
 
 
-def _fitting(scene: Scene, path: Path, options: PageOptions, picture: Callable[[int], bytes]) -> tuple[bytes, int]:
-    """Return the page with the highest degree of spherical harmonics that fits, and its number of Gaussians."""
+def fitting_page(scene: Scene, path: Path, options: PageOptions, picture: Callable[[int], bytes]) -> tuple[bytes, int]:
+    """Return the page with the highest degree of spherical harmonics that fits, and its number of Gaussians.
+
+    Args:
+        path: its name, for messages.
+
+    Raises:
+        UserError: the motion model has no control points, or the page does not fit.
+    """
     page, drawn, most = b"", b"", options.max_mib
     for degree in range(min(scene.gaussians.sh_degree, MAX_DEGREE), -1, -1):
         content = page_scene(scene, degree, motion_of=options.motion)

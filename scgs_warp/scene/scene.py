@@ -27,7 +27,7 @@ from ..storage import checkpoint
 from ..storage.files import read_text
 from ..storage.json_files import parse_json
 from ..types import Camera, Gaussians, Image
-from . import film_maker
+from . import film_maker, page_maker
 from .frame_graph import FrameGraph
 from .validation import check_metadata, check_motion, check_settings, check_tensors, reason
 
@@ -215,6 +215,10 @@ class Scene:
             UserError: an option is out of range, or the film cannot be written.
         """
         return film_maker.film(self, path, **options)
+
+    def _repr_html_(self) -> str | None:
+        """Return the scene's page, which notebooks show; None if it has none (docs/page.md)."""
+        return page_maker.page(self)
 
     def frame_graph(self) -> FrameGraph:
         """Return the renderer of this scene's frames on CUDA, which takes cameras in normalised units. It is kept until
