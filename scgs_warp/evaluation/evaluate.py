@@ -74,8 +74,8 @@ def _measure(frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor, lpips: L
 class _Renders:
     """Writer of renders and ground truth; keeps some pairs of both for the contact sheet."""
 
-    def __init__(self, folder: Path, count: int) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, count: int, background: tuple[float, ...]) -> None:
+        self.folder, self._background = folder, background
         rows = min(SHEET_ROWS, count)
         self._chosen = {round(index * (count - 1) / max(rows - 1, 1)) for index in range(rows)}
         self._rows: list[tuple[Any, Any]] = []
@@ -97,7 +97,9 @@ class _Renders:
         self._write(self.folder / "renders" / f"{name}.png", pair[1])
         if index in self._chosen:
             if frame.mask is not None:  # outside the mask the truth is unknown: show no error
-                pair = pair[0], to_bytes(torch.where(frame.mask.to(image.device)[..., None], image, truth))
+                known = frame.mask.to(image.device)
+                pair = pair[0], to_bytes(torch.where(known[..., None], image, truth))
+                alpha = alpha if frame.alpha is None else torch.where(known, alpha, frame.alpha.to(alpha.device))
             self._rows.append(pair)
             self._scores.append(score)
             self._alphas.append(None if frame.alpha is None else (frame.alpha.cpu(), alpha.cpu()))
@@ -105,7 +107,7 @@ class _Renders:
 
     def finish(self) -> None:
         if self._rows:
-            more = {"scores": self._scores, "alphas": self._alphas}
+            more = {"scores": self._scores, "alphas": self._alphas, "background": self._background}
             self._write(self.folder / "contact_sheet.png", contact_sheet(self._rows, self._titles, **more))
 
     @staticmethod
@@ -152,8 +154,8 @@ def evaluate(
     Raises:
         UserError: ``render_dir`` cannot be written.
     """
-    renders = None if render_dir is None else _Renders(Path(render_dir), len(dataset))
     background = dataset.background_color
+    renders = None if render_dir is None else _Renders(Path(render_dir), len(dataset), background)
     rows = []
     for index, frame in enumerate(dataset):
         rendered = scene.render(frame.camera, frame.time, background)

@@ -25,6 +25,10 @@ CAPTION = 22
 GAP = 4
 PAPER = (255, 255, 255)
 INK = (30, 30, 30)
+NEUTRAL = 0.5
+"""Grey behind pictures with alpha."""
+SOLID, MARGIN = 0.05, 0.04
+"""Alpha from which a pixel belongs to the content, and the margin around the content as a share of the longer side."""
 
 Picture = Tensor | np.ndarray
 
@@ -87,21 +91,50 @@ def _fit(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cell
 
 
+def _content(pair: tuple[Picture, Picture]) -> tuple[slice, slice]:
+    """Return the rows and columns of what either alpha covers, with a margin; all of them if nothing is covered."""
+    solid = np.maximum(*map(_floats, pair)) > SOLID
+    margin, spans = math.ceil(MARGIN * max(solid.shape)), []
+    for axis in (1, 0):
+        found = np.flatnonzero(solid.any(axis))
+        low, high = (found[0], found[-1]) if len(found) else (0, solid.shape[1 - axis])
+        spans.append(slice(max(0, int(low) - margin), int(high) + 1 + margin))
+    return spans[0], spans[1]
+
+
+def _pictures(
+    truth: Picture, render: Picture, pair: tuple[Picture, Picture] | None, background: Sequence[float] | None
+) -> list[np.ndarray]:
+    """Return truth, render, error and, where there is alpha, alpha, cropped to the content and on a neutral
+    background."""
+    shown, error = [_floats(truth), _floats(render)], error_map(truth, render)
+    if pair is None:
+        return [*map(to_bytes, shown), error]
+    if background is not None:
+        change = NEUTRAL - np.asarray(background, np.float32)
+        shown = [image + (1.0 - _floats(alpha))[..., None] * change for image, alpha in zip(shown, pair)]
+    box = _content(pair)
+    return [picture[box] for picture in (*map(to_bytes, shown), error, alpha_map(*pair))]
+
+
 def contact_sheet(
     rows: Sequence[tuple[Picture, Picture]],
     titles: Sequence[str] = (),
     *,
     scores: Sequence[float] = (),
     alphas: Sequence[tuple[Picture, Picture] | None] = (),
+    background: Sequence[float] | None = None,
     cell: int = 400,
 ) -> np.ndarray:
-    """Draw truth, render and error side by side, one row per pair; beside them the alpha, if there is any.
+    """Draw truth, render and error side by side, one row per pair. Rows with alpha are cropped to their content, on a
+    neutral background, with the alpha beside them.
 
     Args:
         rows: (truth, render), each [H, W, 3]: floats in [0, 1] or uint8; the two of a row have one size.
         titles: a caption for each row; may be shorter than ``rows``.
         scores: PSNR of each row, dB, if it differs from that of the two pictures because of masks.
         alphas: (truth, render) of each row, each [H, W]; None for a row without alpha.
+        background: colour on which rows with alpha were composited; None: it is kept.
         cell: longest side of a picture on the sheet, pixels. Errors are computed before the reduction.
 
     Returns:
@@ -115,10 +148,12 @@ def contact_sheet(
     for truth, render in rows:
         if truth.shape != render.shape or truth.ndim != 3:
             raise ValueError(f"truth {list(truth.shape)} and render {list(render.shape)} must both be [H, W, 3]")
-    width = min(cell, max(truth.shape[1] for truth, _ in rows))
-    height = min(cell, max(truth.shape[0] for truth, _ in rows))
+    pairs = [alphas[index] if index < len(alphas) else None for index in range(len(rows))]
+    drawn = [_pictures(truth, render, pair, background) for (truth, render), pair in zip(rows, pairs)]
+    width = min(cell, max(pictures[0].shape[1] for pictures in drawn))
+    height = min(cell, max(pictures[0].shape[0] for pictures in drawn))
     heads = ["truth", "render", f"error (0 .. {ERROR_RANGE:g})"]
-    if any(pair is not None for pair in alphas):
+    if any(pair is not None for pair in pairs):
         heads.append("alpha: red missing, blue extra")
     size = CAPTION + len(rows) * (height + CAPTION + GAP), len(heads) * (width + GAP) + GAP
     sheet = np.full((*size, 3), PAPER, np.uint8)
@@ -127,11 +162,7 @@ def contact_sheet(
         _put_text(sheet, text, x, 0, width)
     for index, (truth, render) in enumerate(rows):
         y = CAPTION + index * (height + CAPTION + GAP)
-        pictures = [to_bytes(_floats(truth)), to_bytes(_floats(render)), error_map(truth, render)]
-        pair = alphas[index] if index < len(alphas) else None
-        if pair is not None:
-            pictures.append(alpha_map(*pair))
-        for x, picture in zip(columns, pictures):
+        for x, picture in zip(columns, drawn[index]):
             sheet[y : y + height, x : x + width] = _fit(picture, width, height)
         score = scores[index] if index < len(scores) else psnr_of(truth, render)
         captions = (titles[index] if index < len(titles) else "", "", f"PSNR {score:.2f} dB")

@@ -38,6 +38,23 @@ def test_contact_sheet_shrinks_and_centres() -> None:
     assert (row[95:105, 96:104] == 0).all() and (row[:80] == 255).all()
 
 
+def test_contact_sheet_shows_the_content_on_grey() -> None:
+    """Rows with alpha are cropped to it; the scores are those of the whole pictures."""
+    alpha, wide = torch.zeros(100, 200), torch.zeros(100, 200)
+    alpha[40:60, 90:120], wide[40:60, 85:120] = 1.0, 1.0
+    truth, render = torch.ones(100, 200, 3), torch.ones(100, 200, 3)
+    truth[alpha > 0], render[wide > 0] = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([1.0, 0.0, 0.0])
+    sheet = figures.contact_sheet([(truth, render)], alphas=[(alpha, wide)], background=(1.0, 1.0, 1.0))
+    height, width = 20 + 2 * 8, 35 + 2 * 8
+    assert sheet.shape == (22 + height + 22 + 4, 4 * (width + 4) + 4, 3)
+    top, left = figures.CAPTION, figures.GAP
+    shown = sheet[top : top + height, left : left + width]
+    assert (shown[8:28, 13:43] == (255, 0, 0)).all() and (shown[:8] == 128).all() and (shown[:, :13] == 128).all()
+    assert (sheet[top + 8 : top + 28, left + width + 4 + 8 : left + width + 4 + 43] == (255, 0, 0)).all(), "the render"
+    kept = figures.contact_sheet([(truth, render)], alphas=[(alpha, wide)])
+    assert (kept[top : top + 8, left : left + width] == 255).all(), "a background that is not known is kept"
+
+
 def test_contact_sheet_of_nothing_or_misfits_raises() -> None:
     with pytest.raises(ValueError, match="empty"):
         figures.contact_sheet([])
