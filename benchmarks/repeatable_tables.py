@@ -1,5 +1,5 @@
-"""Writers of the tables in docs/scaling.md, docs/editing.md, docs/mesh.md and docs/capture.md whose results can be
-measured again with committed scripts (for those on parts and poses, see ``posing_tables.py``).
+"""Writers of the tables in docs/scaling.md, docs/editing.md, docs/mesh.md, docs/page.md and docs/capture.md whose
+results can be measured again with committed scripts (for those on parts and poses, see ``posing_tables.py``).
 
 Until all results of a table are there, the reported table stands in its place. A column NAME of the tables of sharing
 comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharing-NAME-alone.json``:
@@ -11,7 +11,8 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
 of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of long films from
-``results/long-film-memory.json`` (``long_film.py memory``).
+``results/long-film-memory.json`` (``long_film.py memory``). Those of pages come from ``results/page-million.json``
+(``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``).
 """
 
 from __future__ import annotations
@@ -113,6 +114,33 @@ def long_film_memory(results: Results) -> str:
     return table(["kept", "frames", "images in the cache", "peak of memory"], lines)
 
 
+def page_million(results: Results) -> str:
+    """Write how long a page of a million Gaussians takes to load, and a view to be drawn."""
+    one = results["page-million"]
+    lines = [
+        ["size of the file", f"{one['file_mib']:.0f} MiB"],
+        ["steps in which progress is shown", str(one["progress_steps"])],
+        ["until it is read", f"{one['load_s']:.0f} s"],
+        ["until the first picture is complete", f"{one['first_picture_s']:.0f} s"],
+        ["another view, processor time", f"{one['cpu_s_per_view']:.1f} s"],
+    ]
+    head = f"{one['gaussians']:,} Gaussians that move, a window of {one['size']} x {one['size']}"
+    return table([head, f"{one['browser'].split('.')[0]}, WebGL in software"], lines)
+
+
+def live_cost(results: Results) -> str:
+    """Write the ratio of the times of a training with and without a page."""
+    one = results["live-cost"]
+    lines = []
+    for name, text in (("wall", "time"), ("processor", "processor time")):
+        found = one[name]
+        low, high = found["quartiles"]
+        lines.append([text, f"{found['median']:.3f}", f"{low:.3f} to {high:.3f}", f"{found['of_sums']:.3f}"])
+    head = f"with a page over without, {one['steps']:,} steps, {one['pictures']} pictures"
+    note = f"The checkpoints {'have the same bits' if one['same_bits'] else 'differ'}."
+    return table([head, f"median of {one['pairs']} pairs", "quartiles", "whole run"], lines) + f"\n\n{note}"
+
+
 class Repeatable(NamedTuple):
     """A table, the names of its results, and the folders with the code that they measure."""
 
@@ -136,6 +164,8 @@ REPEATABLE = {
     "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-man"), EDITING),
     "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
     "posing-pictures": Repeatable(pictures, ("posing-pictures",), EDITING),
+    "page-million": Repeatable(page_million, ("page-million",), ("scgs_warp/export/web",)),
+    "live-cost": Repeatable(live_cost, ("live-cost",), ("scgs_warp/live", "scgs_warp/training")),
     "editing-updates": Repeatable(edit_updates, ("edit-cpu", "edit-4096-cpu"), EDITING),
 }
 
