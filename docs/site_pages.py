@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages to the site."""
     pages = {
-        "index.md": from_docs((ROOT / "README.md").read_text(encoding="utf-8")),
+        "index.md": with_live_scene(from_docs((ROOT / "README.md").read_text(encoding="utf-8"))),
         "contributing.md": from_docs((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")),
         "code-of-conduct.md": from_docs((ROOT / "CODE_OF_CONDUCT.md").read_text(encoding="utf-8")),
         "security.md": from_docs((ROOT / "SECURITY.md").read_text(encoding="utf-8")),
@@ -45,6 +45,23 @@ def from_docs(text: str) -> str:
     text = re.sub(r"(\]\()docs/", r"\1", text)
     text = text.replace("](SECURITY.md)", "](security.md)").replace("](CONTRIBUTING.md)", "](contributing.md)")
     return re.sub(r"(\]\()examples/?(?:tutorial\.ipynb)?(?=\))", r"\1examples.md", text)
+
+
+def with_live_scene(text: str) -> str:
+    """Put a scene whose parts can be pulled in the place of the first film. It is an exported page:
+
+    python apps/train.py --max-gaussians 15000 --steps 5000 --output runs/live
+    python apps/export.py --run runs/live --output docs/live/figure.html --pose --max-mib 1.5 --title Figure
+    """
+    frame = (
+        '<iframe src="live/figure.html" title="The built-in scene: pull an arm or a leg, or turn the view" '
+        'style="width: 100%; height: 26rem; border: 0"></iframe>\n\n'
+        "*Pull an arm or a leg; drag beside the figure to turn the view.*"
+    )
+    shown, count = re.subn(r"!\[[^\]]*\]\(images/turntable\.gif\)", frame, text, count=1)
+    if not count:
+        raise ValueError("README.md: there is no film in the place of which the live scene could stand")
+    return shown
 
 
 def examples_page() -> str:
