@@ -155,7 +155,7 @@ def evaluate(
         UserError: ``render_dir`` cannot be written.
     """
     background = dataset.background_color
-    renders = None if render_dir is None else _Renders(Path(render_dir), len(dataset), background)
+    renders = None if render_dir is None else _Renders(Path(render_dir), len(dataset), tuple(background.tolist()))
     rows = []
     for index, frame in enumerate(dataset):
         rendered = scene.render(frame.camera, frame.time, background)
