@@ -25,6 +25,8 @@ LEAST_ROOM = 8 << 20
 """Free bytes needed to compile a kernel; the largest ones take a few megabytes."""
 VARIABLE = "WARP_CACHE_PATH"
 REMEDY = f"name a folder of yours with {LEAST_ROOM >> 20} MiB of room in {VARIABLE}"
+NOT_LOADED = "Failed to find"
+"""Beginning of Warp's error where code without a kernel came out of the loader."""
 
 Result = TypeVar("Result")
 _lock = threading.RLock()
@@ -55,7 +57,7 @@ def prepared(kernel: wp.Kernel, prepare: Callable[[], Result]) -> Result:
     """Return ``prepare()``, which compiles a kernel unless it is cached, in a folder that can be written.
 
     Raises:
-        UserError: no folder can be written.
+        UserError: no folder can be written, or the compiled code cannot be loaded.
     """
     with _lock:
         folder = str(wp.config.kernel_cache_dir)
@@ -68,6 +70,13 @@ def prepared(kernel: wp.Kernel, prepare: Callable[[], Result]) -> Result:
                 raise UserError(f"{error.filename or folder}: {error.strerror}; {REMEDY}") from error
             _use_private(f"{folder}: {error.strerror}")
             return prepare()
+        except RuntimeError as error:
+            if NOT_LOADED not in str(error):
+                raise
+            raise UserError(
+                f"{folder}: the code of {kernel.key} is there but cannot be loaded; free memory (or raise ulimit -v), "
+                "or remove the folder if its files are damaged"
+            ) from error
 
 
 def _use_private(reason: str) -> None:
@@ -121,7 +130,7 @@ def _distrust(folder: str) -> str | None:
 def _is_compiled(kernel: wp.Kernel) -> bool:
     """Return whether the cache holds the kernel's module."""
     try:
-        name = kernel.module.get_module_identifier()
+        names = {kernel.module.get_module_identifier(block) for block in (1, None)}  # on a CPU, on CUDA
     except Exception:  # The name is a detail of Warp's; without it the module counts as not compiled.
         return False
-    return os.path.isdir(os.path.join(str(wp.config.kernel_cache_dir), name))
+    return any(os.path.isdir(os.path.join(str(wp.config.kernel_cache_dir), name)) for name in names)

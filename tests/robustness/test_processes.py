@@ -8,15 +8,19 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 import warp as wp
 
 from helpers.full_disk import small_disk
 from helpers.paths import ROOT
 from scgs_warp.apps import cli
 from scgs_warp.errors import UserError
+from scgs_warp.kernels.cpu import activations as cpu_kernels
+from scgs_warp.ops.activations import exponential
 from scgs_warp.runtime import kernel_cache
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT)])}
@@ -158,6 +162,25 @@ def test_kernels_that_are_compiled_need_no_room(cache, monkeypatch, capsys):
     monkeypatch.setattr(kernel_cache, "_is_compiled", lambda _: False)
     kernel_cache.prepared(None, compile_into(places))
     assert places[0] == str(cache) and "temporary" in places[1]
+
+
+def test_a_kernel_that_has_run_counts_as_compiled():
+    exponential(torch.zeros(3))
+    assert kernel_cache._is_compiled(cpu_kernels.exponential)
+
+
+def test_code_that_cannot_be_loaded_is_one_line(cache):
+    """Under a limit on memory the loader gives modules without their kernels."""
+    kernel = SimpleNamespace(key="composite")
+
+    def fail(message: str) -> None:
+        raise RuntimeError(message)
+
+    with pytest.raises(UserError, match=r"usual: the code of composite .* cannot be loaded; free memory") as caught:
+        kernel_cache.prepared(kernel, lambda: fail("Failed to find forward kernel 'composite' from module 'm'"))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(RuntimeError, match="something else"):
+        kernel_cache.prepared(kernel, lambda: fail("something else"))
 
 
 def test_no_folder_for_kernels_is_one_line(cache, monkeypatch):
