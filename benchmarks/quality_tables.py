@@ -340,6 +340,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "correctives": change_of_defaults,
     "sharpness": change_of_defaults,
     "fast-parts": change_of_defaults,
+    "halved": change_of_defaults,
     "levers": levers,
     "levers-today": differences,
     "exposure": exposure,
