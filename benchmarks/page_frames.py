@@ -33,36 +33,8 @@ from scgs_warp.runtime.provenance import command_line, provenance
 
 PATIENCE = 1800.0
 """Seconds to wait for a picture."""
-WATCH = """() => {
-  window.said = [];
-  const look = () => {
-    const text = document.getElementById("said")?.textContent;
-    if (text && text !== window.said.at(-1)) window.said.push(text);
-    if (window.scgs && !window.made) {
-      window.made = true;
-      window.scgs.ready.then((ready) => { window.player = ready.player; });
-    }
-    setTimeout(look, 20);
-  };
-  look();
-}"""
-IDLE = "!player.stale && !player.unsorted && !player.sorting && !player.moving"
-TURN = "() => { player.orbit.azimuth += 0.2; player.changed(); }"
-FINISH = """() => {
-  const { gl, renderer } = player;
-  gl.bindFramebuffer(gl.FRAMEBUFFER, renderer.sum.target);
-  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.FLOAT, new Float32Array(4));
-}"""
-PIXELS = """() => {
-  const { gl, canvas } = player;
-  player.stale = true;
-  player.frame();
-  const bytes = new Uint8Array(4 * canvas.width * canvas.height);
-  gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-  let bright = 0;
-  for (let i = 0; i < bytes.length; i += 4) bright += bytes[i] + bytes[i + 1] + bytes[i + 2] > 60 ? 1 : 0;
-  return bright / (canvas.width * canvas.height);
-}"""
+SCRIPT = Path(__file__).with_suffix(".js")
+"""Functions that run in the page, as ``measured``."""
 
 
 def browser_seconds() -> float:
@@ -93,14 +65,14 @@ def wait(page: Any, condition: str) -> None:
 
 def complete(page: Any) -> None:
     """Wait until the picture is complete."""
-    wait(page, IDLE)
-    page.evaluate(FINISH)
+    wait(page, "measured.idle()")
+    page.evaluate("measured.finish()")
 
 
 def turn(page: Any) -> tuple[float, int]:
     """Turn the view; return the seconds until its picture is complete, and the number of frames drawn for it."""
     seconds, frames = browser_seconds(), page.evaluate("player.frames")
-    page.evaluate(TURN)
+    page.evaluate("measured.turn()")
     complete(page)
     return browser_seconds() - seconds, page.evaluate("player.frames") - frames
 
@@ -116,14 +88,14 @@ def visit(path: Path, size: int, views: int) -> dict[str, Any]:
         browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
         page = browser.new_context(viewport={"width": size, "height": size}).new_page()
         page.set_default_timeout(1e3 * PATIENCE)
-        page.add_init_script(f"({WATCH})()")
+        page.add_init_script(path=SCRIPT)
         began = time.monotonic()
         page.goto(path.as_uri() + "?paused", wait_until="commit")
         wait(page, "Boolean(window.player)")
         loaded = time.monotonic() - began
         complete(page)
         first = time.monotonic() - began
-        said, share = page.evaluate("window.said"), page.evaluate(PIXELS)
+        said, share = page.evaluate("window.said"), page.evaluate("measured.shareDrawn()")
         complete(page)
         turns, version = [turn(page) for _ in range(views)], browser.version
         browser.close()

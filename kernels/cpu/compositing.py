@@ -48,6 +48,8 @@ def composite_tile_adjoint(
     v_image: wp.array3d[float], v_alpha: wp.array2d[float], width: int, height: int, columns: int, sharpness: float,
     absolute: int, v_slots: wp.array2d[float],
 ): ...
+
+
 @native_function("depth.h")
 def expected_depth_block(
     begin: int, accumulated: wp.array[float], alpha: wp.array[float], unit: wp.float64, depth: wp.array[float],

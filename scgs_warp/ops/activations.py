@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from ..kernels.cpu import activations as cpu_kernels
@@ -15,12 +16,17 @@ GRAIN = 256
 """Least number of vectors of ``LANES`` values in a chunk, which take some microseconds."""
 
 
+def _map(kernel: wp.Kernel, values: Tensor) -> Tensor:
+    """Apply a kernel to all values."""
+    result = torch.empty_like(values)
+    launch(kernel, -(-values.numel() // LANES), values.view(-1), result.view(-1), grain=GRAIN)
+    return result
+
+
 class _Exponential(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
-        result = torch.empty_like(values)
-        count = -(-values.numel() // LANES)
-        launch(cpu_kernels.exponential, count, values.view(-1), result.view(-1), grain=GRAIN)
+        result = _map(cpu_kernels.exponential, values)
         ctx.save_for_backward(result)
         return result
 
@@ -34,9 +40,7 @@ class _Exponential(torch.autograd.Function):
 class _Sigmoid(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
-        result = torch.empty_like(values)
-        count = -(-values.numel() // LANES)
-        launch(cpu_kernels.sigmoid, count, values.view(-1), result.view(-1), grain=GRAIN)
+        result = _map(cpu_kernels.sigmoid, values)
         ctx.save_for_backward(result)
         return result
 
