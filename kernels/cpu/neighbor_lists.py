@@ -7,10 +7,10 @@ from ..types import LANES
 
 wp.set_module_options({"enable_backward": False})
 
-LIST_SIZE = wp.constant(128)
+LIST_SIZE = wp.constant(192)
 """Largest number of nodes in a block's list. A block with more nodes within reach is searched in full."""
 
-MARGIN = wp.constant(0.35)
+MARGIN = wp.constant(0.15)
 """Extra reach of a list, in units of the distance to the block's farthest neighbour; it leaves room for movements."""
 
 
@@ -51,32 +51,27 @@ def _list_within(
 ): ...  # fmt: skip
 
 
-@wp.func
-def _spread(x: int):
-    """Move bits 0 .. 9 to bits 0, 3, 6 ... 27."""
-    x = (x | (x << 16)) & 0x030000FF
-    x = (x | (x << 8)) & 0x0300F00F
-    x = (x | (x << 4)) & 0x030C30C3
-    return (x | (x << 2)) & 0x09249249
-
-
 @wp.kernel
 def morton_codes(
     first: int,
     # In:
-    points_in: wp.array2d[float],  # [N, D]
-    low: wp.vec3,
-    inverse_size: wp.vec3,
+    places_in: wp.array2d[float],  # [N, up to 4], most of them in 0 .. 1
     # Out:
     codes_out: wp.array[wp.int32],  # [N]
 ):
-    """Compute the Morton code of point ``i`` from its first three coordinates; arbitrary if the point is non-finite."""
+    """Compute the Morton code of place ``i``, in cubes. Places beyond 0 .. 1 count as those at the border."""
     i = first + wp.tid()
+    dims = places_in.shape[1]
+    levels = 30 / dims
+    most = float((1 << levels) - 1)
     code = int(0)
-    for d in range(wp.min(points_in.shape[1], 3)):
-        cell = (points_in[i, d] - low[d]) * inverse_size[d] * 1023.0
+    for d in range(dims):
+        cell = places_in[i, d] * most
+        bits = int(0)
         if cell > 0.0:
-            code = code | (_spread(int(wp.min(cell, 1023.0))) << d)
+            bits = int(wp.min(cell, most))
+        for level in range(levels):
+            code = code | (((bits >> level) & 1) << (level * dims + d))
     codes_out[i] = code
 
 

@@ -17,6 +17,12 @@ static inline bool search(
     const NodeList* list, int* indices, float* distances
 ) {
     FUSE_WITHIN_EXPRESSIONS
+    struct All {
+        enum { value = 0 };
+    };
+    struct Listed {
+        enum { value = 1 };
+    };
     struct Two {
         enum { value = 2 };
     };
@@ -36,13 +42,17 @@ static inline bool search(
     const float* source = points.data;
     const float* node_data = nodes.data;
     const float infinity = __builtin_inff();
-    // A `dc` of 3 means three dimensions; 2 means any number.
+    // A `dc` of 3 or 4 means as many dimensions; 2 means any number.
     auto squared = [&](auto dc, const vf* x, const float* node) -> vf {
         vf e = x[0] - node[0];
         vf s = e * e;
-        if (decltype(dc)::value == 3) {
+        if (decltype(dc)::value > 2) {
             vf e1 = x[1] - node[1], e2 = x[2] - node[2];
             s = s + e1 * e1 + e2 * e2;
+            if (decltype(dc)::value == 4) {
+                vf e3 = x[3] - node[3];
+                s = s + e3 * e3;
+            }
         } else {
             for (int d = 1; d < D; ++d) {
                 e = x[d] - node[d];
@@ -52,7 +62,7 @@ static inline bool search(
         return s;
     };
     auto read = [&](auto dc, vf* x) {
-        const int dims = decltype(dc)::value == 3 ? 3 : D;
+        const int dims = decltype(dc)::value > 2 ? (int)decltype(dc)::value : D;
         for (int d = 0; d < dims; ++d) {
             float lanes[16];
             for (int lane = 0; lane < 16; ++lane) lanes[lane] = source[(long long)rows[lane] * D + d];
@@ -79,30 +89,31 @@ static inline bool search(
         index[0] = here ? number : index[0];
         best[0] = here ? s : best[0];
     };
-    auto scan = [&](auto kc, auto dc, const vf* x, vf* best, vi* index) {
+    // Search the first `total` of all nodes, or those of a list, ascending.
+    auto scan = [&](auto kc, auto dc, auto listed, const vf* x, const int* list_nodes, int total, vf* best, vi* index) {
         constexpr int S = decltype(kc)::value;
-        const int dims = decltype(dc)::value == 3 ? 3 : D;
+        const int dims = decltype(dc)::value > 2 ? (int)decltype(dc)::value : D;
+        auto number = [&](int at) { return decltype(listed)::value ? list_nodes[at] : at; };
         begin_list(kc, best, index);
-        for (int start = 0; start < M; start += 256) {
-            const int stop = start + 256 < M ? start + 256 : M;
+        for (int start = 0; start < total; start += 256) {
+            const int stop = start + 256 < total ? start + 256 : total;
             // Compute all distances of this batch, and the smallest of every sixteen nodes.
             vf d2[256], least[16];
             const int groups = (stop - start + 15) / 16;
             for (int g = 0; g < groups; ++g) {
                 vf low = (vf){} + infinity;
-                const int end = start + 16 * g + 16 < stop ? start + 16 * g + 16 : stop;
-                const float* node = node_data + (start + 16ll * g) * dims;
+                const int first = start + 16 * g, end = first + 16 < stop ? first + 16 : stop;
                 vf* out = d2 + 16 * g;
                 auto distance = [&](int m) {
-                    vf s = squared(dc, x, node + m * dims);
+                    vf s = squared(dc, x, node_data + (long long)number(first + m) * dims);
                     out[m] = s;
                     low = s < low ? s : low;
                 };
-                if (end - start - 16 * g == 16) {
+                if (end - first == 16) {
 #pragma clang loop unroll_count(4)
                     for (int m = 0; m < 16; ++m) distance(m);
                 } else
-                    for (int m = 0; m < end - start - 16 * g; ++m) distance(m);
+                    for (int m = 0; m < end - first; ++m) distance(m);
                 least[g] = low;
             }
             // K groups hold a node within the K-th smallest of these minima, so no farther node is among the K nearest.
@@ -127,7 +138,7 @@ static inline bool search(
                     found |= (unsigned)(__builtin_reduce_or(d2[m - start] <= limit) != 0) << (m - start - 16 * g);
                 for (; found; found &= found - 1) {
                     const int m = start + 16 * g + __builtin_ctz(found);
-                    insert(kc, best, index, d2[m - start], m);
+                    insert(kc, best, index, d2[m - start], number(m));
                 }
             }
         }
@@ -135,16 +146,12 @@ static inline bool search(
     bool proven = false;
     auto run = [&](auto kc, auto dc) {
         constexpr int S = decltype(kc)::value;
-        const int dims = decltype(dc)::value == 3 ? 3 : D;
-        vf x[decltype(dc)::value == 3 ? 3 : MAX_DIMENSIONS], best[S];
+        const int dims = decltype(dc)::value > 2 ? (int)decltype(dc)::value : D;
+        vf x[decltype(dc)::value > 2 ? (int)decltype(dc)::value : MAX_DIMENSIONS], best[S];
         vi index[S];
         read(dc, x);
         if (list && list->count >= 0) {
-            begin_list(kc, best, index);
-            for (int at = 0; at < list->count; ++at) {
-                vf s = squared(dc, x, node_data + (long long)list->nodes[at] * dims);
-                if (__builtin_reduce_or(s < best[S - 1])) insert(kc, best, index, s, list->nodes[at]);
-            }
+            scan(kc, dc, Listed{}, x, list->nodes, list->count, best, index);
             vf last = best[S - 1], off = squared(dc, x, list->centre), poison = x[0] * 0.0f;
 #pragma clang loop unroll(full)
             for (int j = 0; j < S; ++j) last = j == K - 1 ? best[j] : last;
@@ -155,7 +162,7 @@ static inline bool search(
             // Non-finite points are exempt: their distances are non-finite for every node, in the list or not.
             proven = __builtin_reduce_and((need < list->centre[D]) | ~(poison == 0.0f));
         }
-        if (!proven) scan(kc, dc, x, best, index);
+        if (!proven) scan(kc, dc, All{}, x, nullptr, M, best, index);
         int numbers[S][16];
         __builtin_memcpy(numbers, index, sizeof(numbers));
         for (int lane = 0; lane < count; ++lane) {
@@ -178,6 +185,8 @@ static inline bool search(
     };
     if (D == 3)
         sized(Three{});
+    else if (D == 4)
+        sized(Four{});
     else
         sized(Two{});
     return proven;

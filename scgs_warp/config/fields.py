@@ -68,10 +68,14 @@ class MotionConfig:
     per-gaussian."""
     train_positions: bool = True
     """Learn the rest positions of the control points in stage 2 (paper); the official code never moves them."""
-    hyper_dim: int = bounded(8, 0, 64)
-    """Number of hyper-coordinates appended to positions in the neighbour search (official code). They separate parts
-    that lie side by side and move apart, such as a shadow and the table on which it falls."""
-    hyper_dim_filled: int = bounded(4, 0, 64)
+    hyper_dim: int = bounded(1, 0, 64)
+    """Number of hyper-coordinates appended to positions in the neighbour search. They separate parts that lie side by
+    side and move apart, such as a shadow and the table on which it falls. The official code has eight, which begin
+    equal, have equal gradients, and so stay equal."""
+    hyper_stretch: float = newer(8**0.5, before=1.0, least=0, most=1e3)
+    """Factor on the start and the learning rates of the hyper-coordinates. One coordinate that is stretched by the
+    square root of eight makes the distances of eight equal ones."""
+    hyper_dim_filled: int = bounded(1, 0, 64)
     """Minimum of hyper_dim if no image has alpha."""
     node_weight: bool = True
     """Learn a weight per control point in the RBF (official code)."""

@@ -118,7 +118,7 @@ class ControlPoints(Motion):
         self.config = config
         self.positions = nn.Parameter(positions.clone())
         self.log_radii = nn.Parameter(radii.log())
-        self.hyper = nn.Parameter(torch.full((count, config.hyper_dim), 1e-2, device=device))
+        self.hyper = nn.Parameter(torch.full((count, config.hyper_dim), 1e-2 * config.hyper_stretch, device=device))
         self.strength_logits = nn.Parameter(torch.zeros(count if config.node_weight else 0, device=device))
         self.network = network
         self.takes_time_tensor = isinstance(network, DeformationNetwork)
@@ -300,7 +300,8 @@ class ControlPoints(Motion):
         rates = {name: network for name, _ in self.named_parameters() if name.startswith("network.")}
         positions = optim.node_positions * decay if config.motion.train_positions else 0.0
         nodes = optim.nodes * (decay if optim.nodes_decay else 1.0)
-        return {**rates, "positions": positions, "log_radii": nodes, "hyper": nodes, "strength_logits": nodes}
+        hyper = nodes * config.motion.hyper_stretch
+        return {**rates, "positions": positions, "log_radii": nodes, "hyper": hyper, "strength_logits": nodes}
 
     def extra_state(self) -> dict[str, Tensor]:
         return (

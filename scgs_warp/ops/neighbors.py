@@ -156,12 +156,13 @@ class NeighborSearch:
 
 def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> CandidateLists:
     codes = torch.empty(points.shape[0], dtype=torch.int32)
-    corners = torch.zeros(2, 3)
     if points.shape[0]:
-        space = points[:, :3].nan_to_num(0.0, 0.0, 0.0)
-        corners[:, : space.shape[1]] = torch.stack([space.amin(0), space.amax(0)])
-    size = (corners[1] - corners[0]).clamp(min=1e-12)
-    launch(neighbor_lists.morton_codes, points.shape[0], points, corners[0].tolist(), (1.0 / size).tolist(), codes)
+        space = points.nan_to_num(0.0, 0.0, 0.0)
+        tails = max(1, points.shape[0] // 100)  # a few points far out would make the cubes of all others too large
+        low, high = (space.kthvalue(rank, 0).values for rank in (tails, points.shape[0] + 1 - tails))
+        widest = (high - low).argsort(descending=True, stable=True)[:4]
+        space = ((space - low) / float((high - low).max().clamp_min(1e-12)))[:, widest].contiguous()
+        launch(neighbor_lists.morton_codes, points.shape[0], space, codes)
     order = torch.argsort(codes).int()
     blocks, width = _blocks(points), points.shape[1] + 1
     centres, counts = torch.empty(blocks, width), torch.empty(blocks, dtype=torch.int32)

@@ -218,6 +218,14 @@ def initial_gaussians(
     config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None = None
 ) -> GaussianParameters:
     """Make the Gaussians of stage 2 at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
+    gaussians = _unstretched(config, points, colors, spheres)
+    gaussians.hyper.data[:, : config.motion.hyper_dim] *= config.motion.hyper_stretch
+    return gaussians
+
+
+def _unstretched(
+    config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None
+) -> GaussianParameters:
     options: dict[str, Any] = {
         "sh_degree": config.sh_degree,
         "hyper_dim": config.motion.hyper_columns,

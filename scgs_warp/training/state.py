@@ -172,7 +172,7 @@ class TrainState:
             "opacity_logits": self.config.pretrain.opacity_rate if spheres else rates.opacity,
             "sh_dc": self.config.pretrain.color_rate if spheres else rates.sh_dc,
             "sh_rest": rates.sh_rest,
-            "hyper": rates.hyper,
+            "hyper": rates.hyper * self.config.motion.hyper_stretch,
             "shading": rates.shading,
             "correctives": rates.correctives,
         }

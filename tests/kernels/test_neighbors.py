@@ -32,16 +32,17 @@ def assert_nearest(points, nodes, k, indices, distances):
 @pytest.mark.parametrize(
     ("n", "m", "d", "k"),
     [(333, 64, 3, 4), (17, 512, 3, 3), (100, 70, 11, 8), (50, 16, 3, 16), (16, 5, 3, 5), (1, 1, 3, 1), (31, 9, 1, 9),
-     (40, 33, 24, 9), (40, 33, 70, 4), (64, 300, 5, 1)],
+     (40, 33, 24, 9), (40, 33, 70, 4), (64, 300, 5, 1), (333, 300, 4, 4)],
 )  # fmt: skip
 def test_nearest_matches_brute_force(device, seed, n, m, d, k):
     points, nodes = cloud(seed, n, m, d, device)
     assert_nearest(points, nodes, k, *nearest(points, nodes, k))
 
 
+@pytest.mark.parametrize("d", [3, 4, 5])
 @pytest.mark.parametrize("k", [1, 3, 4, 8, 13])
-def test_plain_kernel_matches_lanes(k):
-    points, nodes = cloud(2, 101, 64, 3)
+def test_plain_kernel_matches_lanes(k, d):
+    points, nodes = cloud(2, 101, 64, d)
     points[::7] = nodes[:15]  # distance 0
     indices, distances = nearest(points, nodes, k)
     plain = torch.empty_like(indices), torch.empty_like(distances)
@@ -98,7 +99,7 @@ def test_sizes_that_cannot_be(device):
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
-    ("n", "m", "d", "k"), [(3001, 300, 3, 4), (2000, 200, 5, 7), (1000, 100, 11, 3), (500, 3, 2, 3), (40, 20, 3, 16)]
+    ("n", "m", "d", "k"), [(3001, 300, 3, 4), (3001, 300, 4, 4), (2000, 200, 5, 7), (1000, 100, 11, 3), (500, 3, 2, 3), (40, 20, 3, 16)]
 )
 def test_search_with_a_memory_is_exact_while_all_moves(device, seed, n, m, d, k):
     points, nodes = cloud(seed, n, m, d, device)
@@ -131,6 +132,21 @@ def test_the_memory_is_used_and_renewed():
         assert torch.equal(search(*other), nearest(*other)[0])
         assert search.lists is not lists
         lists = search.lists
+
+
+@pytest.mark.parametrize("d", [3, 4, 11])
+def test_lists_are_short_where_points_are_apart_in_any_coordinate(d):
+    """Points of two kinds at the same places, apart in the last coordinate, with a few of them far out."""
+    points, nodes = cloud(11, 30_000, 256, d)
+    points[:, 3:], nodes[:, 3:] = 0.0, 0.0
+    points[::2, -1] += 3.0
+    nodes[::2, -1] += 3.0
+    points[:100] *= 40.0
+    search = NeighborSearch()
+    search(points, nodes, 4)
+    counts = search.lists.counts
+    assert int((counts >= 0).sum()) > 0.9 * len(counts)
+    assert float(counts[counts >= 0].float().mean()) < 50
 
 
 @pytest.mark.parametrize("afar", [50.0, 1e25, float("nan"), float("inf")])
