@@ -38,6 +38,7 @@ PAPER = TrainConfig(
         chunks=1,
         train_positions=True,
         hyper_dim=0,
+        hyper_stretch=1.0,
         hyper_dim_filled=0,
         node_weight=False,
         shape_rotation=False,

@@ -24,7 +24,7 @@ def test_best_preset_is_half_the_supplements_schedule():
     assert (made.pretrain.steps, made.pretrain.densify_until, made.main_steps) == (5_000, 3_750, 35_000)
     assert (made.freeze, made.motion.nodes, made.motion.neighbors) == (1_500, 512, 4)
     assert (made.loss.arap, made.loss.arap_end, made.loss.arap_until) == (1e-4, 1e-7, 5_000)
-    assert (made.motion.hyper_dim, made.motion.node_weight) == (8, True), "as in the official code: docs/quality.md"
+    assert (made.motion.hyper_dim, made.motion.node_weight) == (1, True), "docs/quality.md"
     assert (made.motion.layers, made.motion.position_frequencies, made.motion.time_frequencies) == (8, 10, 6)
     assert made.pretrain.progressive_every == 500
 

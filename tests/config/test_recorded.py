@@ -36,7 +36,8 @@ def test_best_is_the_former_paper_in_half_the_steps():
     changed = {
         **{name: value for name, value in halved.items() if name in values and values[name] != value},
         "preset": "best",
-        "motion.hyper_dim": 8,
+        "motion.hyper_dim": 1,
+        "motion.hyper_dim_filled": 1,
         "motion.node_weight": True,
         "loss.arap": 1e-4,
         "loss.arap_end": 1e-7,
@@ -56,6 +57,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "loss.log_error_from": 0.58,
         "sharpness": 0.5,
         "loss.pooled": "auto",
+        "motion.hyper_stretch": 8**0.5,
         "densify.least_views": 2,
         "densify.clear_distance": 0.25,
     }

@@ -39,9 +39,9 @@ def test_opaque_rgba_is_rgb(tmp_path, bits, background):
     for plain, frame in zip(expected, data):
         assert frame.alpha is None and torch.allclose(frame.image, plain.image, rtol=0, atol=1e-6)
         assert frame.mask is not None and torch.equal(frame.mask, plain.mask)
-    config = tiny_config(20, data={"background": background}, motion={"hyper_dim": 2})
+    config = tiny_config(20, data={"background": background}, motion={"hyper_dim": 0})
     state = TrainState.begin(config, data, "cpu")
-    assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 4)
+    assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 1)
     assert len(state.gaussians) == config.init_points > len(data.points)
 
 

@@ -128,10 +128,10 @@ def test_what_the_data_offers_decides(tmp_path):
     """Points: no first stage, control points among them. No alpha: walls may be large, what rests is told apart."""
     write(tmp_path)
     data = load(tmp_path)
-    config = tiny_config(20, motion={"hyper_dim": 2})
+    config = tiny_config(20, motion={"hyper_dim": 0})
     state = TrainState.begin(config, data, "cpu")
     assert state.stage == "main" and state.config.pretrain_steps == 0
-    assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 4)
+    assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 1)
     rest, points = state.motion.positions.detach(), state.normalisation.apply(data.points)
     assert torch.cdist(rest, points).amin(1).max() < 5e-3
     assert torch.cdist(points, state.gaussians.means.detach()).amin(1).max() < 5e-3
@@ -144,4 +144,4 @@ def test_what_the_data_offers_decides(tmp_path):
     asked = dataclasses.replace(config, pretrain=dataclasses.replace(config.pretrain, with_points=True))
     assert TrainState.begin(asked, data, "cpu").stage == "pretrain"
     kept = TrainState.begin(config, tiny_dataset(4), "cpu").config
-    assert kept.pretrain_steps > 0 and (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 2)
+    assert kept.pretrain_steps > 0 and (kept.densify.prune_large, kept.motion.hyper_dim) == ("always", 0)

@@ -69,13 +69,13 @@ def test_what_changes_no_bit_may_differ_on_resume(tmp_path):
 
 
 def test_auto_follows_alpha_when_there_are_no_points():
-    data, config = tiny_dataset(3), tiny_config(20, motion={"hyper_dim": 2})
+    data, config = tiny_dataset(3), tiny_config(20, motion={"hyper_dim": 0})
     assert not has_initial_points(data, config)
     resolved = resolve_auto(config, data)
     assert resolved.densify.prune_large == "always" and resolved.motion.hyper_dim == config.motion.hyper_dim
     filled = type(data)([dataclasses.replace(f, alpha=None) for f in data], folder=Path("filled"), split="train")
     resolved = resolve_auto(config, filled)
-    assert resolved.densify.prune_large == "never" and resolved.motion.hyper_dim == 4
+    assert resolved.densify.prune_large == "never" and resolved.motion.hyper_dim == 1
     assert resolved.pretrain_steps == config.pretrain_steps > 0
 
 
