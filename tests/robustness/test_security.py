@@ -125,8 +125,8 @@ CHECKPOINTS = {
     "other harmonics": (tensor("gaussians.sh_rest", lambda old: old[:, :2]), "gaussians.sh_rest"),
     "whole numbers": (tensor("gaussians.means", lambda old: old.to(torch.int64)), "gaussians.means"),
     "hyper-coordinates of another size": (
-        tensor("gaussians.hyper", lambda old: old[:, :1]),
-        "gaussians.hyper has 1 columns, not 9",
+        tensor("gaussians.hyper", lambda old: old[:, :0]),
+        "gaussians.hyper has 0 columns, not 2",
     ),
     "a control point that overflows": (far_control_point, "the control points are not finite"),
     "scales that overflow": (tensor("gaussians.log_scales", lambda old: old + 1e6), "scales are not finite"),
