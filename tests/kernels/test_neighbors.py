@@ -99,7 +99,8 @@ def test_sizes_that_cannot_be(device):
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
-    ("n", "m", "d", "k"), [(3001, 300, 3, 4), (3001, 300, 4, 4), (2000, 200, 5, 7), (1000, 100, 11, 3), (500, 3, 2, 3), (40, 20, 3, 16)]
+    ("n", "m", "d", "k"),
+    [(3001, 300, 3, 4), (3001, 300, 4, 4), (2000, 200, 5, 7), (1000, 100, 11, 3), (500, 3, 2, 3), (40, 20, 3, 16)],
 )
 def test_search_with_a_memory_is_exact_while_all_moves(device, seed, n, m, d, k):
     points, nodes = cloud(seed, n, m, d, device)
