@@ -180,8 +180,9 @@ def open_browser(session: EditSession, options: Options) -> None:
     autosave = Autosave(session, folder, "" if options.ply is None else options.ply.name)
     autosave.start(restore=options.script is None and not options.new)
     title = source.resolve().name
+    served = {"port": options.port, "shared": options.share, "source": source}
     with stop_signals() as stop:  # Shells may make background processes ignore Ctrl-C.
-        editor = Editor(session, folder, title=title, port=options.port, shared=options.share, autosave=autosave)
+        editor = Editor(session, folder, title=title, **served, autosave=autosave)
         try:
             print(autosave.said or f"the edit is kept in {autosave.path}")
             print(f"open {editor.url} in a browser; Ctrl-C ends", flush=True)

@@ -99,7 +99,7 @@ def live_view(options: Options, output: Path, steps: int) -> TrainingView:
 
     if not 0 <= options.port <= 65535:
         raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
-    view = SceneView(output.resolve().name, port=options.port)
+    view = SceneView(output.resolve().name, port=options.port, source=output)
     say(f"watch the training: open {view.server.url} in a browser")
     return TrainingView(view, steps)
 

@@ -134,7 +134,8 @@ def show_live(options: Options, device: str) -> None:
 
     source = options.run or options.ply
     assert source is not None
-    with stop_signals() as stop, SceneView(source.resolve().name, port=options.port, shared=options.share) as view:
+    served = {"port": options.port, "shared": options.share, "source": source}
+    with stop_signals() as stop, SceneView(source.resolve().name, **served) as view:
         say(f"reading {source}")
         watcher = view_run(source, view, device) if options.run is not None else None
         if watcher is None:

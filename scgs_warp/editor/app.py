@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..edit import EditSession
+from ..edit.edit_file import scene_of
 from ..edit.field_reader import FieldReader
 from ..errors import UserError, one_line
 from ..export.page import MAX_DEGREE, SCRIPTS, document, program_text, read_web
@@ -20,7 +22,7 @@ from ..export.page_edit import own_motion
 from ..export.page_pose import with_parts
 from ..export.page_scene import page_scene
 from ..live.server import Client, PageServer
-from ..live.viewer import WIRE
+from ..live.viewer import WIRE, digest
 from ..storage.json_files import as_number
 from . import files
 from .actions import ACTIONS
@@ -67,7 +69,7 @@ class Editor:
         session: scene and edit.
         folder: folder of edits, films and exports.
         title: name of the scene.
-        port, shared: as for ``PageServer``.
+        port, shared, source: as for ``PageServer``.
         autosave: keeper of the session's edit; None: it is saved on request alone.
 
     Attributes: ``server``, ``model``, ``parts`` (what clicks and drags do with parts), ``worker``, ``jobs``, ``held``
@@ -86,6 +88,7 @@ class Editor:
         title: str = "scene",
         port: int = 8080,
         shared: bool = False,
+        source: Path | None = None,
         autosave: Autosave | None = None,
     ) -> None:
         self.session, self.folder, self.title, self.autosave = session, folder, title, autosave
@@ -110,7 +113,14 @@ class Editor:
         self._page = page_of(title)
         routes = {"/": self._serve_page, "/scene": self._serve_scene, "/file/{name}": self._serve_file}
         self.server = PageServer(
-            routes, port=port, shared=shared, received=self._receive, connected=self._greet, left=self._dismiss
+            routes,
+            port=port,
+            shared=shared,
+            page=digest(self._page, json.dumps(held_by_pages(session)).encode()),
+            source=source,
+            received=self._receive,
+            connected=self._greet,
+            left=self._dismiss,
         )
         if autosave is not None:
             autosave.done = self.tell
@@ -362,6 +372,12 @@ class Editor:
             return web.Response(status=404, text=str(error))
         quiet = re.sub(r"[^A-Za-z0-9 ._-]", "_", path.name)
         return web.FileResponse(path, headers={"Content-Disposition": f'attachment; filename="{quiet}"'})
+
+
+def held_by_pages(session: EditSession) -> dict[str, Any]:
+    """Return what tells a session from others whose scene an open page does not hold."""
+    scene = session.scene
+    return {"scene": scene_of(session.engine), "step": scene.step, "gaussians": scene.gaussian_count}
 
 
 def number_of(message: dict[str, Any]) -> int | None:

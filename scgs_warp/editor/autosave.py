@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,22 +12,13 @@ from ..edit import Edit, EditSession, edit_file
 from ..errors import UserError, one_line
 from ..storage.files import write_atomically
 from ..storage.locks import AlreadyLocked, lock_file
+from ..storage.own_folder import own_folder
 
 NAME = "autosave"
 PREVIOUS = "previous"
 """Suffix of the edit that a new one has replaced."""
 DAMAGED = "damaged"
 """Suffix of a saved edit that could not be read."""
-
-
-def own_folder(source: Path) -> Path:
-    """Return the folder for edits of a run or file whose own folder cannot be written."""
-    base = os.environ.get("XDG_DATA_HOME") or (
-        os.environ.get("LOCALAPPDATA") if sys.platform == "win32" else str(Path.home() / ".local" / "share")
-    )
-    path = source.resolve()
-    mark = hashlib.sha256(os.fsencode(path)).hexdigest()[:8]
-    return Path(base or Path.home()) / "scgs_warp" / "edits" / f"{path.name or 'scene'}-{mark}"
 
 
 def folder_for(source: Path, chosen: Path | None = None) -> Path:
@@ -40,7 +29,7 @@ def folder_for(source: Path, chosen: Path | None = None) -> Path:
         UserError: the chosen folder, or every other one, cannot be written.
     """
     usual = source / "edits" if source.is_dir() else source.parent / "edits"
-    candidates = [chosen] if chosen is not None else [usual, own_folder(source)]
+    candidates = [chosen] if chosen is not None else [usual, own_folder("edits", source)]
     problem: OSError | None = None
     for folder in candidates:
         try:

@@ -66,12 +66,11 @@ class Access:
         self.token = secrets.token_urlsafe(24)
         self.cookie = f"{COOKIE}{port}"
 
-    def refusal(self, request: Request) -> str | None:
-        """Return the reason to refuse a request; None accepts it.
+    def foreign(self, request: Request) -> str | None:
+        """Return why a request cannot be one of this server's pages, whatever its token; None: it can.
 
-        The token keeps out other users and machines. The name of the host keeps out pages that turn a name of their own
-        into this machine's address (DNS rebinding), the origin all other pages: a browser sends the cookie for them,
-        too.
+        The name of the host keeps out pages that turn a name of their own into this machine's address (DNS rebinding),
+        the origin all other pages: a browser sends the cookie for them, too.
         """
         if len(request.hosts) != 1 or len(request.origins) > 1:
             return "not a request of this page"
@@ -80,6 +79,13 @@ class Access:
         origin = request.origins[0] if request.origins else None
         if (request.upgrades or origin is not None) and not same_origin(origin or "", request.hosts[0]):
             return ELSEWHERE
+        return None
+
+    def refusal(self, request: Request) -> str | None:
+        """Return the reason to refuse a request; None accepts it. The token keeps out other users and machines."""
+        foreign = self.foreign(request)
+        if foreign is not None:
+            return foreign
         given = request.tokens if request.tokens else [request.cookies.get(self.cookie, "")]
         if len(given) != 1 or not hmac.compare_digest(given[0].encode("utf-8", "replace"), self.token.encode()):
             return NO_TOKEN

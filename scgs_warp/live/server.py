@@ -9,11 +9,13 @@ import socket
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import UserError
 from ..storage.json_files import parse_json
-from .access import Access, Request, cookies
+from .access import NO_TOKEN, Access, Request, cookies
+from .return_key import ReturnKey, is_number, kept_key, key_file
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -38,6 +40,8 @@ HEADERS = {
     "X-Frame-Options": "DENY",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+RETURN = "/return"
+"""Path at which pages of an earlier start ask to be let in; the only one that needs no token."""
 Handler = Callable[["web.Request"], Awaitable["web.StreamResponse"]]
 
 
@@ -124,6 +128,9 @@ class PageServer:
         routes: handlers of GET requests by path. ``/socket`` is the WebSocket's.
         port: port on this machine; if it is taken, one of the next. 0: any.
         shared: listen on all interfaces, on exactly this port.
+        page: digest of what open pages hold. A page that finds another one after a return loads itself anew.
+        source: run or file that is served. Pages find their way back to its next start on the same port, unless
+            the port may be any, or other machines may use the server: its start then takes their access away.
         received: called on the server's thread with a page and a JSON object that it sent.
         connected, left: called on the server's thread when a page connects and when it is gone.
 
@@ -139,6 +146,8 @@ class PageServer:
         *,
         port: int = 0,
         shared: bool = False,
+        page: str = "",
+        source: Path | None = None,
         received: Callable[[Client, dict[str, Any]], None] = lambda client, message: None,
         connected: Callable[[Client], None] = lambda client: None,
         left: Callable[[Client], None] = lambda client: None,
@@ -148,6 +157,10 @@ class PageServer:
         self._socket = _listen(port, shared)
         self.port: int = self._socket.getsockname()[1]
         self.access = Access(self.port, shared)
+        self._page = page
+        self._way_back: ReturnKey | None = None
+        if source is not None and port and not shared:
+            self._way_back = ReturnKey(kept_key(key_file(source, self.port)), self.port)
         self.clients: dict[int, Client] = {}
         self._count = 0
         self._since: dict[Any, float] = {}
@@ -206,6 +219,8 @@ class PageServer:
             request.query.getall("token", []),
             cookies("; ".join(headers.getall("Cookie", []))),
         )
+        if request.path == RETURN and self.access.foreign(asked) is None:
+            return self._let_back(request)
         why = self.access.refusal(asked)
         if why is not None:
             refused = web.Response(status=403, text=why, headers=HEADERS)
@@ -215,7 +230,7 @@ class PageServer:
         if asked.tokens:
             rest = request.url.without_query_params("token")
             response = web.Response(status=303, headers={**HEADERS, "Location": str(rest.relative())})
-            response.set_cookie(self.access.cookie, self.access.token, path="/", httponly=True, samesite="Lax")
+            self._give_cookie(response)
             return response
         try:
             response = await handler(request)
@@ -224,6 +239,33 @@ class PageServer:
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
+
+    def _give_cookie(self, response: web.StreamResponse) -> None:
+        response.set_cookie(self.access.cookie, self.access.token, path="/", httponly=True, samesite="Lax")
+
+    def _let_back(self, request: web.Request) -> web.StreamResponse:
+        """Answer a page of an earlier start: prove that this is the server that it knew, and give it the token if it
+        proves the same."""
+        web, known = self._aiohttp.web, self._way_back
+        drawn, proof = request.query.get("drawn", ""), request.query.get("proof")
+        if known is None or not is_number(drawn):
+            response = web.Response(status=404, text=NO_TOKEN, headers=HEADERS)
+        elif proof is None:
+            response = web.json_response({"start": known.start, "proof": known.proof("server", drawn)}, headers=HEADERS)
+        elif known.knows(drawn, proof):
+            response = web.Response(status=204, headers=HEADERS)
+            self._give_cookie(response)
+        else:
+            response = web.Response(status=403, text=NO_TOKEN, headers=HEADERS)
+        response.force_close()
+        return response
+
+    def _introduce(self, client: Client) -> None:
+        """Tell a page what it needs to find its way back."""
+        if self._page:
+            known = self._way_back
+            way_back = None if known is None else {"key": known.key, "port": known.port}
+            client.send({"server": {"page": self._page, "back": way_back}})
 
     async def _serve_socket(self, request: web.Request) -> web.StreamResponse:
         web, kinds = self._aiohttp.web, self._aiohttp.WSMsgType
@@ -234,6 +276,7 @@ class PageServer:
         self.clients[client.number] = client
         pumping = asyncio.ensure_future(client.pump())
         try:
+            self._introduce(client)
             self._connected(client)
             async for message in wire:
                 if message.type != kinds.TEXT or not client.allows():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import time
 from collections.abc import Callable
@@ -20,18 +21,26 @@ WIRE = read_web("wire.js", WEB)
 """Script of a page's connection to its ``PageServer``."""
 
 
+def digest(*contents: bytes) -> str:
+    """Return a digest of what a page holds."""
+    whole = hashlib.sha256()
+    for content in contents:
+        whole.update(len(content).to_bytes(8, "little") + content)
+    return whole.hexdigest()
+
+
 class SceneView:
     """Server of one scene's page. ``publish`` replaces the scene; every page follows and keeps its camera and time.
 
     Args:
         title: text shown on the page.
-        port, shared: as for ``PageServer``.
+        port, shared, source: as for ``PageServer``.
 
     Raises:
         UserError: aiohttp is not installed, or the port is not available.
     """
 
-    def __init__(self, title: str, *, port: int = 0, shared: bool = False) -> None:
+    def __init__(self, title: str, *, port: int = 0, shared: bool = False, source: Path | None = None) -> None:
         program = program_text(SCRIPTS, [WIRE, read_web("live.js", WEB)])
         self._page = document(program, title, network="'self'")
         self._content, self._version, self._status = b"", 0, "waiting for the scene"
@@ -39,7 +48,15 @@ class SceneView:
         self.wanted = threading.Event()
         """Set while at least one page is open."""
         routes = {"/": self._serve_page, "/scene": self._serve_scene}
-        self.server = PageServer(routes, port=port, shared=shared, connected=self._greet, left=self._bid_farewell)
+        self.server = PageServer(
+            routes,
+            port=port,
+            shared=shared,
+            page=digest(self._page),
+            source=source,
+            connected=self._greet,
+            left=self._bid_farewell,
+        )
 
     def publish(self, content: bytes, status: str = "") -> None:
         """Show another scene, the result of ``pack``."""

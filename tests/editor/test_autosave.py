@@ -14,8 +14,9 @@ from helpers.edit_scenes import bar_scene
 from helpers.paths import ROOT
 from scgs_warp.edit import Edit, EditSession, edit_file
 from scgs_warp.editor import autosave as module
-from scgs_warp.editor.autosave import Autosave, folder_for, own_folder
+from scgs_warp.editor.autosave import Autosave, folder_for
 from scgs_warp.errors import UserError
+from scgs_warp.storage.own_folder import own_folder
 
 ACTIONS = 60
 SESSION = """
@@ -168,7 +169,9 @@ def test_the_folder(tmp_path, monkeypatch):
     (tmp_path / "sealed").mkdir()
     (tmp_path / "sealed" / "edits").write_text("a file is in the way, as in a folder that nobody may write to")
     found = folder_for(tmp_path / "sealed")
-    assert found == own_folder(tmp_path / "sealed") and found.is_dir() and found.is_relative_to(tmp_path / "home")
+    assert (
+        found == own_folder("edits", tmp_path / "sealed") and found.is_dir() and found.is_relative_to(tmp_path / "home")
+    )
     assert list(found.iterdir()) == []
     with pytest.raises(UserError, match="--folder"):
         folder_for(tmp_path / "run", tmp_path / "scene.ply" / "x")

@@ -69,9 +69,11 @@ def test_a_limb_is_pulled_keyed_undone_and_kept(browser, editor):
     window.page.keyboard.press(" ")
     until(lambda: window.ask("clock.playing && player.time > 0.05"))
     window.page.keyboard.press(" ")
+    window.page.keyboard.press("2")
     window.page.reload()
     window.page.evaluate("window.scgs.ready.then(() => 1)")
     assert window.ask("player.time") > 0.05, "the moment and the view survive a reload"
+    assert window.ask("player.tools.kind") == "turn"
     assert not window.ask("studio.link.state.unedited")
     window.close()
 
@@ -197,14 +199,6 @@ def test_a_page_without_webgl_shows_pictures(browser, editor):
     window.page.get_by_label("Part", exact=True).select_option(index=2)
     until(lambda: window.ask("studio.link.state.part"))
     window.close()
-
-
-def test_the_server_may_go(browser, editor):
-    window = Window(browser, editor)
-    editor.server.stop()
-    until(lambda: window.page.locator("#status").inner_text() == "no server")
-    assert "The server has gone" in window.page.locator("#notes").inner_text()
-    window.context.close()
 
 
 @pytest.mark.parametrize("size", [(1400, 900), (390, 844)])

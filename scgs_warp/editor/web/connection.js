@@ -5,7 +5,7 @@ const KINDS = { pose: 1, picture: 2 };
 
 class Link {
   constructor(listener) {
-    this.listener = listener; // hello, camera, state, said, file, pose, gone
+    this.listener = listener; // hello, camera, state, said, file, pose, gone, moved
     this.state = null;
     this.live = null; // pose of a drag
     this.cache = new Map(); // frame -> pose
@@ -15,18 +15,18 @@ class Link {
     this.missing = new Set(["hello", "camera", "state"]);
     this.first = new Promise((resolve) => { this.arrived = resolve; }); // all of these have come
     const heard = (data) => (typeof data === "string" ? this.hear(JSON.parse(data)) : this.take(data));
-    this.wire = new Wire(heard, () => this.gone());
+    this.wire = new Wire(heard, (answers) => this.gone(answers), () => this.listener.moved());
   }
 
   get open() {
     return this.wire.open;
   }
 
-  gone() {
+  gone(answers) {
     this.forget();
     for (const answer of this.waiting.values()) answer({ problem: "the server has gone" });
     this.waiting.clear();
-    this.listener.gone();
+    this.listener.gone(answers);
   }
 
   forget() {

@@ -49,7 +49,7 @@ class Studio {
     this.link = new Link({
       hello: (hello) => this.greet(hello), camera: (camera) => this.film(camera), state: (state) => this.show(state), said: (said) => this.note(said.text, said.kind),
       file: ({ file, job }) => this.offer(file, job), pose: () => this.player?.changed(),
-      gone: () => this.lost(), picture: (jpeg) => this.player?.take(jpeg),
+      gone: (answers) => this.lost(answers), moved: () => this.anew(), picture: (jpeg) => this.player?.take(jpeg),
     });
   }
 
@@ -58,15 +58,16 @@ class Studio {
   }
 
   greet(hello) {
-    const { title, said, edges, files, folder } = hello;
+    const { title, said, edges, files, folder } = hello, names = JSON.stringify(hello.parts);
+    if (this.gone && this.named !== names) return this.anew();
+    this.named = names;
     Object.assign(this, { title, files, folder, hello });
     this.edges = [];
     for (let k = 0; k < edges.length; k += 2) this.edges.push([edges[k], edges[k + 1]]);
     if (this.tools) this.tools.edges = this.edges;
     if (said && !this.greeted) this.note(said, "info");
-    if (this.gone) this.note("The server is back.", "info");
+    if (this.gone) this.found();
     this.greeted = true;
-    this.gone = false;
   }
 
   // The film's camera has changed.
@@ -75,12 +76,29 @@ class Studio {
     this.player?.film?.(camera);
   }
 
-  lost() {
-    if (!this.gone) this.note("The server has gone. Nothing can be edited until it is back; the page waits for it. Open the printed address"
-      + " if the editor was started anew.");
+  lost(answers) {
+    if (this.tools?.drag) this.tools.stop();
+    const kept = this.link.state?.saved === false ? "Its last change may be lost." : "The edit is saved.";
+    element("gone").textContent = answers ? `${STRANGE} The view is kept.`
+      : `The server has gone. ${kept} Nothing can be edited until the server is started again; this page waits for it.`;
+    element("gone").hidden = false;
     this.gone = true;
     element("status").textContent = "no server";
     element("status").className = "bad";
+  }
+
+  found() {
+    this.gone = false;
+    element("gone").hidden = true;
+    this.note("The server is back, with the edit that it has saved.", "info");
+    if (this.tools) this.use(this.tools.kind);
+    this.player?.changed();
+  }
+
+  // The server shows another scene, or is of another version.
+  anew() {
+    if (this.player) this.remember();
+    location.reload();
   }
 
   async start() {
@@ -89,7 +107,7 @@ class Studio {
     const canvas = element("view"), clock = this.clock = await this.open(canvas, asked.has("pictures"));
     const { player } = this;
     this.timeline = new Timeline(player, this.link, clock);
-    this.restore();
+    const { kind = "pull" } = this.restore();
     this.panel = new Panel(element("panel"), panelSections(this));
     this.commands = new Commands(this);
     listenToPointers(player);
@@ -97,7 +115,7 @@ class Studio {
     element("fold").addEventListener("click", () => this.fold());
     if (innerWidth <= 760) this.fold();
     addEventListener("pagehide", () => this.remember());
-    this.use("pull");
+    this.use(kind);
     this.show(this.link.state);
     const loop = (now) => {
       clock.tick(now);
@@ -266,10 +284,10 @@ class Studio {
     });
   }
 
-  // What a reload brings back: the view, the moment, and what is shown.
+  // What a reload brings back: the view, the moment, the tool, and what is shown.
   remember() {
     const { azimuth, elevation, distance, target } = this.player.orbit;
-    const kept = { azimuth, elevation, distance, target, time: this.player.time, show: this.tools.show,
+    const kept = { azimuth, elevation, distance, target, time: this.player.time, show: this.tools.show, kind: this.tools.kind,
       light: document.body.classList.contains("light") };
     try {
       sessionStorage.setItem(`editor ${this.title}`, JSON.stringify(kept));
@@ -279,15 +297,19 @@ class Studio {
   restore() {
     try {
       const kept = JSON.parse(sessionStorage.getItem(`editor ${this.title}`));
-      if (!kept) return;
+      if (!kept) return {};
       const { azimuth, elevation, distance, target, time, show, light } = kept;
       Object.assign(this.player.orbit, { azimuth, elevation, distance, target });
       Object.assign(this.tools.show, show);
       this.player.seek(time);
       document.body.classList.toggle("light", Boolean(light));
-    } catch { /* nothing usable was kept */ }
+      return kept;
+    } catch { // nothing usable was kept
+      return {};
+    }
   }
 }
 
-const studio = new Studio();
-publish(studio.start());
+const studio = new Studio(), started = studio.start();
+started.catch(() => { studio.link.wire.broken = true; });
+publish(started);

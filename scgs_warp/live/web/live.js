@@ -4,8 +4,9 @@ class Updates {
   constructor() {
     this.version = 0;
     this.shown = 0;
+    this.losses = 0;
     this.first = new Promise((resolve) => { this.arrived = resolve; });
-    new Wire((data) => this.hear(JSON.parse(data)), () => this.gone());
+    this.wire = new Wire((data) => this.hear(JSON.parse(data)), (answers) => this.gone(answers));
   }
 
   hear({ version, status }) {
@@ -16,9 +17,10 @@ class Updates {
     this.refresh();
   }
 
-  gone() {
-    this.tell("The server has gone. The page shows what it has, and waits for it.");
-    this.shown = 0; // another server begins to count again
+  gone(answers) {
+    this.tell(answers ? STRANGE : "The server has gone. The page shows what it has, and tries to reach it again.");
+    this.losses++;
+    this.version = this.shown = 0; // another server begins to count again
   }
 
   tell(text) {
@@ -37,23 +39,27 @@ class Updates {
   async refresh() {
     if (!this.player || this.loading || this.shown === this.version) return;
     this.loading = true;
-    const version = this.version;
+    const { version, losses } = this;
+    let done = false;
     try {
       const model = await readModel(await fetchedScene("scene", () => {}));
       this.player.take(model);
       showModel(this.player);
-      this.shown = version;
+      if (losses === this.losses) this.shown = version;
+      done = true;
     } catch (error) {
       this.tell(error.message);
     }
     this.loading = false;
-    if (this.shown === version) this.refresh();
+    if (done) this.refresh();
   }
 }
 
 const updates = new Updates();
-publish(startPage((report) => updates.load(report), (player) => {
+const started = startPage((report) => updates.load(report), (player) => {
   updates.player = player;
   updates.refresh();
   return {};
-}));
+});
+started.catch(() => { updates.wire.broken = true; });
+publish(started);
