@@ -8,16 +8,28 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.edit_scenes import figure_scene
 from helpers.editor_windows import Window, until
 from scgs_warp.edit import EditSession
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.rendering.render import render
+from scgs_warp.scene.scene import Scene
 
 pytest.importorskip("aiohttp", reason="the package aiohttp is not installed")
-HAND = (0.6, 0.0, -0.3)
+HAND = (-0.43, -0.2, -0.5)
 GESTURES = 3
-RISE = 0.22
-"""Share of the figure's height. Its arm is short: stretched upwards, it raises the hand by a third of the height."""
+RISE = 0.5
+"""Share of the figure's height by which the tip of the hand rises; the arm stretched upwards raises it by 0.55."""
+UP, ASIDE = 0.8, 0.15
+"""Shares of the height by which a drag moves the pointer: beyond the arm's reach, and past the head."""
+
+
+@pytest.fixture(scope="module")
+def figure() -> Scene:
+    """The built-in figure as the page of a trained run first shows it."""
+    scene = figure_scene(nodes=200, points=4000)[0]
+    scene.overview = dataclasses.replace(scene.overview, azimuth=233.9, elevation=26.3)
+    return scene
 
 
 def arm_mask(session: EditSession, nodes: list[int]) -> np.ndarray:
@@ -29,7 +41,21 @@ def arm_mask(session: EditSession, nodes: list[int]) -> np.ndarray:
     return render(shown, camera, torch.zeros(3)).alpha.detach().numpy() > 0.5
 
 
-def test_a_hand_is_raised_above_the_shoulder(browser, editor):
+def on_screen(window: Window, place: np.ndarray) -> tuple[float, float]:
+    """Where the page shows a place, which is in world units."""
+    x, y = window.ask(
+        """(() => { const { centre, scale } = player.model.facts.normalisation, v = player.view();
+        const p = argument.map((value, k) => (value - centre[k]) * scale), { width, height } = player.canvas;
+        const [x, y, z] = v.rows.map((r, k) => r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + v.shift[k]);
+        const b = player.canvas.getBoundingClientRect();
+        return [(v.lens[0] * x / z + v.lens[2]) * b.width / width + b.left,
+          (v.lens[1] * y / z + v.lens[3]) * b.height / height + b.top]; })()""",
+        place.tolist(),
+    )
+    return x, y
+
+
+def test_the_right_hand_is_raised_by_half_the_height_of_the_figure(browser, editor):
     window, session = Window(browser, editor), editor.session
     window.still()
 
@@ -38,21 +64,24 @@ def test_a_hand_is_raised_above_the_shoulder(browser, editor):
 
     begin = places()
     height = np.ptp(begin[:, 2])
-    tip = int(np.linalg.norm(begin - HAND, axis=1).argmin())
-    names = [part.name for part in session.parts()]
-    (row,) = (row for row, part in enumerate(session.parts()) if tip in part.nodes)
-    arm = session.chain(names[row])
-    nodes = sorted(node for name in {*arm, names[row]} for node in session.skeleton.part(name).nodes)
-    pixels = window.ask(
-        "player.view().lens[1] / player.orbit.distance * player.canvas.clientHeight / player.canvas.height"
-    )
+    hand = session.part_at(HAND, 0.0)
+    tip = min(session.skeleton.part(hand).nodes, key=lambda node: begin[node, 2])
+    arm = {*session.chain(hand)}
+    for _ in session.parts():  # with what hangs on it
+        arm |= {part.name for part in session.parts() if part.parent in arm}
+    nodes = sorted(node for name in arm for node in session.skeleton.part(name).nodes)
+    right, down, _ = orbit_camera(session.scene.overview, session.scene.overview.azimuth, 300).viewmat[:3, :3].numpy()
+    goal = begin[tip] - height * (UP * down + ASIDE * right)
     window.ask(
         """(() => { const { link } = studio, tell = link.tell.bind(link); window.drags = [];
         link.tell = (what, fields) => { if (what === "drag") window.drags.push(fields); tell(what, fields); }; })()"""
     )
     rise = gestures = 0.0
     while rise < RISE * height and gestures < GESTURES:
-        window.drag(window.part_on_screen(row), (0, -pixels * ((RISE + 0.02) * height - rise)))
+        x, y = on_screen(window, places()[tip])
+        there = on_screen(window, goal)
+        window.drag((x, y), (there[0] - x, there[1] - y))
+        assert window.ask("studio.link.state.part") == hand
         until(lambda: not window.ask("studio.link.state.unedited"))
         rise, gestures = float((places() - begin)[tip, 2]), gestures + 1
     assert rise >= RISE * height, f"{rise / height:.2f} of the height in {gestures} drags"
@@ -60,7 +89,7 @@ def test_a_hand_is_raised_above_the_shoulder(browser, editor):
     script, drags = EditSession(session.scene), window.page.evaluate("window.drags")
     script.parts()
     for pull in {tuple(drag["grip"]): drag for drag in drags}.values():  # the last message of each drag
-        script.pull(names[row], pull["to"], 0.0, pull["grip"])
+        script.pull(hand, pull["to"], 0.0, pull["grip"])
     by_mouse = editor.worker.call(lambda: arm_mask(session, nodes))
     by_script, before = arm_mask(script, nodes), arm_mask(EditSession(session.scene), nodes)
     overlap = (by_mouse & by_script).sum() / (by_mouse | by_script).sum()
