@@ -40,6 +40,16 @@ def test_a_limb_is_pulled_keyed_undone_and_kept(browser, editor):
     assert np.linalg.norm(moved - (25, -45)) < 25, "the part follows the pointer"
     assert window.ask("player.orbit.azimuth") == azimuth and window.ask("studio.link.state.part")
     until(lambda: window.page.locator("#status").inner_text() == "saved")
+    turn = window.page.get_by_label("Turn, degrees, z")
+    pulled = window.ask("studio.link.state.target.degrees")
+    turn.fill("3.5")
+    turn.press("Enter")
+    until(lambda: abs(window.ask("studio.link.state.target.degrees[2]") - 3.5) < 1e-3)
+    typed = window.ask("studio.link.state.target.degrees")
+    assert np.abs(np.subtract(typed, pulled)[:2]).max() < 1e-3, "what is not typed stays, though it is shown rounded"
+    window.page.locator("#view").focus()
+    window.page.keyboard.press("Control+z")
+    until(lambda: window.ask("studio.link.state.target.degrees") == pulled)
     edit = editor.session.edit
 
     window.page.keyboard.press("k")
@@ -201,7 +211,7 @@ def test_a_page_without_webgl_shows_pictures(browser, editor):
     window.close()
 
 
-@pytest.mark.parametrize("size", [(1400, 900), (390, 844)])
+@pytest.mark.parametrize("size", [(1400, 900), (2560, 1440), (390, 844)])
 def test_every_control_can_be_named_reached_and_read(browser, editor, size):
     """Labels, contrast, titles and roles, by axe-core; nothing sticks out of the window."""
     source = (package("axe-core") / "axe.min.js").read_text(encoding="utf-8")

@@ -95,23 +95,26 @@ class Panel {
   triple(row) {
     const line = document.createElement("label"), text = document.createElement("span");
     const fields = document.createElement("span");
+    let exact = [0, 0, 0]; // what is not typed stays as it is, although it is shown rounded
     text.textContent = row.label;
     fields.className = "triple";
     const inputs = ["x", "y", "z"].map((axis) => {
       const input = document.createElement("input");
       input.type = "number";
-      input.step = row.step ?? "any";
+      input.step = "any";
       input.setAttribute("aria-label", `${row.label}, ${axis}`);
       input.addEventListener("change", () => {
-        if (inputs.every((one) => one.value !== "" && one.checkValidity())) row.set(inputs.map((one) => Number(one.value)));
+        if (input.value === "" || !input.checkValidity()) return;
+        row.set(exact.map((value, k) => (inputs[k] === input ? Number(input.value) : value)));
       });
       return input;
     });
     this.controls.push((state) => {
-      const values = row.get(state);
+      exact = row.get(state);
       inputs.forEach((input, k) => {
         input.disabled = Boolean(row.when && !row.when(state));
-        if (document.activeElement !== input) input.value = tidy(values[k]);
+        input.title = tidy(exact[k]);
+        if (document.activeElement !== input) input.value = Number(Number(exact[k]).toPrecision(3));
       });
     });
     fields.append(...inputs);
@@ -139,7 +142,7 @@ function panelSections(studio) {
         [name, part ? `${name} (part)` : name])], get: (s) => s.active ?? "", set: (name) => name && ask("activate", { name }) },
       { type: "triple", label: "Move", when: (s) => active(s) || chosen(s), get: (s) => s.target.translation,
         set: (translation) => ask("put", { translation }) },
-      { type: "triple", label: "Turn, degrees", step: 1, when: (s) => active(s) || chosen(s), get: (s) => s.target.degrees,
+      { type: "triple", label: "Turn, degrees", when: (s) => active(s) || chosen(s), get: (s) => s.target.degrees,
         set: (degrees) => ask("put", { degrees }) },
       { type: "choice", label: "It lasts", options: [["motion", "the whole motion"], ["frame", "one frame"], ["fade", "and fades"]],
         title: "How long a handle acts: always, in the frame at which it was moved, or fading out around it", picture: "lasts",
