@@ -65,6 +65,10 @@ def test_a_limb_is_pulled_keyed_undone_and_kept(browser, editor):
     window.page.mouse.move(box["x"] + 120, box["y"] + 8, steps=4)
     window.page.mouse.up()
     until(lambda: window.ask("studio.link.state.keyframes.at(-1).at") > 2.2)
+    window.ask("studio.link.ask('film', { seconds: 1 })")
+    until(lambda: "left: 100%" in (keys.nth(1).get_attribute("style") or ""))
+    window.page.keyboard.press("Control+z")
+    until(lambda: "left: 100%" not in (keys.nth(1).get_attribute("style") or ""))
     keys.nth(1).click()
     window.page.keyboard.press("Delete")
     until(lambda: len(editor.session.edit.keyframes) == 1)
@@ -242,5 +246,6 @@ def test_every_control_can_be_named_reached_and_read(browser, editor, size):
     window.page.keyboard.press("Enter")
     assert window.ask("player.tools.show.ribbons")
     window.page.keyboard.press("?")
-    assert window.page.locator("dialog#keys").is_visible()
+    assert window.page.get_by_role("heading", name="Keys").is_visible()
+    assert window.page.evaluate("document.getElementById('keys').scrollTop") == 0, "it begins with its beginning"
     window.close()

@@ -45,8 +45,13 @@ function commandTable(studio) {
       () => studio.theme(document.body.classList.contains("light") ? "dark" : "light")],
     ["panel", "Show or hide the panel", "n", () => studio.fold()],
     ["palette", "Search all commands", "ctrl+k", () => studio.palette()],
-    ["keys", "Show all keys", "?", () => element("keys").showModal()],
+    ["keys", "Show all keys", "?", () => showKeys()],
   ].map(([id, label, key, run, when]) => ({ id, label, key, run, when: when ?? (() => true) }));
+}
+
+function showKeys() {
+  element("keys").showModal();
+  element("keys").scrollTop = 0; // the button at its end has the focus
 }
 
 const KEY_NAMES = { " ": "Space", ArrowLeft: "\u2190", ArrowRight: "\u2192", Escape: "Esc" };

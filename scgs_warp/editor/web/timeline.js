@@ -110,9 +110,11 @@ class Timeline {
     const button = document.createElement("button");
     button.type = "button";
     button.className = name === CAMERA ? "key camera" : "key";
-    button.style.left = `${(100 * frame.at) / state.film.seconds}%`;
+    const beyond = frame.at > state.film.seconds; // the film was made shorter
+    button.classList.toggle("beyond", beyond);
+    button.style.left = `${beyond ? 100 : (100 * frame.at) / state.film.seconds}%`;
     button.setAttribute("aria-label", `${name === CAMERA ? "View" : "Keyframe"} of ${name === null ? "all" : text} at ${frame.at.toFixed(2)} seconds`);
-    button.title = "Drag to move, with Alt to copy; Delete removes it";
+    button.title = `${beyond ? "After the end of the film. " : ""}Drag to move, with Alt to copy; Delete removes it`;
     const its = { name, at: frame.at };
     button.classList.toggle("chosen", this.chosen?.name === name && this.chosen?.at === frame.at);
     button.addEventListener("pointerdown", (event) => {
