@@ -88,7 +88,9 @@ def test_a_proof_is_for_one_side_one_port_and_one_start():
     assert one.knows(DRAWN, one.proof("page", DRAWN))
     for proof in (one.proof("server", DRAWN), one.proof("page", other), "", "\udce9"):
         assert not one.knows(DRAWN, proof)
-    for stranger in (ReturnKey(secret, 8081), ReturnKey(secret, 8080), ReturnKey(other, 8080)):
+    assert not one.knows(DRAWN, ReturnKey(secret, 8080).proof("page", DRAWN)), "another start"
+    for stranger in (ReturnKey(secret, 8081), ReturnKey(other, 8080)):
+        stranger.start = one.start
         assert not one.knows(DRAWN, stranger.proof("page", DRAWN))
     assert not one.knows("short", one.proof("page", "short"))
 
