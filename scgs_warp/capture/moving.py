@@ -15,6 +15,7 @@ import numpy as np
 
 from ..data.images import size_text
 from ..errors import UserError
+from ..geometry.optical_flow import at_targets, targets_of, textured
 from .source import Folder, Source, open_source, read_rgb, shrunk
 
 FLOW_SIDE = 480
@@ -31,8 +32,6 @@ TYPICAL_FACTOR = 6.0
 """Factor on the median distance from epipolar lines; a moving pixel's distance must exceed this product, too."""
 MAX_ROUND_TRIP = 1.5
 """Largest distance between a pixel and its position after flow forth and back, in pixels; occluded pixels exceed it."""
-MIN_CONTRAST = 4.0
-"""Smallest local contrast, in grey levels, at which flow is trusted."""
 MIN_AGREEMENT = 0.5
 """Smallest share of the comparisons that must find a pixel moving."""
 MAX_MASK_SHARE = 0.5
@@ -103,10 +102,10 @@ def leaves_epipolar_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -
     """
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    targets = np.stack([x, y], 2) + forth
-    returned = cv2.remap(back, targets[..., 0], targets[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    targets = targets_of(forth)
+    returned = at_targets(back, targets)
     inside = (targets >= 0).all(2) & (targets[..., 0] < width) & (targets[..., 1] < height)
-    sure = inside & (np.square(forth + returned).sum(2) < MAX_ROUND_TRIP**2) & _textured(one)
+    sure = inside & (np.square(forth + returned).sum(2) < MAX_ROUND_TRIP**2) & textured(one)
     chosen = np.zeros_like(sure)
     chosen[GRID // 2 :: GRID, GRID // 2 :: GRID] = True
     chosen &= sure
@@ -119,12 +118,6 @@ def leaves_epipolar_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -
     distance = sampson(matrix, starts, targets)
     limit = max(MIN_LINE_DISTANCE, TYPICAL_FACTOR * float(np.median(distance[sure])))
     return distance > limit, sure
-
-
-def _textured(gray: np.ndarray) -> np.ndarray:
-    values = gray.astype(np.float32)
-    mean = cv2.blur(values, (9, 9))
-    return cv2.blur(values * values, (9, 9)) - mean * mean > MIN_CONTRAST**2
 
 
 def sampson(matrix: np.ndarray, starts: np.ndarray, targets: np.ndarray) -> np.ndarray:

@@ -294,6 +294,13 @@ class LossConfig:
     """Number of neighbours of each control point for ARAP."""
     arap_refresh: int = bounded(200, 1)
     """Number of steps between two computations of the neighbours."""
+    flow: float = newer(0.0, before=0.0, least=0, most=1e6)
+    """Weight of the distance between rendered and measured optical flow, as a share of the image (not in the paper). It
+    fades linearly until ``flow_until``. Frames that do not follow each other as a film's do have no such term."""
+    flow_until: float = newer(0.8, before=0.8, least=0, most=1)
+    """Share of the main stage until which the term applies."""
+    flow_every: int = newer(2, before=2, least=1)
+    """Apply the term in every n-th step only, with n times the weight."""
     frame_colors: float = newer(1e-3, before=1e-3, least=0, most=1e6)
     """Weight of the squared distance between a frame's affine colour (``optim.frame_colors``) and the identity."""
     frame_colors_smooth: float = newer(1e-3, before=1e-3, least=0, most=1e6)

@@ -178,6 +178,12 @@ def overview(cameras: Sequence[Camera]) -> Overview:
     )
 
 
+def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Return a camera with the same view in an image of another size."""
+    factors = camera.K.new_tensor([width / camera.width, height / camera.height, 1.0])
+    return Camera(camera.viewmat, camera.K * factors[:, None], width, height)
+
+
 def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
     """Return the viewmat of a camera at ``eye`` that sees ``target`` at the image's centre and ``up`` upwards.
 

@@ -59,6 +59,10 @@ class Motion(nn.Module):
         """Activate the Gaussians and pose them at ``time``; differentiable."""
         raise NotImplementedError
 
+    def means_at(self, gaussians: GaussianParameters, time: float) -> Tensor:
+        """Return the Gaussians' means [N, 3] at ``time``; differentiable."""
+        return self.gaussians_at(gaussians, time).means
+
     def plan(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, view: int = 0
     ) -> MotionStep:

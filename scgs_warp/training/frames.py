@@ -18,6 +18,7 @@ from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Camera, Frame
 from .device_images import DeviceImages
+from .flow import Flows
 from .silhouettes import Silhouette, Silhouettes
 
 PROGRESSIVE_SHARE = 0.2
@@ -85,6 +86,7 @@ class Frames:
         self.images = DeviceImages(self.device)
         self.random_background = data.background == "random"
         self.silhouettes = Silhouettes(device)
+        self.flows = Flows(data, self.views)
         self._parts: dict[tuple[int, bool], Parts] = {}
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
         self.by_time = sorted(range(len(self.frames)), key=lambda i: data.entries[i].time)

@@ -23,6 +23,7 @@ from ..kernels.types import STEP_FINE, STEP_GRADIENT, STEP_HALTED, STEP_LOSS, TI
 from ..ops.binning_cuda import MAX_ROOM, bytes_within
 from ..runtime import debug, memory
 from ..runtime.cuda_graph import GraphMemory
+from .flow import flow_applies
 from .frames import Frames
 from .recorded_update import Kind, RecordedUpdate
 from .state import StepResult, TrainState
@@ -115,7 +116,11 @@ class RecordedSteps:
         """Return True if the present step can be taken without the host, as far as is known beforehand."""
         state = self._state
         ready = state.motion.takes_time_tensor and not state.refines_cameras and not len(state.exposure)
-        ready = ready and not debug.enabled()
+        ready = (
+            ready
+            and not debug.enabled()
+            and not (state.stage == "main" and flow_applies(state.stage_step, state.config))
+        )
         if not ready:
             return False
         if self.capacity > 0 and self._update is not None and self._update.holds():

@@ -29,6 +29,7 @@ from ..types import Stats
 from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .exposure import Exposure
+from .flow import follow_each_other
 from .frames import first_frames
 from .initial_points import random_points, sample_initial_points
 from .pretrain import (
@@ -304,6 +305,8 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     if config.pretrain.fade == "auto":
         led = config.pretrain.silhouette > 0 and not thin and is_in_parts(data)
         config = replace(config, pretrain=replace(config.pretrain, fade="never" if led else "always"))
+    if config.loss.flow > 0.0 and not follow_each_other(data):
+        config = replace(config, loss=replace(config.loss, flow=0.0))
     if has_initial_points(data, config) and not config.pretrain.with_points:
         config = replace(config, init_from="points", pretrain=replace(config.pretrain, steps=0))
     return config

@@ -13,10 +13,11 @@ from ..optim import log_linear
 from ..runtime.device_copies import sent
 from ..types import Camera, Stats
 from .camera_refinement import camera_rate
+from .flow import FlowNumbers, flow_weight
 from .frames import Frames
 from .multi_view import all_views
 from .state import StepResult, TrainState
-from .view import Numbers, compare, prepare
+from .view import Numbers, View, compare, prepare
 
 SETTLED = 0.05
 """Factor on the constant learning rates at the last step."""
@@ -72,7 +73,7 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
         camera = state.cameras.apply(camera, prepared.index)
     times = sent(torch.tensor(plan.times), device)
     color = state.exposure.color(prepared.index) if len(state.exposure) else None
-    numbers = Numbers(camera, sent(prepared.background, device), times, plan.weight, color)
+    numbers = Numbers(camera, sent(prepared.background, device), times, plan.weight, color, _flow(state, prepared))
     compared = compare(state, prepared, numbers, stats)
     if color is not None:
         compared = compared.with_penalty(state.exposure.penalty(prepared.index, state.config.loss))
@@ -86,6 +87,20 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     size = given.width, given.height
     images = compared.picture.detach(), prepared.truth, prepared.mask
     return StepResult(state.step, *losses, *images, failed, size)
+
+
+def _flow(state: TrainState, prepared: View) -> FlowNumbers | None:
+    """Send the flow that the step compares to the device. Its cameras are those that are learnt, if they are."""
+    flow, device = prepared.flow, state.device
+    if flow is None:
+        return None
+    camera, other = flow.camera.to(device), flow.other_camera.to(device)
+    if state.refines_cameras:
+        with torch.no_grad():
+            camera = state.cameras.apply(camera, prepared.index)
+            other = state.cameras.apply(other, flow.other)
+    weight = flow_weight(state.stage_step, state.config)
+    return FlowNumbers(camera, other, sent(flow.vectors, device), sent(flow.certain, device), weight)
 
 
 def least_logit(state: TrainState) -> float | None:

@@ -20,6 +20,7 @@ from ..rendering.render import draw
 from ..seeding import generator
 from ..types import Camera, Splats, Stats, Tiles
 from .exposure import exposed
+from .flow import Flow, FlowNumbers, flow_term, flow_weight
 from .frames import Frames, view_number
 from .silhouettes import SilhouetteSample, silhouette_term
 from .state import TrainState
@@ -42,6 +43,8 @@ class View(NamedTuple):
     """[H, W] bool on the device, True where the pixel is valid."""
     sample: SilhouetteSample | None
     """Part of the image's silhouette, on the device."""
+    flow: Flow | None = None
+    """Optical flow to another frame, in steps that compare it."""
 
 
 class Form(NamedTuple):
@@ -66,6 +69,8 @@ class Numbers(NamedTuple):
     """Weight of the motion's regulariser."""
     color: Tensor | None = None
     """[3, 4] affine colour of the frame; None: frames have none."""
+    flow: FlowNumbers | None = None
+    """None: the step compares no flow."""
 
 
 class Compared(NamedTuple):
@@ -109,7 +114,10 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     pooled = config.pretrain.pooled if pretraining else config.loss.pooled == "always"
     collects = pretraining or step < config.densify.until
     form = Form(sh_degree(state, step), collects, log_weight(state), pooled)
-    return View(index, loaded.camera, loaded.background, plan, form, loaded.truth, loaded.mask, sample)
+    flow = None
+    if state.stage == "main" and flow_weight(step, config) > 0.0:
+        flow = frames.flows.between(index, generator(config.seed, 46, view_number(state.step, config, view)))
+    return View(index, loaded.camera, loaded.background, plan, form, loaded.truth, loaded.mask, sample, flow)
 
 
 def compare(
@@ -147,6 +155,10 @@ def compare(
         picture = exposed(picture, alpha, numbers.background, numbers.color)
 
     # 3. Compare.
+    if numbers.flow is not None and view.flow is not None:
+        there = state.motion.means_at(state.gaussians, view.flow.time)
+        moved = numbers.flow.weight * flow_term(posed, there, numbers.flow)
+        regulariser = moved if regulariser is None else regulariser + moved
     loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
     if form.pooled:
         loss = loss + pooled_residual(picture, view.truth, view.mask)
