@@ -296,7 +296,7 @@ class LossConfig:
     """Number of steps between two computations of the neighbours."""
     flow: float = newer(0.0, before=0.0, least=0, most=1e6)
     """Weight of the distance between rendered and measured optical flow, as a share of the image (not in the paper). It
-    fades linearly until ``flow_until``. Frames that do not follow each other as a film's do have no such term."""
+    fades linearly until ``flow_until``. Where frames do not follow each other as a film's do, there is no such term."""
     flow_until: float = newer(0.8, before=0.8, least=0, most=1)
     """Share of the main stage until which the term applies."""
     flow_every: int = newer(2, before=2, least=1)
@@ -328,6 +328,9 @@ class TrainConfig:
     shortest: int = newer(0, before=0, least=0)
     """Number of steps to which ``freeze``, ``coarse`` and ``densify.opacity_reset_every`` shrink at most in a shorter
     run: Gaussians need about so many to turn transparent or opaque."""
+    flow_points: int = newer(4_000, before=0, least=0, most=10_000_000)
+    """Number of initial points that optical flow gives for one instant of a film, so that control points and Gaussians
+    begin on what moves, too (only with initial points, and without alpha). 0: none."""
     init_points: int = bounded(20_000, 1, 10_000_000)
     """Number of initial Gaussians. If the data has more points, only this many are used; if it has fewer and the images
     have no alpha, points behind the data's points are added up to this number."""

@@ -22,6 +22,7 @@ def dense_flow(one: np.ndarray, two: np.ndarray) -> np.ndarray:
     cv2.setNumThreads(1)
     try:
         search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        search.setFinestScale(0)
         return search.calc(one, two, None)  # type: ignore[call-overload]
     finally:
         cv2.setNumThreads(before)

@@ -94,17 +94,24 @@ class Flows:
         the end of the film."""
         draws = torch.rand(2, generator=random).tolist()
         span, side = SPANS[int(draws[0] * len(SPANS))], int(draws[1] * 2)
-        path = self._path(index, span, side)
-        path = self._path(index, span, 1 - side) if len(path) == 1 else path
+        path = self.path(index, span, side)
+        path = self.path(index, span, 1 - side) if len(path) == 1 else path
         if len(path) == 1:
             return None
-        vectors, certain = self._along(path)
-        height, width = certain.shape
-        camera, other = (scaled_camera(self._views[i], width, height) for i in (index, path[-1]))
+        vectors, certain = self.along(path)
+        camera, other = (self.camera(i) for i in (index, path[-1]))
         planar = torch.from_numpy(np.ascontiguousarray(vectors.transpose(2, 0, 1)))
         return Flow(camera, path[-1], other, self._data.entries[path[-1]].time, planar, torch.from_numpy(certain))
 
-    def _path(self, index: int, span: int, side: int) -> list[int]:
+    def camera(self, index: int) -> Camera:
+        """Return the normalised camera of a frame, at the size of the flow, on the host."""
+        return scaled_camera(self._views[index], *self.size(index))
+
+    def size(self, index: int) -> tuple[int, int]:
+        """Return width and height of the flow of a frame, pixels."""
+        return flow_size(self._views[index].width, self._views[index].height)
+
+    def path(self, index: int, span: int, side: int) -> list[int]:
         """Return a frame and up to ``span`` frames before (side 0) or after it (side 1), of one size."""
         path, views = [index], self._views
         while len(path) <= span:
@@ -114,11 +121,11 @@ class Flows:
             path.append(following)
         return path
 
-    def _along(self, path: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    def along(self, path: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Compose the flow of neighbours: vectors [h, w, 2], and [h, w] bool where all of it is certain."""
         vectors, certain = self._pair(path[0], path[1])
         vectors = vectors.astype(np.float32)
-        for one, two in itertools.pairwise(path):
+        for one, two in itertools.pairwise(path[1:]):
             more, sure = self._pair(one, two)
             targets = targets_of(vectors)
             vectors = vectors + at_targets(more.astype(np.float32), targets)
@@ -144,8 +151,7 @@ def measured(one: Frame, two: Frame) -> tuple[tuple[np.ndarray, np.ndarray], tup
     forth, back = dense_flow(*grays), dense_flow(*reversed(grays))
     height, width = grays[0].shape
     most = ROUND_TRIP * max(height, width)
-    factor = min(1.0, TERM_SIDE / max(height, width))
-    size = max(1, round(width * factor)), max(1, round(height * factor))
+    size = flow_size(one.camera.width, one.camera.height)
     results = []
     for frame, gray, there, home in ((one, grays[0], forth, back), (two, grays[1], back, forth)):
         sure = returns(there, home, most) & textured(gray)
@@ -158,6 +164,12 @@ def measured(one: Frame, two: Frame) -> tuple[tuple[np.ndarray, np.ndarray], tup
         certain = cv2.resize(sure.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
         results.append((vectors.astype(np.float16), certain))
     return results[0], results[1]
+
+
+def flow_size(width: int, height: int) -> tuple[int, int]:
+    """Return the width and height at which the flow between images of a size is kept."""
+    factor = min(1.0, TERM_SIDE / max(width, height))
+    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def _gray(frame: Frame) -> np.ndarray:

@@ -75,19 +75,25 @@ def initial_spheres(
     return gaussians, Spheres(network, radius).to(device)
 
 
-def initial_motion(config: TrainConfig, points: Tensor, times: int = 0) -> Motion:
+def initial_motion(config: TrainConfig, points: Tensor, times: int = 0, moves: Tensor | None = None) -> Motion:
     """Make a motion model for a run without stage 1; its control points are a sample of ``points`` [P, 3], without
     motion.
 
     Args:
         times: number of distinct training times, which determines the size of feature planes.
+        moves: [P] bool, the points that are known to move; half of the control points are among them.
     """
     if config.motion.model == "hexplane":
         return HexPlane(config.seed, config.motion.plane_times or max(2, times // 2))
     if config.motion.model != "control-points":
         return build_motion(config.motion.model, config)
-    positions = points[farthest_points(points, min(config.motion.nodes, len(points)))]
+    count = min(config.motion.nodes, len(points))
+    moving = points[:0] if moves is None else points[moves]
+    moving = moving[farthest_points(moving, min(count // 2, len(moving)))] if len(moving) else moving
+    positions = torch.cat([moving, points[farthest_points(points, count - len(moving))]])
     radii = torch.full((len(positions),), float(neighbor_distance(positions).median()), device=points.device)
+    if len(moving):  # those of a mover are closer together
+        radii[: len(moving)] = float(neighbor_distance(moving).median())
     network = make_network(config.motion, heads_of(config.motion), config.seed)
     return ControlPoints(positions, radii, network, config.motion)
 

@@ -30,6 +30,7 @@ from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .exposure import Exposure
 from .flow import follow_each_other
+from .flow_points import flow_points
 from .frames import first_frames
 from .initial_points import random_points, sample_initial_points
 from .pretrain import (
@@ -118,7 +119,8 @@ class TrainState:
         """Make the state at step 0."""
         normalisation = Normalisation.fit(data.cameras, data.points)
         config = resolve_auto(config, data)
-        points, colors = (tensor.to(device) for tensor in _initial_points(config, data, normalisation))
+        points, colors, moves = _initial_points(config, data, normalisation)
+        points, colors = points.to(device), colors.to(device)
         # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
         rest = (normalisation, overview(data.cameras), extent, points, colors)
@@ -128,9 +130,9 @@ class TrainState:
             spheres = initial_spheres(config, points, colors, device, wide)
             return TrainState(config, *spheres, *rest, stage="pretrain", **identity)
         gaussians = initial_gaussians(config, points, colors)
-        # Control points start on the data's points, not on those of bare walls.
-        own = len(data.points) if data.points is not None and has_initial_points(data, config) else len(points)
-        motion = initial_motion(config, points[:own], len(data.times.unique())).to(device)
+        # Control points start on what is seen, not on bare walls.
+        moves = moves.to(device)
+        motion = initial_motion(config, points[: len(moves)], len(data.times.unique()), moves).to(device)
         return TrainState(config, gaussians, motion, *rest, stage="main", **identity)
 
     def begin_main(self) -> None:
@@ -312,24 +314,38 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     return config
 
 
-def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
-    """Choose initial points [P, 3], normalised, and colours [P, 3]: the data's own in random order, followed by points
-    behind them for surfaces without texture; without points in the data, points sampled where the images are covered.
-    With ``init_random`` cube, nothing follows the data's own points, and others are random in a cube."""
+def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose initial points [P, 3], normalised, and colours [P, 3]: the data's own in random order, followed by those
+    that the flow of a film gives for one instant, and by points behind them for surfaces without texture; without
+    points in the data, points sampled where the images are covered. With ``init_random`` cube, nothing follows the
+    data's own points, and others are random in a cube.
+
+    Returns:
+        points, colours, and [Q] bool for the leading Q points, which lie on what is seen: True if known to move.
+    """
     count = max(config.init_points, round(sphere_unit(config) * config.pretrain.start_ratio))
     cube = config.init_random == "cube"
     if data.points is None or not has_initial_points(data, config):
         if cube:
             points = random_points(count, config.seed, 31)
-            return points, torch.full_like(points, 0.5)
+            return points, torch.full_like(points, 0.5), torch.zeros(count, dtype=torch.bool)
         # Spheres that start in the pose of the first frames are sampled from these frames only.
         frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
         points, colors = sample_initial_points(count, frames, normalisation, config.seed, 31)
-        return points, torch.full_like(points, 0.5) if colors is None else colors
+        colors = torch.full_like(points, 0.5) if colors is None else colors
+        return points, colors, torch.zeros(len(points), dtype=torch.bool)
     order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
     points = normalisation.apply(data.points)[order].float().contiguous()
     colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
+    moves = torch.zeros(len(points), dtype=torch.bool)
     if cube or data.with_alpha:  # with alpha, no background lies behind the points
-        return points, colors
-    behind = background_points(count - len(points), points, data, normalisation, config.seed, 35)
-    return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]])
+        return points, colors, moves
+    known, room = points, count - len(points)
+    if config.flow_points and room > 0 and config.motion.model != "static" and follow_each_other(data):
+        views = [normalisation.apply_camera(camera) for camera in data.cameras]
+        seen = flow_points(min(config.flow_points, room), known, data, views)
+        if seen is not None:
+            points, colors = torch.cat([points, seen.points]), torch.cat([colors, seen.colors])
+            moves = torch.cat([moves, seen.moves])
+    behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
+    return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves

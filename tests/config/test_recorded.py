@@ -58,6 +58,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "sharpness": 0.5,
         "loss.pooled": "auto",
         "motion.hyper_stretch": 8**0.5,
+        "flow_points": 4_000,
         "densify.least_views": 2,
         "densify.clear_distance": 0.25,
     }

@@ -128,7 +128,7 @@ def test_what_the_data_offers_decides(tmp_path):
     """Points: no first stage, control points among them. No alpha: walls may be large, what rests is told apart."""
     write(tmp_path)
     data = load(tmp_path)
-    config = tiny_config(20, motion={"hyper_dim": 0})
+    config = tiny_config(20, flow_points=0, motion={"hyper_dim": 0})
     state = TrainState.begin(config, data, "cpu")
     assert state.stage == "main" and state.config.pretrain_steps == 0
     assert (state.config.densify.prune_large, state.config.motion.hyper_dim) == ("never", 1)

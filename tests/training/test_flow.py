@@ -137,14 +137,14 @@ def test_the_flow_of_a_film_is_that_of_its_points():
     data = film(36)
     flows = Flows(data, data.cameras)
     for path in ([3, 4], [3, 4, 5, 6, 7], [9, 8, 7]):
-        vectors, certain = flows._along(path)
+        vectors, certain = flows.along(path)
         assert certain.mean() > 0.03
         first, last = data.entries[path[0]], data.entries[path[-1]]
         here, there = blobs(first.time).means, blobs(last.time).means
         expected, alpha = displacement(blobs(first.time), there - here, first.camera, last.camera)
         chosen = torch.from_numpy(certain) & (alpha > 0.9)
         error = (torch.from_numpy(vectors) - expected).norm(dim=2)[chosen]
-        assert int(chosen.sum()) > 100 and float(error.median()) < 0.35
+        assert int(chosen.sum()) > 100 and float(error.median()) < 0.25, path
 
 
 def displacement(here: Gaussians, moved: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch.Tensor, ...]:
@@ -204,11 +204,13 @@ def test_large_images_are_compared_at_a_reduced_size():
     large = torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], scale_factor=16, mode="bicubic")[0]
     one = large.permute(1, 2, 0).clamp(0, 1)
     two = one.roll(16, 1)
-    (vectors, certain), _ = measured(Frame(film_camera(0), 0.0, one), Frame(film_camera(0), 1.0, two))
-    assert vectors.shape == (170, 256, 2), "960 x 640 pixels to 256"
+    camera = dataclasses.replace(film_camera(0, 960), height=640)
+    (vectors, certain), _ = measured(Frame(camera, 0.0, one), Frame(camera, 1.0, two))
+    assert vectors.shape == (171, 256, 2), "960 x 640 pixels to 256"
     assert float(abs(float(vectors[certain][:, 0].mean()) - 16 * 256 / 960)) < 0.1
-    camera = scaled_camera(film_camera(0, 960), 256, 170)
-    torch.testing.assert_close(camera.K[0], film_camera(0, 960).K[0] * 256 / 960)
+    reduced = scaled_camera(camera, 256, 171)
+    torch.testing.assert_close(reduced.K[0], camera.K[0] * 256 / 960)
+    torch.testing.assert_close(reduced.K[1], camera.K[1] * 171 / 640)
 
 
 def test_the_weight_fades_and_skips_steps():
