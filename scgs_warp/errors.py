@@ -32,7 +32,7 @@ def one_line(error: Exception) -> str:
     return printable(error)
 
 
-SHORTAGE = ("allocate memory", "out of memory", "failed to map segment")
+SHORTAGE = ("allocate memory", "out of memory", "failed to map segment", "can't start new thread")
 """Words of errors that mean a lack of memory."""
 
 

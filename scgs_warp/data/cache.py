@@ -14,7 +14,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ..config.fields import CACHE_MIB
-from ..runtime import memory
+from ..runtime import addresses, memory
 
 MEMORY_SHARE = 0.5
 """Largest share that the cache may take of the memory that is free at the start."""
@@ -79,11 +79,13 @@ class ImageCache:
         return len(self._coming)
 
     def expect(self, key: Hashable, read: Callable[[], Pixels]) -> None:
-        """Start to read an image in the background, before it is accessed."""
+        """Start to read an image in the background, before it is accessed, if there is room for a thread."""
         with self._lock:
             if key in self._kept or key in self._coming:
                 return
             if self._pool is None:
+                if not addresses.fits(addresses.THREAD):
+                    return
                 self._pool = ThreadPoolExecutor(1, "images")
             while len(self._coming) >= READ_AHEAD:  # The order has changed: drop the oldest.
                 self._coming.pop(next(iter(self._coming))).cancel()

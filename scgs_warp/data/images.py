@@ -8,6 +8,7 @@ import struct
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -17,7 +18,7 @@ import torch
 
 from ..config.fields import BACKGROUND_COLORS
 from ..errors import UserError
-from ..runtime import environment
+from ..runtime import addresses, environment
 from ..storage.files import open_regular
 from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
@@ -80,19 +81,24 @@ class ReadOptions(NamedTuple):
 def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[[int, int], None] | None = None):
     """Apply ``work`` to every item, in order, in as many threads as the process may use; raise the first exception.
 
+    Where addresses leave no room for threads, this one does it all.
+
     Args:
         progress: called with (done, total) after each item.
     """
-    with ThreadPoolExecutor(environment.thread_count(), "decode") as pool:
-        results: list[R] = []
-        try:
-            for result in pool.map(work, items):
-                results.append(result)
-                if progress is not None:
-                    progress(len(results), len(items))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    threads = environment.thread_count()
+    results: list[R] = []
+    with ExitStack() as stack:
+        if addresses.fits(threads * addresses.THREAD):
+            pool = stack.enter_context(ThreadPoolExecutor(threads, "decode"))
+            stack.callback(pool.shutdown, cancel_futures=True)
+            found = pool.map(work, items)
+        else:
+            found = map(work, items)
+        for result in found:
+            results.append(result)
+            if progress is not None:
+                progress(len(results), len(items))
     return results
 
 

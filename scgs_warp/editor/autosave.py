@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..edit import Edit, EditSession, edit_file
 from ..errors import UserError, one_line
+from ..runtime import addresses
 from ..storage.files import write_atomically
 from ..storage.locks import AlreadyLocked, lock_file
 from ..storage.own_folder import own_folder
@@ -94,7 +95,7 @@ class Autosave:
             else:
                 self._move_aside(PREVIOUS)
         self._saved = self._session.edit if self.said else Edit()
-        self._thread.start()
+        addresses.start(self._thread)
         self.note(self._session.edit)
 
     def _restore(self) -> None:

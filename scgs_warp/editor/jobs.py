@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import UserError
+from ..runtime import addresses
 
 REPORT_SECONDS = 0.2
 """Shortest time between two progress reports in seconds."""
@@ -59,7 +60,7 @@ class Jobs:
         CancelledError once the job is cancelled.
 
         Raises:
-            UserError: another job is running.
+            UserError: another job is running, or there is no room for its thread.
         """
         with self._lock:
             if self._progress is not None:
@@ -67,8 +68,15 @@ class Jobs:
             self._stop.clear()
             self._progress = JobProgress(name, 0, total)
         self._shown(self._progress)
-        self._thread = threading.Thread(target=self._run, args=(name, action, who), name="job", daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self._run, args=(name, action, who), name="job", daemon=True)
+        try:
+            addresses.start(thread)
+        except UserError:
+            with self._lock:
+                self._progress = None
+            self._shown(None)
+            raise
+        self._thread = thread
 
     def cancel(self) -> None:
         """Ask the job to end after its present piece."""

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from ..runtime import addresses
 from .pose_schedule import PoseSchedule, Wanted
 
 Result = TypeVar("Result")
@@ -50,7 +51,7 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name="editor", daemon=True)
 
     def start(self) -> None:
-        self._thread.start()
+        addresses.start(self._thread)
 
     @property
     def here(self) -> bool:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import UserError
+from ..runtime import addresses
 from ..storage.json_files import parse_json
 from .access import NO_TOKEN, Access, Request, cookies
 from .return_key import ReturnKey, is_number, kept_key, key_file
@@ -138,6 +139,7 @@ class PageServer:
 
     Raises:
         UserError: aiohttp is not installed, or the port is not available.
+        NotEnoughMemory: there is no room for the thread.
     """
 
     def __init__(
@@ -168,7 +170,7 @@ class PageServer:
         self._known: set[Any] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="page server", daemon=True)
-        self._thread.start()
+        addresses.start(self._thread)
         asyncio.run_coroutine_threadsafe(self._start(dict(routes)), self._loop).result(30)
 
     @property

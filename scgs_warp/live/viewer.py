@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import UserError
 from ..export.page import SCRIPTS, document, program_text, read_web
+from ..runtime import addresses
 from .server import Client, PageServer
 
 if TYPE_CHECKING:
@@ -134,7 +135,7 @@ class RunWatcher:
         self._seen = self._stamp()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="run watcher", daemon=True)
-        self._thread.start()
+        addresses.start(self._thread)
 
     def _stamp(self) -> tuple[int, int] | None:
         try:

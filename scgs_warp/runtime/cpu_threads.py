@@ -12,13 +12,15 @@ import itertools
 import os
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from queue import SimpleQueue
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from . import environment
+from . import addresses, environment
+from .memory import NotEnoughMemory
 
 Chunk = tuple[int, int]
 """Chunk of a grid: its first index and its number of indices."""
@@ -76,12 +78,16 @@ class HelperThreads:
         self.jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self.count = 0
 
-    def submit(self, job: Callable[[], None], copies: int) -> None:
-        while self.count < copies:
-            self.count += 1
-            threading.Thread(target=self._serve, name=f"warp-{self.count}", daemon=True).start()
+    def submit(self, job: Callable[[], None], copies: int) -> int:
+        """Let up to ``copies`` threads run ``job``, fewer where no more can be started; return their number."""
+        with suppress(NotEnoughMemory):
+            while self.count < copies:
+                addresses.start(threading.Thread(target=self._serve, name=f"warp-{self.count + 1}", daemon=True))
+                self.count += 1
+        copies = min(copies, self.count)
         for _ in range(copies):
             self.jobs.put(job)
+        return copies
 
     def dismiss(self) -> None:
         for _ in range(self.count):
@@ -131,13 +137,13 @@ def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: in
             if next(finished) == len(chunks):
                 all_done.release()
 
-    copies, left = min(threads, len(chunks)) - 1, threading.Semaphore(0)
+    left = threading.Semaphore(0)
 
     def help_out() -> None:
         work()
         left.release()
 
-    helpers.submit(help_out, copies)
+    copies = helpers.submit(help_out, min(threads, len(chunks)) - 1)
     try:
         work()
         all_done.acquire()

@@ -128,11 +128,17 @@ def configure(threads: int | None = None) -> None:
 
     Args:
         threads: number of CPU threads. None: all available ones.
+
+    Raises:
+        NotEnoughMemory: the limit of addresses (``ulimit -v``) leaves too little to work with.
     """
     global _threads, _configured
     import numpy as np
     import torch
 
+    from . import addresses
+
+    addresses.prepare()
     for dtype in (np.float32, np.float64):
         np.finfo(dtype)  # asked before flushing: older versions of NumPy warn of missing denormals
     _threads, _configured = threads, True

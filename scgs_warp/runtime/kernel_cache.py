@@ -20,13 +20,14 @@ from typing import TypeVar
 import warp as wp
 
 from ..errors import UserError
+from . import addresses
 
 LEAST_ROOM = 8 << 20
 """Free bytes needed to compile a kernel; the largest ones take a few megabytes."""
 VARIABLE = "WARP_CACHE_PATH"
 REMEDY = f"name a folder of yours with {LEAST_ROOM >> 20} MiB of room in {VARIABLE}"
-NOT_LOADED = "Failed to find"
-"""Beginning of Warp's error where code without a kernel came out of the loader."""
+NOT_LOADED = ("Failed to find", "Failed to load CPU module")
+"""Beginnings of Warp's errors where the loader failed, or yielded code without a kernel."""
 
 Result = TypeVar("Result")
 _lock = threading.RLock()
@@ -58,7 +59,9 @@ def prepared(kernel: wp.Kernel, prepare: Callable[[], Result]) -> Result:
 
     Raises:
         UserError: no folder can be written, or the compiled code cannot be loaded.
+        NotEnoughMemory: the limit of addresses leaves no room for it.
     """
+    addresses.require(addresses.KERNEL, "the code of a kernel")
     with _lock:
         folder = str(wp.config.kernel_cache_dir)
         if _room(folder) < LEAST_ROOM and not _is_compiled(kernel):
@@ -70,8 +73,8 @@ def prepared(kernel: wp.Kernel, prepare: Callable[[], Result]) -> Result:
                 raise UserError(f"{error.filename or folder}: {error.strerror}; {REMEDY}") from error
             _use_private(f"{folder}: {error.strerror}")
             return prepare()
-        except RuntimeError as error:
-            if NOT_LOADED not in str(error):
+        except Exception as error:  # Warp raises nothing more specific
+            if not str(error).startswith(NOT_LOADED):
                 raise
             raise UserError(
                 f"{folder}: the code of {kernel.key} is there but cannot be loaded; free memory (or raise ulimit -v), "

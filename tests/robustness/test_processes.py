@@ -173,12 +173,14 @@ def test_code_that_cannot_be_loaded_is_one_line(cache):
     """Under a limit on memory the loader gives modules without their kernels."""
     kernel = SimpleNamespace(key="composite")
 
-    def fail(message: str) -> None:
-        raise RuntimeError(message)
+    def fail(message: str, kind: type[Exception] = RuntimeError) -> None:
+        raise kind(message)
 
     with pytest.raises(UserError, match=r"usual: the code of composite .* cannot be loaded; free memory") as caught:
         kernel_cache.prepared(kernel, lambda: fail("Failed to find forward kernel 'composite' from module 'm'"))
     assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match="cannot be loaded; free memory"):
+        kernel_cache.prepared(kernel, lambda: fail("Failed to load CPU module 'm' (no memory)", Exception))
     with pytest.raises(RuntimeError, match="something else"):
         kernel_cache.prepared(kernel, lambda: fail("something else"))
 
