@@ -1,7 +1,7 @@
 """Disturb the programs at random, and check after every fault that nothing is lost.
 
     python benchmarks/chaos.py --minutes 120                  # half an hour of each kind of work
-    python benchmarks/chaos.py --minutes 3 --part training export
+    python benchmarks/chaos.py --minutes 3 --part training export --fault memory
     python benchmarks/chaos.py --minutes 120 --json chaos.json
 
 Training, training while a page shows the scene, exports and the editor run in turn, each in a process of its own. A
@@ -42,8 +42,13 @@ from scgs_warp.storage import checkpoint
 from scgs_warp.training.loop import fit
 
 DISK_MIB = 96
-PATIENCE = 300.0
-"""Seconds after which a process hangs."""
+PATIENCE = 60.0
+"""Seconds after which a process hangs if it used less than ``LEAST_WORK`` in them: an unfinished process that other
+programs leave little of the processor is slow and does not hang."""
+LEAST_WORK = 0.05
+"""Seconds of processor time that an idle server does not reach within ``PATIENCE``."""
+MOST_WORK = 300.0
+"""Seconds of processor time after which a process hangs in a loop."""
 FAULTS = ("none", "kill", "terminate", "hang up", "full disk", "slow disk", "clock", "memory", "rival")
 SIGNALS = {"kill": signal.SIGKILL, "terminate": signal.SIGTERM, "hang up": signal.SIGHUP}
 PARTS = ("training", "live", "export", "editor")
@@ -63,9 +68,13 @@ def begin(work: Callable[[], None], log: Path, before: Callable[[], None] = lamb
         for stream in (1, 2):
             os.dup2(number, stream)
         sys.stdout, sys.stderr = (open(stream, "w", closefd=False) for stream in (1, 2))
-        environment.configure(1)
         before()
-        status = run_app(lambda _: work())
+
+        def main(_: object) -> None:
+            environment.configure(1)
+            work()
+
+        status = run_app(main)
     except BaseException:
         import traceback
 
@@ -77,13 +86,28 @@ def begin(work: Callable[[], None], log: Path, before: Callable[[], None] = lamb
         os._exit(status)
 
 
+def processor_time(child: int) -> float:
+    """Return the seconds of processor time that a process has used, with all its threads."""
+    words = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def end(child: int, seconds: float = PATIENCE) -> int | None:
-    """Wait for a child; return its status, minus the signal that ended it, or None if it hung and was killed."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
+    """Wait for a child; return its status, minus the signal that ended it, or None if it hung and was killed.
+
+    Args:
+        seconds: time within which a child that does not hang has used ``LEAST_WORK``.
+    """
+    since, used = time.monotonic(), 0.0
+    while True:
         done, how = os.waitpid(child, os.WNOHANG)
         if done:
             return os.waitstatus_to_exitcode(how)
+        now = processor_time(child)
+        if now - used >= LEAST_WORK:
+            since, used = time.monotonic(), now
+        if time.monotonic() - since > seconds or now > MOST_WORK:
+            break
         time.sleep(0.02)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
@@ -195,8 +219,9 @@ def wait_for(child: int, seconds: float) -> bool:
 class Arena:
     """Data, references and works in one folder."""
 
-    def __init__(self, folder: Path, parts: list[str], seed: int) -> None:
+    def __init__(self, folder: Path, parts: list[str], faults: list[str], seed: int) -> None:
         self._folder, self._disk, self._draw = folder, folder / "disk", random.Random(seed)
+        self._faults = faults
         self._log = folder / "log"
         data, whole, exports = folder / "data", folder / "whole", folder / "references"
         finish(lambda: (make_synthetic(data, size=64, train=12, test=2), None)[1], self._log)
@@ -219,7 +244,7 @@ class Arena:
     def round(self, work: Work, mounted: bool) -> dict[str, Any]:
         """Do one piece of work under one fault and return what happened."""
         first = work.name not in self._usual
-        fault = Fault("none" if first else self._draw.choice(FAULTS), self._draw, self._disk, mounted)
+        fault = Fault("none" if first else self._draw.choice(self._faults), self._draw, self._disk, mounted)
         seed, began = self._draw.randrange(2**31), time.monotonic()
         (self._disk / work.name).mkdir(exist_ok=True)
         child = begin(lambda: work.work(seed), self._log, fault.inside)
@@ -280,6 +305,7 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=120.0, help="for all parts together")
     parser.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--fault", nargs="+", choices=FAULTS, default=list(FAULTS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(args)
@@ -287,7 +313,7 @@ def main(args: list[str] | None = None) -> int:
         print("error: this needs fork and /proc (Linux)", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory(prefix="scgs-chaos-") as folder:
-        arena = Arena(Path(folder), options.part, options.seed)
+        arena = Arena(Path(folder), options.part, options.fault, options.seed)
         rounds = arena.run(60 * options.minutes, lambda text: print(text, flush=True))
     report = {"command": command_line("benchmarks/chaos.py", sys.argv[1:]), **summary(rounds)}
     if options.json is not None:

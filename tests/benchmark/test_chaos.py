@@ -8,6 +8,7 @@ import random
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +55,23 @@ def test_a_child_is_an_app(tmp_path):
     assert chaos.end(chaos.begin(lambda: None, log)) == 0
     assert chaos.end(chaos.begin(refuse, log)) == 2 and log.read_text() == "error: no\n"
     assert chaos.end(chaos.begin(fail, log)) == 70 and "KeyError" in log.read_text()
-    assert chaos.end(chaos.begin(signal.pause, log), 0.3) is None, "a process that hangs is ended"
+    assert chaos.end(chaos.begin(signal.pause, log), 0.5) is None, "a process that hangs is ended"
     with pytest.raises(RuntimeError, match="undisturbed work ended with 2: error: no"):
         chaos.finish(refuse, log)
+
+
+def test_a_slow_child_does_not_hang(tmp_path, monkeypatch):
+    """Where other programs take the processor, a child needs any time; one that only loops is ended."""
+    working = chaos.begin(lambda: work_for(1.2), tmp_path / "log")
+    assert chaos.end(working, 0.6) == 0
+    monkeypatch.setattr(chaos, "MOST_WORK", 0.3)
+    assert chaos.end(chaos.begin(lambda: work_for(1e9), tmp_path / "log"), 1e9) is None
+
+
+def work_for(seconds: float) -> None:
+    until = time.process_time() + seconds
+    while time.process_time() < until:
+        pass
 
 
 def test_a_signal_meets_a_child_that_works(tmp_path):
