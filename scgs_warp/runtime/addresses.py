@@ -12,13 +12,13 @@ import contextlib
 import ctypes
 import threading
 
-from .memory import NotEnoughMemory, status
+from .memory import NotEnoughMemory, hand_back, status
 
-PROGRAM = 128 << 20
+PROGRAM = 64 << 20
 """Free bytes that a program needs when its libraries are loaded."""
 THREAD = 32 << 20
 """Free bytes that a thread needs: a stack of 8 MiB, as is usual, and some to work with."""
-KERNEL = 16 << 20
+KERNEL = 2 << 20
 """Free bytes that loading a compiled kernel needs."""
 STACK_LEVELS = 300
 """Depth of calls through C that takes about 600 KiB of stack; a training step takes 300 KiB."""
@@ -35,9 +35,17 @@ def limit() -> int | None:
 
 
 def fits(need: int) -> bool:
-    """Return whether the limit leaves ``need`` bytes."""
+    """Return whether the limit leaves ``need`` bytes, after freed memory is handed back if it must be."""
     most = limit()
-    return most is None or most - (status("VmSize") or 0) >= need
+    return most is None or _left(most, need) >= need
+
+
+def _left(most: int, need: int) -> int:
+    left = most - (status("VmSize") or 0)
+    if left < need:
+        hand_back()
+        left = most - (status("VmSize") or 0)
+    return left
 
 
 def require(need: int, what: str) -> None:
@@ -53,7 +61,7 @@ def require(need: int, what: str) -> None:
     most = limit()
     if most is None:
         return
-    free = most - (status("VmSize") or 0)
+    free = _left(most, need)
     if free < need:
         raise NotEnoughMemory(
             f"{what} needs {need >> 20} MiB of addresses, and {max(0, free) >> 20} MiB are left of the "

@@ -38,6 +38,14 @@ def test_the_refusal_gives_the_figures(monkeypatch: pytest.MonkeyPatch):
     assert addresses.fits(2**60)
 
 
+def test_freed_memory_is_handed_back_first(monkeypatch: pytest.MonkeyPatch):
+    leave(monkeypatch, 7)
+    monkeypatch.setattr(addresses, "hand_back", lambda: leave(monkeypatch, 9))
+    assert not addresses.fits(10 * MIB) and addresses.fits(9 * MIB)
+    leave(monkeypatch, 7)
+    addresses.require(8 * MIB, "a thing")
+
+
 def run_limited(code: str, mib: int) -> subprocess.CompletedProcess[str]:
     """Run Python code in a process that may use ``mib`` MiB more than its libraries take."""
     code = (
@@ -51,9 +59,9 @@ def run_limited(code: str, mib: int) -> subprocess.CompletedProcess[str]:
 
 @linux
 def test_a_program_that_is_left_too_little_ends_in_one_line():
-    done = run_limited("sys.exit(cli.run(lambda _: environment.configure(1)))", 64)
+    done = run_limited("sys.exit(cli.run(lambda _: environment.configure(1)))", 48)
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
-    assert "a program needs 128 MiB of addresses" in done.stderr and "(ulimit -v)" in done.stderr
+    assert "a program needs 64 MiB of addresses" in done.stderr and "(ulimit -v)" in done.stderr
 
 
 @linux
