@@ -10,8 +10,8 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
 
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
-of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of long films from
-``results/long-film-memory.json`` (``long_film.py memory``). Those of pages come from ``results/page-million.json``
+of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of optical flow from ``results/optical-flow.json``
+(``optical_flow.py``), that of long films from ``results/long-film-memory.json`` (``long_film.py memory``). Those of pages come from ``results/page-million.json``
 (``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``).
 """
 
@@ -104,6 +104,15 @@ def mask_edges(results: Results) -> str:
     return table(["mask", *filters.values()], lines)
 
 
+def optical_flow(results: Results) -> str:
+    """Write how far measured flow is from the truth, and what it costs."""
+    lines = []
+    for row in results["optical-flow"]["rows"]:
+        errors = (f"{row[name]:.2f}" for name in ("error", "error_moving", "error_trusted"))
+        lines.append([row["flow"], *errors, f"{100 * row['trusted']:.0f} %", f"{row['ms']:,.0f} ms"])
+    return table(["flow", "error, pixels", "of what moves", "of what is trusted", "trusted", "processor time"], lines)
+
+
 def long_film_memory(results: Results) -> str:
     """Write how much memory reading a film takes, by its length."""
     lines = []
@@ -158,6 +167,7 @@ REPEATABLE = {
     ),
     "mesh-distance": Repeatable(mesh_distance, ("mesh-distance",), MESHES),
     "capture-mask-edges": Repeatable(mask_edges, ("mask-edges",), ("scgs_warp/capture/moving.py",)),
+    "capture-optical-flow": Repeatable(optical_flow, ("optical-flow",), ("scgs_warp/geometry/optical_flow.py",)),
     "capture-long-films": Repeatable(
         long_film_memory, ("long-film-memory",), ("scgs_warp/training/silhouettes.py", "scgs_warp/data/cache.py")
     ),

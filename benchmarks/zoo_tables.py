@@ -103,6 +103,18 @@ def gallery(source: Source) -> str:
     return table(["run", "PSNR", "worst image", "SSIM", "Gaussians", "steps"], lines)
 
 
+def films(source: Source) -> str:
+    """Write what initial points on the mover, and flow in the loss, do for two films."""
+    rows = (("off", "neither (`flow_points=0`)"), ("on", "points on the mover (default)"), ("flow", "and `loss.flow=2`"))
+    lines = []
+    for row, label in rows:
+        phone, hand = source.run(row, "phone"), source.run(row, "handheld")
+        scores = (number(run.get(key), 2) for run in (phone, hand) for key in ("psnr", "psnr_worst"))
+        lines.append([source.label(row, label), f"{number(phone.get('epe'), 1)} %", *scores])
+    head = ["", "walking robot: motion error", "PSNR", "worst", "hand: PSNR", "worst"]
+    return table(head, lines)
+
+
 def exposure(source: Source) -> str:
     """Write what affine colours per frame do for a film whose exposure changes."""
     keys, lines = ("psnr", "psnr_fitted", "psnr_interpolated"), []

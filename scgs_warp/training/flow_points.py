@@ -48,6 +48,9 @@ CLOSE, STRAY = 8, 3.0
 NEARER, FARTHER = 0.2, 1.1
 """Range of plausible depths, as shares of the depth of the sparse points around the pixel: a mover stands before
 them."""
+BEFORE, LACKING = 0.8, 0.5
+"""Depth below which a point lies before the sparse points around it, as a share of theirs, and the least share of the
+moving points for which this holds where a mover has no sparse points."""
 AROUND = 3
 """Number of sparse points nearest to a pixel; their median depth is used as that of the pixel's surroundings."""
 
@@ -73,7 +76,7 @@ def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -
         views: normalised cameras, on the host.
 
     Returns:
-        None if no frame has a neighbour seen from elsewhere.
+        None if no frame has a neighbour seen from elsewhere, nothing moves, or ``known`` has points on what moves.
     """
     flows, found = Flows(data, views), []
     candidates = spread(len(data), CANDIDATES + 2)[1:-1]
@@ -83,12 +86,13 @@ def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -
             if seen is not None and len(seen.points):
                 found.append((index, seen))
             bar.advance()
-    if not found:
+    most = max((int(seen.moves.sum()) for _, seen in found), default=0)
+    large = [pair for pair in found if int(pair[1].moves.sum()) >= max(1, ENOUGH * most)]
+    # Of a slow mover, a reconstruction has points already.
+    if not large or sorted(seen.share_before() for _, seen in large)[len(large) // 2] < LACKING:
         return None
     # A mover that goes with or against the camera looks farther and larger, or nearer and smaller, than it is: at the
     # instant of its median size, depth is least wrong.
-    most = max(int(seen.moves.sum()) for _, seen in found)
-    large = [pair for pair in found if int(pair[1].moves.sum()) >= ENOUGH * most]
     index, seen = sorted(large, key=lambda pair: pair[1].size())[len(large) // 2]
     points, pixels, moves = seen.points, seen.pixels, seen.moves
     chosen = _spread(moves, count)
@@ -141,6 +145,13 @@ class _Seen(NamedTuple):
     """[P, 2] (x, y) at the size of the flow."""
     moves: Tensor
     """[P] bool"""
+
+    before: Tensor
+    """[P] bool: clearly nearer than the sparse points around it in the image."""
+
+    def share_before(self) -> float:
+        """Return the share of the moving points that lie before the sparse points."""
+        return float(self.before[self.moves].double().mean())
 
     def size(self) -> float:
         """Return the median distance of the moving points from their middle; 0 if nothing moves."""
@@ -202,7 +213,8 @@ def _seen(index: int, known: Tensor, flows: Flows, views: list[Camera]) -> _Seen
     plausible &= (depth > NEARER) & (depth < FARTHER)
     moves = _coherent(here[plausible], _moves(index, here[plausible], flows), sure.shape)
     moves &= ~_stray(points[plausible], moves)
-    return _Seen(*(torch.from_numpy(values) for values in (points[plausible], here[plausible], moves)))
+    values = points[plausible], here[plausible], moves, depth[plausible] < BEFORE
+    return _Seen(*(torch.from_numpy(each) for each in values))
 
 
 def _path(index: int, side: int, distance: float, flows: Flows, views: list[Camera]) -> list[int] | None:

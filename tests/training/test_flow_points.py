@@ -123,6 +123,26 @@ def test_cameras_that_rest_give_none(film):
     assert flow_points(100, normalisation.apply(film.points).float(), still, views) is None
 
 
+def test_a_mover_that_has_sparse_points_needs_no_others(film):
+    ball = mover(0.5)
+    points = torch.cat([film.points, ball.means[::3]])
+    normalisation = Normalisation.fit(film.cameras, film.points)
+    views = [normalisation.apply_camera(camera) for camera in film.cameras]
+    assert flow_points(100, normalisation.apply(points).float(), film, views) is None
+
+
+def test_a_film_of_what_stands_still_needs_none(film):
+    frames = []
+    for entry in film.entries:
+        with torch.no_grad():
+            image = render(wall(), entry.camera, torch.full((3,), 0.5))
+        frames.append(Frame(entry.camera, entry.time, image.rgb.clamp(0, 1), None, None, entry.name))
+    still = Dataset(frames, folder=Path("still"), split="train", points=film.points, colors=film.colors)
+    normalisation = Normalisation.fit(still.cameras, still.points)
+    views = [normalisation.apply_camera(camera) for camera in still.cameras]
+    assert flow_points(100, normalisation.apply(still.points).float(), still, views) is None
+
+
 def test_half_of_the_control_points_begin_on_the_mover(film):
     config = tiny_config(40, init_points=1200, flow_points=600, motion={"nodes": 64})
     state = TrainState.begin(config, film, "cpu")
