@@ -11,8 +11,8 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
 of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of optical flow from ``results/optical-flow.json``
-(``optical_flow.py``), that of long films from ``results/long-film-memory.json`` (``long_film.py memory``). Those of pages come from ``results/page-million.json``
-(``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``).
+(``optical_flow.py``), that of long films from ``results/long-film-memory.json`` (``long_film.py memory``). Those of
+pages come from ``results/page-million.json`` (``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``).
 """
 
 from __future__ import annotations

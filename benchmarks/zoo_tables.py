@@ -105,7 +105,11 @@ def gallery(source: Source) -> str:
 
 def films(source: Source) -> str:
     """Write what initial points on the mover, and flow in the loss, do for two films."""
-    rows = (("off", "neither (`flow_points=0`)"), ("on", "points on the mover (default)"), ("flow", "and `loss.flow=2`"))
+    rows = (
+        ("off", "neither (`flow_points=0`)"),
+        ("on", "points on the mover (default)"),
+        ("flow", "and `loss.flow=2`"),
+    )
     lines = []
     for row, label in rows:
         phone, hand = source.run(row, "phone"), source.run(row, "handheld")
