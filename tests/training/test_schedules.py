@@ -27,7 +27,7 @@ from scgs_warp.training.view import log_weight, seeks_silhouettes, sh_degree
 
 STEADY = {"sh_dc": 2.5e-3, "sh_rest": 1.25e-4, "opacity_logits": 0.05, "log_scales": 5e-3, "quats": 1e-3}
 STEADY |= {"shading": 2.5e-3, "correctives": 8e-4}
-SPHERES = {**STEADY, "opacity_logits": 0.02, "sh_dc": 0.01, "hyper": 2.5e-3}
+SPHERES = {**STEADY, "opacity_logits": 0.02, "sh_dc": 0.01, "hyper": 2.5e-3 * 8**0.5}
 
 
 class Row(NamedTuple):
@@ -109,7 +109,8 @@ def test_rates_of_stage_2(name, row):
     assert len(networks) == 1 and networks.pop() == pytest.approx(row.network, rel=1e-4)
     assert rates.pop("means") == pytest.approx(row.means, rel=1e-4)
     assert rates.pop("positions") == pytest.approx(0.1 * row.network, rel=1e-4)
-    nodes = {rates.pop(key) for key in ("log_radii", "strength_logits", "hyper") if key in rates}
+    nodes = {rates.pop(key) for key in ("log_radii", "strength_logits") if key in rates}
+    assert rates.pop("hyper") == pytest.approx(row.network * 8**0.5, rel=1e-4), "stretched"
     assert len(nodes) == 1 and nodes.pop() == pytest.approx(row.network, rel=1e-4)
     assert rates == expected(STEADY, row.settled)
 

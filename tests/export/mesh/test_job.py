@@ -59,7 +59,7 @@ def test_the_moving_mesh_of_the_figure_follows_its_true_surface(tmp_path):
         made = trimesh.Trimesh(found.posed(moments[at].seconds).positions, faces, process=False)
         assert made.is_watertight
         error = distances(figure_at(moments[at].time), made) / height
-        assert error.mean() < 0.022 and np.quantile(error, 0.95) < 0.035, (at, error.mean(), np.quantile(error, 0.95))
+        assert error.mean() < 0.022 and np.quantile(error, 0.95) < 0.04, (at, error.mean(), np.quantile(error, 0.95))
     assert gltf_errors(tmp_path / "a.glb") == []
 
 
