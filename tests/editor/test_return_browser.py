@@ -78,7 +78,7 @@ def test_the_editor_ends_and_returns(browser, serve, tmp_path):
         assert window.ask(kept) == before, "no reload, and everything is as it was"
         until(lambda: window.ask("studio.link.state.tool.parts_first") is False)
     window.ask("studio.link.ask('film', { seconds: 3 })")
-    until(lambda: window.ask("player.seconds") == 3)
+    until(lambda: page.locator("#status").inner_text() == "saved" and window.ask("player.seconds") == 3)
 
     end(served, signal.SIGKILL)
     shutil.rmtree(tmp_path / "home")  # the new server cannot know the page
