@@ -199,7 +199,10 @@ class Follower:
             async with session.ws_connect(f"{root}/socket", headers={"Origin": root}, max_msg_size=0) as wire:
                 self._open.set()
                 async for message in wire:
-                    version = json.loads(message.data)["version"]
+                    state = json.loads(message.data)
+                    if "version" not in state:  # how to find the server again
+                        continue
+                    version = state["version"]
                     with self._changed:
                         self._known = version
                     if version:
@@ -216,10 +219,12 @@ class Follower:
         self.bytes += len(content)
 
     def settle(self) -> None:
-        """Wait until the newest scene has come."""
+        """Wait until the newest scene has come; raise UserError if the page is closed."""
         time.sleep(0.05)
         with self._changed:
             self._changed.wait_for(lambda: self._shown == self._known, SETTLED)
+        if not self._thread.is_alive():
+            raise UserError(f"the page was closed: {self._problem}")
 
 
 def configuration(options: argparse.Namespace) -> TrainConfig:

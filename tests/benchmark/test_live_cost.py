@@ -1,0 +1,27 @@
+"""The page that the benchmark of ``--live`` opens."""
+
+from __future__ import annotations
+
+import pytest
+
+from helpers.scripts import benchmark_script
+from scgs_warp.errors import UserError
+from scgs_warp.export.page_data import pack
+from scgs_warp.live.viewer import SceneView
+
+pytest.importorskip("aiohttp")
+
+
+def test_the_page_fetches_every_scene_and_says_when_it_was_closed():
+    """A page that fetches nothing would make ``--live`` look free of cost."""
+    live_cost = benchmark_script("live_cost")
+    with SceneView("training") as view:
+        page = live_cost.Follower(view.server.url)
+        for number in (1, 2):
+            view.publish(pack({"gaussians": 10 * number}, []), f"step {number}")
+            page.settle()
+            assert (page.scenes, page.gaussians) == (number, 10 * number)
+        assert view.wanted.is_set()
+    page._thread.join(10)
+    with pytest.raises(UserError, match="the page was closed"):
+        page.settle()
