@@ -39,6 +39,7 @@ adam         adam         adam                                  kernels/test_ada
              step_outcome                                       kernels/test_step_outcome
 network      torch        network                               kernels/test_network
                           network_adjoint
+                          network_pairs
 roofline                  roofline                              benchmark/test_scaling
 ===========  ===========  ================  ==================  ========================================
 

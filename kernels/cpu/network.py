@@ -22,7 +22,7 @@ def pack_row(
 
 
 @native_function("network.h")
-def pack_panel(layer: int, panel: int, table: wp.array2d[wp.int64], packed: wp.array[float]): ...
+def pack_panel(layer: int, panel: int, adjoint: int, table: wp.array2d[wp.int64], packed: wp.array[float]): ...
 
 
 @native_function("network.h")
@@ -40,13 +40,14 @@ def pack_weights(
     first: int,
     # In:
     panels: int,  # of the widest matrix
+    adjoint: int,  # 1: pack for the adjoint of the layer before as well
     table_in: wp.array2d[wp.int64],  # [L, 9]
     # Out:
     packed_out: wp.array[float],
 ):
     """Pack weights into panels, in the layout that each matrix product of a layer reads. Grid: L x panels."""
     task = first + wp.tid()
-    pack_panel(task // panels, task % panels, table_in, packed_out)
+    pack_panel(task // panels, task % panels, adjoint, table_in, packed_out)
 
 
 @wp.kernel

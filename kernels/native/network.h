@@ -2,8 +2,11 @@
 #pragma once
 #include "network_panels.h"
 
-// Pack one panel of a layer's weights, in the layout that each of its products reads.
-static inline void pack_panel(int layer, int panel, const wp::array_t<wp::int64>& table, wp::array_t<float>& packed) {
+// Pack one panel of a layer's weights, in the layout that each of its products reads; for the adjoint of the layer
+// before only if asked.
+static inline void pack_panel(
+    int layer, int panel, int adjoint, const wp::array_t<wp::int64>& table, wp::array_t<float>& packed
+) {
     const long long* own = (const long long*)table.data + (long long)layer * TABLE_COLUMNS;
     const float* weights = (const float*)own[WEIGHTS];
     const int in = (int)(own[INPUTS] + own[HIDDEN]), out = (int)own[OUTPUTS];
@@ -21,7 +24,8 @@ static inline void pack_panel(int layer, int panel, const wp::array_t<wp::int64>
         for (int j = 0; j < out; ++j)
             for (int k = 0; k < PANEL; ++k) to[j * PANEL + k] = k < n ? from[(long long)j * in + k] : 0.0f;
     }
-    if (own[PACKED_ADJOINT] >= 0 && panel < panels(own[HIDDEN])) {  // row j, column k: weights[j, inputs + k]
+    if (adjoint && own[PACKED_ADJOINT] >= 0 &&
+        panel < panels(own[HIDDEN])) {  // row j, column k: weights[j, inputs + k]
         float* to = packed.data + own[PACKED_ADJOINT] + (long long)panel * out * PANEL;
         const float* from = weights + own[INPUTS] + (long long)panel * PANEL;
         for (int j = 0; j < out; ++j) __builtin_memcpy(to + j * PANEL, from + (long long)j * in, PANEL * sizeof(float));

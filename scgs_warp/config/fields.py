@@ -101,6 +101,8 @@ class MotionConfig:
     ``network_until`` (official code, for real video)."""
     bfloat16: bool = False
     """Compute the hidden layers in bfloat16 while training."""
+    bfloat16_adjoint: bool = newer(True, before=False)
+    """On a CPU, round the factors of the network's gradients to bfloat16; sums stay in float32."""
     plane_times: int = bounded(0, 0, 4_096)
     """Number of texels of the feature planes along t; 0: half the number of training times (4D-GS)."""
 
@@ -229,6 +231,9 @@ class DensifyConfig:
     clear_distance: float = newer(0.25, before=0.0, least=0, most=1)
     """Visibility pruning without alpha: also remove Gaussians that a view sees nearer than this share of the distance
     at which its content begins: they become fog before the lens. 0: off."""
+    faint_share: float = newer(0.0, before=0.0, least=0, most=1)
+    """Visibility pruning at the end of densification: also remove the Gaussians that contribute least, as many as have
+    together at most this share of the contributions of all (of each the largest to a sampled view). 0: off."""
     prune_large: Literal["auto", "always", "never"] = "auto"
     """Apply max_screen and max_scale. auto: only if the images have alpha, because images without alpha show bare
     walls, which need large Gaussians."""

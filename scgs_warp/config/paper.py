@@ -50,6 +50,7 @@ PAPER = TrainConfig(
         mask=False,
         time_noise=0.0,
         bfloat16=False,
+        bfloat16_adjoint=False,
         plane_times=0,
     ),
     pretrain=PretrainConfig(
@@ -114,6 +115,7 @@ PAPER = TrainConfig(
         min_contribution=0.0,
         least_views=1,
         clear_distance=0.0,
+        faint_share=0.0,
         prune_large="always",
         max_screen=0.0,
         max_scale=0.1,

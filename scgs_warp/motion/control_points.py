@@ -52,6 +52,7 @@ def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> Defo
             position_frequencies=config.position_frequencies,
             time_frequencies=config.time_frequencies,
             bfloat16=config.bfloat16,
+            bfloat16_adjoint=config.bfloat16_adjoint,
             generator=generator(seed, 11, chunk) if chunk else generator(seed, 11),
         )
 

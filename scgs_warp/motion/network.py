@@ -74,11 +74,12 @@ class DeformationNetwork(nn.Module):
         position_frequencies: int = 10,
         time_frequencies: int = 6,
         bfloat16: bool = False,
+        bfloat16_adjoint: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
-        self.skip, self.low_precision = skip, bfloat16
+        self.skip, self.low_precision, self.low_precision_adjoint = skip, bfloat16, bfloat16_adjoint
         inputs = 3 * (1 + 2 * position_frequencies) + 1 + 2 * time_frequencies
         self.layers = nn.ModuleList()
         for i in range(layers):
@@ -152,7 +153,7 @@ class DeformationNetwork(nn.Module):
         if (self.low_precision and self.training) or wants_inputs or not supported(weights, biases):
             return None
         if self.training or torch.is_grad_enabled():
-            return network(where, when, weights, biases)
+            return network(where, when, weights, biases, bfloat16=self.low_precision_adjoint)
         columns = where.shape[1] + when.shape[1]
         packed = self._packed((*weights, *biases), lambda: Layers(weights, biases, columns))
         return evaluate(packed, where, when)

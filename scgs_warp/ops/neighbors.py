@@ -14,6 +14,9 @@ from ..runtime.launch import launch
 from . import compositing_cuda, radix
 from .node_sums import rbf_node_sums
 
+SAMPLE = 4096
+"""Number of points at least (or all) from which the extent of candidate lists is estimated."""
+
 
 class NodeLists(NamedTuple):
     """The (Gaussian, neighbour) pairs of every node in ascending order, the order in which its gradients are summed."""
@@ -158,8 +161,9 @@ def _make_lists(points: Tensor, nodes: Tensor, distances: Tensor) -> CandidateLi
     codes = torch.empty(points.shape[0], dtype=torch.int32)
     if points.shape[0]:
         space = points.nan_to_num(0.0, 0.0, 0.0)
-        tails = max(1, points.shape[0] // 100)  # a few points far out would make the cubes of all others too large
-        low, high = (space.kthvalue(rank, 0).values for rank in (tails, points.shape[0] + 1 - tails))
+        sample = space[:: max(1, points.shape[0] // SAMPLE)]
+        tails = max(1, len(sample) // 100)  # a few points far out would make the cubes of all others too large
+        low, high = (sample.kthvalue(rank, 0).values for rank in (tails, len(sample) + 1 - tails))
         widest = (high - low).argsort(descending=True, stable=True)[:4]
         space = ((space - low) / float((high - low).max().clamp_min(1e-12)))[:, widest].contiguous()
         launch(neighbor_lists.morton_codes, points.shape[0], space, codes)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..kernels.cpu import network as kernels
 from ..kernels.cpu import network_adjoint as kernels_adjoint
+from ..kernels.cpu import network_pairs as kernels_pairs
 from ..kernels.types import NETWORK_BLOCK, NETWORK_PANEL
 from ..runtime.launch import launch
 
@@ -19,6 +20,8 @@ ROWS_AT_ONCE = 8192
 """Number of rows evaluated at once without gradients: hidden values stay in the cache from layer to layer."""
 ADJOINT_ROWS_AT_ONCE = 2048
 """Number of rows of the adjoint evaluated at once; it does not affect the result."""
+PARTS = 2
+"""Number of tasks that share a panel of a layer's weight gradients."""
 
 
 class Layers:
@@ -30,9 +33,17 @@ class Layers:
         inputs: number of input columns. A layer whose ``in`` exceeds its predecessor's ``out`` by this number reads the
             inputs again, before the predecessor's outputs (a skip connection).
         inputs_adjoint: whether :meth:`gradients` will compute the gradient of the inputs.
+        bfloat16: whether :meth:`gradients` rounds its factors to bfloat16; not with ``inputs_adjoint``.
     """
 
-    def __init__(self, weights: list[Tensor], biases: list[Tensor], inputs: int, inputs_adjoint: bool = False) -> None:
+    def __init__(
+        self,
+        weights: list[Tensor],
+        biases: list[Tensor],
+        inputs: int,
+        inputs_adjoint: bool = False,
+        bfloat16: bool = False,
+    ) -> None:
         self.weights, self.biases = [w.detach() for w in weights], [b.detach() for b in biases]
         self.inputs = inputs
         self.panels = max(-(-w.shape[0] // NETWORK_PANEL) for w in weights)
@@ -44,7 +55,7 @@ class Layers:
             own = columns - before
             panels = -(-out // NETWORK_PANEL)
             adjoint = at + panels * NETWORK_PANEL * columns
-            to_inputs = adjoint + before * out
+            to_inputs = adjoint + before * panels * NETWORK_PANEL
             own_row = [weight.data_ptr(), self.biases[layer].data_ptr(), own, before, out, at]
             wanted = inputs_adjoint and own > 0
             rows.append([*own_row, adjoint if before else -1, to_inputs if wanted else -1, 0])
@@ -56,7 +67,12 @@ class Layers:
         self.table = torch.tensor(rows, dtype=torch.int64)
         self.packed = torch.empty(at)
         widest = max(self.panels, -(-inputs // NETWORK_PANEL)) if inputs_adjoint else self.panels
-        launch(kernels.pack_weights, len(rows) * widest, widest, self.table, self.packed, grain=1)
+        self.pairs = torch.empty(at // 2 if bfloat16 and not inputs_adjoint else 0, dtype=torch.int32)
+        """Weights in pairs of bfloat16, for the adjoint; empty: it is computed in float32."""
+        paired, tasks = len(self.pairs) > 0, len(rows) * widest
+        launch(kernels.pack_weights, tasks, widest, int(not paired), self.table, self.packed, grain=1)
+        if paired:
+            launch(kernels_pairs.pack_weight_pairs, tasks, widest, self.table, self.pairs, grain=1)
 
     def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Return the inputs and the hidden values in panels, and the outputs [T M, out]."""
@@ -78,21 +94,16 @@ class Layers:
         Args:
             sizes: M, T and A of ``where`` [M, A] at T times. None: the gradient of ``where`` is not needed.
         """
-        layers, rows, count = len(self.weights), hidden.shape[1], v_out.shape[0]
+        count = v_out.shape[0]
         flat = torch.zeros(self.gradient_size) if count == 0 else torch.empty(self.gradient_size)
         table = self.table.clone()
         table[:, 8] = torch.tensor(self.gradient_begin) * flat.element_size() + flat.data_ptr()
         v_inputs = None if sizes is None else torch.empty(count, sizes[2])
-        v_hidden = torch.empty(layers, min(rows, ADJOINT_ROWS_AT_ONCE), hidden.shape[2])
-        parts = 2
-        for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
-            own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
-            grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, self.packed)
-            launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
-            if v_inputs is not None:
-                launch(kernels_adjoint.network_inputs_adjoint, grid, *where, v_hidden, v_inputs, grain=1)
-            shared = self.panels, parts, begin, min(own, count - begin), table, inputs, hidden, v_hidden
-            launch(kernels_adjoint.network_weights_adjoint, layers * self.panels * parts, *shared, grain=1)
+        if len(self.pairs):
+            assert v_inputs is None
+            self._backward_in_pairs(table, inputs, hidden, v_out)
+        else:
+            self._backward(table, inputs, hidden, v_out, v_inputs)
         v_where = None if v_inputs is None or sizes is None else _over_times(v_inputs, *sizes)
         weights, biases = [], []
         for start, weight in zip(self.gradient_begin, self.weights):
@@ -100,6 +111,40 @@ class Layers:
             weights.append(flat[start:end].view_as(weight))
             biases.append(flat[end : end + weight.shape[0]])
         return v_where, weights + biases
+
+    def _backward(self, table: Tensor, inputs: Tensor, hidden: Tensor, v_out: Tensor, v_inputs: Tensor | None) -> None:
+        """Write the gradients of the parameters to the table's addresses, and those of the inputs to ``v_inputs``."""
+        layers, rows, width = hidden.shape
+        v_hidden = torch.empty(layers, min(rows, ADJOINT_ROWS_AT_ONCE), width)
+        for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
+            own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
+            grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, self.packed)
+            launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
+            if v_inputs is not None:
+                launch(kernels_adjoint.network_inputs_adjoint, grid, *where, v_hidden, v_inputs, grain=1)
+            shared = self.panels, PARTS, begin, min(own, len(v_out) - begin), table, inputs, hidden, v_hidden
+            launch(kernels_adjoint.network_weights_adjoint, layers * self.panels * PARTS, *shared, grain=1)
+
+    def _backward_in_pairs(self, table: Tensor, inputs: Tensor, hidden: Tensor, v_out: Tensor) -> None:
+        """Write the gradients of the parameters, from factors in bfloat16, to the table's addresses."""
+        layers, rows, width = hidden.shape
+        most = min(rows, ADJOINT_ROWS_AT_ONCE)
+        columns, input_rows, hidden_rows, v_rows = (
+            torch.empty(shape, dtype=torch.int32)
+            for shape in (
+                (2, most, width // 2),
+                (inputs.shape[0], most // 2, NETWORK_PANEL),
+                (layers - 1, most // 2, width),
+                (layers, most // 2, width),
+            )
+        )
+        for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
+            own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
+            read = NETWORK_BLOCK, begin, table, self.pairs, inputs, hidden, v_out
+            pairs = input_rows, hidden_rows, v_rows
+            launch(kernels_pairs.network_adjoint_pairs, -(-own // NETWORK_BLOCK), *read, columns, *pairs, grain=1)
+            shared = self.panels, PARTS, begin, min(own, len(v_out) - begin), table, *pairs
+            launch(kernels_pairs.network_weights_adjoint_pairs, layers * self.panels * PARTS, *shared, grain=1)
 
 
 def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> Tensor:
@@ -139,10 +184,10 @@ class PackedLayers:
 
 class _Network(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, where, when, *parameters):
+    def forward(ctx: Any, bfloat16, where, when, *parameters):
         half = len(parameters) // 2
         columns = where.shape[1] + when.shape[1]
-        layers = Layers(list(parameters[:half]), list(parameters[half:]), columns, ctx.needs_input_grad[0])
+        layers = Layers(list(parameters[:half]), list(parameters[half:]), columns, ctx.needs_input_grad[1], bfloat16)
         inputs, hidden, out = layers.values(where, when, keep=True)
         ctx.layers, ctx.sizes = layers, (where.shape[0], when.shape[0], where.shape[1])
         ctx.save_for_backward(inputs, hidden)
@@ -151,9 +196,9 @@ class _Network(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients):  # type: ignore[override]
-        sizes = ctx.sizes if ctx.needs_input_grad[0] else None
+        sizes = ctx.sizes if ctx.needs_input_grad[1] else None
         v_where, of_parameters = ctx.layers.gradients(*ctx.saved_tensors, gradients[0].contiguous(), sizes)
-        return v_where, None, *of_parameters
+        return None, v_where, None, *of_parameters
 
 
 def supported(weights: list[Tensor], biases: list[Tensor]) -> bool:
@@ -163,7 +208,9 @@ def supported(weights: list[Tensor], biases: list[Tensor]) -> bool:
     ) and all(w.shape[0] % NETWORK_PANEL == 0 for w in weights[:-1])
 
 
-def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
+def network(
+    where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Tensor], *, bfloat16: bool = False
+) -> Tensor:
     """Evaluate hidden layers with ReLU and a last layer without, for every position at every time.
 
     Args:
@@ -172,6 +219,8 @@ def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Ten
         weights: [out, in] of every layer. ``in`` is A + B for the first layer and the previous layer's ``out`` for the
             others; A + B more make a skip connection, which reads the inputs again, before the previous outputs.
         biases: [out] of every layer.
+        bfloat16: round the factors of the parameters' gradients to bfloat16, unless ``where`` has a gradient. Sums stay
+            in float32.
 
     Returns:
         [T M, out of the last layer], with time t and position m in row ``t M + m``. Gradients reach weights, biases and
@@ -183,7 +232,7 @@ def network(where: Tensor, when: Tensor, weights: list[Tensor], biases: list[Ten
     _validate(where, when, weights, biases)
     where, when = where.contiguous(), when.detach().contiguous()
     if torch.is_grad_enabled() and any(p.requires_grad for p in (where, *weights, *biases)):
-        return _Network.apply(where, when, *weights, *biases)  # type: ignore[return-value]
+        return _Network.apply(bfloat16, where, when, *weights, *biases)  # type: ignore[return-value]
     return evaluate(Layers(weights, biases, where.shape[1] + when.shape[1]), where, when)
 
 

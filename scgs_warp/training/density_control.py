@@ -34,7 +34,7 @@ from .frames import Frames
 from .near_bound import nearest_content
 from .pretrain import densify_spheres, densify_spheres_by_gradient, thin_spheres
 from .state import TrainState
-from .visibility import seen_by
+from .visibility import faintest, seen_by
 
 STEPS_PER_VIEW = 20
 """Visibility pruning renders at most one view per this many steps since the last pruning. A view takes about half as
@@ -131,7 +131,8 @@ def density_due(state: TrainState) -> bool:
 
 def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
     """Find the Gaussians that contribute at least ``densify.min_contribution`` pixels to one of a few sampled views, or
-    to ``densify.least_views`` of all views, and that none of them sees closer than ``densify.clear_distance``.
+    to ``densify.least_views`` of all views, and that none of them sees closer than ``densify.clear_distance``. At the
+    end of densification, leave out the faintest as well (``densify.faint_share``).
 
     The views are drawn at random, different ones each time.
 
@@ -154,6 +155,8 @@ def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
         keep &= (seen.views >= config.least_views) | seen.most.isinf()
     if config.clear_distance > 0.0:
         keep &= seen.nearest >= config.clear_distance * nearest_content(frames.frames, state.normalisation)
+    if done == config.until:
+        keep &= ~faintest(seen.most, config.faint_share)
     return keep
 
 

@@ -51,6 +51,23 @@ def seen_by(state: TrainState, frames: Frames, indices: list[int], least: float)
     return Seen(torch.where(ever, most, torch.inf), views, nearest)
 
 
+def faintest(contributions: Tensor, share: float) -> Tensor:
+    """Find the smallest contributions that together are at most this share of the sum of all.
+
+    Args:
+        contributions: [N] pixels (:attr:`Seen.most`). Infinite ones are neither found nor counted.
+
+    Returns:
+        [N] bool. Of equal contributions, those of the first rows are found first.
+    """
+    finite = contributions.isfinite()
+    counted = torch.where(finite, contributions, 0.0).cpu().double()  # on a GPU, sums have no fixed order
+    order = counted.argsort(stable=True)
+    found = torch.empty(len(order), dtype=torch.bool)
+    found[order] = counted[order].cumsum(0) <= share * counted.sum()
+    return found.to(finite.device) & finite
+
+
 def view_contributions(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> tuple[Tensor, Tensor]:
     """Sum each Gaussian's blending weights alpha T over one image.
 

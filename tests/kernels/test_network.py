@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from reference.network import gradients_in_bfloat16
 from reference.network import network as twin
 from scgs_warp.motion.network import DeformationNetwork
 from scgs_warp.ops import network as ops
@@ -55,6 +56,54 @@ def test_values_and_gradients(shape, positions, times, seed):
         assert float((got.double() - want).norm() / want.norm().clamp_min(1e-6)) < 2e-3
 
 
+@pytest.mark.parametrize("positions, times", [(1, 1), (7, 1), (13, 3), (70, 1)])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_gradients_of_factors_in_bfloat16(shape, positions, times):
+    """Ten times closer to the twin that rounds than to the one that does not."""
+    weights, biases = parameters(shape, 3)
+    where, when = rows(shape, positions, times, 3)
+    found = network(where, when, weights, biases, bfloat16=True)
+    assert torch.equal(found, network(where, when, weights, biases))
+    v = torch.randn(found.shape, generator=torch.Generator().manual_seed(3))
+    gradients = torch.autograd.grad(found, (*weights, *biases), v)
+    own = [p.detach().double().requires_grad_() for p in (*weights, *biases)]
+    half = len(weights)
+    exact = torch.autograd.grad(twin(where.double(), when.double(), own[:half], own[half:]), own, v.double())
+    with torch.no_grad():
+        expected = gradients_in_bfloat16(where.double(), when.double(), own[:half], own[half:], v.double())
+    for got, want, unrounded in zip(gradients, expected, exact):
+        size = want.norm().clamp_min(1e-6)
+        assert float((got.double() - want).norm() / size) < 1e-3
+        assert float((got.double() - unrounded).norm() / size) < 2e-2
+    of_first, first = gradients[0].double(), (expected[0], exact[0])
+    errors = [float((of_first - want).norm()) for want in first]
+    assert errors[0] < 0.1 * errors[1], "nothing was rounded"
+
+
+def test_with_a_gradient_of_the_inputs_nothing_is_rounded():
+    weights, biases = parameters(SHAPES[2], 14)
+    where, when = rows(SHAPES[2], 9, 2, 14)
+    where.requires_grad_()
+    results = [
+        torch.autograd.grad(network(where, when, weights, biases, bfloat16=bfloat16).sum(), (where, *weights, *biases))
+        for bfloat16 in (False, True)
+    ]
+    assert all(torch.equal(a, b) for a, b in zip(*results))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_a_gradient_that_is_not_finite_is_not_hidden_by_rounding(bad):
+    weights, biases = parameters(SHAPES[1], 15)
+    where, when = rows(SHAPES[1], 9, 1, 15)
+    found = network(where, when, weights, biases, bfloat16=True)
+    v = torch.ones_like(found)
+    v[4] = bad
+    if bad != bad:  # bits that a rounding by addition would carry into the sign
+        v.view(torch.int32)[4] = 0x7FFFFFFF
+    gradients = torch.autograd.grad(found, (*weights, *biases), v)
+    assert not bool(gradients[len(weights) - 1].isfinite().all()) and not bool(gradients[-1].isfinite().all())
+
+
 def test_inputs_without_a_gradient_cost_nothing_and_change_no_bit(monkeypatch):
     weights, biases = parameters(SHAPES[2], 11)
     where, when = rows(SHAPES[2], 13, 2, 11)
@@ -69,15 +118,17 @@ def test_inputs_without_a_gradient_cost_nothing_and_change_no_bit(monkeypatch):
     assert all(torch.equal(a, b) for a, b in zip(*results))
 
 
+@pytest.mark.parametrize("bfloat16", [False, True])
 @pytest.mark.parametrize("largest", [32, 64])
-def test_the_adjoint_in_parts_gives_the_same_bits(largest, monkeypatch):
+def test_the_adjoint_in_parts_gives_the_same_bits(largest, bfloat16, monkeypatch):
     weights, biases = parameters(SHAPES[2], 13)
     where, when = rows(SHAPES[2], 51, 2, 13)
-    where.requires_grad_()
+    where.requires_grad_(not bfloat16)
+    wanted = (*weights, *biases) if bfloat16 else (where, *weights, *biases)
     v = torch.randn(102, 40, generator=torch.Generator().manual_seed(13))
-    whole = torch.autograd.grad(network(where, when, weights, biases), (where, *weights, *biases), v)
+    whole = torch.autograd.grad(network(where, when, weights, biases, bfloat16=bfloat16), wanted, v)
     monkeypatch.setattr(ops, "ADJOINT_ROWS_AT_ONCE", largest)
-    parts = torch.autograd.grad(network(where, when, weights, biases), (where, *weights, *biases), v)
+    parts = torch.autograd.grad(network(where, when, weights, biases, bfloat16=bfloat16), wanted, v)
     assert all(torch.equal(a, b) for a, b in zip(whole, parts))
 
 
@@ -100,17 +151,19 @@ def test_without_gradient_in_parts_and_packed_gives_the_same_bits():
         assert torch.equal(evaluate(Layers(weights, biases, 76), where, when), trained)
 
 
-def test_same_bits_on_any_number_of_threads():
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_same_bits_on_any_number_of_threads(bfloat16):
     weights, biases = parameters(SHAPES[0], 4)
     where, when = rows(SHAPES[0], 101, 3, 4)
-    where.requires_grad_()
+    where.requires_grad_(not bfloat16)
+    wanted = (*weights, *biases) if bfloat16 else (where, *weights, *biases)
     results = []
     before = environment.thread_count()
     try:
         for threads in (1, 2, 3):
             environment.configure(threads)
-            out = network(where, when, weights, biases)
-            results.append([out, *torch.autograd.grad(out, (where, *weights, *biases), torch.ones_like(out))])
+            out = network(where, when, weights, biases, bfloat16=bfloat16)
+            results.append([out, *torch.autograd.grad(out, wanted, torch.ones_like(out))])
     finally:
         environment.configure(before)
     for other in results[1:]:
@@ -120,6 +173,8 @@ def test_same_bits_on_any_number_of_threads():
 def test_no_positions():
     weights, biases = parameters(SHAPES[1], 5)
     where, when = rows(SHAPES[1], 0, 2, 5)
+    rounded = network(where, when, weights, biases, bfloat16=True)
+    assert not any(bool(g.any()) for g in torch.autograd.grad(rounded.sum(), (*weights, *biases)))
     where.requires_grad_()
     out = network(where, when, weights, biases)
     assert out.shape == (0, 1)

@@ -27,7 +27,7 @@ from scgs_warp.training.density_control import (
     visible_gaussians,
 )
 from scgs_warp.training.loop import fit
-from scgs_warp.training.visibility import Seen, seen_by
+from scgs_warp.training.visibility import Seen, faintest, seen_by
 from scgs_warp.types import Stats, plain_scale
 
 
@@ -197,6 +197,27 @@ def test_the_unseen_go_before_a_reset_and_at_the_end_of_densification(step, due,
     assert torch.equal(state.stats.count, stay.float()), "the others' statistics go on"
     faint = bool((state.gaussians.opacities() < 0.02).all())
     assert faint == (step == 19), "reset where it was due, after the look at the images"
+
+
+@pytest.mark.parametrize(
+    "share, found", [(0.0, []), (0.05, []), (0.1, [2]), (0.49, [1, 2]), (0.5, [1, 2, 3]), (1.0, [0, 1, 2, 3])]
+)
+def test_the_faintest_share_is_counted_from_below(share, found):
+    """No view can judge the last one."""
+    assert torch.where(faintest(torch.tensor([5.0, 2.0, 1.0, 2.0, torch.inf]), share))[0].tolist() == found
+
+
+@pytest.mark.parametrize("step, due", [(19, False), (39, True)])
+def test_the_faintest_go_at_the_end_of_densification_only(step, due, monkeypatch):
+    monkeypatch.setattr(density_control, "STEPS_PER_VIEW", 1)
+    state, frames = state_with_hidden_gaussian(faint_share=0.2)
+    least = state.config.densify.min_contribution
+    seen = seen_by(state, frames, list(range(6)), least).most
+    state.step = step
+    found = visible_gaussians(state, frames)
+    faint = faintest(seen, 0.2)
+    assert int((faint & (seen >= least)).sum()) > 0
+    assert torch.equal(found, (seen >= least) & ~faint if due else seen >= least)
 
 
 def test_those_that_stay_are_judged_for_densification_by_all_their_steps(monkeypatch):
