@@ -12,7 +12,7 @@ from scgs_warp.training.state import TrainState
 def state_with_hidden_gaussian(**densify) -> tuple[TrainState, Frames]:
     """Start the main stage with the last Gaussian hidden inside the others."""
     data = tiny_dataset(6)
-    schedule = {"until": 40, "opacity_reset_every": 20, "every": 1_000, **densify}
+    schedule = {"until": 40, "opacity_reset_every": 20, "every": 1_000, "faint_share": 0.0, **densify}
     config = tiny_config(60, motion={"model": "static"}, densify=schedule)
     state = TrainState.begin(config, data, "cpu")
     with torch.no_grad():
