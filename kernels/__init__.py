@@ -41,6 +41,7 @@ network      torch        network                               kernels/test_net
                           network_adjoint
                           network_pairs
 roofline                  roofline                              benchmark/test_scaling
+sharing                   sharing                               runtime/test_launch
 ===========  ===========  ================  ==================  ========================================
 
 - ``binning.py`` has no kernels: it holds the geometry that the sorts in ``cpu/`` and ``cuda/`` share.
@@ -48,7 +49,8 @@ roofline                  roofline                              benchmark/test_s
 - ``cuda/compositing_blocks.py`` uses Warp's tile API instead of native code. It takes over when there are more channels
   than a gradient slot of ``cuda/compositing.py`` holds.
 - ``cuda/node_sums.py`` replaces the sums by chunks in the adjoints of ``neighbors`` and ``skinning``.
-- ``cpu/roofline.py`` is not a stage: it measures the machine for benchmarks.
+- ``cpu/roofline.py`` and ``cpu/sharing.py`` are not stages: one measures the machine for benchmarks, the other lets
+  threads share the grid of any kernel.
 - Every stage that the table does not list has a portable form only.
 
 Conventions

@@ -64,6 +64,9 @@ ROOFLINE_CHAINS = 12
 ROOFLINE_BLOCK = 1 << 18
 """Number of floats that one grid index copies: 1 MiB."""
 
+SHARED_ARGUMENTS = 4096
+"""Largest size in bytes of the arguments of a kernel that threads of a CPU share."""
+
 NETWORK_PANEL = 32
 """Number of columns in a panel of the network's matrices on a CPU. Widths of hidden layers are multiples of it."""
 

@@ -37,6 +37,7 @@ CONSTANTS: dict[str, int | float] = {
     "ROOFLINE_BLOCK": types.ROOFLINE_BLOCK,
     "ROOFLINE_CHAINS": types.ROOFLINE_CHAINS,
     **{f"SH_{name}": getattr(harmonics, name) for name in harmonics.FACTORS},
+    "SHARED_ARGUMENTS": types.SHARED_ARGUMENTS,
     "SSIM_BAND": types.SSIM_BAND,
     "SSIM_BLOCK": types.SSIM_BLOCK,
     "SSIM_C1": ssim.SSIM_C1,

@@ -7,11 +7,12 @@ known beforehand, chunks are cut by cost and the heaviest come first.
 
 from __future__ import annotations
 
+import ctypes
 import functools
-import itertools
 import os
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from queue import SimpleQueue
 
@@ -19,11 +20,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..kernels.cpu import sharing as kernels
+from ..kernels.types import SHARED_ARGUMENTS
 from . import addresses, environment
+from .cpu_kernel import CpuKernel
+from .kernel_cache import prepared
 from .memory import NotEnoughMemory
 
-Chunk = tuple[int, int]
-"""Chunk of a grid: its first index and its number of indices."""
+STATE, DONE, AWAKE, ENTRY, SPINS, JOB_SIZE = 0, 8, 16, 24, 32, 33
+"""Indices of a job's numbers (``kernels/native/sharing.h``), and how many there are."""
+FIRST_SIZE = 4
+"""Size in bytes of a kernel's first argument."""
+LOOKS = 4000
+"""Number of looks in vain after which a helper sleeps: 0.1 to 0.2 ms."""
 
 CHUNKS_PER_SHARE = 3
 """Number of chunks in a thread's fair share of the remaining grid. More than one, because costs are estimates and the
@@ -42,14 +51,35 @@ def _shares(threads: int) -> np.ndarray:
     return np.array(ends)
 
 
+class Chunks:
+    """Chunks of a grid, in the order in which threads take them. Iteration yields the first index and the size."""
+
+    def __init__(self, firsts: np.ndarray, sizes: np.ndarray) -> None:
+        self.firsts, self.sizes = np.ascontiguousarray(firsts, np.int32), sizes
+        self._bounds: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.firsts)
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        return zip(self.firsts.tolist(), self.sizes.tolist())
+
+    def bounds(self, of_size: Callable[[int], bytes]) -> np.ndarray:
+        """Return the launch bounds of the chunks, [chunks, bytes]."""
+        if self._bounds is None:
+            raw = b"".join(map(of_size, self.sizes.tolist()))
+            self._bounds = np.frombuffer(raw, np.uint8).reshape(len(self), -1)
+        return self._bounds
+
+
 @functools.lru_cache(maxsize=1024)
-def cut_evenly(count: int, threads: int, grain: int) -> list[Chunk]:
+def cut_evenly(count: int, threads: int, grain: int) -> Chunks:
     """Cut a grid into chunks of multiples of ``grain`` indices; the last may be smaller."""
     ends = np.minimum(np.ceil(_shares(threads) * (count / grain)).astype(np.int64) * grain, count)
-    return _chunks(np.unique(ends))
+    return Chunks(*_between(np.unique(ends)))
 
 
-def cut_by_load(load: Tensor, threads: int) -> list[Chunk]:
+def cut_by_load(load: Tensor, threads: int) -> Chunks:
     """Cut a grid into chunks of similar cost, heaviest first.
 
     Args:
@@ -59,44 +89,105 @@ def cut_by_load(load: Tensor, threads: int) -> list[Chunk]:
     running = load.numpy()
     last = np.searchsorted(running, _shares(threads) * float(running[-1]))
     ends = np.unique(np.append(np.minimum(last + 1, len(running)), len(running)))
-    costs = np.diff(running[ends - 1], prepend=0)
-    chunks = _chunks(ends)
-    return [chunks[k] for k in np.argsort(-costs, kind="stable").tolist()]
+    order = np.argsort(-np.diff(running[ends - 1], prepend=0), kind="stable")
+    firsts, sizes = _between(ends)
+    return Chunks(firsts[order], sizes[order])
 
 
-def _chunks(ends: np.ndarray) -> list[Chunk]:
-    begins = [0, *ends[:-1].tolist()]
-    return [(begin, end - begin) for begin, end in zip(begins, ends.tolist())]
+def _between(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first indices and the sizes of consecutive chunks."""
+    sizes = np.diff(ends, prepend=0)
+    return ends - sizes, sizes
 
 
 class HelperThreads:
-    """Helper threads that wait for jobs as long as the process lives."""
+    """Threads that take chunks of the same job (``kernels/native/sharing.h``).
+
+    A helper without work looks for the next job for a fraction of a millisecond, because waking it up would take longer
+    than most kernels run; then it sleeps.
+    """
 
     def __init__(self, flush_denormals: bool) -> None:
         # Either all threads flush denormals or none does, so that results do not depend on the thread.
         self.flush_denormals = flush_denormals
-        self.jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self.count = 0
+        self._wakes: SimpleQueue[bool] = SimpleQueue()
+        """For each helper that is to wake up: True to look for jobs, False to end."""
+        self._busy = threading.Lock()
+        self._shared = torch.zeros(JOB_SIZE, dtype=torch.int64)
+        self._job = self._shared.numpy()
+        self._arguments = bytearray(SHARED_ARGUMENTS)
+        self._address = ctypes.addressof(ctypes.c_char.from_buffer(self._arguments))
+        self._calls: dict[str, Callable[[], None]] = {}
 
-    def submit(self, job: Callable[[], None], copies: int) -> int:
-        """Let up to ``copies`` threads run ``job``, fewer where no more can be started; return their number."""
+    def share(self, kernel: CpuKernel, arguments: bytes, chunks: Chunks, threads: int, begin: int) -> bool:
+        """As :func:`share`."""
+        size = FIRST_SIZE + len(arguments)
+        if size > SHARED_ARGUMENTS or not self._busy.acquire(blocking=False):
+            return False
+        try:
+            if not self._calls and not self._prepare():
+                return False
+            firsts, bounds = chunks.firsts + np.int32(begin) if begin else chunks.firsts, chunks.bounds(kernel.bounds)
+            self._arguments[FIRST_SIZE:size] = arguments
+            seats = min(threads, len(chunks)) - 1
+            places = bounds.ctypes.data, bounds.shape[1], firsts.ctypes.data, self._address
+            self._job[ENTRY:SPINS] = kernel.address, *places, size, len(chunks), seats
+            self._wake(seats)
+            self._run(len(chunks))
+        finally:
+            self._busy.release()
+        return True
+
+    def _prepare(self) -> bool:
+        """Compile the kernels that share a job; return False if there is no room for them."""
+        calls = {}
         with suppress(NotEnoughMemory):
-            while self.count < copies:
+            for kernel in (kernels.share_job, kernels.await_job, kernels.serve_job):
+                cpu = prepared(kernel, lambda kernel=kernel: CpuKernel(kernel, (self._shared,)))
+                calls[kernel.key] = functools.partial(cpu, (self._shared,), 0, 1)
+            self._calls = calls
+        return bool(self._calls)
+
+    def _wake(self, helpers: int) -> None:
+        """Wake as many helpers as are missing, fewer where no more can be started."""
+        missing = helpers - int(self._job[AWAKE])
+        if missing <= 0:
+            return
+        with suppress(NotEnoughMemory):
+            while self.count < helpers:
                 addresses.start(threading.Thread(target=self._serve, name=f"warp-{self.count + 1}", daemon=True))
                 self.count += 1
-        copies = min(copies, self.count)
-        for _ in range(copies):
-            self.jobs.put(job)
-        return copies
+        # Threads that share a core would take it from each other while they look for jobs.
+        self._job[SPINS] = LOOKS if environment.available_threads() > helpers else 0
+        for _ in range(min(missing, self.count) - self._wakes.qsize()):
+            self._wakes.put(True)
+
+    def _run(self, chunks: int) -> None:
+        """Run the job. After an interrupt as well, return only when no helper writes to its tensors any more."""
+        job, before, interrupt = self._job, int(self._job[STATE]), None
+        while True:
+            try:
+                if job[STATE] == before:
+                    self._calls["share_job"]()
+                elif job[DONE] == chunks:
+                    break
+                else:
+                    time.sleep(0.0)
+                    self._calls["await_job"]()
+            except BaseException as error:
+                interrupt = error
+        if interrupt is not None:
+            raise interrupt
 
     def dismiss(self) -> None:
         for _ in range(self.count):
-            self.jobs.put(None)
+            self._wakes.put(False)
 
     def _serve(self) -> None:
         torch.set_flush_denormal(self.flush_denormals)
-        while (job := self.jobs.get()) is not None:
-            job()
+        while self._wakes.get():
+            self._calls["serve_job"]()
 
 
 helpers = HelperThreads(False)
@@ -112,54 +203,21 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forked)
 
 
-def share(call: Callable[[int, int], None], chunks: Sequence[Chunk], threads: int) -> None:
-    """Run ``call(first, size)`` once for each chunk, in this thread and up to ``threads - 1`` others.
+def share(kernel: CpuKernel, arguments: bytes, chunks: Chunks, threads: int, begin: int = 0) -> bool:
+    """Run each chunk of a grid once, in this thread and up to ``threads - 1`` others.
 
-    The function returns when all chunks are done, even if some helpers have not woken up yet. Such a helper finds
-    nothing to do and does not keep ``call`` and its tensors alive, because the next step needs their memory.
+    The function returns when all chunks are done, even if some helpers have not woken up yet.
+
+    Args:
+        arguments: those after ``first``, as ``kernel.pack`` returns them; the caller keeps their tensors alive.
+        begin: added to the chunks' first indices.
+
+    Returns:
+        False if nothing was run, because another thread shares a grid, or because there is no room.
     """
     global helpers
     flush = environment.configured()
     if helpers.flush_denormals != flush:
         helpers.dismiss()
         helpers = HelperThreads(flush)
-    ticket, finished, all_done = itertools.count(), itertools.count(1), threading.Lock()
-    all_done.acquire()
-    errors: list[BaseException] = []
-    calls = [call]
-
-    def work() -> None:
-        while (turn := next(ticket)) < len(chunks):
-            try:
-                calls[0](*chunks[turn])
-            except BaseException as error:  # raised again below, in the calling thread
-                errors.append(error)
-            if next(finished) == len(chunks):
-                all_done.release()
-
-    left = threading.Semaphore(0)
-
-    def help_out() -> None:
-        work()
-        left.release()
-
-    copies = helpers.submit(help_out, min(threads, len(chunks)) - 1)
-    try:
-        work()
-        all_done.acquire()
-    except BaseException:  # after an interrupt, helpers may still write to memory that would be freed
-        _acquire_all(left, copies)
-        raise
-    finally:
-        calls.clear()
-    if errors:
-        raise errors[0]
-
-
-def _acquire_all(semaphore: threading.Semaphore, count: int) -> None:
-    while count > 0:
-        try:
-            semaphore.acquire()
-            count -= 1
-        except KeyboardInterrupt:
-            continue
+    return helpers.share(kernel, arguments, chunks, threads, begin)

@@ -7,47 +7,18 @@ begins. On CUDA the whole grid is launched at once, on torch's current stream.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import torch
 import warp as wp
 
 from . import environment
+from .cpu_kernel import CpuKernel
 from .cpu_threads import cut_by_load, cut_evenly, share
 from .cuda_graph import warp_stream
 from .cuda_launch import RecordedKernel
-from .kernel_arguments import ArgumentPacker, warp_arguments
+from .kernel_arguments import warp_arguments
 from .kernel_cache import prepared
-
-CPU = torch.device("cpu")
-
-
-class CpuKernel:
-    """A kernel prepared for the CPU: its compiled entry point, and the packer of its arguments."""
-
-    def __init__(self, kernel: wp.Kernel, args: tuple) -> None:
-        self.kernel = kernel
-        inputs = [0, *warp_arguments(kernel, args)]
-        self._command: Any = wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True)  # compiles it
-        self._entry = self._command.hooks.forward
-        params = self._command.params
-        self._bounds = functools.lru_cache(maxsize=4096)(lambda size: bytes(type(params[0])((size,))))
-        self.pack = ArgumentPacker(kernel, params[1:], CPU).pack
-
-    def bind(self, arguments: bytes, tensors: tuple, begin: int = 0) -> Callable[[int, int], None]:
-        """Return a function that runs one chunk of the grid, and that keeps the tensors alive.
-
-        Its arguments are the chunk's first index, counted from ``begin``, and the chunk's size.
-        """
-        entry, bounds = self._entry, self._bounds
-
-        def call(first: int, size: int, _tensors: tuple = tensors) -> None:
-            entry(bounds(size), (begin + first).to_bytes(4, "little") + arguments)
-
-        return call
-
 
 _cpu_kernels: dict[wp.Kernel, CpuKernel] = {}
 _cuda_kernels: dict[tuple[wp.Kernel, int | None, int], RecordedKernel] = {}
@@ -83,12 +54,12 @@ def launch(
     cpu = _cpu_kernels.get(kernel)
     if cpu is None:
         cpu = _cpu_kernels[kernel] = prepared(kernel, lambda: CpuKernel(kernel, args))
-    call = cpu.bind(cpu.pack(args), args, begin)
     threads = min(environment.thread_count(), -(-count // grain))
-    if threads <= 1:
-        call(0, count)
-    else:
-        share(call, cut_evenly(count, threads, grain) if load is None else cut_by_load(load, threads), threads)
+    if threads > 1:
+        chunks = cut_evenly(count, threads, grain) if load is None else cut_by_load(load, threads)
+        if share(cpu, cpu.pack(args), chunks, threads, begin):
+            return
+    cpu(args, begin, count)
 
 
 def _launch_on_cuda(

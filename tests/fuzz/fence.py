@@ -126,19 +126,13 @@ def fenced() -> Iterator[Fence]:
     """Fence launches on the CPU; the thread count must be 1."""
     global current
     fence, kernels = Fence(), launch.CpuKernel
-    bind = kernels.bind
+    call = kernels.__call__
 
-    def bound(self: Any, arguments: bytes, tensors: tuple, begin: int) -> Callable[[int, int], None]:
-        def call(first: int, size: int) -> None:
-            def go(args: tuple) -> None:
-                bind(self, self.pack(args), args, begin)(first, size)
+    def guarded(self: Any, args: tuple, begin: int, size: int) -> None:
+        fence.run(self.kernel, parameters_of(self.kernel), args, lambda moved: call(self, moved, begin, size))
 
-            fence.run(self.kernel, parameters_of(self.kernel), tensors, go)
-
-        return call
-
-    kernels.bind, current = bound, fence  # type: ignore[method-assign]
+    kernels.__call__, current = guarded, fence  # type: ignore[method-assign]
     try:
         yield fence
     finally:
-        kernels.bind, current = bind, None  # type: ignore[method-assign]
+        kernels.__call__, current = call, None  # type: ignore[method-assign]

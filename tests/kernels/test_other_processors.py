@@ -20,7 +20,7 @@ STAGES = (
 )  # fmt: skip
 LEFT_OUT = "gsplat or thread or wrong or any_s or many_splats or refus or not_fit or nothing_to_do or in_parts"
 """Tests that do not concern the processor, or that take long where it is emulated."""
-NOT_RUN = {"roofline"}
+NOT_RUN = {"roofline", "sharing"}
 """Modules that compute nothing."""
 
 

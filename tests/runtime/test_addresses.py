@@ -9,6 +9,7 @@ from concurrent.futures import Future
 
 import pytest
 
+from helpers.python_kernel import PythonKernel, single_chunks
 from scgs_warp.apps import cli
 from scgs_warp.data.cache import ImageCache
 from scgs_warp.data.images import parallel_map
@@ -118,22 +119,8 @@ def test_a_grid_is_computed_without_helpers(monkeypatch: pytest.MonkeyPatch, how
         monkeypatch.setattr(threading.Thread, "start", refuse)
     monkeypatch.setattr(cpu_threads, "helpers", cpu_threads.HelperThreads(cpu_threads.environment.configured()))
     done: list[int] = []
-    cpu_threads.share(lambda first, size: done.append(first), [(k, 1) for k in range(9)], 4)
+    assert cpu_threads.share(PythonKernel(lambda first, size: done.append(first)), b"", single_chunks(9), 4)
     assert done == list(range(9)) and cpu_threads.helpers.count == 0
-    with pytest.raises(KeyboardInterrupt):  # it waits for no helper that was never there
-        cpu_threads.share(lambda first, size: None, Interrupted([(0, 1), (1, 1)]), 4)
-
-
-class Interrupted(list):
-    """A list of chunks whose length is told once."""
-
-    asked = 0
-
-    def __len__(self) -> int:
-        self.asked += 1
-        if self.asked > 1:
-            raise KeyboardInterrupt
-        return super().__len__()
 
 
 def test_images_are_read_without_threads(monkeypatch: pytest.MonkeyPatch):

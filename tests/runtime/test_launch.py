@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 import threading
 import time
-import weakref
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
+from helpers.python_kernel import PythonKernel, single_chunks
 from scgs_warp.runtime import cpu_threads, environment
-from scgs_warp.runtime.cpu_threads import cut_by_load, cut_evenly, share
+from scgs_warp.runtime.cpu_threads import Chunks, cut_by_load, cut_evenly, share
 from scgs_warp.runtime.launch import launch
 
 
@@ -92,7 +92,7 @@ def test_many_shapes(all_threads: None):
         assert bool((arguments[-1][:, 0] > 1000.0).all()), count
 
 
-def covered(chunks: list[tuple[int, int]]) -> list[int]:
+def covered(chunks: Chunks) -> list[int]:
     return sorted(i for begin, size in chunks for i in range(begin, begin + size))
 
 
@@ -137,56 +137,85 @@ def test_chunks_of_no_load(load: list[int]):
     assert covered(cut_by_load(torch.tensor(load), 2)) == list(range(len(load)))
 
 
-def test_an_error_in_a_chunk_comes_back_after_all_others_ran():
-    ran: list[int] = []
+@pytest.fixture
+def own_helpers(monkeypatch: pytest.MonkeyPatch) -> cpu_threads.HelperThreads:
+    helpers = cpu_threads.HelperThreads(environment.configured())
+    monkeypatch.setattr(cpu_threads, "helpers", helpers)
+    return helpers
+
+
+@pytest.mark.parametrize("begin", [0, 1000])
+@pytest.mark.parametrize("count", [1, 2, 3, 300])
+def test_every_chunk_runs_once(own_helpers, count: int, begin: int):
+    for _ in range(20):
+        ran: list[int] = []
+        assert share(PythonKernel(lambda first, size, ran=ran: ran.append(first)), b"", single_chunks(count), 3, begin)
+        assert sorted(ran) == list(range(begin, begin + count))
+
+
+def test_only_as_many_threads_as_asked_share(own_helpers):
+    """Others, which an earlier job has started, are awake and stay away."""
+    own: set[int] = set()
 
     def call(first: int, size: int) -> None:
-        ran.append(first)
-        if first == 3:
-            raise ValueError("chunk 3")
+        own.add(threading.get_ident())
+        time.sleep(0.001)
 
-    with pytest.raises(ValueError, match="chunk 3"):
-        share(call, [(k, 1) for k in range(10)], 3)
-    assert sorted(ran) == list(range(10))
+    assert share(PythonKernel(call), b"", single_chunks(40), 4)
+    assert own_helpers.count == 3 and len(own) == 4
+    own.clear()
+    assert share(PythonKernel(call), b"", single_chunks(40), 2)
+    assert len(own) == 2
 
 
-def test_nobody_waits_for_a_helper_that_found_nothing(monkeypatch: pytest.MonkeyPatch):
-    """The only helper is busy with another job: the asking thread does its own job alone."""
-    monkeypatch.setattr(cpu_threads, "helpers", cpu_threads.HelperThreads(environment.configured()))
+def test_a_sleeping_helper_wakes_up(own_helpers):
+    for _ in range(3):
+        own: set[int] = set()
+
+        def call(first: int, size: int, own=own) -> None:
+            own.add(threading.get_ident())
+            time.sleep(0.001)
+
+        assert share(PythonKernel(call), b"", single_chunks(40), 2)
+        assert len(own) == 2
+        ends = time.monotonic() + 10
+        while own_helpers._job[cpu_threads.AWAKE]:
+            assert time.monotonic() < ends, "it never sleeps"
+            time.sleep(0.001)
+
+
+def test_threads_that_share_a_core_do_not_look_for_jobs(own_helpers, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(environment, "available_threads", lambda: 1)
+    ran: list[int] = []
+    assert share(PythonKernel(lambda first, size: ran.append(first)), b"", single_chunks(9), 2)
+    assert sorted(ran) == list(range(9)) and own_helpers._job[cpu_threads.SPINS] == 0
+
+
+def test_a_second_grid_meanwhile_runs_alone(all_threads: None, own_helpers):
+    environment.configure(2)
     hold, started = threading.Event(), threading.Event()
 
     def slow(first: int, size: int) -> None:
-        if threading.current_thread() is asking:
-            assert started.wait(10)
-        else:
-            started.set()
-            assert hold.wait(10)
+        started.set()
+        assert hold.wait(10)
 
-    asking = threading.Thread(target=lambda: share(slow, [(0, 1), (1, 1)], 2))
+    asking = threading.Thread(target=lambda: share(PythonKernel(slow), b"", single_chunks(2), 2))
     asking.start()
     assert started.wait(10)
-    ran = torch.zeros(2)
-    share(lambda first, size, ran=ran: ran[first : first + size].add_(1.0), [(0, 1), (1, 1)], 2)
-    assert ran.tolist() == [1.0, 1.0] and not hold.is_set()
-    memory = weakref.ref(ran)
-    del ran
-    assert memory() is None, "a helper that has not woken up yet holds on to the tensors"
+    assert not share(PythonKernel(lambda first, size: None), b"", single_chunks(2), 2)
+    arguments = mixed_arguments(37)
+    launch(mixed, 37, *arguments, grain=1)
+    assert bool((arguments[-1][:, 0] > 1000.0).all()) and not hold.is_set()
     hold.set()
     asking.join(10)
     assert not asking.is_alive()
+    assert share(PythonKernel(lambda first, size: None), b"", single_chunks(2), 2)
 
 
-def test_an_interrupt_waits_until_no_helper_writes_any_more(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cpu_threads, "helpers", cpu_threads.HelperThreads(environment.configured()))
-    started, ended = threading.Event(), threading.Event()
-
-    class Interrupted(list):
-        """A list of chunks whose length the asking thread fails to learn, once a helper is at work."""
-
-        def __len__(self) -> int:
-            if threading.current_thread() is threading.main_thread() and started.is_set():
-                raise KeyboardInterrupt
-            return super().__len__()
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_an_interrupt_waits_until_no_helper_writes_any_more(when: str, own_helpers, monkeypatch: pytest.MonkeyPatch):
+    """It comes before the chunks are offered, or while a helper still works."""
+    started, ended, interrupted = threading.Event(), threading.Event(), threading.Event()
 
     def call(first: int, size: int) -> None:
         if threading.current_thread() is threading.main_thread():
@@ -196,19 +225,31 @@ def test_an_interrupt_waits_until_no_helper_writes_any_more(monkeypatch: pytest.
             time.sleep(0.2)
             ended.set()
 
+    share(PythonKernel(lambda first, size: None), b"", single_chunks(2), 2)
+    offer = own_helpers._calls["share_job"]
+
+    def interrupt() -> None:
+        if when == "before" and not interrupted.is_set():
+            interrupted.set()
+            raise KeyboardInterrupt
+        offer()
+        if when == "after":
+            raise KeyboardInterrupt
+
+    monkeypatch.setitem(own_helpers._calls, "share_job", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        share(call, Interrupted([(0, 1), (1, 1), (2, 1)]), 2)
+        share(PythonKernel(call), b"", single_chunks(2), 2)
     assert ended.is_set()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_forked_child_starts_threads_of_its_own():
-    share(lambda first, size: None, [(0, 1), (1, 1)], 2)
+    share(PythonKernel(lambda first, size: None), b"", single_chunks(2), 2)
     child = os.fork()
     if child == 0:
         done: list[int] = []
-        share(lambda first, size: done.append(first), [(k, 1) for k in range(4)], 2)
+        ran = share(PythonKernel(lambda first, size: done.append(first)), b"", single_chunks(4), 2)
         own = any(thread.name.startswith("warp-") for thread in threading.enumerate())
-        os._exit(0 if sorted(done) == [0, 1, 2, 3] and own else 1)
+        os._exit(0 if ran and sorted(done) == [0, 1, 2, 3] and own else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
