@@ -341,6 +341,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "sharpness": change_of_defaults,
     "fast-parts": change_of_defaults,
     "halved": change_of_defaults,
+    "faint": change_of_defaults,
     "levers": levers,
     "levers-today": differences,
     "exposure": exposure,
