@@ -7,6 +7,7 @@ known beforehand, chunks are cut by cost and the heaviest come first.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import functools
 import os
@@ -110,7 +111,7 @@ class HelperThreads:
     def __init__(self, flush_denormals: bool) -> None:
         # Either all threads flush denormals or none does, so that results do not depend on the thread.
         self.flush_denormals = flush_denormals
-        self.count = 0
+        self._threads: list[threading.Thread] = []
         self._wakes: SimpleQueue[bool] = SimpleQueue()
         """For each helper that is to wake up: True to look for jobs, False to end."""
         self._busy = threading.Lock()
@@ -119,6 +120,11 @@ class HelperThreads:
         self._arguments = bytearray(SHARED_ARGUMENTS)
         self._address = ctypes.addressof(ctypes.c_char.from_buffer(self._arguments))
         self._calls: dict[str, Callable[[], None]] = {}
+
+    @property
+    def count(self) -> int:
+        """Number of helpers that have been started."""
+        return len(self._threads)
 
     def share(self, kernel: CpuKernel, arguments: bytes, chunks: Chunks, threads: int, begin: int) -> bool:
         """As :func:`share`."""
@@ -156,8 +162,9 @@ class HelperThreads:
             return
         with suppress(NotEnoughMemory):
             while self.count < helpers:
-                addresses.start(threading.Thread(target=self._serve, name=f"warp-{self.count + 1}", daemon=True))
-                self.count += 1
+                thread = threading.Thread(target=self._serve, name=f"warp-{self.count + 1}", daemon=True)
+                addresses.start(thread)
+                self._threads.append(thread)
         # Threads that share a core would take it from each other while they look for jobs.
         self._job[SPINS] = LOOKS if environment.available_threads() > helpers else 0
         for _ in range(min(missing, self.count) - self._wakes.qsize()):
@@ -181,8 +188,16 @@ class HelperThreads:
             raise interrupt
 
     def dismiss(self) -> None:
+        """Let the helpers end."""
+        self._job[SPINS] = 0
         for _ in range(self.count):
             self._wakes.put(False)
+
+    def end(self) -> None:
+        """Let the helpers end, and wait for them: none may run compiled code that is being unloaded."""
+        self.dismiss()
+        for thread in self._threads:
+            thread.join(1.0)
 
     def _serve(self) -> None:
         torch.set_flush_denormal(self.flush_denormals)
@@ -199,6 +214,7 @@ def _forked() -> None:
     helpers = HelperThreads(helpers.flush_denormals)
 
 
+atexit.register(lambda: helpers.end())
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forked)
 

@@ -153,32 +153,31 @@ def test_every_chunk_runs_once(own_helpers, count: int, begin: int):
         assert sorted(ran) == list(range(begin, begin + count))
 
 
-def test_only_as_many_threads_as_asked_share(own_helpers):
-    """Others, which an earlier job has started, are awake and stay away."""
+def seen_by(threads: int) -> set[int]:
+    """Share a grid whose chunks wait until ``threads`` have come; return the threads that ran any."""
     own: set[int] = set()
+    ends = time.monotonic() + 20
 
     def call(first: int, size: int) -> None:
         own.add(threading.get_ident())
+        while len(own) < threads and time.monotonic() < ends:
+            time.sleep(0.001)
         time.sleep(0.001)
 
-    assert share(PythonKernel(call), b"", single_chunks(40), 4)
-    assert own_helpers.count == 3 and len(own) == 4
-    own.clear()
-    assert share(PythonKernel(call), b"", single_chunks(40), 2)
-    assert len(own) == 2
+    assert share(PythonKernel(call), b"", single_chunks(40), threads)
+    return own
+
+
+def test_only_as_many_threads_as_asked_share(own_helpers):
+    """Others, which an earlier job has started, are awake and stay away."""
+    assert len(seen_by(4)) == 4 and own_helpers.count == 3
+    assert len(seen_by(2)) == 2
 
 
 def test_a_sleeping_helper_wakes_up(own_helpers):
     for _ in range(3):
-        own: set[int] = set()
-
-        def call(first: int, size: int, own=own) -> None:
-            own.add(threading.get_ident())
-            time.sleep(0.001)
-
-        assert share(PythonKernel(call), b"", single_chunks(40), 2)
-        assert len(own) == 2
-        ends = time.monotonic() + 10
+        assert len(seen_by(2)) == 2
+        ends = time.monotonic() + 20
         while own_helpers._job[cpu_threads.AWAKE]:
             assert time.monotonic() < ends, "it never sleeps"
             time.sleep(0.001)
@@ -240,6 +239,16 @@ def test_an_interrupt_waits_until_no_helper_writes_any_more(when: str, own_helpe
     with pytest.raises(KeyboardInterrupt):
         share(PythonKernel(call), b"", single_chunks(2), 2)
     assert ended.is_set()
+
+
+def test_at_the_end_no_helper_runs_any_more(own_helpers):
+    """Not even one that would look for jobs for ever."""
+    assert share(PythonKernel(lambda first, size: time.sleep(0.001)), b"", single_chunks(40), 3)
+    threads = [thread for thread in threading.enumerate() if thread in own_helpers._threads]
+    assert len(threads) == 2
+    own_helpers._job[cpu_threads.SPINS] = 1 << 40
+    own_helpers.end()
+    assert not any(thread.is_alive() for thread in threads)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
