@@ -14,7 +14,7 @@ def share_chunks(job: wp.array[wp.int64]): ...
 
 
 @native_function("sharing.h")
-def await_chunks(job: wp.array[wp.int64]): ...
+def finish_chunks(job: wp.array[wp.int64]): ...
 
 
 @native_function("sharing.h")
@@ -27,18 +27,18 @@ def share_job(
     # In and out:
     job: wp.array[wp.int64],
 ):
-    """Offer the chunks of a job to the helpers, and run them together. Grid: 1."""
+    """Offer the chunks of a job, and run them with the helpers if enough of these are awake. Grid: 1."""
     share_chunks(job)
 
 
 @wp.kernel
-def await_job(
+def finish_job(
     first: int,
     # In and out:
     job: wp.array[wp.int64],
 ):
-    """Wait some microseconds for the end of a job. Grid: 1."""
-    await_chunks(job)
+    """Run the remaining chunks, and wait some microseconds for those of others. Grid: 1."""
+    finish_chunks(job)
 
 
 @wp.kernel

@@ -44,7 +44,7 @@ static inline void run_chunk(const word* job, unsigned chunk) {
 
 // Take a chunk and run it; return whether there was one. ``own`` is the number of the job that the thread has joined.
 static inline bool take_chunk(word* job, word& own) {
-    word state = __atomic_load_n(job + STATE, __ATOMIC_ACQUIRE);
+    word state = __atomic_load_n(job + STATE, __ATOMIC_SEQ_CST);
     for (;;) {
         const unsigned next = state & 0xffff, count = state >> NEXT_BITS & 0xffff;
         if (next >= count) return false;
@@ -62,36 +62,37 @@ static inline bool take_chunk(word* job, word& own) {
     }
 }
 
-// Wait until all chunks are done, or give up.
-static inline void await_chunks(const wp::array_t<wp::int64>& shared) {
-    const word* job = (const word*)shared.data;
+// Run chunks of the offered job as long as there are any, then wait some microseconds for the others.
+static inline void finish_chunks(const wp::array_t<wp::int64>& shared) {
+    word* job = (word*)shared.data;
+    for (word own = job[STATE] >> JOB_SHIFT; take_chunk(job, own);) {
+    }
     for (word k = 0; k < 1000 && __atomic_load_n(job + DONE, __ATOMIC_ACQUIRE) != job[CHUNKS]; ++k) pause_a_little();
 }
 
-// Offer the chunks to the helpers, and run them with those that come.
+// Offer the chunks of a new job, and run them with the helpers if enough of these are awake. If not, the caller wakes
+// some up before it finishes the job: a helper that woke up too early would sleep again.
 static inline void share_chunks(const wp::array_t<wp::int64>& shared) {
     word* job = (word*)shared.data;
     const word own = ((job[STATE] >> JOB_SHIFT) + 1) & 0xffffff;
     __atomic_store_n(job + DONE, 0ull, __ATOMIC_RELAXED);
     const word state = own << JOB_SHIFT | job[SEATS] << SEAT_SHIFT | job[CHUNKS] << NEXT_BITS;
-    __atomic_store_n(job + STATE, state, __ATOMIC_RELEASE);
-    for (word joined = own; take_chunk(job, joined);) {
-    }
-    await_chunks(shared);
+    __atomic_store_n(job + STATE, state, __ATOMIC_SEQ_CST);
+    if (__atomic_load_n(job + AWAKE, __ATOMIC_SEQ_CST) >= job[SEATS]) finish_chunks(shared);
 }
 
 // Help with every job until none has come for a while.
 static inline void serve_chunks(const wp::array_t<wp::int64>& shared) {
     word* job = (word*)shared.data;
     word own = ~0ull;
-    __atomic_fetch_add(job + AWAKE, 1ull, __ATOMIC_ACQ_REL);
+    __atomic_fetch_add(job + AWAKE, 1ull, __ATOMIC_SEQ_CST);
     for (word k = 0; k < job[SPINS]; ++k) {
         if (take_chunk(job, own))
             k = 0;
         else
             pause_a_little();
     }
-    __atomic_fetch_sub(job + AWAKE, 1ull, __ATOMIC_ACQ_REL);
+    __atomic_fetch_sub(job + AWAKE, 1ull, __ATOMIC_SEQ_CST);
     while (take_chunk(job, own)) {
     }  // one that has just been offered
 }

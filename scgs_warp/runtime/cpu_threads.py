@@ -139,8 +139,7 @@ class HelperThreads:
             seats = min(threads, len(chunks)) - 1
             places = bounds.ctypes.data, bounds.shape[1], firsts.ctypes.data, self._address
             self._job[ENTRY:SPINS] = kernel.address, *places, size, len(chunks), seats
-            self._wake(seats)
-            self._run(len(chunks))
+            self._run(len(chunks), seats)
         finally:
             self._busy.release()
         return True
@@ -149,7 +148,7 @@ class HelperThreads:
         """Compile the kernels that share a job; return False if there is no room for them."""
         calls = {}
         with suppress(NotEnoughMemory):
-            for kernel in (kernels.share_job, kernels.await_job, kernels.serve_job):
+            for kernel in (kernels.share_job, kernels.finish_job, kernels.serve_job):
                 cpu = prepared(kernel, lambda kernel=kernel: CpuKernel(kernel, (self._shared,)))
                 calls[kernel.key] = functools.partial(cpu, (self._shared,), 0, 1)
             self._calls = calls
@@ -170,18 +169,21 @@ class HelperThreads:
         for _ in range(min(missing, self.count) - self._wakes.qsize()):
             self._wakes.put(True)
 
-    def _run(self, chunks: int) -> None:
+    def _run(self, chunks: int, helpers: int) -> None:
         """Run the job. After an interrupt as well, return only when no helper writes to its tensors any more."""
-        job, before, interrupt = self._job, int(self._job[STATE]), None
+        job, before, called, interrupt = self._job, int(self._job[STATE]), False, None
         while True:
             try:
                 if job[STATE] == before:
                     self._calls["share_job"]()
                 elif job[DONE] == chunks:
                     break
+                elif not called:
+                    called = True
+                    self._wake(helpers)
                 else:
+                    self._calls["finish_job"]()
                     time.sleep(0.0)
-                    self._calls["await_job"]()
             except BaseException as error:
                 interrupt = error
         if interrupt is not None:
