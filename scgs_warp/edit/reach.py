@@ -12,12 +12,11 @@ from .rotations import conjugate, exponential, logarithm, multiply, rotate, to_m
 
 OFF_AXIS = 4.0
 """Cost of a turn across the axis about which the motion turned an inner joint, relative to a turn about it: a knee
-bends forwards. The first joint swings in any direction alike."""
+bends forwards. The first joint swings in any direction alike, but a twist about the line to the last joint costs as
+much more: the place of a hand leaves this twist open, and the least turn from hand to hand would roll the upper arm."""
 BEND = 10.0
-"""Cost of a turn of any joint but the first, relative to a swing of the first: a limb swings as a whole, and its inner
-joints bend as far as the distance of the place requires. A twist of the first joint about its own bone, which leads to
-the next joint, costs as much. The place of a hand leaves this twist open; the least turn of shoulder and hand would
-roll the upper arm."""
+"""Cost of a turn of any joint but the first, relative to one of the first: a limb swings as a whole, and its inner
+joints bend as far as the distance of the place requires."""
 SLIDE = 300.0
 """Cost of a squared shift of the first joint, in lengths of the chain, relative to squared angles. A nearly straight
 limb bends a lot for a small change of distance, so that a joint beside its true place would bend the elbow of an arm
@@ -60,7 +59,7 @@ def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -
     """Return the pose of a chain that takes a point to a place, or as near as the chain reaches.
 
     Among the poses that reach it, the one that differs least from the present one is taken: the sum of squared angles
-    is least, where angles of inner joints and a twist of the first count ``BEND`` times, those across known axes
+    is least, where angles of inner joints count ``BEND`` times, those across their known axes and a twist of the first
     ``OFF_AXIS`` times more, and a shift of the first joint counts ``SLIDE`` times. The result depends on the arguments
     alone.
 
@@ -89,12 +88,11 @@ def _cost(axis: np.ndarray | None) -> np.ndarray:
 
 
 def _swing_cost(links: list[Link]) -> np.ndarray:
-    """Return the quadratic form [3, 3] of the first joint's cost; a chain of one joint has no bone to twist."""
-    if len(links) < 2:
-        return np.eye(3)
-    bone = rotate(links[0].quat, links[1].joint + links[1].shift - links[0].joint)
-    length = float(np.linalg.norm(bone))
-    return np.eye(3) if length < 1e-9 else np.eye(3) + (BEND - 1.0) * np.outer(bone, bone) / length**2
+    """Return the quadratic form [3, 3] of the first joint's cost: a twist about the line to the last joint costs
+    ``OFF_AXIS`` times more than a swing. A chain of one joint has no such line."""
+    bone = rotate(links[0].quat, links[-1].joint - links[0].joint)
+    length2 = float(bone @ bone)
+    return np.eye(3) if length2 < 1e-18 else np.eye(3) + (OFF_AXIS - 1.0) * np.outer(bone, bone) / length2
 
 
 def posed_chain(links: list[Link], pose: Reached, base: Rigid, grip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

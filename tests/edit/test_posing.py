@@ -115,11 +115,11 @@ def test_a_pull_costs_no_more_than_a_general_minimiser_finds(seed):
     ours = reach(links, base, grip, place)
     assert np.linalg.norm(posed_chain(links, ours, base, grip)[1] - place) < 4e-3
 
-    bone = rotate(links[0].quat, joints[1] - joints[0])
+    bone = rotate(links[0].quat, joints[2] - joints[0])
     bone /= np.linalg.norm(bone)
 
     def cost(vector: np.ndarray) -> float:
-        total = SLIDE * float(vector[:3] @ vector[:3]) / length**2 + (BEND - 1.0) * float(vector[3:6] @ bone) ** 2
+        total = SLIDE * float(vector[:3] @ vector[:3]) / length**2 + (OFF_AXIS - 1.0) * float(vector[3:6] @ bone) ** 2
         for row, (link, turn) in enumerate(zip(links, vector[3:].reshape(-1, 3))):
             off = np.zeros(3) if link.axis is None or not row else turn - (turn @ link.axis) * link.axis
             total += (turn @ turn + (OFF_AXIS - 1.0) * off @ off) * (BEND if row else 1.0)
@@ -166,7 +166,7 @@ def test_a_swing_does_not_roll_a_bent_limb(degrees):
     grip, swing = np.array([1.8, 0.0, 0.6]), from_axis((0, 0, 1), degrees)
     found = reach(links, Rigid.none(), grip, rotate(swing, grip))
     off = np.degrees(np.linalg.norm(logarithm(multiply(found.turns[0], conjugate(swing)))))
-    assert off < 0.2 * degrees and np.degrees(np.linalg.norm(logarithm(found.turns[1]))) < 0.1 * degrees
+    assert off < 0.3 * degrees and np.degrees(np.linalg.norm(logarithm(found.turns[1]))) < 0.1 * degrees
 
 
 def test_a_pull_takes_the_grip_and_leaves_the_trunk(session):
