@@ -9,9 +9,12 @@ track best, and is compared with the part of the nearest opaque Gaussian. Bones 
 against their parent count as one with it. Parts and bones are matched one to one; a point of a part that matches no
 bone, or another bone than the point's, disagrees.
 
-Rows hold `run`, `bone` (`all` for the run's `agreement`, `parts`, `bones` and processor `seconds` of finding them), and
-for each bone whose joint was found `joint_error` in percent of the height, and `axis_error` in degrees where both the
-truth and the run have an axis and the bone turns by more than 20 degrees.
+Rows hold `run` and `bone`. Those of bone `all` hold the run's `agreement`, `parts`, `bones`, processor `seconds` of
+finding them, and `tracked`: the share of points whose nearest Gaussian moves, in the trained motion, more like the true
+bone than like any other. A surface that looks the same however it turns, such as a ball at a joint, need not. Rows of
+bones hold the same for their own `points` (share of all), their `turn` against their parent, and `trained_turn`, that
+of the Gaussians nearest to their points. Where the joint was found they hold `joint_error` in percent of the height,
+and `axis_error` in degrees if both the truth and the run have an axis and the bone turns by more than 20 degrees.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ from scgs_warp.data.synthetic.from_mesh import span_of
 from scgs_warp.data.synthetic.mesh import MeshSubject
 from scgs_warp.data.synthetic.shading import Shading
 from scgs_warp.edit import EditSession
-from scgs_warp.edit.rotations import from_matrix, logarithm
+from scgs_warp.edit.rotations import from_matrix, logarithm, rigid_fit, to_matrix
 from scgs_warp.runtime.environment import configure
 from scgs_warp.runtime.provenance import command_line, provenance
 from scgs_warp.scene.scene import Scene
@@ -115,6 +118,19 @@ def true_labels(bones: Bones, points: np.ndarray, times: np.ndarray) -> np.ndarr
     return np.asarray(errors).argmin(0)
 
 
+class Surface(NamedTuple):
+    """Points of the true surface that a training view sees, and the Gaussians nearest to them."""
+
+    bone: np.ndarray
+    """[P] true bone; bones that hardly turn count as their parents."""
+    part: np.ndarray
+    """[P] part of the nearest Gaussian."""
+    tracked: np.ndarray
+    """[P] bone whose motion explains the nearest Gaussian's track best."""
+    tracks: np.ndarray
+    """[T, P, 3] nearest Gaussians at the compared instants."""
+
+
 def rows_of(run: Path, bones: Bones, data: Path) -> list[dict[str, Any]]:
     with np.load(data / "ground_truth.npz") as truth:
         seen = truth["visible"].any(0)
@@ -124,40 +140,69 @@ def rows_of(run: Path, bones: Bones, data: Path) -> list[dict[str, Any]]:
     for bone in sorted(whole, key=lambda b: _depth(bones, b)):
         if turns[bone] < LEAST_TURN:
             whole[bone] = whole[bones.parents[bone]]
-    labels = np.array(whole)[true_labels(bones, points, times)]
     session = EditSession(Scene.load(run, device="cpu"))
     begin = time.process_time()
     skeleton = session._find(None)
     seconds = time.process_time() - begin
     session._found[None] = skeleton
+    surface = _surface(session, bones, np.array(whole), points, times)
+    table = np.zeros((len(skeleton.parts), len(whole)), np.int64)
+    np.add.at(table, (surface.part, surface.bone), 1)
+    parts, own = linear_sum_assignment(-table)
+    matched = {int(b): int(p) for p, b in zip(parts, own) if table[p, b] > 0}
+    rows: list[dict[str, Any]] = [{
+        "run": run.name, "bone": "all", "agreement": float(table[parts, own].sum() / len(surface.bone)),
+        "parts": len(skeleton.parts), "bones": len(np.unique(surface.bone)), "seconds": seconds,
+        "tracked": float((surface.tracked == surface.bone).mean()),
+    }]  # fmt: skip
+    start = bones.at(0.0)
+    for bone in np.unique(surface.bone).tolist():
+        above = whole[bones.parents[bone]] if bones.parents[bone] >= 0 else -1
+        mine, has = surface.bone == bone, matched.get(bone, -1)
+        row: dict[str, Any] = {
+            "run": run.name, "bone": bones.names[bone], "points": float(mine.mean()),
+            "agreement": float((surface.part[mine] == has).mean()),
+            "tracked": float((surface.tracked[mine] == bone).mean()),
+        }  # fmt: skip
+        if (surface.bone == above).any():
+            row["turn"], row["trained_turn"] = turns[bone], _trained_turn(surface, bone, above)
+        if bone in matched and above in matched:
+            one, other = skeleton.parts[has], skeleton.parts[matched[above]]
+            joint = one if one.parent == other.name else other if other.parent == one.name else None
+            row["found"] = joint is not None
+            if joint is not None:
+                row["joint_error"] = 100.0 * float(np.linalg.norm(joint.joint - start[bone, :3, 3])) / height
+                axis = main_axis(relative_turns(bones, bone), start[bones.parents[bone], :3, :3])
+                if axis is not None and joint.axis is not None and turns[bone] > LEAST_AXIS_TURN:
+                    row["axis_error"] = math.degrees(math.acos(min(1.0, abs(float(np.dot(axis, joint.axis))))))
+        rows.append(row)
+    return rows
+
+
+def _surface(session: EditSession, bones: Bones, whole: np.ndarray, points: np.ndarray, times: np.ndarray) -> Surface:
+    """Compare the true surface's tracks [T, P, 3] with the nearest Gaussians.
+
+    Args:
+        whole: [B] the bone as which each counts.
+    """
     gaussians = session.scene.gaussians_at(float(times[0]))
     solid = np.flatnonzero((gaussians.opacities > 0.5).cpu().numpy())
     nearest = solid[cKDTree(gaussians.means.double().cpu().numpy()[solid]).query(points[0])[1]]
-    table = np.zeros((len(skeleton.parts), len(whole)), np.int64)
-    np.add.at(table, (session.gaussian_parts()[nearest], labels), 1)
-    parts, own = linear_sum_assignment(-table)
-    matched = {int(b): skeleton.parts[p] for p, b in zip(parts, own) if table[p, b] > 0}
-    agreement = float(table[parts, own].sum() / len(labels))
-    rows: list[dict[str, Any]] = [{
-        "run": run.name, "bone": "all", "agreement": agreement, "parts": len(skeleton.parts),
-        "bones": len(set(labels.tolist())), "seconds": seconds,
-    }]  # fmt: skip
-    start = bones.at(0.0)
-    for bone, part in matched.items():
-        above = whole[bones.parents[bone]] if bones.parents[bone] >= 0 else -1
-        other = matched.get(above)
-        if whole[bone] != bone or other is None or other is part:
-            continue
-        joint = part if part.parent == other.name else other if other.parent == part.name else None
-        row: dict[str, Any] = {"run": run.name, "bone": bones.names[bone], "turn": turns[bone]}
-        row["found"] = joint is not None
-        if joint is not None:
-            row["joint_error"] = 100.0 * float(np.linalg.norm(joint.joint - start[bone, :3, 3])) / height
-            axis = main_axis(relative_turns(bones, bone), start[bones.parents[bone], :3, :3])
-            if axis is not None and joint.axis is not None and turns[bone] > LEAST_AXIS_TURN:
-                row["axis_error"] = math.degrees(math.acos(min(1.0, abs(float(np.dot(axis, joint.axis))))))
-        rows.append(row)
-    return rows
+    instants = times[np.linspace(0, len(times) - 1, COMPARED).astype(int)]
+    tracks = np.stack([session.scene.gaussians_at(float(t)).means[nearest].double().cpu().numpy() for t in instants])
+    return Surface(
+        whole[true_labels(bones, points, times)], session.gaussian_parts()[nearest],
+        whole[true_labels(bones, tracks, instants)], tracks,
+    )  # fmt: skip
+
+
+def _trained_turn(surface: Surface, bone: int, parent: int) -> float:
+    """Return the largest turn of a bone's Gaussians against those of its parent, degrees."""
+    own, base = (
+        np.stack([to_matrix(rigid_fit(tracks[0], now)[0]) for now in tracks])
+        for tracks in (surface.tracks[:, surface.bone == which] for which in (bone, parent))
+    )
+    return largest_turn(np.swapaxes(base, 1, 2) @ own)
 
 
 def _depth(bones: Bones, bone: int) -> int:

@@ -3,7 +3,8 @@
     python benchmarks/posing_pictures.py --run runs/figure-quick ... --json benchmarks/results/posing-pictures.json
 
 At time 0 the left arm is turned about the shoulder, and the left shin about the knee, by 45 and 90 degrees: in the run
-by ``EditSession.turn`` of the part that was found there, in the truth by the figure's own bones. Views are new. Rows
+by ``EditSession.turn`` of the part that was found there (for the arm the topmost part of the forearm's chain, as in
+``benchmarks/posing.py``), in the truth by the figure's own bones. Views are new. Rows
 hold `run`, `limb`, `degrees`, `skin` (see ``Edit.skin``), `psnr`, and `psnr_unedited`, of the same views without the
 turn. ``--bones`` takes the true bones as parts, which shows the skin alone.
 """
@@ -38,8 +39,11 @@ from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Camera
 from scgs_warp.visualization.video import write_png
 
-LIMBS = {"shoulder": ("shoulder_left", (0.0, -1.0, 0.0)), "knee": ("knee_left", (1.0, 0.0, 0.0))}
-"""Bone that turns, and the axis."""
+LIMBS = {
+    "shoulder": ("shoulder_left", (0.0, -1.0, 0.0), "elbow_left"),
+    "knee": ("knee_left", (1.0, 0.0, 0.0), None),
+}
+"""Bone that turns, the axis, and the end of a limb that turns as a whole."""
 DEGREES = (45, 90)
 AZIMUTHS = (-110.0, -70.0, -20.0, 35.0)
 ELEVATION = 20.0
@@ -88,13 +92,14 @@ def rows_of(run: Path, size: int, bones: bool, sheet: list[np.ndarray]) -> list[
     views = [orbit_camera(session.scene.overview, azimuth, size, ELEVATION) for azimuth in AZIMUTHS]
     unedited, start, rows = pictures(session, views), session.edit, []
     plain = psnr(unedited, truth(bone_transforms(0.0), views))
-    for limb, (bone, axis) in LIMBS.items():
+    for limb, (bone, axis, end) in LIMBS.items():
         for degrees in DEGREES:
             wanted = truth(turned_bones(bone, axis, degrees), views)
             shown = [wanted]
             for skin in get_args(SkinName):
                 session.edit = dataclasses.replace(start, skin=skin)
-                session.turn(part_of(session, node_bones, bone), degrees, axis)
+                part = part_of(session, node_bones, end or bone)
+                session.turn(session.chain(part)[-1] if end else part, degrees, axis)
                 found = pictures(session, views)
                 shown.append(found)
                 row = {"run": run.name, "limb": limb, "degrees": degrees, "skin": skin}

@@ -6,9 +6,12 @@
     python benchmarks/posing_pictures.py --run fig-0 fig-1 fig-2 --size 200 \\
         --json benchmarks/results/posing-pictures.json
 
-and of a glTF character, ``man``, filmed by ``apps/synthesize.py`` and trained with ``--preset cpu --steps 6000``:
+and of two glTF characters, ``man`` and ``robot``, filmed by ``apps/synthesize.py --size 200 --train 150`` (``robot``
+with ``--clip Robot_Dance``) and trained with ``--preset cpu --steps 6000 --threads 1``:
 
     python benchmarks/parts.py --run man --data data/man --mesh CesiumMan.glb --json benchmarks/results/parts-man.json
+    python benchmarks/parts.py --run robot --data data/robot --mesh RobotExpressive.glb \\
+        --json benchmarks/results/parts-robot.json
 """
 
 from __future__ import annotations
@@ -32,10 +35,30 @@ def parts_found(results: Results) -> str:
             joints = sorted(row["joint_error"] for row in own if "joint_error" in row)
             axes = sorted(row["axis_error"] for row in own if "axis_error" in row)
             lines.append([
-                whole["run"], f"{100 * whole['agreement']:.0f} %", f"{whole['parts']} ({whole['bones']})",
+                whole["run"], f"{100 * whole['agreement']:.0f} %",
+                f"{100 * whole['tracked']:.0f} %" if "tracked" in whole else "", f"{whole['parts']} ({whole['bones']})",
                 _spread(joints, " %"), _spread(axes, "°"), f"{whole['seconds']:.1f} s",
             ])  # fmt: skip
-    head = ["run", "surface", "parts (bones)", "joints off: median, largest", "axes off: median, largest", "found in"]
+    head = [
+        "run", "surface", "trained motion", "parts (bones)", "joints off: median, largest",
+        "axes off: median, largest", "found in",
+    ]  # fmt: skip
+    return table(head, lines)
+
+
+def bones_shown(results: Results) -> str:
+    """Write, for each bone of the figure, what the trained motion shows of it, for each run."""
+    rows, lines = results["parts-figure"]["rows"], []
+    for bone in dict.fromkeys(row["bone"] for row in rows if row["bone"] != "all"):
+        own = [row for row in rows if row["bone"] == bone]
+        shares = [" ".join(f"{100 * row[name]:.0f}" for row in own) for name in ("tracked", "agreement")]
+        trained = " ".join(f"{row['trained_turn']:.0f}" for row in own if "trained_turn" in row)
+        turn = f"{own[0]['turn']:.0f}" if "turn" in own[0] else ""
+        lines.append([bone, f"{100 * own[0]['points']:.0f}", turn, trained, *shares])
+    head = [
+        "bone", "share of the surface, %", "turns by, °", "trained: turns by, °",
+        "trained: points that move with it, %", "parts: points that agree, %",
+    ]  # fmt: skip
     return table(head, lines)
 
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from markdown_table import number, table
-from posing_tables import gestures, parts_found, pictures
+from posing_tables import bones_shown, gestures, parts_found, pictures
 from provenance import EDITING, MESHES, OLDER, TRAINING, changed_since, older_note
 from timing_tables import machine_line
 
@@ -171,7 +171,8 @@ REPEATABLE = {
     "capture-long-films": Repeatable(
         long_film_memory, ("long-film-memory",), ("scgs_warp/training/silhouettes.py", "scgs_warp/data/cache.py")
     ),
-    "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-man"), EDITING),
+    "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-man", "parts-robot"), EDITING),
+    "posing-bones": Repeatable(bones_shown, ("parts-figure",), EDITING),
     "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
     "posing-pictures": Repeatable(pictures, ("posing-pictures",), EDITING),
     "page-million": Repeatable(page_million, ("page-million",), ("scgs_warp/export/web",)),

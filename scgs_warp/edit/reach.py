@@ -12,7 +12,8 @@ from .rotations import conjugate, exponential, logarithm, multiply, rotate, to_m
 
 OFF_AXIS = 4.0
 """Cost of a turn across the axis about which the motion turned an inner joint, relative to a turn about it: a knee
-bends forwards. The first joint swings in any direction alike."""
+bends forwards. The first joint swings in any direction alike, but a twist about the line to the last joint costs as
+much more: the place of a hand leaves this twist open, and the least turn from hand to hand would roll the upper arm."""
 BEND = 10.0
 """Cost of a turn of any joint but the first, relative to one of the first: a limb swings as a whole, and its inner
 joints bend as far as the distance of the place requires."""
@@ -58,8 +59,9 @@ def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -
     """Return the pose of a chain that takes a point to a place, or as near as the chain reaches.
 
     Among the poses that reach it, the one that differs least from the present one is taken: the sum of squared angles
-    is least, where angles of inner joints count ``BEND`` times, those across their known axes ``OFF_AXIS`` times more,
-    and a shift of the first joint counts ``SLIDE`` times. The result depends on the arguments alone.
+    is least, where angles of inner joints count ``BEND`` times, those across their known axes and a twist of the first
+    ``OFF_AXIS`` times more, and a shift of the first joint counts ``SLIDE`` times. The result depends on the arguments
+    alone.
 
     Args:
         links: joints from the base to the end.
@@ -72,7 +74,7 @@ def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -
     centre, here = points[0], now - points[0]
     length = max(sum(float(np.linalg.norm(b - a)) for a, b in pairwise(points)), 1e-12)
     there = (place - centre) * min(1.0, length / max(float(np.linalg.norm(place - centre)), 1e-300))
-    costs = [np.eye(3), *(BEND * _cost(link.axis) for link in links[1:])]
+    costs = [_swing_cost(links), *(BEND * _cost(link.axis) for link in links[1:])]
     for step in range(1, STEPS + 1):
         aim = centre + _between(here, there, step / STEPS)
         most = FINAL_ITERATIONS if step == STEPS else STEP_ITERATIONS
@@ -83,6 +85,14 @@ def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -
 def _cost(axis: np.ndarray | None) -> np.ndarray:
     """Return the quadratic form [3, 3] of a rotation vector's cost."""
     return np.eye(3) if axis is None else OFF_AXIS * np.eye(3) - (OFF_AXIS - 1.0) * np.outer(axis, axis)
+
+
+def _swing_cost(links: list[Link]) -> np.ndarray:
+    """Return the quadratic form [3, 3] of the first joint's cost: a twist about the line to the last joint costs
+    ``OFF_AXIS`` times more than a swing. A chain of one joint has no such line."""
+    bone = rotate(links[0].quat, links[-1].joint - links[0].joint)
+    length2 = float(bone @ bone)
+    return np.eye(3) if length2 < 1e-18 else np.eye(3) + (OFF_AXIS - 1.0) * np.outer(bone, bone) / length2
 
 
 def posed_chain(links: list[Link], pose: Reached, base: Rigid, grip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,8 +130,10 @@ def _solve(
         slope[:3] += slide * (pose.shift - links[0].shift)
         for row, (link, turn, cost) in enumerate(zip(links, pose.turns, costs), 1):
             block = slice(3 * row, 3 * row + 3)
-            normal[block, block] += cost
-            slope[block] += cost @ logarithm(multiply(turn, conjugate(link.quat)))
+            angles = logarithm(multiply(turn, conjugate(link.quat)))
+            inner = _change_of_logarithm(angles)
+            normal[block, block] += inner.T @ cost @ inner
+            slope[block] += inner.T @ cost @ angles
         change = -np.linalg.solve(normal, slope).reshape(-1, 3)
         change *= min(1.0, LONGEST_TURN / max(float(np.linalg.norm(change[1:], axis=1).max()), 1e-300))
         turns = [multiply(exponential(further), turn) for further, turn in zip(change[1:], pose.turns)]
@@ -129,6 +141,14 @@ def _solve(
         if np.abs(change[1:]).max() < TOLERANCE:
             break
     return pose
+
+
+def _change_of_logarithm(vector: np.ndarray) -> np.ndarray:
+    """Return the derivative [3, 3] of a rotation vector by a small turn that follows the rotation."""
+    angle, cross = float(np.linalg.norm(vector)), _cross(vector)
+    if angle < 1e-3:
+        return np.eye(3) - 0.5 * cross + cross @ cross / 12.0
+    return np.eye(3) - 0.5 * cross + (1.0 / angle - 0.5 / np.tan(0.5 * angle)) / angle * cross @ cross
 
 
 def _cross(vector: np.ndarray) -> np.ndarray:
