@@ -119,5 +119,15 @@ class Edit:
         handles = tuple(h for h in self.handles if h.name != name)
         return dataclasses.replace(self, handles=handles, targets=targets, keyframes=tuple(frames))
 
+    def with_name(self, old: str, new: str) -> Edit:
+        """Return the edit with another name for a handle, also in targets and keyframes."""
+
+        def named(targets: Mapping[str, Target]) -> dict[str, Target]:
+            return {new if name == old else name: target for name, target in targets.items()}
+
+        handles = tuple(dataclasses.replace(h, name=new) if h.name == old else h for h in self.handles)
+        frames = tuple(dataclasses.replace(frame, targets=named(frame.targets)) for frame in self.keyframes)
+        return dataclasses.replace(self, handles=handles, targets=named(self.targets), keyframes=frames)
+
     def handle(self, name: str) -> Handle | None:
         return next((handle for handle in self.handles if handle.name == name), None)

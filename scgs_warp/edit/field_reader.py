@@ -16,6 +16,7 @@ from ..storage.json_files import parse_json
 
 MAX_BYTES = 64 << 20
 """Largest size of an edit file in bytes."""
+_JOINERS = dict.fromkeys((0x200C, 0x200D))
 MAX_NUMBER = 1e9
 """Largest magnitude of numbers without a limit of their own; beyond it float32 cannot resolve a scene."""
 
@@ -137,7 +138,7 @@ class FieldReader:
 
     def text(self, name: str) -> str:
         value = self.raw(name)
-        if not isinstance(value, str) or not value.strip() or len(value) > 100 or not value.isprintable():
+        if not isinstance(value, str) or not value.strip() or len(value) > 100 or not _printable(value):
             raise self.wrong(name, f"is {show_value(value)}", "give a name of 1 to 100 letters")
         return value
 
@@ -192,6 +193,11 @@ def plain_values(fields: Mapping[str, Any]) -> dict[str, Any]:
         return [plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
     return {name: plain(value) for name, value in fields.items()}
+
+
+def _printable(text: str) -> bool:
+    """Return whether a text can be shown on one line. Joiners count as letters: Persian, Hindi and emoji need them."""
+    return text.translate(_JOINERS).isprintable()
 
 
 def _is_number(value: Any) -> bool:

@@ -179,6 +179,16 @@ class EditSession(Posing):
         """Remove a handle, its target, and its part in every keyframe."""
         self.apply(self.edit.without(self._handle(name).name))
 
+    def rename_handle(self, old: str, new: str) -> None:
+        """Rename a handle, also in targets and keyframes.
+
+        Raises:
+            UserError: there is no such handle, or the new name is taken or not a name.
+        """
+        if self._handle(old).name != new and self.edit.handle(new) is not None:
+            raise UserError(f"handle {new!r}: the name is taken; choose another")
+        self.apply(self.edit.with_name(old, new))
+
     def pivot(self, name: str) -> np.ndarray:
         """Return a handle's centre of rotation at its own time, [3], world units. That of a part is its joint in the
         present pose of its parent."""

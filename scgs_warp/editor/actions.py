@@ -55,12 +55,12 @@ def _need_selection(editor: Host) -> tuple[int, ...]:
 
 def pick(editor: Host, fields: FieldReader) -> None:
     """Choose what a click at a surface point means; without a point, the click was beside the scene."""
-    how = fields.choice("how", COMBINE, editor.model.combine)
+    how, parts_first = fields.choice("how", COMBINE, editor.model.combine), fields.boolean("parts_first")
     if fields.raw("point") is None:
         editor.parts.click(None, how)
         return
     point, moment = np.array(_point(fields)), editor.model.moment()
-    editor.parts.click(hit(editor.session, point, editor.model.region, moment), how)
+    editor.parts.click(hit(editor.session, point, editor.model.region, moment), how, parts_first)
 
 
 def pick_pixel(editor: Host, fields: FieldReader) -> None:
@@ -70,7 +70,8 @@ def pick_pixel(editor: Host, fields: FieldReader) -> None:
         raise fields.wrong("pixel", "is missing", "give 2 numbers")
     point = editor.session.pick(camera, pixel[0], pixel[1], moment.time, moment.at)
     found = None if point is None else hit(editor.session, point, editor.model.region, moment)
-    editor.parts.click(found, fields.choice("how", COMBINE, editor.model.combine))
+    how = fields.choice("how", COMBINE, editor.model.combine)
+    editor.parts.click(found, how, fields.boolean("parts_first"))
 
 
 def select(editor: Host, fields: FieldReader) -> None:

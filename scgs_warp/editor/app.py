@@ -13,51 +13,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..edit import EditSession
-from ..edit.edit_file import scene_of
 from ..edit.field_reader import FieldReader
+from ..edit.skeleton import Skeleton
 from ..errors import UserError, one_line
-from ..export.page import MAX_DEGREE, SCRIPTS, document, program_text, read_web
+from ..export.page import MAX_DEGREE
 from ..export.page_data import pack
 from ..export.page_edit import own_motion
 from ..export.page_pose import with_parts
 from ..export.page_scene import page_scene
 from ..live.server import Client, PageServer
-from ..live.viewer import WIRE, digest
+from ..live.viewer import digest
 from ..storage.json_files import as_number
-from . import files
+from . import choice, files
 from .actions import ACTIONS
 from .autosave import Autosave
 from .exports import EXPORTS, downloadable
 from .gizmo_pose import GizmoFrame
 from .jobs import JobProgress, Jobs
 from .model import EditorModel, Moment
+from .part_changes import PART_CHANGES, parts_message
 from .parts_tool import PartsTool
 from .pictures import camera_of, scene_jpeg
 from .pose_schedule import PoseSchedule, Wanted
 from .poses import picture_message, pose_message, pose_table
+from .program import held_by_pages, page_of
 from .state import film_camera_of, page_state, turn_curve
 from .worker import Worker
 
 if TYPE_CHECKING:
     from aiohttp import web
 
-WEB = Path(__file__).parent / "web"
-OWN_SCRIPTS = (
-    "connection",
-    "overlay",
-    "gizmo",
-    "pivot",
-    "areas",
-    "tools",
-    "pictures",
-    "timeline",
-    "panel",
-    "commands",
-    "studio",
-)
-"""Scripts of ``web/``, after those of the exported page."""
-SHADERS = ("overlay.vert", "overlay.frag")
-REQUESTS = {**ACTIONS, **EXPORTS}
+REQUESTS = {**ACTIONS, **PART_CHANGES, **EXPORTS}
+LEAVE_A_DRAG_ALONE = {"tool", "save", "stop_job", "export_film", "export_ply", "export_page"}
+"""Requests that a page may make while another one drags."""
 MAX_WAITING = 200
 """Largest number of requests that may wait; further ones are refused."""
 
@@ -100,6 +88,8 @@ class Editor:
         self.held: tuple[GizmoFrame, tuple[Any, Any]] | None = None
         self.latency: list[float] = []
         self._version, self._posed, self._film = 1, self._pose_key(), session.edit.film
+        self._skeleton: Skeleton | None = None
+        """Parts that pages know; None: no page has asked yet."""
         self._curve: tuple[tuple[Any, Any], list[list[float]]] = (None, None), []
         """Edit and active handle, and the curve of its turns."""
         self._asked: float | None = None
@@ -123,7 +113,8 @@ class Editor:
             left=self._dismiss,
         )
         if autosave is not None:
-            autosave.done = self.tell
+            kept, autosave.done = autosave.choice or "{}", self.tell
+            self.worker.post(lambda: choice.restore(kept, self.model, self.parts))
         self.worker.start()
 
     @property
@@ -153,9 +144,10 @@ class Editor:
             "overview": scene.overview.to_dict(),
             "normalisation": {"centre": scene.normalisation.centre.tolist(), "scale": scene.normalisation.scale},
             "background": list(scene.background_color),
-            "parts": [{"name": part.name} for part in self.session.parts()],
         }
+        self._skeleton = self.session.skeleton
         client.send({"hello": hello})
+        client.send({"parts": parts_message(self.session)}, latest="parts")
         client.send({"camera": film_camera_of(self.session)}, latest="camera")
         client.send({"state": self._state()}, latest="state")
 
@@ -189,7 +181,7 @@ class Editor:
             with self.worker.changing() as schedule:
                 schedule.ask_live()
         elif self.autosave is not None:
-            self.autosave.note(self.session.edit)
+            self.autosave.note(self.session.edit, choice.to_json(self.model, self.parts))
         if self.session.edit.film is not self._film:
             self._film = self.session.edit.film
             self.server.broadcast({"camera": film_camera_of(self.session)}, latest="camera")
@@ -198,6 +190,9 @@ class Editor:
     def tell(self) -> None:
         """Send the state to all pages, on the worker's thread: two threads could send an older state after a newer."""
         if self.worker.here:
+            if self._skeleton is not None and self.session.skeleton is not self._skeleton:
+                self._skeleton = self.session.skeleton
+                self.server.broadcast({"parts": parts_message(self.session)}, latest="parts")
             self.server.broadcast({"state": self._state()}, latest="state")
         else:
             self.worker.post(self.tell, once=True)
@@ -252,12 +247,12 @@ class Editor:
     def _act(self, client: Client, what: str, message: dict[str, Any]) -> None:
         """Do what a page asks for, on the worker's thread, and answer it."""
         answer: dict[str, Any] = {"id": number_of(message), "done": what}
+        if self._dragger not in (None, client.number) and what not in LEAVE_A_DRAG_ALONE:
+            if what not in ("release", "cancel"):
+                answer["problem"] = "another page drags at present; try again when it has let go"
+            client.send(answer)
+            return
         if what in ("grab", "release", "cancel"):
-            if self._dragger not in (None, client.number):  # one page drags at a time
-                if what == "grab":
-                    answer["problem"] = "another page drags at present; try again when it has let go"
-                client.send(answer)
-                return
             self._apply_drag()
             self._dragger = client.number if what == "grab" else None
         fields = FieldReader({key: value for key, value in message.items() if key not in ("do", "id")}, "the page")
@@ -374,22 +369,7 @@ class Editor:
         return web.FileResponse(path, headers={"Content-Disposition": f'attachment; filename="{quiet}"'})
 
 
-def held_by_pages(session: EditSession) -> dict[str, Any]:
-    """Return what tells a session from others whose scene an open page does not hold."""
-    scene = session.scene
-    return {"scene": scene_of(session.engine), "step": scene.step, "gaussians": scene.gaussian_count}
-
-
 def number_of(message: dict[str, Any]) -> int | None:
     """Return the number by which a page knows the answer to its request."""
     number = message.get("id")
     return number if isinstance(number, int) and abs(number) < 1 << 53 else None
-
-
-def page_of(title: str) -> bytes:
-    """Return the editor's page for a scene."""
-    scripts = [WIRE, *(read_web(f"{name}.js", WEB) for name in OWN_SCRIPTS)]
-    shaders = {name: read_web(f"{name}.glsl", WEB) for name in SHADERS}
-    program = program_text((*SCRIPTS, "rotations"), scripts, shaders)
-    template, style = read_web("editor.html", WEB), read_web("editor.css", WEB)
-    return document(program, title, network="'self'", template=template, further_style=style)

@@ -1,4 +1,5 @@
-"""Keeping of an edit without being asked: saved after every change, restored when the editor starts again."""
+"""Keeping of an edit, and of what is chosen, without being asked: saved after every change, restored when the editor
+starts again."""
 
 from __future__ import annotations
 
@@ -11,11 +12,15 @@ from pathlib import Path
 from ..edit import Edit, EditSession, edit_file
 from ..errors import UserError, one_line
 from ..runtime import addresses
-from ..storage.files import write_atomically
+from ..storage.files import read_text, write_atomically
 from ..storage.locks import AlreadyLocked, lock_file
 from ..storage.own_folder import own_folder
 
 NAME = "autosave"
+AGAIN = 5.0
+"""Seconds after which it is tried again to save what could not be saved."""
+MAX_CHOICE = 4 << 20
+"""Largest size of the file that says what is chosen."""
 PREVIOUS = "previous"
 """Suffix of the edit that a new one has replaced."""
 DAMAGED = "damaged"
@@ -54,8 +59,9 @@ class Autosave:
         folder: folder of edits, which exists.
         stem: name of the run or file, which tells its edits from those of other files beside it; "" for a run.
 
-    Attributes: ``path`` (the file), ``said`` (what to tell the user at the start; may be empty), ``problem`` (why the
-    latest change could not be saved; None if it was).
+    Attributes: ``path`` (the file), ``choice`` (what is chosen; at first what was when the editor ended, None: not
+    known), ``said`` (what to tell the user at the start; may be empty), ``problem`` (why the latest change could not be
+    saved; None if it was).
 
     Raises:
         UserError: another editor keeps this edit.
@@ -72,12 +78,17 @@ class Autosave:
             ) from None
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror}); give another --folder") from None
+        self._choice_path = self.path.with_name(f".{self.path.stem}.choice.json")
+        self.choice: str | None = None
+        self._wanted_choice: str | None = None
         self.said = ""
         self.done: Callable[[], None] = lambda: None
         """Called on another thread after each attempt to save."""
         self.problem: str | None = None
         self._saved: Edit | None = None
         self._wanted: Edit | None = None
+        self._failed: Edit | None = None
+        """Edit that could not be saved, which is tried again."""
         self._writing = False
         self._condition = threading.Condition()
         self._stopped = False
@@ -89,6 +100,9 @@ class Autosave:
         Args:
             restore: False: begin with the session's present edit; the one that was kept moves aside.
         """
+        if restore:
+            with suppress(OSError, ValueError, UserError):
+                self.choice = read_text(self._choice_path, MAX_CHOICE)
         if self.path.is_file():
             if restore:
                 self._restore()
@@ -113,10 +127,12 @@ class Autosave:
             os.replace(self.path, aside)
         return aside
 
-    def note(self, edit: Edit) -> None:
-        """Save an edit soon; a later one replaces it while it waits."""
+    def note(self, edit: Edit, choice: str | None = None) -> None:
+        """Save an edit soon, and what is chosen; later ones replace them while they wait."""
         with self._condition:
             self._wanted = edit
+            if choice is not None and choice != self.choice:
+                self.choice = self._wanted_choice = choice
             self._condition.notify_all()
 
     def saved(self, edit: Edit) -> bool:
@@ -127,18 +143,30 @@ class Autosave:
     def _run(self) -> None:
         while True:
             with self._condition:
-                while self._wanted is None or (self._wanted == self._saved and self.problem is None):
+                while not self._due() and self._wanted_choice is None:
                     if self._stopped:
                         return
-                    self._condition.wait()
-                edit, self._wanted, self._writing = self._wanted, None, True
-            problem = self._write(edit)
+                    if not self._condition.wait(None if self.problem is None else AGAIN) and self._wanted is None:
+                        self._wanted = self._failed
+                edit = self._wanted if self._due() else None
+                self._wanted = None
+                choice, self._wanted_choice = self._wanted_choice, None
+                self._writing = True
+            problem = self.problem if edit is None else self._write(edit)
+            if choice is not None:
+                with suppress(UserError):  # the edit has the same problem, and its is shown
+                    write_atomically(self._choice_path, choice.encode())
             with self._condition:
                 self.problem, self._writing = problem, False
-                if problem is None:
-                    self._saved = edit
+                if edit is not None:
+                    self._failed = edit if problem else None
+                    self._saved = self._saved if problem else edit
                 self._condition.notify_all()
-            self.done()
+            if edit is not None:
+                self.done()
+
+    def _due(self) -> bool:
+        return self._wanted is not None and (self._wanted != self._saved or self.problem is not None)
 
     def _write(self, edit: Edit) -> str | None:
         try:
@@ -151,7 +179,7 @@ class Autosave:
         """Wait until everything is saved; return whether it is."""
         with self._condition:
             self._condition.wait_for(
-                lambda: not self._writing and (self._wanted is None or self._wanted == self._saved), seconds
+                lambda: not self._writing and not self._due() and self._wanted_choice is None, seconds
             )
             return self.problem is None
 

@@ -101,8 +101,10 @@ class EditorModel:
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[EditSession]:
-        """Yield the session for a change of its edit, then report the change."""
+        """Yield the session for a change of its edit, then report the change. A drag ends first: what it did is a step
+        of its own."""
         with self.lock:
+            self._let_go()
             try:
                 yield self.session
             finally:
@@ -119,18 +121,15 @@ class EditorModel:
 
     def undo(self) -> bool:
         with self.changing() as session:
-            self._let_go()
             return session.undo()
 
     def redo(self) -> bool:
         with self.changing() as session:
-            self._let_go()
             return session.redo()
 
     def reset(self) -> None:
         """Remove the whole edit; can be undone."""
         with self.changing() as session:
-            self._let_go()
             session.reset()
 
     def set(self, **fields: Any) -> None:

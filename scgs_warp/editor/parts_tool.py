@@ -26,13 +26,6 @@ class Hit(NamedTuple):
     """Control points that a click on the surface selects."""
 
 
-class _Chosen(NamedTuple):
-    """A part as it was when it was chosen."""
-
-    part: str
-    nodes: tuple[int, ...]
-
-
 def hit(session: EditSession, point: np.ndarray, region: Region, moment: Moment) -> Hit:
     """Say what a click at a surface point [3], world units, means.
 
@@ -55,7 +48,8 @@ class PartsTool:
     def __init__(self, model: EditorModel) -> None:
         self.model = model
         self.on = True
-        self._chosen: _Chosen | None = None
+        self._chosen: tuple[int, ...] | None = None
+        """Control points of the chosen part: its name may change."""
         self._inside: str | None = None
         """Part whose control points a second click has selected; further clicks on it select control points."""
         self._since = model.session.edit
@@ -65,25 +59,25 @@ class PartsTool:
     def part(self) -> str | None:
         """The chosen part; None: none is chosen. Selecting anything else, and changes of the skeleton, unchoose it."""
         chosen = self._chosen
-        if chosen is None or chosen.nodes != self.model.selection:
+        if chosen is None or chosen != self.model.selection:
             return None
-        there = any((part.name, part.nodes) == chosen for part in self.model.session.skeleton.parts)
-        return chosen.part if there else None
+        return next((part.name for part in self.model.session.skeleton.parts if part.nodes == chosen), None)
 
-    def click(self, hit: Hit | None, how: Combine = "replace") -> None:
+    def click(self, hit: Hit | None, how: Combine = "replace", parts_first: bool | None = None) -> None:
         """Choose what a click means.
 
         Args:
             hit: None: the click was beside the scene, which clears the selection unless it is to be changed.
+            parts_first: whether this click takes parts, for pages that each have a tool; None: as ``on`` says.
         """
-        model = self.model
+        model, takes_parts = self.model, self.on if parts_first is None else parts_first
         with model.lock:
             part, inside = self.part, self._inside
             if hit is None:
                 self._inside = None
                 if how == "replace":
                     model.select(())
-            elif self.on and how == "replace" and hit.part is not None and hit.part not in (part, inside):
+            elif takes_parts and how == "replace" and hit.part is not None and hit.part not in (part, inside):
                 self.choose(hit.part)
             else:
                 self._inside = hit.part
@@ -105,7 +99,7 @@ class PartsTool:
         """
         with self.model.lock:
             nodes = self.model.session.skeleton.part(part).nodes
-            self._chosen = _Chosen(part, nodes)
+            self._chosen = nodes
             self._inside = None
             self.model.select(nodes)
 

@@ -292,12 +292,15 @@ class PageServer:
         return wire
 
     def _hear(self, client: Client, text: str) -> None:
-        """Pass a message on if it is a JSON object; ignore anything else."""
+        """Pass a message on if it is a JSON object; ignore anything else. A page that asks whether the server is there
+        is answered at once."""
         try:
             message = parse_json(text)
         except ValueError:
             return
-        if isinstance(message, dict):
+        if isinstance(message, dict) and message.get("do") == "beat":
+            client.send({"beat": True}, latest="beat")
+        elif isinstance(message, dict):
             self._received(client, message)
 
     async def _sweep(self) -> None:

@@ -19,6 +19,10 @@ function commandTable(studio) {
     ["rotate", "Rotate: turn parts", "r", () => studio.use("turn")],
     ["tool-points", "Tool: choose control points", "3", () => studio.use("points")],
     ["pivot", "Put the pivot of the rings back", ".", () => tools.pivot.reset(), () => Boolean(tools.pivot?.place())],
+    ["rename", "Rename the chosen part or handle", "F2", () => studio.changes.rename(), () => link.state?.part || link.state?.active],
+    ["merge", "Merge the chosen part with a neighbour", "", () => studio.changes.merge(),
+      () => link.state?.part && studio.changes.neighbours(link.state.part).length],
+    ["split", "Split the chosen control points off as a part", "", () => studio.changes.split(), () => chosen() && !link.state.part],
     ["hold", "Hold the selection as it is now", "h", () => ask("hold", { frame: studio.holdFrame }), chosen],
     ["frame", "Frame the scene", "f", () => studio.frame()],
     ["cancel", "Cancel, or choose nothing", "Escape", () => tools.cancel()],
@@ -61,6 +65,7 @@ const keyText = (key) => (key === "+" ? "+" : key.split("+").filter(Boolean).map
 class Commands {
   constructor(studio) {
     this.list = commandTable(studio);
+    this.busy = () => Boolean(studio.tools.drag);
     for (const button of document.querySelectorAll("[data-command]")) {
       const command = this.list.find(({ id }) => id === button.dataset.command);
       button.title = command.key ? `${command.label} (${keyText(command.key)})` : command.label;
@@ -90,6 +95,7 @@ class Commands {
     const command = this.list.find(({ key }) => key === plain || (key === "Delete" && plain === "Backspace"));
     if (!command) return;
     event.preventDefault();
+    if (this.busy() && command.id !== "cancel") return; // the drag ends first
     if (command.when() && !(event.repeat && command.id === "play")) command.run();
   }
 

@@ -1,30 +1,32 @@
 // The server's state and poses, and what is asked of it.
 
 const AHEAD = 24; // frames that are asked for while the film plays
+const NO_SERVER = "there is no server at present";
 const KINDS = { pose: 1, picture: 2 };
 
 class Link {
   constructor(listener) {
-    this.listener = listener; // hello, camera, state, said, file, pose, gone, moved
+    this.listener = listener; // hello, parts, camera, state, said, file, pose, gone, moved, silent
     this.state = null;
     this.live = null; // pose of a drag
     this.cache = new Map(); // frame -> pose
     this.asked = new Set();
     this.waiting = new Map();
     this.count = 0;
-    this.missing = new Set(["hello", "camera", "state"]);
+    this.missing = new Set(["hello", "parts", "camera", "state"]);
     this.first = new Promise((resolve) => { this.arrived = resolve; }); // all of these have come
     const heard = (data) => (typeof data === "string" ? this.hear(JSON.parse(data)) : this.take(data));
-    this.wire = new Wire(heard, (answers) => this.gone(answers), () => this.listener.moved());
+    this.wire = new Wire(heard, (answers) => this.gone(answers), () => this.listener.moved(),
+      (on) => this.listener.silent(on));
   }
 
   get open() {
-    return this.wire.open;
+    return this.wire.open && !this.wire.quiet;
   }
 
   gone(answers) {
     this.forget();
-    for (const answer of this.waiting.values()) answer({ problem: "the server has gone" });
+    for (const { answer } of this.waiting.values()) answer({ problem: NO_SERVER });
     this.waiting.clear();
     this.listener.gone(answers);
   }
@@ -36,6 +38,7 @@ class Link {
 
   hear(message) {
     if (message.hello) this.listener.hello(message.hello);
+    if (message.parts) this.listener.parts(message.parts);
     if (message.state) {
       const before = this.state;
       this.state = message.state;
@@ -49,10 +52,10 @@ class Link {
     if (message.said) this.listener.said(message.said);
     if (message.file) this.listener.file(message);
     if (message.done) {
-      const answer = this.waiting.get(message.id);
+      const asker = this.waiting.get(message.id);
       this.waiting.delete(message.id);
-      if (message.problem) this.listener.said({ text: message.problem, kind: "error" });
-      answer?.(message);
+      if (message.problem && !asker?.shows) this.listener.said({ text: message.problem, kind: "error" });
+      asker?.answer(message);
     }
   }
 
@@ -69,12 +72,12 @@ class Link {
     this.listener.pose();
   }
 
-  // Resolves with the server's answer.
-  ask(what, fields = {}) {
-    if (!this.open) return Promise.resolve({ problem: "the server has gone" });
+  // Resolves with the server's answer. shows: whoever asks shows the problem that it may have.
+  ask(what, fields = {}, shows = false) {
+    if (!this.open) return Promise.resolve({ problem: NO_SERVER });
     const id = ++this.count;
     this.wire.send({ do: what, id, ...fields });
-    return new Promise((resolve) => this.waiting.set(id, resolve));
+    return new Promise((answer) => this.waiting.set(id, { answer, shows }));
   }
 
   // Without an answer, for what is sent many times a second.

@@ -136,10 +136,16 @@ function panelSections(studio) {
   const partNames = () => [["", "none"], ...tools.parts.map(({ name }) => [name, name])];
   return [
     { title: "Part or handle", open: true, rows: [
-      { type: "choice", label: "Part", options: partNames(), get: (s) => s.part ?? "",
+      { type: "choice", label: "Part", options: partNames, get: (s) => s.part ?? "",
         set: (name) => (name ? ask("choose_part", { name }) : ask("pick", { how: "replace" })) },
       { type: "choice", label: "Handle", options: (s) => [["", "none"], ...s.handles.map(({ name, part }) =>
-        [name, part ? `${name} (part)` : name])], get: (s) => s.active ?? "", set: (name) => name && ask("activate", { name }) },
+        [name, part ? `${isolated(part)} (part)` : name])], get: (s) => s.active ?? "", set: (name) => name && ask("activate", { name }) },
+      { type: "buttons", items: [
+        { label: "Rename", when: (s) => s.part || s.active, press: () => studio.changes.rename() },
+        { label: "Merge", title: "Make the part and a neighbour one", when: (s) => s.part && studio.changes.neighbours(s.part).length,
+          press: () => studio.changes.merge() },
+        { label: "Split", title: "Make the chosen control points of a part a part of their own", when: (s) => !s.part && chosen(s),
+          press: () => studio.changes.split() }] },
       { type: "triple", label: "Move", when: (s) => active(s) || chosen(s), get: (s) => s.target.translation,
         set: (translation) => ask("put", { translation }) },
       { type: "triple", label: "Turn, degrees", when: (s) => active(s) || chosen(s), get: (s) => s.target.degrees,

@@ -76,16 +76,22 @@ class PicturePlayer {
     if (!pressed || Math.hypot(event.clientX - pressed.clientX, event.clientY - pressed.clientY) > CLICK) return;
     const camera = this.camera(), share = camera.width / box.width;
     const pixel = [(event.clientX - box.left) * share, (event.clientY - box.top) * share];
-    this.link.ask("pick_pixel", { at: this.at, pixel, how: event.shiftKey ? "add" : "replace", ...camera });
+    this.link.ask("pick_pixel", { at: this.at, pixel, how: event.shiftKey ? "add" : "replace", ...camera,
+      parts_first: this.tools.kind !== "points" });
   }
 }
 
 // What the page's tools are where there is nothing to draw with.
 class NoTools {
   constructor(link, parts) {
-    Object.assign(this, { link, parts });
+    Object.assign(this, { link });
+    this.know(parts);
     this.show = { points: false, graph: false, bones: false, ribbons: false };
     this.local = false;
+  }
+
+  know({ list }) {
+    this.parts = list;
   }
 
   use(kind) {

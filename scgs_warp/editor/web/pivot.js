@@ -8,8 +8,7 @@ class Pivot {
 
   // What the rings turn.
   get turned() {
-    const { state } = this.tools;
-    return state.part ?? state.selection.join();
+    return this.tools.state.selection.join();
   }
 
   // Put it on the surface under the pointer, where it stays on the nearest control point.

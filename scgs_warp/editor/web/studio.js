@@ -48,7 +48,7 @@ class Studio {
     this.folder = "";
     this.link = new Link({
       hello: (hello) => this.greet(hello), camera: (camera) => this.film(camera), state: (state) => this.show(state), said: (said) => this.note(said.text, said.kind),
-      file: ({ file, job }) => this.offer(file, job), pose: () => this.player?.changed(),
+      file: ({ file, job }) => this.offer(file, job), parts: (parts) => this.know(parts), silent: (on) => this.silent(on), pose: () => this.player?.changed(),
       gone: (answers) => this.lost(answers), moved: () => this.anew(), picture: (jpeg) => this.player?.take(jpeg),
     });
   }
@@ -58,9 +58,7 @@ class Studio {
   }
 
   greet(hello) {
-    const { title, said, edges, files, folder } = hello, names = JSON.stringify(hello.parts);
-    if (this.gone && this.named !== names) return this.anew();
-    this.named = names;
+    const { title, said, edges, files, folder } = hello;
     Object.assign(this, { title, files, folder, hello });
     this.edges = [];
     for (let k = 0; k < edges.length; k += 2) this.edges.push([edges[k], edges[k + 1]]);
@@ -68,6 +66,12 @@ class Studio {
     if (said && !this.greeted) this.note(said, "info");
     if (this.gone) this.found();
     this.greeted = true;
+  }
+
+  know(parts) {
+    this.parts = parts;
+    this.tools?.know(parts);
+    if (this.link.state) this.panel?.show(this.link.state);
   }
 
   // The film's camera has changed.
@@ -85,6 +89,16 @@ class Studio {
     this.gone = true;
     element("status").textContent = "no server";
     element("status").className = "bad";
+  }
+
+  // The connection stands, but nothing comes: what was asked for waits, nothing else is sent.
+  silent(on) {
+    if (on) this.tools?.let?.();
+    element("gone").textContent = `${SILENT} Nothing can be edited until it does; the view can still be turned.`;
+    element("gone").hidden = !on;
+    element("status").textContent = on ? "no answer" : "";
+    element("status").className = on ? "bad" : "";
+    if (!on && this.link.state) this.show(this.link.state);
   }
 
   found() {
@@ -107,7 +121,8 @@ class Studio {
     const canvas = element("view"), clock = this.clock = await this.open(canvas, asked.has("pictures"));
     const { player } = this;
     this.timeline = new Timeline(player, this.link, clock);
-    const { kind = "pull" } = this.restore();
+    const { kind = this.link.state.tool.parts_first ? "pull" : "points" } = this.restore();
+    this.changes = new PartChanges(this);
     this.panel = new Panel(element("panel"), panelSections(this));
     this.commands = new Commands(this);
     listenToPointers(player);
@@ -138,13 +153,13 @@ class Studio {
     }
     if (why) {
       this.player = new PicturePlayer(canvas, this.link, this.hello);
-      this.tools = new NoTools(this.link, this.hello.parts);
+      this.tools = this.player.tools = new NoTools(this.link, this.parts);
       this.note(`${why} The server draws instead: parts are chosen by clicks and posed by the numbers in the panel.`, "info");
     } else {
       const report = (share) => say(`Loading ${Math.round(100 * share)} %`, share);
       this.player = new StudioPlayer(canvas, await readModel(await fetchedScene("scene", report)));
       this.player.link = this.link;
-      this.tools = new Tools(this.player, this.link);
+      this.tools = new Tools(this.player, this.link, this.parts);
       this.tools.edges = this.edges;
     }
     this.player.film(this.camera);
@@ -161,6 +176,7 @@ class Studio {
     }
     this.timeline.show(state);
     this.panel.show(state);
+    this.changes.show(state);
     this.commands.show();
     const status = element("status");
     status.className = state.problem ? "bad" : "";

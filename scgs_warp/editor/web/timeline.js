@@ -32,7 +32,7 @@ class Timeline {
     const { place } = this, names = [...new Set(state.keyframes.flatMap((frame) => frame.names))];
     for (const handle of state.handles) if (!names.includes(handle.name)) names.push(handle.name);
     const label = (name) => state.handles.find((handle) => handle.name === name)?.part ?? name;
-    const key = JSON.stringify([names, state.keyframes, state.film, this.chosen, state.active, state.curve]);
+    const key = JSON.stringify([names, names.map(label), state.keyframes, state.film, this.chosen, state.active, state.curve]);
     if (key === this.shown || this.moving) return; // a key that is pressed stays what it is
     this.shown = key;
     const rows = [["Film", null], ...names.map((name) => [label(name), name])], { views } = state.film;
@@ -41,7 +41,9 @@ class Timeline {
       title.type = "button";
       title.className = "name";
       title.textContent = text;
+      title.dir = "auto";
       title.disabled = name === null;
+      if (name !== null) Object.assign(title, { title: `${text}: double click for another name` }).dataset.handle = name;
       title.addEventListener("click", () => this.link.ask("activate", { name, at: this.player.at }));
       const lane = document.createElement("div");
       lane.className = name === null ? "lane ruler" : "lane";

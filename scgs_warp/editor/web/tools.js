@@ -2,69 +2,9 @@
 
 const CLICK = 4; // pixels that a click may move
 
-class StudioPlayer extends Player {
-  // Take the film's camera: its path over the film, and its lens and upright axis.
-  film({ path, overview }) {
-    this.model.facts.path = path;
-    this.filmed = overview;
-    this.free = { ...this.model.facts.overview, up: overview.up };
-    this.changed();
-  }
-
-  view() {
-    this.orbit.overview = this.follows ? this.filmed : this.free ?? this.model.facts.overview;
-    return super.view();
-  }
-
-  // The second of the film that is shown.
-  get at() {
-    return this.time * this.seconds;
-  }
-
-  get seconds() {
-    return this.link?.state?.film.seconds ?? SECONDS;
-  }
-
-  get fps() {
-    return this.link?.state?.film.fps ?? 30;
-  }
-
-  pose(time, table, exact) {
-    const { link, model } = this, state = link?.state;
-    if (!state || state.unedited || this.original) poseAt(model, state ? sceneTime(state, time * this.seconds) : time, table);
-    else if (state.dragging && link.live) table.set(link.live);
-    else {
-      const frames = Math.max(1, Math.round(this.seconds * this.fps));
-      const frame = Math.min(Math.floor(time * this.seconds * this.fps + 1e-6), frames - 1);
-      const pose = link.poseOf(frame, frames, this.clock?.playing);
-      if (pose) table.set(pose);
-      else if (this.shown) table.set(this.shown);
-      else poseAt(model, sceneTime(state, time * this.seconds), table);
-    }
-    if (!exact) this.observe(table);
-    return table;
-  }
-
-  // Keep where the control points are, and light up what the pointer is on.
-  observe(table) {
-    const { nodes, trajectories } = this.model, { rest } = trajectories;
-    this.places ??= new Float64Array(3 * nodes);
-    this.shown = table.slice();
-    for (let m = 0; m < nodes; m++) {
-      const row = 28 * m;
-      for (let r = 0; r < 3; r++) {
-        const at = row + 4 * r;
-        this.places[3 * m + r] = table[at] * rest[3 * m] + table[at + 1] * rest[3 * m + 1] + table[at + 2] * rest[3 * m + 2]
-          + table[at + 3];
-      }
-      table[row + 19] = this.tools?.lights(m) ? 1 : 0;
-    }
-  }
-}
-
 class Tools {
-  constructor(player, link, say) {
-    Object.assign(this, { player, link, say });
+  constructor(player, link, parts) {
+    Object.assign(this, { player, link });
     this.kind = "pull"; // or turn, points
     this.lit = -1; // row of the part under the pointer
     this.show = { points: false, graph: false, bones: true, ribbons: false };
@@ -76,11 +16,8 @@ class Tools {
     this.overlay = player.overlay = new Overlay(player);
     this.gizmo = new Gizmo(this.overlay);
     this.overlay.items = () => this.draw();
-    const { facts, pose } = player.model;
-    this.overlay.behind = 0.5 * facts.pose.edge_length;
-    this.parts = facts.parts;
-    this.owner = pose.owner;
-    this.members = this.parts.map((_, row) => [...this.owner.keys()].filter((m) => this.owner[m] === row));
+    this.overlay.behind = 0.5 * player.model.facts.pose.edge_length;
+    this.know(parts);
     const { canvas } = player;
     canvas.addEventListener("pointermove", (event) => this.move(event));
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => this.end(event));
@@ -89,6 +26,14 @@ class Tools {
 
   get state() {
     return this.link.state;
+  }
+
+  // The parts as the server has them at present, which may be other ones than when the page was loaded.
+  know({ list, owner, chains }) {
+    Object.assign(this, { parts: list, owner, chains });
+    this.members = list.map((_, row) => [...owner.keys()].filter((m) => owner[m] === row));
+    this.lit = -1;
+    this.player.stale = true;
   }
 
   lights(m) {
@@ -150,7 +95,7 @@ class Tools {
 
   // Called for every press: true keeps it from turning the view.
   takes(event, fingers) {
-    if (this.drag || fingers || event.button !== 0 || !this.state || this.player.original) return Boolean(this.drag);
+    if (this.drag || fingers || event.button !== 0 || !this.state || this.player.original || !this.link.open) return Boolean(this.drag);
     const { player } = this, spot = this.spot(event);
     const begin = (drag) => {
       player.canvas.setPointerCapture(event.pointerId);
@@ -203,7 +148,7 @@ class Tools {
     if (drag.kind === "pull") {
       const row = this.owner[drag.node], chosen = this.kind === "points" && state.selection.includes(drag.node);
       if (!chosen && (this.kind === "points" || state.part !== this.parts[row].name)) {
-        const answer = await this.link.ask("pick", { at, point: this.world(drag.point), how: drag.how });
+        const answer = await this.link.ask("pick", this.picked(drag));
         if (answer.problem) return this.stop();
       }
     }
@@ -215,6 +160,10 @@ class Tools {
     drag.held = true;
     if (drag.latest) this.send(drag);
     if (drag.over) this.finish(drag);
+  }
+
+  picked({ point, how }) {
+    return { at: this.player.at, point: this.world(point), how, parts_first: this.kind !== "points" };
   }
 
   send(drag) {
@@ -245,7 +194,7 @@ class Tools {
       this.stop();
     } else if (!drag.moved) {
       if (drag.kind === "pull") {
-        this.link.ask("pick", { at: this.player.at, point: this.world(drag.point), how: drag.how });
+        this.link.ask("pick", this.picked(drag));
       }
       this.stop();
     } else if (drag.held) this.finish(drag);
@@ -263,6 +212,15 @@ class Tools {
     this.player.clock.hold(false);
     this.player.changed();
     clearLasso();
+  }
+
+  // The server does not answer: what is dragged stays where it is.
+  let() {
+    const { drag } = this;
+    if (!drag) return;
+    if (drag.held) this.finish(drag);
+    else if (drag.moved && !drag.area && drag.kind !== "pivot") drag.over = true;
+    else this.stop();
   }
 
   cancel() {
@@ -326,7 +284,7 @@ class Tools {
 
   // Joints of the chosen part's chain, and where they are without the edit.
   drawBones(row, state) {
-    const { player } = this, chain = player.model.facts.pose.chains[row];
+    const { player } = this, chain = this.chains[row];
     const bones = (places, alpha, front) => {
       let last = rigidFit(player.model.pose.start, places, this.members[row]).after;
       for (const link of chain) {

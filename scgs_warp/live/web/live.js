@@ -6,11 +6,14 @@ class Updates {
     this.shown = 0;
     this.losses = 0;
     this.first = new Promise((resolve) => { this.arrived = resolve; });
-    this.wire = new Wire((data) => this.hear(JSON.parse(data)), (answers) => this.gone(answers));
+    this.status = "";
+    this.wire = new Wire((data) => this.hear(JSON.parse(data)), (answers) => this.gone(answers), undefined,
+      (on) => this.tell(on ? `${SILENT} The page shows what it has.` : this.status));
   }
 
   hear({ version, status }) {
     this.version = version;
+    this.status = status;
     if (!this.player && !version) say(status);
     else this.tell(status);
     if (version) this.arrived();

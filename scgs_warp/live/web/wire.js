@@ -2,8 +2,11 @@
 
 const RETRY = 1000; // milliseconds, doubled up to four times as long
 const ANSWER = 5000; // milliseconds that a server may take
+const BEAT = 2000; // milliseconds between questions whether it is there
 
 const STRANGE = "A server answers again, but it does not know this page. Open the address that it has printed, here or in another tab.";
+
+const SILENT = "The server does not answer.";
 
 const toHex = (bytes) => [...new Uint8Array(bytes)].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 const toBytes = (hex) => Uint8Array.from(hex.match(/../g), (pair) => parseInt(pair, 16));
@@ -30,13 +33,36 @@ async function findWayBack(back) {
 class Wire {
   // heard(data): a text or an ArrayBuffer has come. gone(answers): the connection is lost, or could not be opened;
   // answers: a server is there, and refuses this page. moved(): the server shows another scene, or another program.
-  constructor(heard, gone, moved = () => location.reload()) {
-    Object.assign(this, { heard, gone, moved });
+  // silent(on): the server has not answered for some time, though the connection stands; or it does again.
+  constructor(heard, gone, moved = () => location.reload(), silent = () => {}) {
+    Object.assign(this, { heard, gone, moved, silent });
+    this.quiet = false;
+    this.beaten = null; // when the server was asked whether it is there, until it says anything
     this.delay = RETRY;
     this.open = false;
     this.back = null; // secret for the way back
     this.broken = false; // the page could not begin: it does so when the server is back
     this.connect();
+    setInterval(() => this.beat(), BEAT);
+  }
+
+  // Ask whether the server is there; a stopped one leaves connections open.
+  beat() {
+    if (!this.open) return;
+    if (this.beaten === null) {
+      this.beaten = performance.now();
+      this.send({ do: "beat" });
+    } else if (!this.quiet && performance.now() - this.beaten > ANSWER) {
+      this.silent(true); // may still send something
+      this.quiet = true;
+    }
+  }
+
+  heardAnything() {
+    this.beaten = null;
+    if (!this.quiet) return;
+    this.quiet = false;
+    this.silent(false);
   }
 
   connect(answers = false) {
@@ -48,11 +74,12 @@ class Wire {
     this.socket.binaryType = "arraybuffer";
     this.socket.onopen = () => {
       this.open = opened = true;
+      this.beaten = null;
       this.delay = RETRY;
     };
     this.socket.onmessage = ({ data }) => this.hear(data);
     this.socket.onclose = () => {
-      this.open = false;
+      this.open = this.quiet = false;
       this.gone(answers && !opened);
       setTimeout(() => this.retry(), this.delay);
       this.delay = Math.min(4 * RETRY, 2 * this.delay);
@@ -65,7 +92,9 @@ class Wire {
   }
 
   hear(data) {
-    const server = typeof data === "string" && JSON.parse(data).server;
+    this.heardAnything();
+    const { server, beat } = typeof data === "string" ? JSON.parse(data) : {};
+    if (beat) return;
     if (!server) return this.heard(data);
     if (this.page && (this.broken || server.page !== this.page)) return this.moved();
     this.page = server.page;
