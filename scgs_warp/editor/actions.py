@@ -170,13 +170,20 @@ def put(editor: Host, fields: FieldReader) -> None:
 
 
 def undo(editor: Host, fields: FieldReader) -> None:
-    if not editor.model.undo():
-        raise UserError("there is nothing to undo")
+    _step(editor, editor.model.undo, "undo")
 
 
 def redo(editor: Host, fields: FieldReader) -> None:
-    if not editor.model.redo():
-        raise UserError("there is nothing to redo")
+    _step(editor, editor.model.redo, "redo")
+
+
+def _step(editor: Host, step: Callable[[], bool], name: str) -> None:
+    """Undo or redo. A part that has other control points afterwards stays chosen."""
+    chosen = editor.parts.part
+    if not step():
+        raise UserError(f"there is nothing to {name}")
+    if chosen is not None and editor.parts.part is None and chosen in editor.session.skeleton.names:
+        editor.parts.choose(chosen)
 
 
 def reset(editor: Host, fields: FieldReader) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..edit import EditSession
-from ..edit.field_reader import FieldReader
+from ..edit.field_reader import FieldReader, show_value
 from ..errors import UserError
 from ..export.page_parts import part_facts
 from .actions import short_text
@@ -69,7 +69,10 @@ def _new_name(fields: FieldReader) -> str:
     """
     value = fields.raw("to")
     name = value.strip() if isinstance(value, str) else value
-    return FieldReader({"name": name}, "the page").text("name")
+    try:
+        return FieldReader({"name": name}, "the page").text("name")
+    except UserError:
+        raise UserError(f"{show_value(name)} is no name; give 1 to 100 letters") from None
 
 
 PART_CHANGES = {action.__name__: action for action in (rename_part, rename_handle, merge_parts, split_part)}

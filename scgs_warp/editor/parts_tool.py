@@ -80,7 +80,7 @@ class PartsTool:
             elif takes_parts and how == "replace" and hit.part is not None and hit.part not in (part, inside):
                 self.choose(hit.part)
             else:
-                self._inside = hit.part
+                self._inside = hit.part if takes_parts else None
                 self._take_points(hit, how)
 
     def _take_points(self, hit: Hit, how: Combine) -> None:

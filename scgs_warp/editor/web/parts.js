@@ -82,7 +82,7 @@ class PartChanges {
   // What is chosen, over the picture.
   show({ part, selection, active, handles }) {
     const chip = element("chosen"), count = selection.length;
-    const name = part ?? handles.find((handle) => handle.name === active)?.name;
+    const handle = handles.find((one) => one.name === active), name = part ?? handle?.part ?? handle?.name;
     chip.hidden = !count;
     chip.disabled = !name;
     chip.textContent = name ?? `${count} control point${count === 1 ? "" : "s"}`;
