@@ -33,6 +33,17 @@ def test_a_number_is_a_finite_number_within_its_range(value):
         FieldReader({"x": value}, "a.json").number("x", None, 0.0, 1.0)
 
 
+@pytest.mark.parametrize("name", ["می\u200cرود", "\U0001f468\u200d\U0001f467", "יד"])
+def test_a_name_may_be_of_any_script(name):
+    assert FieldReader({"x": name}, "a.json").text("x") == name
+
+
+@pytest.mark.parametrize("name", ["", " ", "x" * 101, "a\nb", "\u202egnp", "\x00", 3, None])
+def test_what_cannot_be_shown_on_one_line_is_no_name(name):
+    with pytest.raises(UserError, match="give a name"):
+        FieldReader({"x": name}, "a.json").text("x")
+
+
 def test_objects_are_strict_json():
     assert parse_object('{"a": 1}', "a.json") == {"a": 1}
     for text in ("[1]", '{"a": Infinity}', '{"a": 1, "a": 2}', "{"):

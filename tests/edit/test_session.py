@@ -262,6 +262,25 @@ def test_mistakes_are_one_line(session):
     assert session.edit == Edit()
 
 
+def test_a_handle_is_renamed_in_targets_and_keyframes(session):
+    nodes = ends(session)[0]
+    session.add_handle(nodes, 0.0, "hand")
+    session.add_handle([nodes[0]], 0.0, "finger")
+    session.move("hand", (0.0, 0.1, 0.0))
+    session.add_keyframe(1.0)
+    before, targets = session.edit, session.engine.targets(session.edit, 1.0)
+    session.rename_handle("hand", "left hand")
+    renamed = {{"hand": "left hand"}.get(name, name): target for name, target in targets.items()}
+    assert session.engine.targets(session.edit, 1.0) == renamed
+    assert [handle.name for handle in session.edit.handles] == ["left hand", "finger"]
+    assert session.edit.handles[0].nodes == tuple(sorted(nodes))
+    assert session.undo() and session.edit == before
+    for old, new, words in (("hand", "finger", "is taken"), ("nobody", "x", "no handle"), ("hand", "", "give a name")):
+        with pytest.raises(UserError, match=words):
+            session.rename_handle(old, new)
+    assert session.edit == before
+
+
 def test_choosing(session):
     positions = session.node_positions(0.2)
     assert session.nearest(positions[17] + 1e-4, 0.2) == 17

@@ -6,6 +6,7 @@ import os
 import random
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -111,6 +112,26 @@ def test_what_cannot_be_saved_is_said_and_tried_again(session, tmp_path, monkeyp
     monkeypatch.setattr(module, "write_atomically", write)
     keeper.note(session.edit)
     assert keeper.flush() and kept(tmp_path, session) == session.edit
+    keeper.stop()
+
+
+def test_what_could_not_be_saved_is_saved_when_the_folder_is_there_again(session, tmp_path, monkeypatch):
+    """Without another change: nobody may come back to make one."""
+    monkeypatch.setattr(module, "AGAIN", 0.05)
+    folder = tmp_path / "edits"
+    folder.mkdir()
+    keeper = Autosave(session, folder)
+    keeper.start(restore=True)
+    folder.rename(tmp_path / "away")
+    session.add_handle([0, 1], 0.0, "hand")
+    keeper.note(session.edit, "{}")
+    assert not keeper.flush() and "cannot be written" in (keeper.problem or "")
+    (tmp_path / "away").rename(folder)
+    end = time.monotonic() + 30
+    while not keeper.saved(session.edit):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert kept(folder, session) == session.edit
     keeper.stop()
 
 

@@ -41,20 +41,6 @@ def arm_mask(session: EditSession, nodes: list[int]) -> np.ndarray:
     return render(shown, camera, torch.zeros(3)).alpha.detach().numpy() > 0.5
 
 
-def on_screen(window: Window, place: np.ndarray) -> tuple[float, float]:
-    """Where the page shows a place, which is in world units."""
-    x, y = window.ask(
-        """(() => { const { centre, scale } = player.model.facts.normalisation, v = player.view();
-        const p = argument.map((value, k) => (value - centre[k]) * scale), { width, height } = player.canvas;
-        const [x, y, z] = v.rows.map((r, k) => r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + v.shift[k]);
-        const b = player.canvas.getBoundingClientRect();
-        return [(v.lens[0] * x / z + v.lens[2]) * b.width / width + b.left,
-          (v.lens[1] * y / z + v.lens[3]) * b.height / height + b.top]; })()""",
-        place.tolist(),
-    )
-    return x, y
-
-
 def test_the_right_hand_is_raised_by_half_the_height_of_the_figure(browser, editor):
     window, session = Window(browser, editor), editor.session
     window.still()
@@ -78,8 +64,8 @@ def test_the_right_hand_is_raised_by_half_the_height_of_the_figure(browser, edit
     )
     rise = gestures = 0.0
     while rise < RISE * height and gestures < GESTURES:
-        x, y = on_screen(window, places()[tip])
-        there = on_screen(window, goal)
+        x, y = window.on_screen(places()[tip])
+        there = window.on_screen(goal)
         window.drag((x, y), (there[0] - x, there[1] - y))
         assert window.ask("studio.link.state.part") == hand
         until(lambda: not window.ask("studio.link.state.unedited"))

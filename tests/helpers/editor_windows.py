@@ -68,6 +68,19 @@ class Window:
         )
         return x, y
 
+    def on_screen(self, place: Any) -> tuple[float, float]:
+        """Where the page shows a place, [3] world units."""
+        x, y = self.ask(
+            """(() => { const { centre, scale } = player.model.facts.normalisation, v = player.view();
+            const p = argument.map((value, k) => (value - centre[k]) * scale), { width, height } = player.canvas;
+            const [x, y, z] = v.rows.map((r, k) => r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + v.shift[k]);
+            const b = player.canvas.getBoundingClientRect();
+            return [(v.lens[0] * x / z + v.lens[2]) * b.width / width + b.left,
+              (v.lens[1] * y / z + v.lens[3]) * b.height / height + b.top]; })()""",
+            [float(value) for value in place],
+        )
+        return x, y
+
     def lowest_limb(self) -> int:
         """The foot that nothing hides."""
         session = self.editor.session

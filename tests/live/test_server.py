@@ -119,6 +119,14 @@ def test_messages_of_a_page(server):
     assert server.gone.wait(10) and server.clients == {}
 
 
+def test_a_page_hears_at_once_that_the_server_is_there(server):
+    async def ask(wire: Any) -> Any:
+        await wire.send_str('{"do": "beat"}')
+        return await wire.receive_json()
+
+    assert talk(server, ask) == {"beat": True} and server.heard == []
+
+
 def test_a_slow_page_gets_the_newest_state(server):
     async def wait(wire: Any) -> list[bytes | str]:
         while not server.clients:
