@@ -76,10 +76,10 @@ def film_pull(window: Window) -> list[Image.Image]:
         shown(window)
         frames.append(picture(window, at))
     page.mouse.up()
-    page.mouse.move(end_x + 130, end_y + 60)
+    page.mouse.move(end_x - 150, end_y + 60)
     window.still()
     until(lambda: page.locator("#status").inner_text() == "saved")
-    return [*frames, *[picture(window, (end_x + 130, end_y + 60))] * 6]
+    return [*frames, *[picture(window, (end_x - 150, end_y + 60))] * 6]
 
 
 def keyed(window: Window) -> Image.Image:
@@ -87,7 +87,8 @@ def keyed(window: Window) -> Image.Image:
     page = window.page
     page.keyboard.press("k")
     until(lambda: page.locator(".key").count() > 1)
-    part = window.ask("studio.link.state.part")
+    window.ask("studio.link.ask('rename_part', { name: studio.link.state.part, to: 'right hand' })")
+    until(lambda: window.ask("studio.link.state.part") == "right hand")
     for at, turns in ((1.2, [0, 60, -20]), (2.4, [0, 20, 25])):
         window.ask("player.seek(argument / player.seconds)", at)
         degrees = window.ask("studio.link.state.target.degrees")
@@ -100,11 +101,12 @@ def keyed(window: Window) -> Image.Image:
         window.ask("(player.seek(argument[0] / player.seconds), player.orbit.turn(argument[1], 0))", [at, turn])
         page.keyboard.press("v")
     until(lambda: page.locator(".key.camera").count() == 2)
-    window.ask("(player.orbit.turn(-0.5, 0), player.seek(0.3), studio.display('ribbons', true))")
-    window.ask("studio.link.ask('choose_part', { name: argument })", part)
+    window.ask("(player.orbit.turn(-0.5, 0), player.seek(0), studio.display('ribbons', true))")
+    window.ask("studio.link.ask('choose_part', { name: 'right hand' })")
     page.keyboard.press("2")
     page.mouse.move(200, 300)
     page.evaluate("document.querySelectorAll('#panel details').forEach((one, k) => { one.open = k === 3; })")
+    page.evaluate("document.activeElement.blur()")
     window.still()
     return picture(window)
 
@@ -145,7 +147,7 @@ def main(arguments: list[str] | None) -> None:
             window = Window(browser, editor, size=SIZE)
             window.still()
             frames = [frame.resize((640, 400), Image.Resampling.LANCZOS) for frame in film_pull(window)]
-            colors = frames[-1].quantize(128, dither=Image.Dither.NONE)
+            colors = frames[len(frames) // 2].quantize(128, dither=Image.Dither.NONE)
             frames = [frame.quantize(palette=colors, dither=Image.Dither.NONE) for frame in frames]
             frames[0].save(
                 options.output / "editor-pull.gif",

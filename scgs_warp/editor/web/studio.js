@@ -130,6 +130,7 @@ class Studio {
     element("fold").addEventListener("click", () => this.fold());
     if (innerWidth <= 760) this.fold();
     addEventListener("pagehide", () => this.remember());
+    this.listenToDrops();
     this.use(kind);
     this.show(this.link.state);
     const loop = (now) => {
@@ -269,13 +270,29 @@ class Studio {
 
   choose() {
     const input = Object.assign(document.createElement("input"), { type: "file", accept: ".json,application/json" });
-    input.addEventListener("change", async () => {
-      const [file] = input.files;
-      if (!file) return;
-      if (file.size > MOST_SENT) this.note(`${file.name} is too large to be sent; put it into ${this.folder} and choose it there.`);
-      else this.link.ask("upload", { text: await file.text() });
-    });
+    input.addEventListener("change", () => this.send(input.files));
     input.click();
+  }
+
+  // Load an edit file that was chosen, or dropped on the page.
+  async send([file, ...others]) {
+    if (!file) return;
+    if (others.length) this.note("One edit at a time: drop a single file.");
+    else if (file.size > MOST_SENT) this.note(`${file.name} is too large to be sent; put it into ${this.folder} and choose it there.`);
+    else {
+      const text = await file.text().catch(() => null); // a folder has none
+      if (text === null) this.note(`${file.name} cannot be read; drop an edit's JSON.`);
+      else if (!(await this.link.ask("upload", { text })).problem) this.note(`${file.name} is loaded; undo brings the other edit back.`, "info");
+    }
+  }
+
+  // A browser would leave the page for a file that is dropped on it.
+  listenToDrops() {
+    addEventListener("dragover", (event) => event.preventDefault());
+    addEventListener("drop", (event) => {
+      event.preventDefault();
+      this.send(event.dataTransfer.files);
+    });
   }
 
   share() {

@@ -1,0 +1,149 @@
+"""What no manual foresees: files of other scenes, extremes of the view, a folder that cannot be written, keys lost and
+found."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from helpers.edit_scenes import bar_scene
+from helpers.editor_windows import Window, serve, until
+from scgs_warp.edit import EditSession, edit_file
+
+pytest.importorskip("aiohttp", reason="the package aiohttp is not installed")
+
+
+@pytest.fixture
+def editor(tmp_path):
+    made = serve(bar_scene(nodes=40, gaussians=600), tmp_path / "edits")
+    yield made
+    made.stop()
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path):
+    (tmp_path / "edits").mkdir()
+    return tmp_path / "edits"
+
+
+def drop(window: Window, *texts: str) -> None:
+    """Drop files on the page."""
+    window.page.evaluate(
+        """(texts) => { const data = new DataTransfer();
+        for (const text of texts) data.items.add(new File([text], "other.json"));
+        document.getElementById("view").dispatchEvent(
+          new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true })); }""",
+        list(texts),
+    )
+
+
+def test_a_dropped_edit_is_loaded_or_refused_in_one_line(browser, editor):
+    window, notes = Window(browser, editor), None
+    window.still()
+    notes = window.page.locator("#notes")
+    other = EditSession(bar_scene(nodes=30, gaussians=300))
+    other.add_handle([25, 28], 0.0, "hand")
+    other.move("hand", (0.0, 0.1, 0.0))
+    other.turn(other.parts()[0].name, 20, (0, 0, 1))
+    foreign = edit_file.to_json(other.edit, other.engine)
+    for texts, words in (
+        ((foreign,), "scene"), (("{",), "not valid JSON"), (("<html></html>",), "not valid JSON"),
+        ((foreign, foreign), "One edit"),
+        (("x" * 2_100_000,), "too large"), ((json.dumps({"format": "scgs-warp edit", "version": 9}),), "version"),
+    ):  # fmt: skip
+        drop(window, *texts)
+        until(lambda words=words: words in notes.locator("li").last.inner_text())
+        assert "\n" not in notes.locator("li").last.inner_text()
+        assert window.ask("studio.link.state.unedited && !studio.link.state.undo"), words
+    own = editor.session.fork()
+    own.add_handle([1, 2], 0.0, "<i>hand</i>")
+    own.move("<i>hand</i>", (0.0, 0.1, 0.0))
+    drop(window, edit_file.to_json(own.edit, own.engine))
+    until(lambda: editor.session.edit == own.edit and "is loaded" in notes.inner_text())
+    assert window.page.locator("#tracks .name").last.inner_text() == "<i>hand</i>"
+    assert "editor" in window.page.title(), "the page has not been left for the file"
+    window.close()
+
+
+def test_the_view_stays_usable_at_its_extremes(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    start = window.ask("[player.orbit.distance, player.orbit.azimuth]")
+    box = window.page.locator("#view").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    window.page.mouse.move(*middle)
+    window.ask("studio.link.ask('select', { what: 'nodes', nodes: [3], how: 'replace' })")
+    window.page.keyboard.press("2")
+    for wheel in (-4000, 8000):
+        for _ in range(20):
+            window.page.mouse.wheel(0, wheel)
+        window.still()
+        assert np.isfinite(window.ask("[player.orbit.distance, ...player.orbit.target]")).all()
+        window.drag(middle, (30, 200))
+        window.drag(middle, (0, -600))
+        window.page.keyboard.down("Shift")
+        window.drag((box["x"] + 5, box["y"] + 5), (500, 300))
+        window.page.keyboard.up("Shift")
+        assert np.isfinite(window.ask("player.view().shift")).all()
+    window.page.keyboard.press("Escape")
+    window.page.locator("#view").focus()
+    window.page.keyboard.press("f")
+    window.still()
+    assert window.ask("[player.orbit.distance, player.orbit.azimuth]") == start
+    assert window.ask("player.places.every(Number.isFinite)")
+    window.close()
+
+
+def test_a_folder_that_can_no_longer_be_written(browser, editor, folder, tmp_path):
+    """The page says so, the edit goes on, and is saved when the folder is there again."""
+    window = Window(browser, editor)
+    window.still()
+    status = window.page.locator("#status")
+    folder.rename(tmp_path / "away")
+    folder.write_text("a file where the folder was")
+    window.ask("studio.link.ask('select', { what: 'nodes', nodes: [1, 2], how: 'replace' })")
+    window.ask("studio.link.ask('put', { translation: [0, 0, 0.1] })")
+    until(lambda: "not saved" in status.inner_text())
+    window.ask("studio.link.ask('put', { translation: [0, 0, 0.2] })")
+    window.page.keyboard.press("Control+s")
+    until(lambda: "cannot be" in window.page.locator("#notes").inner_text())
+    assert window.ask("!studio.link.state.unedited && studio.link.state.undo")
+    folder.unlink()
+    (tmp_path / "away").rename(folder)
+    until(lambda: status.inner_text() == "saved")
+    assert edit_file.read(folder / "autosave.json", editor.session.engine) == editor.session.edit
+    window.close()
+
+
+def test_all_keys_are_deleted_and_undone(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    page = window.page
+    window.ask("studio.link.ask('select', { what: 'nodes', nodes: [1, 2], how: 'replace' })")
+    for row in range(4):
+        window.ask("studio.link.ask('put', { at: 0.5 * argument, translation: [0, 0, 0.1 * argument + 0.1] })", row)
+        window.ask("studio.link.ask('key', { at: 0.5 * argument })", row)
+    keys = page.locator("#tracks .ruler .key")
+    until(lambda: keys.count() == 4)
+    edit = editor.session.edit
+    while keys.count():
+        count = keys.count()
+        keys.first.click()
+        page.keyboard.press("Delete")
+        until(lambda count=count: keys.count() == count - 1)
+    page.keyboard.press("Delete")
+    until(lambda: not window.ask("studio.link.state.handles.length"))
+    page.locator("#view").focus()
+    for _ in range(5):
+        page.keyboard.press("Control+z")
+    until(lambda: editor.session.edit == edit)
+    until(lambda: keys.count() == 4)
+    for _ in range(30):
+        page.keyboard.press("Control+z")
+    until(lambda: window.ask("studio.link.state.unedited && !studio.link.state.undo"))
+    for _ in range(30):
+        page.keyboard.press("Control+y")
+    until(lambda: window.ask("!studio.link.state.redo") and keys.count() == 0)
+    window.close()
