@@ -221,6 +221,8 @@ def test_every_control_can_be_named_reached_and_read(browser, editor, size):
     source = (package("axe-core") / "axe.min.js").read_text(encoding="utf-8")
     window = Window(browser, editor, size={"width": size[0], "height": size[1]})
     window.still()
+    window.ask("studio.link.ask('choose_part', { name: studio.tools.parts[0].name })")
+    until(lambda: window.page.locator("#chosen").is_visible())
     for name in ("dark", "light"):
         window.ask("studio.theme(argument)", name)
         window.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
@@ -228,6 +230,12 @@ def test_every_control_can_be_named_reached_and_read(browser, editor, size):
         found = window.page.evaluate("axe.run({ resultTypes: ['violations'] }).then((r) => r.violations)")
         told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in found]
         assert told == [], name
+        for key, dialog in (("Control+k", "#palette"), ("?", "#keys"), ("F2", "#changes")):
+            window.page.keyboard.press(key)
+            found = window.page.evaluate("(place) => axe.run(place).then((r) => r.violations.map((v) => v.id))", dialog)
+            assert found == [], (name, dialog)
+            window.page.locator(dialog).evaluate("(dialog) => dialog.close()")
+        window.page.locator("#view").focus()
     assert window.page.evaluate("document.documentElement.scrollWidth") <= size[0]
     if window.page.evaluate("document.body.classList.contains('folded')"):
         window.page.get_by_role("button", name="Panel", exact=True).click()

@@ -85,7 +85,8 @@ class Commands {
 
   press(event) {
     if (event.altKey || document.querySelector("dialog[open]")) return;
-    const typed = /^(input|select|textarea)$/i.test(event.target.tagName) && event.target.type !== "checkbox";
+    const typed = /^(input|select|textarea)$/i.test(event.target.tagName) && event.target.type !== "checkbox"
+      && !event.target.closest("dialog:not([open])"); // it keeps the focus until the next frame
     const onButton = event.target.tagName === "BUTTON" && /^( |Enter|Arrow)/.test(event.key);
     const onSummary = event.target.tagName === "SUMMARY" && /^( |Enter)/.test(event.key);
     const control = event.ctrlKey || event.metaKey;
@@ -120,6 +121,7 @@ class Commands {
     this.at = 0;
     element("found").replaceChildren(...this.found.map((command, k) => {
       const row = document.createElement("li"), key = document.createElement("kbd");
+      row.id = `found-${k}`;
       row.setAttribute("role", "option");
       row.setAttribute("aria-disabled", String(!command.when()));
       key.textContent = keyText(command.key);
@@ -132,6 +134,7 @@ class Commands {
 
   mark() {
     [...element("found").children].forEach((row, k) => row.setAttribute("aria-selected", String(k === this.at)));
+    element("sought").setAttribute("aria-activedescendant", this.found.length ? `found-${this.at}` : "");
     element("found").children[this.at]?.scrollIntoView({ block: "nearest" });
   }
 

@@ -114,7 +114,7 @@ class Panel {
       inputs.forEach((input, k) => {
         input.disabled = Boolean(row.when && !row.when(state));
         input.title = tidy(exact[k]);
-        if (document.activeElement !== input) input.value = Number(Number(exact[k]).toPrecision(3));
+        if (document.activeElement !== input) input.value = Math.abs(exact[k]) < 1e-6 ? 0 : Number(Number(exact[k]).toPrecision(3));
       });
     });
     fields.append(...inputs);
