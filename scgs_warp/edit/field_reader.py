@@ -16,7 +16,7 @@ from ..storage.json_files import parse_json
 
 MAX_BYTES = 64 << 20
 """Largest size of an edit file in bytes."""
-_JOINERS = dict.fromkeys((0x200C, 0x200D))
+_JOINERS: dict[int, str | None] = {0x200C: None, 0x200D: None}
 MAX_NUMBER = 1e9
 """Largest magnitude of numbers without a limit of their own; beyond it float32 cannot resolve a scene."""
 
