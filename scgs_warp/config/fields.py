@@ -232,8 +232,9 @@ class DensifyConfig:
     """Visibility pruning without alpha: also remove Gaussians that a view sees nearer than this share of the distance
     at which its content begins: they become fog before the lens. 0: off."""
     faint_share: float = newer(0.01, before=0.0, least=0, most=1)
-    """Visibility pruning at the end of densification: also remove the Gaussians that contribute least, as many as have
-    together at most this share of the contributions of all (of each the largest to a sampled view). 0: off."""
+    """Visibility pruning with alpha, at the end of densification: also remove the Gaussians that contribute least, as
+    many as have together at most this share of the contributions of all (of each the largest to a sampled view). 0:
+    off."""
     prune_large: Literal["auto", "always", "never"] = "auto"
     """Apply max_screen and max_scale. auto: only if the images have alpha, because images without alpha show bare
     walls, which need large Gaussians."""

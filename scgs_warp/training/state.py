@@ -299,7 +299,9 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
         config = replace(config, motion=replace(motion, hyper_dim=hyper_dim))
     if growth.prune_large == "auto":
         config = replace(config, densify=replace(growth, prune_large="never" if filled else "always"))
-    if not filled:  # Beside a cut-out subject every Gaussian is contradicted by the background of some view.
+    if filled:  # Much of a photo is covered by Gaussians of which each contributes little.
+        config = replace(config, densify=replace(config.densify, faint_share=0.0))
+    else:  # Beside a cut-out subject every Gaussian is contradicted by the background of some view.
         config = replace(config, densify=replace(config.densify, least_views=1, clear_distance=0.0))
     thin = "auto" in (config.loss.pooled, config.pretrain.fade) and is_thin(data)
     if config.loss.pooled == "auto":

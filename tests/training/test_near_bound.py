@@ -91,7 +91,9 @@ def test_a_sample_of_the_views_cannot_tell_that_no_other_sees_it(monkeypatch):
 
 
 def test_cut_out_subjects_are_left_alone():
-    config = tiny_config(60, densify={"least_views": 2, "clear_distance": 0.25})
-    assert resolve_auto(config, filled()).densify.least_views == 2
+    """They lose their faintest Gaussians instead."""
+    config = tiny_config(60, densify={"least_views": 2, "clear_distance": 0.25, "faint_share": 0.01})
+    resolved = resolve_auto(config, filled()).densify
+    assert (resolved.least_views, resolved.clear_distance, resolved.faint_share) == (2, 0.25, 0.0)
     resolved = resolve_auto(config, tiny_dataset(4)).densify
-    assert (resolved.least_views, resolved.clear_distance) == (1, 0.0)
+    assert (resolved.least_views, resolved.clear_distance, resolved.faint_share) == (1, 0.0, 0.01)
