@@ -30,6 +30,8 @@ from .memory import NotEnoughMemory
 
 STATE, DONE, AWAKE, ENTRY, SPINS, JOB_SIZE = 0, 8, 16, 24, 32, 33
 """Indices of a job's numbers (``kernels/native/sharing.h``), and how many there are."""
+MOST_SEATS = 255
+"""Largest number of helpers that share a grid; a job has eight bits for it."""
 FIRST_SIZE = 4
 """Size in bytes of a kernel's first argument."""
 LOOKS = 4000
@@ -136,7 +138,7 @@ class HelperThreads:
                 return False
             firsts, bounds = chunks.firsts + np.int32(begin) if begin else chunks.firsts, chunks.bounds(kernel.bounds)
             self._arguments[FIRST_SIZE:size] = arguments
-            seats = min(threads, len(chunks)) - 1
+            seats = min(threads, len(chunks), MOST_SEATS + 1) - 1
             places = bounds.ctypes.data, bounds.shape[1], firsts.ctypes.data, self._address
             self._job[ENTRY:SPINS] = kernel.address, *places, size, len(chunks), seats
             self._run(len(chunks), seats)

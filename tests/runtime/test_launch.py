@@ -183,6 +183,16 @@ def test_a_sleeping_helper_wakes_up(own_helpers):
             time.sleep(0.001)
 
 
+def test_a_job_has_no_more_seats_than_its_bits_hold(own_helpers, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(own_helpers, "_wake", lambda helpers: None)
+    ran: list[int] = []
+    for _ in range(2):
+        assert share(PythonKernel(lambda first, size: ran.append(first)), b"", single_chunks(600), 500)
+        assert own_helpers._job[cpu_threads.SPINS - 1] == 255
+    assert ran == 2 * list(range(600))
+    assert int(own_helpers._job[cpu_threads.STATE]) >> 40 == 2, "jobs are counted one by one"
+
+
 def test_threads_that_share_a_core_do_not_look_for_jobs(own_helpers, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(environment, "available_threads", lambda: 1)
     ran: list[int] = []
