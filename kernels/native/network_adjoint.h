@@ -129,24 +129,9 @@ WHOLE_REGISTERS static inline void network_panel_adjoint(
                 for (int r = 0; r < ROWS; ++r)
                     for (int u = 0; u < VECTORS; ++u) acc[r][u] = vn{};
                 float* to = gradient + (long long)(panel * PANEL + j) * in + column + c;
-                // Visit the part of the tile that exists, in vectors where they fit.
-                auto visit = [&](auto whole, auto single) {
-                    for (int r = 0; r < ROWS && j + r < n_out; ++r)
-                        for (int u = 0; u < VECTORS; ++u) {
-                            float* at = to + (long long)r * in + u * LANES;
-                            if (c + (u + 1) * LANES <= n)
-                                whole(at, acc[r][u]);
-                            else
-                                for (int s = 0; s < LANES && c + u * LANES + s < n; ++s) single(at + s, acc[r][u], s);
-                        }
-                };
-                if (first)
-                    visit(
-                        [](const float* at, vn& sum) { sum = *(const vnu*)at; },
-                        [](const float* at, vn& sum, int s) { sum[s] = *at; }
-                    );
+                if (first) read_tile()(acc, to, in, n_out - j, n - c);
                 accumulate(acc, v + j, One(), Panel(), x + c, count);
-                visit([](float* at, vn sum) { *(vnu*)at = sum; }, [](float* at, vn sum, int s) { *at = sum[s]; });
+                write_tile()(acc, to, in, n_out - j, n - c);
             }
     }
 }

@@ -86,3 +86,34 @@ static inline auto accumulation() {
             for (int v = 0; v < V; ++v) sums[r][v] = acc[r][v];
     };
 }
+
+// Return functions that read a tile of sums from, and write it to, the rows of a matrix with ``stride`` columns: the
+// part of the tile that exists, in vectors where they fit.
+static inline auto visit_tile() {
+    return [](auto& sums, float* at, long long stride, int rows, int columns, auto vector, auto number) {
+        for (int r = 0; r < ROWS && r < rows; ++r)
+            for (int v = 0; v < VECTORS; ++v) {
+                float* to = at + r * stride + v * LANES;
+                if ((v + 1) * LANES <= columns)
+                    vector(to, sums[r][v]);
+                else
+                    for (int s = 0; s < LANES && v * LANES + s < columns; ++s) number(to + s, sums[r][v], s);
+            }
+    };
+}
+static inline auto read_tile() {
+    return [](auto& sums, const float* from, long long stride, int rows, int columns) {
+        visit_tile()(
+            sums, (float*)from, stride, rows, columns, [](float* at, vn& sum) { sum = *(const vnu*)at; },
+            [](float* at, vn& sum, int s) { sum[s] = *at; }
+        );
+    };
+}
+static inline auto write_tile() {
+    return [](auto& sums, float* to, long long stride, int rows, int columns) {
+        visit_tile()(
+            sums, to, stride, rows, columns, [](float* at, vn sum) { *(vnu*)at = sum; },
+            [](float* at, vn sum, int s) { *at = sum[s]; }
+        );
+    };
+}
