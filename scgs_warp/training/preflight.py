@@ -22,6 +22,7 @@ CHOSEN_BY_THE_DATA = (
     "densify.prune_large",
     "densify.least_views",
     "densify.clear_distance",
+    "densify.faint_share",
     "loss.pooled",
     "pretrain.fade",
     "pretrain.steps",

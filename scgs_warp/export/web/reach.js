@@ -41,9 +41,10 @@ function reach(links, base, grip, place) {
   for (let k = 1; k < way.length; k++) length += Math.hypot(...plus(way[k], way[k - 1], -1));
   const here = plus(end, centre, -1), far = Math.hypot(...plus(place, centre, -1));
   const there = plus(place, centre, -1).map((value) => value * Math.min(1, length / Math.max(far, 1e-300)));
+  const costs = links.map((link, row) => (row ? bendCost(link.axis) : swingCost(links)));
   for (let step = 1; step <= STEPS; step++) {
     const aim = plus(centre, between(here, there, step / STEPS));
-    pose = approach(links, pose, base, grip, aim, length, step === STEPS ? 40 : 4);
+    pose = approach(links, costs, pose, base, grip, aim, length, step === STEPS ? 40 : 4);
   }
   return pose;
 }
@@ -60,7 +61,7 @@ function between(here, there, share) {
 }
 
 // Gauss-Newton steps for the cost of the change since the links' present pose plus the pull.
-function approach(links, pose, base, grip, aim, length, iterations) {
+function approach(links, costs, pose, base, grip, aim, length, iterations) {
   const pull = PULL / length ** 2, slide = SLIDE / length ** 2, size = 3 * links.length + 3;
   for (let iteration = 0; iteration < iterations; iteration++) {
     const { points, end } = posedChain(links, pose, base, grip);
@@ -79,12 +80,12 @@ function approach(links, pose, base, grip, aim, length, iterations) {
       slope[a] += slide * (pose.shift[a] - links[0].shift[a]);
     }
     links.forEach((link, row) => {
-      const since = qLogarithm(qMultiply(pose.turns[row], qConjugate(link.quat)));
+      const since = qLogarithm(qMultiply(pose.turns[row], qConjugate(link.quat))), inner = changeOfLogarithm(since);
+      const weighted = product(costs[row], inner), at = 3 * row + 3;
       for (let a = 0; a < 3; a++) {
         for (let b = 0; b < 3; b++) {
-          const cost = costOf(row, link.axis, a, b);
-          normal[3 * row + 3 + a][3 * row + 3 + b] += cost;
-          slope[3 * row + 3 + a] += cost * since[b];
+          for (let c = 0; c < 3; c++) normal[at + a][at + b] += inner[c][a] * weighted[c][b];
+          slope[at + a] += weighted[b][a] * since[b];
         }
       }
     });
@@ -102,8 +103,25 @@ function approach(links, pose, base, grip, aim, length, iterations) {
   return pose;
 }
 
-function costOf(row, axis, a, b) {
-  const same = a === b ? 1 : 0;
-  if (!row) return same;
-  return BEND * (axis ? OFF_AXIS * same - (OFF_AXIS - 1) * axis[a] * axis[b] : same);
+// Return the 3 x 3 matrix one * I + two * v v^T.
+const alongAndAcross = (one, two, v) => v.map((x, a) => v.map((y, b) => (a === b ? one : 0) + two * x * y));
+
+const product = (left, right) => left.map((row) => right[0].map((_, c) => row.reduce((sum, x, k) => sum + x * right[k][c], 0)));
+
+// Quadratic form of an inner joint's cost: a turn across a known axis costs more than one about it.
+function bendCost(axis) {
+  return axis ? alongAndAcross(BEND * OFF_AXIS, -BEND * (OFF_AXIS - 1), axis) : alongAndAcross(BEND, 0, [0, 0, 0]);
+}
+
+// That of the first joint: a twist about the line to the last joint costs more than a swing.
+function swingCost(links) {
+  const bone = qRotate(links[0].quat, plus(links[links.length - 1].joint, links[0].joint, -1)), square = dot(bone, bone);
+  return alongAndAcross(1, square < 1e-18 ? 0 : (OFF_AXIS - 1) / square, bone);
+}
+
+// Derivative of a rotation vector by a small turn that follows the rotation.
+function changeOfLogarithm(v) {
+  const angle = Math.hypot(...v), [x, y, z] = v, turn = [[0, -z, y], [z, 0, -x], [-y, x, 0]], twice = product(turn, turn);
+  const second = angle < 1e-3 ? 1 / 12 : (1 / angle - 0.5 / Math.tan(0.5 * angle)) / angle;
+  return turn.map((row, a) => row.map((value, b) => (a === b ? 1 : 0) - 0.5 * value + second * twice[a][b]));
 }
