@@ -106,8 +106,8 @@ def _between(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class HelperThreads:
     """Threads that take chunks of the same job (``kernels/native/sharing.h``).
 
-    A helper without work looks for the next job for a fraction of a millisecond, because waking it up would take longer
-    than most kernels run; then it sleeps.
+    A helper without work looks for the next job for a fraction of a millisecond, because a short kernel would be over
+    before it woke up; then it sleeps.
     """
 
     def __init__(self, flush_denormals: bool) -> None:
@@ -172,7 +172,10 @@ class HelperThreads:
             self._wakes.put(True)
 
     def _run(self, chunks: int, helpers: int) -> None:
-        """Run the job. After an interrupt as well, return only when no helper writes to its tensors any more."""
+        """Run the job. After an interrupt as well, return only when no helper writes to its tensors any more.
+
+        What is raised before the job was offered is raised at once.
+        """
         job, before, called, interrupt = self._job, int(self._job[STATE]), False, None
         while True:
             try:
@@ -187,6 +190,8 @@ class HelperThreads:
                     self._calls["finish_job"]()
                     time.sleep(0.0)
             except BaseException as error:
+                if job[STATE] == before:
+                    raise
                 interrupt = error
         if interrupt is not None:
             raise interrupt

@@ -221,10 +221,8 @@ def test_a_second_grid_meanwhile_runs_alone(all_threads: None, own_helpers):
     assert share(PythonKernel(lambda first, size: None), b"", single_chunks(2), 2)
 
 
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_an_interrupt_waits_until_no_helper_writes_any_more(when: str, own_helpers, monkeypatch: pytest.MonkeyPatch):
-    """It comes before the chunks are offered, or while a helper still works."""
-    started, ended, interrupted = threading.Event(), threading.Event(), threading.Event()
+def test_an_interrupt_waits_until_no_helper_writes_any_more(own_helpers, monkeypatch: pytest.MonkeyPatch):
+    started, ended = threading.Event(), threading.Event()
 
     def call(first: int, size: int) -> None:
         if threading.current_thread() is threading.main_thread():
@@ -238,17 +236,30 @@ def test_an_interrupt_waits_until_no_helper_writes_any_more(when: str, own_helpe
     offer = own_helpers._calls["share_job"]
 
     def interrupt() -> None:
-        if when == "before" and not interrupted.is_set():
-            interrupted.set()
-            raise KeyboardInterrupt
         offer()
-        if when == "after":
-            raise KeyboardInterrupt
+        raise KeyboardInterrupt
 
     monkeypatch.setitem(own_helpers._calls, "share_job", interrupt)
     with pytest.raises(KeyboardInterrupt):
         share(PythonKernel(call), b"", single_chunks(2), 2)
     assert ended.is_set()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+def test_what_is_raised_before_the_offer_is_raised_at_once(error, own_helpers, monkeypatch: pytest.MonkeyPatch):
+    share(PythonKernel(lambda first, size: None), b"", single_chunks(2), 2)
+
+    def refuse() -> None:
+        raise error
+
+    ran: list[int] = []
+    with monkeypatch.context() as patch:
+        patch.setitem(own_helpers._calls, "share_job", refuse)
+        with pytest.raises(error):
+            share(PythonKernel(lambda first, size: ran.append(first)), b"", single_chunks(2), 2)
+    assert not ran
+    assert share(PythonKernel(lambda first, size: ran.append(first)), b"", single_chunks(2), 2), "the next one runs"
+    assert sorted(ran) == [0, 1]
 
 
 def test_at_the_end_no_helper_runs_any_more(own_helpers):
