@@ -10,6 +10,7 @@ import pytest
 from helpers.chromium import chromium
 from helpers.edit_scenes import figure_scene
 from helpers.editor_windows import serve
+from helpers.studios import Page
 from scgs_warp.editor import Editor
 from scgs_warp.scene.scene import Scene
 
@@ -30,3 +31,11 @@ def editor(figure, tmp_path) -> Iterator[Editor]:
     made = serve(figure, tmp_path)
     yield made
     made.stop()
+
+
+@pytest.fixture
+def page(editor) -> Iterator[Page]:
+    """A page of the test's own ``editor``."""
+    made = Page(editor)
+    yield made
+    made.close()

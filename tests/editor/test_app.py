@@ -42,13 +42,6 @@ def editor(tmp_path) -> Iterator[Editor]:
     made.stop()
 
 
-@pytest.fixture
-def page(editor) -> Iterator[Page]:
-    made = Page(editor)
-    yield made
-    made.close()
-
-
 def places_of(editor: Editor, *moment: float) -> np.ndarray:
     """Control points, computed where the editor computes: two threads may not use one session."""
     return editor.worker.call(lambda: editor.session.node_positions(*moment))

@@ -30,13 +30,6 @@ def editor(tmp_path) -> Iterator[Editor]:
     made.stop()
 
 
-@pytest.fixture
-def page(editor) -> Iterator[Page]:
-    made = Page(editor)
-    yield made
-    made.close()
-
-
 def parts_of(page: Page) -> dict:
     """The newest message about the parts."""
     return [message["parts"] for message in page.heard if "parts" in message][-1]
