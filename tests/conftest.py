@@ -1,4 +1,5 @@
-"""Fixtures: devices that are present, thread counts, data sets at hand; and the list of what was skipped."""
+"""Fixtures: devices that are present, thread counts, data sets at hand; the number of processes that run the tests;
+and the list of what was skipped."""
 
 from __future__ import annotations
 
@@ -13,13 +14,32 @@ from helpers import skipped
 
 import torch  # isort: skip
 
-from scgs_warp.runtime import environment
+from scgs_warp.runtime import environment, memory
 
-environment.configure()
+THREADS = 1 if "PYTEST_XDIST_WORKER" in os.environ else None
+"""Threads of a process of tests: where several share the cores, helpers would only wait for each other."""
 
-collect_ignore = [] if os.environ.get("SCGS_PRETENDED_CUDA") else ["pretended_cuda"]
+environment.configure(THREADS)
+
+PRETENDED = bool(os.environ.get("SCGS_PRETENDED_CUDA"))
+collect_ignore = [] if PRETENDED else ["pretended_cuda"]
+
+MEMORY_PER_PROCESS = 2.5 * 2**30
+"""Bytes that a process of tests and the programs that it starts may need."""
+MOST_PROCESSES = 8
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Return how many processes run the tests: one more than cores, since some tests wait for programs; none but this
+    one for single files, for a debugger, and where there is a GPU, whose memory they would share."""
+    folders = all(Path(argument.partition("::")[0]).is_dir() for argument in config.args)
+    gpu = torch.cuda.is_available() and not PRETENDED
+    if not folders or config.getoption("usepdb") or gpu:
+        return 0
+    room = min(memory.free_on_host()) / MEMORY_PER_PROCESS
+    return int(max(1, min(environment.available_threads() + 1, MOST_PROCESSES, room)))
 
 
 @pytest.fixture(params=DEVICES)
@@ -32,7 +52,7 @@ def device(request: pytest.FixtureRequest) -> str:
 def all_threads():
     """Restore the thread count after the test."""
     yield
-    environment.configure()
+    environment.configure(THREADS)
 
 
 @pytest.fixture

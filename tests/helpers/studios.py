@@ -47,7 +47,9 @@ class Page:
                 self._ready.set()
                 async for message in wire:
                     self._take(message.data)
-        self.closed.set()
+        with self._changed:
+            self.closed.set()
+            self._changed.notify_all()
 
     def _take(self, data: str | bytes) -> None:
         with self._changed:

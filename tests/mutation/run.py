@@ -123,7 +123,8 @@ def run_tests(copy: Path, tests: tuple[str, ...]) -> int:
 
     for package in (scgs_warp, scgs_warp.kernels):
         assert str(package.__file__).startswith(str(copy)), f"{package.__file__} is not of the copy"
-    return int(pytest.main(["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:randomly", *tests]))
+    options = ["-x", "-q", "-n", "0", "--no-header", "-p", "no:cacheprovider", "-p", "no:randomly"]
+    return int(pytest.main([*options, *tests]))
 
 
 @contextmanager
