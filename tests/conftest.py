@@ -3,6 +3,7 @@ and the list of what was skipped."""
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,12 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
         return 0
     room = min(memory.free_on_host()) / MEMORY_PER_PROCESS
     return int(max(1, min(environment.available_threads() + 1, MOST_PROCESSES, room)))
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the objects of libraries and of thousands of tests."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(params=DEVICES)
