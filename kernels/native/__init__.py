@@ -15,6 +15,7 @@ share; they reach a header as macros. ``tests/kernels/test_native.py`` compiles 
 
 from __future__ import annotations
 
+import functools
 import inspect
 import re
 from collections.abc import Callable
@@ -73,9 +74,11 @@ CONSTANTS: dict[str, int | float] = {
 """Values of the shared macros by name; a header gets those that occur in its text."""
 
 _INCLUDE = re.compile(r'^#include "([\w./]+)"\n', re.MULTILINE)
+_WORD = re.compile(r"\w+")
 _GUARDS = {"cpu": "#if !defined(__CUDA_ARCH__)", "cuda": "#if defined(__CUDA_ARCH__)"}
 
 
+@functools.cache
 def header_text(name: str, folder: Path = FOLDER) -> str:
     """Return the text of a header of ``folder``, with each included header in place of its first ``#include``."""
     seen: set[str] = set()
@@ -92,10 +95,11 @@ def header_text(name: str, folder: Path = FOLDER) -> str:
 
 def constant_macros(text: str) -> dict[str, str]:
     """Return the shared constants that occur in ``text``, as macro names and C++ literals."""
+    words = set(_WORD.findall(text))
     return {
         name: f"{value!r}f" if isinstance(value, float) else str(int(value))
         for name, value in CONSTANTS.items()
-        if re.search(rf"\b{name}\b", text)
+        if name in words
     }
 
 

@@ -145,7 +145,7 @@ def configure(threads: int | None = None) -> None:
     _keep_freed_memory()
     torch.set_flush_denormal(True)
     torch.set_num_threads(thread_count())
-    torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.set_deterministic_debug_mode("warn")  # use_deterministic_algorithms would import the compiler, for a second
     # This switch would make torch.empty fill every buffer with NaN; the kernels write all they allocate.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
 
+from scgs_warp.apps import cli
 from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.motion.network import encode
 from scgs_warp.runtime import environment
@@ -56,3 +60,32 @@ def test_activations_of_many_gaussians_have_the_same_bits_on_any_number_of_threa
         environment.configure()
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_apps_start_without_the_compiler_of_torch():
+    """Importing it takes as long as all the rest."""
+    code = (
+        "import sys\n"
+        "from scgs_warp.apps import cli\n"
+        "cli.prepare('cpu', 1)\n"
+        "import scgs_warp.editor.app, scgs_warp.export.run, scgs_warp.training.run, torch\n"
+        "assert torch.are_deterministic_algorithms_enabled()\n"
+        "assert torch.is_deterministic_algorithms_warn_only_enabled()\n"
+        "print([name for name in ('sympy', 'torch._dynamo', 'torch._inductor') if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_an_app_collects_garbage_again_once_its_libraries_are_loaded():
+    cli.prepare("cpu", 1)
+    try:
+        assert gc.isenabled() and gc.get_freeze_count() > 0
+        gc.disable()
+        with cli.no_collection():
+            pass
+        assert not gc.isenabled(), "left as it was"
+    finally:
+        gc.enable()
+        environment.configure()
