@@ -15,7 +15,6 @@ share; they reach a header as macros. ``tests/kernels/test_native.py`` compiles 
 
 from __future__ import annotations
 
-import functools
 import inspect
 import re
 from collections.abc import Callable
@@ -78,7 +77,6 @@ _WORD = re.compile(r"\w+")
 _GUARDS = {"cpu": "#if !defined(__CUDA_ARCH__)", "cuda": "#if defined(__CUDA_ARCH__)"}
 
 
-@functools.cache
 def header_text(name: str, folder: Path = FOLDER) -> str:
     """Return the text of a header of ``folder``, with each included header in place of its first ``#include``."""
     seen: set[str] = set()
