@@ -1,5 +1,6 @@
-"""Writers of the tables in docs/scaling.md, docs/editing.md, docs/mesh.md, docs/page.md and docs/capture.md whose
-results can be measured again with committed scripts (for those on parts and poses, see ``posing_tables.py``).
+"""Writers of the tables in docs/scaling.md, docs/editing.md, docs/mesh.md, docs/page.md, docs/capture.md and
+docs/trust.md whose results can be measured again with committed scripts (for those on parts and poses, see
+``posing_tables.py``).
 
 Until all results of a table are there, the reported table stands in its place. A column NAME of the tables of sharing
 comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharing-NAME-alone.json``:
@@ -12,7 +13,8 @@ The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
 of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of optical flow from ``results/optical-flow.json``
 (``optical_flow.py``), that of long films from ``results/long-film-memory.json`` (``long_film.py memory``). Those of
-pages come from ``results/page-million.json`` (``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``).
+pages come from ``results/page-million.json`` (``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``),
+and that of soaks from ``results/chaos-PART.json`` (``chaos.py --part PART --minutes 118``).
 """
 
 from __future__ import annotations
@@ -150,6 +152,26 @@ def live_cost(results: Results) -> str:
     return table([head, f"median of {one['pairs']} pairs", "quartiles", "whole run"], lines) + f"\n\n{note}"
 
 
+SOAKS = {
+    "training": "training",
+    "live": "training with an open page",
+    "export": "exports",
+    "editor": "the editor",
+}
+"""What ``chaos.py`` disturbs, by the names of its parts."""
+
+
+def soaks(results: Results) -> str:
+    """Write how many rounds of each kind of work were disturbed, and how many broke an invariant."""
+    lines = []
+    for part, text in SOAKS.items():
+        one = results[f"chaos-{part}"]
+        minutes = one["command"].partition("--minutes ")[2].split()[0]
+        disturbed = one["rounds"] - one["faults"][part].get("none", 0)
+        lines.append([text, f"{minutes} min", str(one["rounds"]), str(disturbed), str(len(one["broken"]))])
+    return table(["work", "time", "rounds", "of them with a fault", "invariants broken"], lines)
+
+
 class Repeatable(NamedTuple):
     """A table, the names of its results, and the folders with the code that they measure."""
 
@@ -177,6 +199,9 @@ REPEATABLE = {
     "posing-pictures": Repeatable(pictures, ("posing-pictures",), EDITING),
     "page-million": Repeatable(page_million, ("page-million",), ("scgs_warp/export/web",)),
     "live-cost": Repeatable(live_cost, ("live-cost",), ("scgs_warp/live", "scgs_warp/training")),
+    "trust-soaks": Repeatable(
+        soaks, tuple(f"chaos-{part}" for part in SOAKS), ("scgs_warp/storage", "scgs_warp/editor", "scgs_warp/live")
+    ),
     "editing-updates": Repeatable(edit_updates, ("edit-cpu", "edit-4096-cpu"), EDITING),
 }
 

@@ -217,3 +217,21 @@ def test_rows_of_two_threads_on_a_busy_machine_are_refused():
     tables = benchmark_script("timing_tables")
     assert "quote the one-thread column" in tables.scaling_line(rows)
     assert "quote" not in tables.scaling_line(rows[:1]) and tables.scaling_line([{**rows[0], "device": "cuda"}]) == ""
+
+
+def test_soaks_are_counted(report, tmp_path):
+    tables = benchmark_script("repeatable_tables")
+    origin = {"date": "2026-01-01", "commit": COMMIT, "machine": {"gpu": None, "processor": "x", "cores": 2}}
+    origin["machine"].update(torch="2", warp="1")
+    for part in tables.SOAKS:
+        one = {
+            "command": f"python benchmarks/chaos.py --minutes 118 --part {part}",
+            "rounds": 9,
+            "faults": {name: {"kill": 5, "none": 4} if name == part else {} for name in tables.SOAKS},
+            "broken": ["live, memory: it hung"] if part == "live" else [],
+        }
+        (tmp_path / f"chaos-{part}.json").write_text(json.dumps({**origin, **one}), encoding="utf-8")
+    text = report.section("trust-soaks", tmp_path)
+    assert (
+        "| training | 118 min | 9 | 5 | 0 |" in text and "| training with an open page | 118 min | 9 | 5 | 1 |" in text
+    )
