@@ -7,8 +7,8 @@ import gc
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Literal
 
 from scgs_warp.errors import UserError, is_shortage, one_line
@@ -65,18 +65,6 @@ def _more_memory() -> str:
     return f"this process may use {limit >> 20} MiB of addresses (ulimit -v): allow more, or give less at once"
 
 
-@contextmanager
-def no_collection() -> Iterator[None]:
-    """Collect no garbage meanwhile: imports make millions of objects, and no garbage."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
 @functools.cache
 def spare_libraries() -> None:
     """Take the objects of the libraries out of all later collections, once in a process: each would take 0.1 s."""
@@ -117,7 +105,7 @@ def prepare(device: Device, threads: int | None, memory_gib: float | None = None
         raise UserError(f"--threads {threads}: must be at least 1")
     if memory_gib is not None and not 0.0 < memory_gib < math.inf:
         raise UserError(f"--memory-gib {memory_gib:g}: must be greater than 0")
-    with no_collection():
+    with environment.no_collection():
         environment.configure(threads)
     spare_libraries()
     if memory_gib is not None:

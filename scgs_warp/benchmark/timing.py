@@ -80,13 +80,8 @@ def _nothing() -> None:
 def _no_garbage_collection() -> Iterator[None]:
     """Keep garbage of earlier rows out of the times, as ``timeit`` does."""
     gc.collect()
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
+    with environment.no_collection():
         yield
-    finally:
-        if was_on:
-            gc.enable()
 
 
 class Stages:

@@ -83,7 +83,7 @@ def test_an_app_collects_garbage_again_once_its_libraries_are_loaded():
     try:
         assert gc.isenabled() and gc.get_freeze_count() > 0
         gc.disable()
-        with cli.no_collection():
+        with environment.no_collection():
             pass
         assert not gc.isenabled(), "left as it was"
     finally:
