@@ -137,7 +137,8 @@ print(*words[words.index("--preset"):], file=open("runs", "a"))
 log, config = folder / "log.jsonl", folder / "config.json"
 if config.exists() != ("--resume" in words):
     sys.exit("a run is there, or not")
-config.write_text(json.dumps({"steps": 1000}))
+(folder / "begun").write_text(json.dumps({"steps": 1000}))
+(folder / "begun").rename(config)
 if pathlib.Path("broken").exists():
     sys.exit("no images")
 rows = [json.loads(line) for line in log.open()] if log.exists() else []
