@@ -46,7 +46,7 @@ def find_joints(patches: Patches, labels: np.ndarray) -> list[Joint]:
         labels: [P] part of each patch, from ``find_parts``.
     """
     parts = int(labels.max()) + 1
-    pooled, motions = fit_parts(patches, labels)
+    pooled, motions = fit_parts(patches.moments, labels)
     ends = labels[patches.edges]
     pairs = np.unique(np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1), axis=0)
     turns = relative_turns(pooled, motions, pairs)

@@ -10,6 +10,7 @@ splits a body whose surface drifts slowly, and so the number of parts follows fr
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
@@ -32,6 +33,8 @@ MAX_ROUNDS = 4
 keep moving back and forth, this may split off as many pieces as merge."""
 ROBUST_FITS = 2
 
+_Fit = Callable[[Moments, np.ndarray], tuple[Moments, Motions]]
+
 
 def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
     """Label patches by part, [P], numbered by decreasing size.
@@ -41,12 +44,18 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
             parts as pieces.
     """
     first = max(FIRST_PARTS, 3 * count if count else 0)
-    labels = _merge_by_cost(patches, first)
+    labels, fits = _merge_by_cost(patches, first), _Fits(patches.moments)
     least = max(MIN_PATCHES, math.ceil(MIN_SHARE * len(patches.nodes)))
     rounds = MAX_ROUNDS * (int(labels.max()) + 1)
+    at: dict[bytes, int] = {}  # rounds that were left when these labels were met
     while True:
         if rounds > 0:
-            labels = _refined(patches, labels)
+            key = labels.tobytes()
+            if key in at:  # The same rounds would follow again and again: leave out whole periods.
+                rounds %= at[key] - rounds
+            at.setdefault(key, rounds)
+        if rounds > 0:
+            labels = _refined(patches, labels, fits)
         rounds -= 1
         parts = int(labels.max()) + 1
         if count is not None and parts <= count:
@@ -54,7 +63,7 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
         pairs = _neighbors(patches.edges, labels)
         if not len(pairs):
             break
-        turns = relative_turns(*fit_parts(patches, labels), pairs)
+        turns = relative_turns(*fits.robust(labels), pairs)
         sizes = np.bincount(labels)
         small = np.minimum(sizes[pairs[:, 0]], sizes[pairs[:, 1]]) < least
         chosen = int(np.where(small, turns - 2.0 * math.pi, turns).argmin())
@@ -67,10 +76,10 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
     return rank[labels]
 
 
-def fit_parts(patches: Patches, labels: np.ndarray) -> tuple[Moments, Motions]:
-    """Fit the motion of each part. Patches that it explains badly count less: the skin at a joint moves half with each
-    of two parts."""
-    parts, moments = int(labels.max()) + 1, patches.moments
+def fit_parts(moments: Moments, labels: np.ndarray) -> tuple[Moments, Motions]:
+    """Fit the motion of each part to the moments of its patches. Patches that it explains badly count less: the skin at
+    a joint moves half with each of two parts."""
+    parts = int(labels.max()) + 1
     own = np.arange(len(labels)), labels
     weights = np.ones(len(labels))
     for _ in range(ROBUST_FITS):
@@ -79,6 +88,39 @@ def fit_parts(patches: Patches, labels: np.ndarray) -> tuple[Moments, Motions]:
         usual = np.array([np.median(off[labels == part]) for part in range(parts)])[labels]
         weights = 1.0 / (1.0 + off / np.maximum(usual, 1e-30))
     pooled = moments.scaled(weights).pooled(labels, parts)
+    return pooled, pooled.motions()
+
+
+class _Fits:
+    """Fits of parts, kept by the patches that belong to them: a merge changes few parts, and a fit is slow."""
+
+    def __init__(self, moments: Moments) -> None:
+        self._moments = moments
+        self._plain: dict[bytes, tuple[Moments, Motions]] = {}
+        self._robust: dict[bytes, tuple[Moments, Motions]] = {}
+
+    def plain(self, labels: np.ndarray) -> Motions:
+        """Return the best motion of each part."""
+        return self._of(labels, self._plain, _fit_plainly)[1]
+
+    def robust(self, labels: np.ndarray) -> tuple[Moments, Motions]:
+        """Return the fits of ``fit_parts``."""
+        return self._of(labels, self._robust, fit_parts)
+
+    def _of(self, labels: np.ndarray, kept: dict[bytes, tuple[Moments, Motions]], fit: _Fit) -> tuple[Moments, Motions]:
+        keys = [np.flatnonzero(labels == part).tobytes() for part in range(int(labels.max()) + 1)]
+        new = np.array([key not in kept for key in keys])
+        if new.any():
+            rows = np.flatnonzero(new[labels])
+            moments, motions = fit(self._moments.take(rows), _renumbered(labels[rows]))
+            for row, part in enumerate(np.flatnonzero(new)):
+                kept[keys[part]] = Moments(*(each[row] for each in moments)), Motions(*(each[row] for each in motions))
+        moments, motions = zip(*(kept[key] for key in keys))
+        return Moments(*map(np.stack, zip(*moments))), Motions(*map(np.stack, zip(*motions)))
+
+
+def _fit_plainly(moments: Moments, labels: np.ndarray) -> tuple[Moments, Motions]:
+    pooled = moments.pooled(labels, int(labels.max()) + 1)
     return pooled, pooled.motions()
 
 
@@ -152,7 +194,7 @@ def _merged(labels: np.ndarray, pairs: np.ndarray, most: int) -> np.ndarray:
     return _renumbered(into[labels])
 
 
-def _refined(patches: Patches, labels: np.ndarray) -> np.ndarray:
+def _refined(patches: Patches, labels: np.ndarray, fits: _Fits) -> np.ndarray:
     """Move patches to the neighbouring part whose motion explains theirs best, until none changes; then number the
     connected pieces."""
     count = len(labels)
@@ -162,7 +204,7 @@ def _refined(patches: Patches, labels: np.ndarray) -> np.ndarray:
     even = np.arange(count) % 2 == 0
     for _ in range(SWEEPS):
         parts = int(labels.max()) + 1
-        errors = patches.moments.errors_under(patches.moments.pooled(labels, parts).motions())
+        errors = patches.moments.errors_under(fits.plain(labels))
         changed = labels.copy()
         for turn in (even, ~even):
             own = np.zeros((count, parts))

@@ -12,11 +12,12 @@ from scipy.optimize import linear_sum_assignment
 
 from helpers.edit_scenes import bar_scene, figure_scene
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
-from scgs_warp.edit import EditSession
+from scgs_warp.edit import EditSession, parts
 from scgs_warp.edit.joints import find_joints
-from scgs_warp.edit.parts import LEAST_TURN, find_parts, relative_turns
+from scgs_warp.edit.parts import LEAST_TURN, find_parts, fit_parts, relative_turns
 from scgs_warp.edit.patches import Moments, Patches, make_patches
 from scgs_warp.edit.rotations import from_axis, rigid_fit, rotate, to_matrix
+from scgs_warp.edit.skeleton_from_motion import observe
 from scgs_warp.runtime import environment
 
 TIMES = np.linspace(0.0, 1.0, 16)
@@ -106,6 +107,35 @@ def test_a_chain_falls_into_its_segments(noise):
         assert joint.axis is not None
         assert abs(joint.axis[1 if index % 2 == 0 else 2]) > math.cos(math.radians(10)), "the axis of the hinge"
         assert joint.confidence > 0.9 and joint.play < 0.03
+
+
+def merged_plainly(patches: Patches) -> np.ndarray:
+    """Merge as ``find_parts`` does, every round and every fit anew."""
+    labels = parts._merge_by_cost(patches, parts.FIRST_PARTS)
+    least = max(parts.MIN_PATCHES, math.ceil(parts.MIN_SHARE * len(patches.nodes)))
+    for left in range(parts.MAX_ROUNDS * (int(labels.max()) + 1), -1000, -1):
+        if left > 0:
+            labels = parts._refined(patches, labels, parts._Fits(patches.moments))
+        pairs = parts._neighbors(patches.edges, labels)
+        turns = relative_turns(*fit_parts(patches.moments, labels), pairs)
+        small = (np.bincount(labels)[pairs] < least).any(1)
+        best = int((turns - 2.0 * math.pi * small).argmin())
+        if turns[best] > LEAST_TURN and not small[best]:
+            break
+        labels = parts._renumbered(np.where(labels == pairs[best, 1], pairs[best, 0], labels))
+    return labels
+
+
+def test_rounds_that_repeat_are_left_out_and_change_nothing(monkeypatch):
+    """On a figure, merges that the next round takes back would repeat until no round is left."""
+    scene = figure_scene(nodes=200, points=4000)[0]
+    session = EditSession(scene)
+    patches = observe(scene, tuple(x.numpy() for x in session.engine.binding))
+    monkeypatch.setattr(parts, "MAX_ROUNDS", 1)
+    expected, refined, rounds = merged_plainly(patches), parts._refined, []
+    monkeypatch.setattr(parts, "_refined", lambda *args: rounds.append(1) or refined(*args))
+    assert same_partition(find_parts(patches), expected)
+    assert len(rounds) < 60
 
 
 def test_what_turns_by_less_than_the_limit_is_one_part():
