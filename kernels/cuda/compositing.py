@@ -31,7 +31,7 @@ MAX_CHANNELS = SLOT_WIDTH - SLOT_GEOMETRY
 
 _FORWARD_BOUNDS, _ADJOINT_BOUNDS = (BLOCK_DIM, 6), (BLOCK_DIM, 4)
 """Launch bounds: threads per block, and blocks per multiprocessor. They leave 40 and 64 registers to each thread, the
-fewest that spill none to memory on sm_90 (``tests/kernels/test_kernel_budgets.py``)."""
+fewest that spill none to memory on sm_90 (``tests/kernels/test_compile.py``)."""
 
 
 # fmt: off

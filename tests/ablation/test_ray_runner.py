@@ -25,7 +25,7 @@ from scgs_warp.apps import ablate as app
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra: cluster)")
 OFTEN = ["--set", "checkpoint_seconds=0.05", "--threads", "2"]
-STEPS = 120
+STEPS = 60
 
 
 @pytest.fixture(scope="module", autouse=True)

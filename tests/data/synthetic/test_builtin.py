@@ -12,10 +12,11 @@ import torch
 
 from reference.raycast import first_hit
 from scgs_warp.data import load
+from scgs_warp.data.synthetic import builtin
 from scgs_warp.data.synthetic.builtin import FIELD_OF_VIEW, make_synthetic, random_camera, sample_surface
 from scgs_warp.data.synthetic.figure import PARTS, build_figure
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
-from scgs_warp.data.synthetic.orbit_cameras import camera_of
+from scgs_warp.data.synthetic.orbit_cameras import PlannedPicture, camera_of
 from scgs_warp.data.synthetic.raycast import Raycaster
 from scgs_warp.data.synthetic.renderer import write_rgba
 from scgs_warp.data.synthetic.surface import RigidParts
@@ -126,16 +127,18 @@ def test_scene_is_a_data_set(scene):
     assert torch.pdist(positions).min() > 1e-3
 
 
-def test_every_instant_has_a_view_of_the_front(tmp_path):
+def test_every_instant_has_a_view_of_the_front(tmp_path, monkeypatch):
     """Within 60 degrees of where the face and the chest look, among the nine nearest frames."""
-    scene = make_synthetic(tmp_path / "robot", size=8, train=100, test=1)
-    content = json.loads((scene / "transforms_train.json").read_text())
-    views = np.array([frame["transform_matrix"] for frame in content["frames"]])[:, :3, 3]
+    planned: dict[str, list[PlannedPicture]] = {}
+    monkeypatch.setattr(builtin, "write_pictures", lambda *given: planned.update(given[3]))
+    make_synthetic(tmp_path / "robot", size=8, train=100, test=1)
+    views = np.array([picture.camera_to_world for picture in planned["train"]])[:, :3, 3]
     views /= np.linalg.norm(views, axis=1, keepdims=True)
-    for index, frame in enumerate(content["frames"]):
+    assert len(views) == 100
+    for index, picture in enumerate(planned["train"]):
         near = views[max(0, index - 4) : index + 5]
         for bone in ("head", "torso"):
-            front = bone_transforms(frame["time"])[bone][:3, :3] @ [0.0, -1.0, 0.0]
+            front = bone_transforms(picture.time)[bone][:3, :3] @ [0.0, -1.0, 0.0]
             assert np.degrees(np.arccos((near @ front).max())) < 60, (index, bone)
 
 

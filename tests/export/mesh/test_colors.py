@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 
 from helpers.mesh_scenes import ball_gaussians, still_scene
+from scgs_warp.export.mesh import colors
 from scgs_warp.export.mesh.colors import PosedMesh, paint, vertex_normals
 from scgs_warp.export.mesh.views import surroundings_of
 
 RED, BLUE = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(autouse=True)
+def small_views(monkeypatch):
+    monkeypatch.setattr(colors, "SIZE", 256)
 
 
 @torch.no_grad()
@@ -25,9 +32,9 @@ def painted(vertices: np.ndarray, faces: np.ndarray, seen: list[int]) -> np.ndar
 
 def test_vertices_have_the_colours_of_the_gaussians_that_they_show():
     mesh, seen = trimesh.creation.icosphere(4, 0.503), []
-    colors = painted(mesh.vertices - (0.2, -0.1, 0.3), mesh.faces, seen)
+    found = painted(mesh.vertices - (0.2, -0.1, 0.3), mesh.faces, seen)
     above, below = mesh.vertices[:, 2] > 0.1, mesh.vertices[:, 2] < -0.1
-    assert np.abs(colors[above] - RED).max() < 0.05 and np.abs(colors[below] - BLUE).max() < 0.05
+    assert np.abs(found[above] - RED).max() < 0.05 and np.abs(found[below] - BLUE).max() < 0.05
     assert len(seen) == 32
 
 
@@ -35,8 +42,8 @@ def test_hidden_vertices_take_the_colours_around_them():
     outer, inner = trimesh.creation.icosphere(3, 0.503), trimesh.creation.icosphere(1, 0.1)
     whole = trimesh.util.concatenate([outer, inner])
     faces = np.concatenate([whole.faces, [[0, len(outer.vertices), len(outer.vertices) + 1]]])  # ties them together
-    colors = painted(np.asarray(whole.vertices) - (0.2, -0.1, 0.3), faces, [])
-    np.testing.assert_allclose(colors[len(outer.vertices) + 2 :], colors[0][None].repeat(40, 0), atol=0.3)
+    found = painted(np.asarray(whole.vertices) - (0.2, -0.1, 0.3), faces, [])
+    np.testing.assert_allclose(found[len(outer.vertices) + 2 :], found[0][None].repeat(40, 0), atol=0.3)
 
 
 def test_normals_point_outwards():
