@@ -35,6 +35,8 @@ class FilmOptions:
     """Largest relative change of red and blue against green during a film."""
     crf: int = 20
     """Compression of a film: x264's constant rate factor, 0 (lossless) to 51; phones are near 23."""
+    arc: float = 100.0
+    """Angle about the subject that a walk with the phone covers, or across which the cameras of a rig stand, degrees."""
     offsets: float = 0.0
     """Largest difference, in seconds, between the moments at which two cameras of a rig begin."""
     sound: bool = True
@@ -161,7 +163,20 @@ def _film(options: Options, kind: Literal["phone", "rig"], device: str) -> None:
     given = {"fov": o.fov, "samples": o.samples, "views": o.views, "subject": o.subject}
     if o.size is not None:
         given |= {"width": o.size[0], "height": o.size[-1]}
-    named = ("seconds", "fps", "shake", "blur", "rolling", "exposure", "balance", "crf", "offsets", "sound", "maps")
+    named = (
+        "seconds",
+        "fps",
+        "shake",
+        "blur",
+        "rolling",
+        "exposure",
+        "balance",
+        "crf",
+        "arc",
+        "offsets",
+        "sound",
+        "maps",
+    )
     common = {name: getattr(o, name) for name in (*named, "test", "seed")}
     request = FilmRequest(kind, **common, **{name: value for name, value in given.items() if value is not None})
     plan = plan_film(o.output, request, device)

@@ -29,13 +29,16 @@ class RigFilms(NamedTuple):
     floor: float
 
 
+ARC = 100.0
+
+
 def film_rig(
     folder: Path, late: list[int], count: int = 10, width: int = 320, height: int = 180, sound: bool = True
 ) -> RigFilms:
     """Film with one camera per entry of ``late``: the number of frames by which it begins late."""
     folder.mkdir()
     stage = stage_of("robot", "cpu")
-    viewmats = rig_viewmats(len(late), stage.floor)
+    viewmats = rig_viewmats(len(late), stage.floor, ARC)
     focal = 0.8 * width
     K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     cameras = [Camera(torch.from_numpy(v).float(), torch.from_numpy(K).float(), width, height) for v in viewmats]

@@ -13,8 +13,6 @@ DISTANCE = 3.1
 """Distance of the cameras from the middle of the room."""
 HEIGHT = 1.5
 """Mean height of the cameras above the floor."""
-ARC = 100.0
-"""Degrees about the subject that a walk with the phone covers, and across which the cameras of a rig stand."""
 AIM = 1.05
 """Height above the floor at which the cameras look."""
 TREMOR = ((0.45, 1.0), (0.8, 0.7), (1.7, 0.45), (3.1, 0.25), (6.3, 0.12), (9.1, 0.06))
@@ -46,20 +44,21 @@ def at(azimuth: float, height: float, floor: float, distance: float = DISTANCE) 
 class HandHeldPath:
     """Somebody walks half round the subject with a phone; the hand sways and trembles."""
 
-    def __init__(self, seconds: float, floor: float, shake: float, rng: np.random.Generator) -> None:
+    def __init__(self, seconds: float, floor: float, shake: float, arc: float, rng: np.random.Generator) -> None:
         """
         Args:
             seconds: length of the film.
             shake: strength of the hand's movements; 0: none.
+            arc: angle of the walk about the subject, degrees.
         """
-        self.seconds, self.floor, self.shake = seconds, floor, shake
+        self.seconds, self.floor, self.shake, self.arc = seconds, floor, shake, arc
         self._phases = rng.uniform(0.0, 2.0 * math.pi, (6, len(TREMOR)))
         self._side = 1.0 if rng.uniform() < 0.5 else -1.0
 
     def viewmat(self, seconds: float) -> np.ndarray:
         """Return the world-to-camera matrix [4, 4] at a moment of the film."""
         share = seconds / self.seconds
-        azimuth = self._side * ARC * (share - 0.5)
+        azimuth = self._side * self.arc * (share - 0.5)
         height = HEIGHT + 0.3 * math.sin(2.0 * math.pi * share + 0.7)
         steady = at(azimuth, height, self.floor, DISTANCE + 0.25 * math.sin(3.0 * math.pi * share))
         return self._hand(seconds) @ steady
@@ -85,10 +84,10 @@ def _small_rotation(x: float, y: float, z: float) -> np.ndarray:
     return np.eye(3) + math.sin(angle) / angle * K + (1.0 - math.cos(angle)) / angle**2 * K @ K
 
 
-def rig_viewmats(count: int, floor: float) -> np.ndarray:
-    """Return the matrices [C, 4, 4] of a rig. The first camera stands nearest to the middle, the others on both sides,
-    alternately lower and higher."""
-    spacing = ARC / max(count - 1, 1)
+def rig_viewmats(count: int, floor: float, arc: float) -> np.ndarray:
+    """Return the matrices [C, 4, 4] of a rig that stands across ``arc`` degrees about the subject. The first camera is
+    nearest to the middle, the others on both sides, alternately lower and higher."""
+    spacing = arc / max(count - 1, 1)
     azimuths = sorted((spacing * (k - (count - 1) / 2) for k in range(count)), key=abs)
     heights = [HEIGHT + (0.0 if k == 0 else 0.35 * (-1.0) ** k) for k in range(count)]
     return np.stack([at(azimuth, height, floor) for azimuth, height in zip(azimuths, heights)])

@@ -24,6 +24,8 @@ class FilmRequest:
     fps: float = 30.0
     fov: float = 65.0
     """Horizontal field of view, degrees."""
+    arc: float = 100.0
+    """Angle about the subject that a walk with the phone covers, or across which the cameras of a rig stand, degrees."""
     samples: int = 3
     """Number of rays per pixel along each axis."""
     shake: float = 1.0
@@ -65,6 +67,8 @@ def check(request: FilmRequest) -> None:
         raise UserError(f"--seconds {request.seconds:g}: give a film of 8 to {MAX_FRAMES} frames")
     if not 20.0 <= request.fov <= 110.0:
         raise UserError(f"--fov {request.fov:g}: give 20 to 110 degrees for a film")
+    if not 1.0 <= request.arc <= 300.0:
+        raise UserError(f"--arc {request.arc:g}: give 1 to 300 degrees")
     for name, most in (("shake", 10.0), ("blur", 1.0), ("rolling", 1.0), ("exposure", 1.0), ("balance", 1.0)):
         if not 0.0 <= getattr(request, name) <= most:
             raise UserError(f"--{name} {getattr(request, name):g}: give 0 to {most:g}")

@@ -57,8 +57,9 @@ class Shooting:
         own = np.arange(count) / request.fps
         K = intrinsics(request)
         phone = request.kind == "phone"
-        path = HandHeldPath(own[-1], floor, request.shake, rng)
-        poses = [path.viewmat] if phone else [_standing(matrix) for matrix in rig_viewmats(request.views, floor)]
+        path = HandHeldPath(own[-1], floor, request.shake, request.arc, rng)
+        rig = rig_viewmats(request.views, floor, request.arc)
+        poses = [path.viewmat] if phone else [_standing(matrix) for matrix in rig]
         starts = np.zeros(len(poses))
         if not phone and request.offsets > 0:
             starts = rng.uniform(0.0, request.offsets, len(poses))

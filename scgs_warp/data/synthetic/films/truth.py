@@ -15,7 +15,7 @@ from torch import Tensor
 from ....types import Camera
 from ...points import write_points
 from ..renderer import GROUND_TRUTH_TIMES, SurfacePoints, write_png
-from .cameras import ARC, at
+from .cameras import at
 from .encoding import decoded
 from .photography import View
 from .request import FilmRequest
@@ -135,7 +135,8 @@ def _write_held_out(
     names = []
     for index in range(request.test):
         time = (index + 0.5) / request.test
-        viewmat = at(rng.uniform(-0.45, 0.45) * ARC, rng.uniform(1.2, 1.9), shooting.floor, rng.uniform(2.8, 3.2))
+        azimuth = rng.uniform(-0.45, 0.45) * request.arc
+        viewmat = at(azimuth, rng.uniform(1.2, 1.9), shooting.floor, rng.uniform(2.8, 3.2))
         still = View(lambda _, matrix=viewmat: matrix, view.K, view.width, view.height)
         image = stage.caster.render(stage.pose(time), still.camera(0.0), request.samples)[..., :3]
         pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()

@@ -141,7 +141,7 @@ def test_blur_and_rolling_shutter_average_moments(stage):
     """A picture without exposure time shows one moment; a rolling shutter shows the moment of each row."""
 
     def swinging(seconds: float) -> np.ndarray:
-        matrix = rig_viewmats(1, stage.floor)[0]
+        matrix = rig_viewmats(1, stage.floor, 100.0)[0]
         turn = np.eye(4)
         angle = 2.0 * seconds
         turn[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -160,8 +160,8 @@ def test_blur_and_rolling_shutter_average_moments(stage):
 
 
 def test_a_hand_sways_within_bounds():
-    path = HandHeldPath(4.0, -1.2, 1.0, np.random.default_rng(3))
-    steady = HandHeldPath(4.0, -1.2, 0.0, np.random.default_rng(3))
+    path = HandHeldPath(4.0, -1.2, 1.0, 100.0, np.random.default_rng(3))
+    steady = HandHeldPath(4.0, -1.2, 0.0, 100.0, np.random.default_rng(3))
     moments = np.linspace(0.0, 4.0, 81)
     views = np.stack([path.viewmat(moment) for moment in moments])
     np.testing.assert_allclose(
@@ -172,6 +172,16 @@ def test_a_hand_sways_within_bounds():
     assert 0.5 < angles.max() < 5.0
     centres = -np.einsum("vji,vj->vi", views[:, :3, :3], views[:, :3, 3])
     assert np.linalg.norm(np.diff(centres, axis=0), axis=1).max() < 0.2
+
+
+@pytest.mark.parametrize("arc", [30.0, 100.0])
+def test_cameras_stand_across_the_arc(arc):
+    path = HandHeldPath(4.0, -1.2, 0.0, arc, np.random.default_rng(3))
+    walk = np.stack([path.viewmat(moment) for moment in (0.0, 4.0)])
+    for views in (walk, rig_viewmats(6, -1.2, arc)):
+        eyes = -np.einsum("vji,vj->vi", views[:, :3, :3], views[:, :3, 3])
+        azimuths = np.degrees(np.arctan2(eyes[:, 1], eyes[:, 0]))
+        assert np.ptp(azimuths) == pytest.approx(arc) and azimuths.mean() == pytest.approx(-90.0)
 
 
 def test_sound_arrives_late(tmp_path):
@@ -208,6 +218,7 @@ def test_a_rig_begins_at_different_moments():
         ({"seconds": 0.1}, "--seconds 0.1"),
         ({"fps": float("nan")}, "--fps nan"),
         ({"fov": 5.0}, "--fov 5"),
+        ({"arc": 0.0}, "--arc 0"),
         ({"blur": 1.5}, "--blur 1.5"),
         ({"crf": 60}, "--crf 60"),
         ({"kind": "rig", "views": 1}, "--views 1"),
