@@ -36,7 +36,7 @@ class FilmOptions:
     crf: int = 20
     """Compression of a film: x264's constant rate factor, 0 (lossless) to 51; phones are near 23."""
     arc: float = 100.0
-    """Angle about the subject that a walk with the phone covers, or across which the cameras of a rig stand, degrees."""
+    """Angle in degrees about the subject across which the cameras of a rig stand, or a walk with the phone leads."""
     offsets: float = 0.0
     """Largest difference, in seconds, between the moments at which two cameras of a rig begin."""
     sound: bool = True

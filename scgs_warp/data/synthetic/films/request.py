@@ -25,7 +25,7 @@ class FilmRequest:
     fov: float = 65.0
     """Horizontal field of view, degrees."""
     arc: float = 100.0
-    """Angle about the subject that a walk with the phone covers, or across which the cameras of a rig stand, degrees."""
+    """Angle in degrees about the subject across which the cameras of a rig stand, or a walk with the phone leads."""
     samples: int = 3
     """Number of rays per pixel along each axis."""
     shake: float = 1.0
