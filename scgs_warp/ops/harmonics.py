@@ -134,13 +134,14 @@ def spherical_harmonics(
 
 @torch.no_grad()
 def colors_and_depths(
-    sh_dc: Tensor, sh_rest: Tensor, means: Tensor, viewmat: Tensor, depths: Tensor, degree: int
+    sh_dc: Tensor, sh_rest: Tensor, means: Tensor, viewmat: Tensor, depths: Tensor, degree: int, *, form: Form = "auto"
 ) -> Tensor:
     """Return the colours of :func:`spherical_harmonics` and the depths side by side, [N, 4], without gradients.
 
     Args:
         viewmat: [4, 4] world-to-camera.
         depths: [N] of the Gaussians.
+        form: as for :func:`spherical_harmonics`.
 
     Raises:
         ValueError: as :func:`spherical_harmonics`, or ``viewmat`` or ``depths`` has a wrong shape.
@@ -151,7 +152,7 @@ def colors_and_depths(
         raise ValueError(f"viewmat must be [4, 4] and depths [{count}], got {[*viewmat.shape]} and {[*depths.shape]}")
     channels = sh_dc.new_empty(count, 4)
     tensors = sh_dc.contiguous(), sh_rest.contiguous().view(count * rest, 3), rest, means.contiguous()
-    if sh_dc.device.type == "cpu":
+    if form == "cpu" or (form == "auto" and sh_dc.device.type == "cpu"):
         position = -viewmat[:3, :3].T @ viewmat[:3, 3]
         rows = position[None], depths.contiguous(), degree, channels
         launch(cpu_kernels.channels_with_depth, -(-count // LANES), *tensors, *rows, grain=32)

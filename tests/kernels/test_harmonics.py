@@ -128,11 +128,14 @@ def test_wrong_arguments_are_named():
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("n", [0, 1, 333])
-def test_colours_beside_depths(n, degree, device):
+@pytest.mark.parametrize("form", ["plain", "cpu"])
+def test_colours_beside_depths(form, n, degree, device):
+    if form == "cpu" and device != "cpu":
+        pytest.skip("SIMD is for the CPU")
     dc, rest, means, _ = inputs_of(4, n, device)
     camera = random_camera(4, 60, 40, device)
     depths = torch.rand(n, generator=torch.Generator().manual_seed(n)).to(device)
-    channels = harmonics.colors_and_depths(dc, rest, means, camera.viewmat, depths, degree)
+    channels = harmonics.colors_and_depths(dc, rest, means, camera.viewmat, depths, degree, form=form)
     expected = harmonics_reference(dc.double(), rest.double(), means.double(), camera.position.double(), degree)
     torch.testing.assert_close(channels[:, :3].double(), expected, rtol=1e-5, atol=5e-6)
     assert torch.equal(channels[:, 3], depths)
