@@ -119,6 +119,16 @@ def films(source: Source) -> str:
     return table(head, lines)
 
 
+def rig(source: Source) -> str:
+    """Write how good the view of a camera that was held out is, by the angle between the cameras of a rig."""
+    lines = []
+    for angle in (20, 8):
+        run = source.run(str(angle), "robot")
+        scores = (number(run.get(key), 2) for key in ("psnr", "psnr_worst"))
+        lines.append([source.label(str(angle), f"{angle} degrees"), *scores, number(run.get("ssim"), 3)])
+    return table(["angle between neighbours", "PSNR", "worst", "SSIM"], lines)
+
+
 def exposure(source: Source) -> str:
     """Write what affine colours per frame do for a film whose exposure changes."""
     keys, lines = ("psnr", "psnr_fitted", "psnr_interpolated"), []
