@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -163,20 +163,7 @@ def _film(options: Options, kind: Literal["phone", "rig"], device: str) -> None:
     given = {"fov": o.fov, "samples": o.samples, "views": o.views, "subject": o.subject}
     if o.size is not None:
         given |= {"width": o.size[0], "height": o.size[-1]}
-    named = (
-        "seconds",
-        "fps",
-        "shake",
-        "blur",
-        "rolling",
-        "exposure",
-        "balance",
-        "crf",
-        "arc",
-        "offsets",
-        "sound",
-        "maps",
-    )
+    named = [field.name for field in fields(FilmOptions) if field.name != "film"]
     common = {name: getattr(o, name) for name in (*named, "test", "seed")}
     request = FilmRequest(kind, **common, **{name: value for name, value in given.items() if value is not None})
     plan = plan_film(o.output, request, device)

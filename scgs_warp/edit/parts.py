@@ -47,13 +47,10 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
     labels, fits = _merge_by_cost(patches, first), _Fits(patches.moments)
     least = max(MIN_PATCHES, math.ceil(MIN_SHARE * len(patches.nodes)))
     rounds = MAX_ROUNDS * (int(labels.max()) + 1)
-    at: dict[bytes, int] = {}  # rounds that were left when these labels were met
+    met: dict[bytes, int] = {}
     while True:
         if rounds > 0:
-            key = labels.tobytes()
-            if key in at:  # The same rounds would follow again and again: leave out whole periods.
-                rounds %= at[key] - rounds
-            at.setdefault(key, rounds)
+            rounds = _without_repetition(rounds, labels.tobytes(), met)
         if rounds > 0:
             labels = _refined(patches, labels, fits)
         rounds -= 1
@@ -74,6 +71,15 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
     rank = np.empty(len(sizes), np.int64)
     rank[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))
     return rank[labels]
+
+
+def _without_repetition(rounds: int, labels: bytes, met: dict[bytes, int]) -> int:
+    """Return how many of the ``rounds`` left must still be made. Labels that return would do so again and again: whole
+    periods are left out. ``met`` keeps the rounds that were left when labels were first met."""
+    if labels in met:
+        rounds %= met[labels] - rounds
+    met.setdefault(labels, rounds)
+    return rounds
 
 
 def fit_parts(moments: Moments, labels: np.ndarray) -> tuple[Moments, Motions]:

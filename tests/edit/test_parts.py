@@ -138,6 +138,21 @@ def test_rounds_that_repeat_are_left_out_and_change_nothing(monkeypatch):
     assert len(rounds) < 60
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_whole_periods_are_left_out(seed):
+    """Any rule that leads from one state to the next ends in the state in which all rounds would end."""
+    random = np.random.default_rng(seed)
+    follows, rounds = random.integers(0, 12, 12), int(random.integers(30, 60))
+    expected = state = 0
+    for _ in range(rounds):
+        expected = int(follows[expected])
+    met: dict[bytes, int] = {}
+    made = 0
+    while (rounds := parts._without_repetition(rounds, bytes([state]), met)) > 0:
+        state, rounds, made = int(follows[state]), rounds - 1, made + 1
+    assert state == expected and made < 24
+
+
 def test_what_turns_by_less_than_the_limit_is_one_part():
     patches, _, _ = chain([12.0, 30.0])
     assert find_parts(patches).max() == 1
