@@ -20,6 +20,8 @@ UNABLE = re.compile(r"^=+ .*(?:not supported|Unable to|not found).*$", re.MULTIL
 KEPT = 40
 """Number of lines of a report that are kept."""
 LEAST = 5.0
+NO_GRAPHS = ("--no-graphs",)
+"""Recording needs torch's own allocator, and racecheck ends it: "operation failed due to a previous error"."""
 
 
 class Check(NamedTuple):
@@ -31,9 +33,9 @@ class Check(NamedTuple):
 
 CHECKS = {
     "plain": Check(None),
-    # Each tensor in memory of its own, so that memcheck sees its end; recording needs torch's own allocator.
-    "memcheck": Check("memcheck", ("--no-graphs",), ("PYTORCH_NO_CUDA_MEMORY_CACHING",)),
-    "racecheck": Check("racecheck"),
+    # Each tensor in memory of its own, so that memcheck sees its end.
+    "memcheck": Check("memcheck", NO_GRAPHS, ("PYTORCH_NO_CUDA_MEMORY_CACHING",)),
+    "racecheck": Check("racecheck", NO_GRAPHS),
 }
 
 

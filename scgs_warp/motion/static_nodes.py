@@ -53,7 +53,9 @@ class StaticNodes(Motion):
         opaque = finite & (opacities > OPAQUE)
         points = means[opaque if bool(opaque.any()) else finite].contiguous()
         if len(points) > 16:
-            away = (points - points.median(dim=0).values).norm(dim=1)
+            # torch's median along a dimension warns on CUDA that its indices are not deterministic.
+            median = points.sort(dim=0).values[(len(points) - 1) // 2]
+            away = (points - median).norm(dim=1)
             points = points[away <= away.quantile(CORE) if len(away) < 10_000_000 else away > -1].contiguous()
         middle = (points - points.mean(dim=0)).norm(dim=1) if len(points) else torch.zeros(0)
         start = int(middle.argmin()) if len(points) else 0

@@ -70,8 +70,8 @@ def run_cases(first: int, last: int, device: str, cases: dict[str, tuple[Any, fl
             done.write(json.dumps([number, op, failure]) + "\n")
 
 
-def work(own: argparse.Namespace) -> None:
-    """Run all cases in child processes; a child that a case crashes is replaced."""
+def prepared(own: argparse.Namespace) -> dict[str, tuple[Any, float]]:
+    """Load and configure everything that cases need; return the cases."""
     import warnings
 
     import scgs_warp  # noqa: F401  (sets the environment before torch is imported)
@@ -88,13 +88,26 @@ def work(own: argparse.Namespace) -> None:
     environment.configure(threads=1)
     torch.utils.deterministic.fill_uninitialized_memory = True  # what no kernel has written is NaN
     warnings.simplefilter("ignore")
+    return cases_of(own.modules, own.ops)
+
+
+def work(own: argparse.Namespace) -> None:
+    """Run all cases in child processes; a child that a case crashes is replaced."""
     folder: Path = own.worker
-    cases, first, last = cases_of(own.modules, own.ops), own.seed, own.seed + own.cases
+    first, last = own.seed, own.seed + own.cases
+    # CUDA cannot be used in the child of a process that has initialised it, so there every child loads for itself.
+    loaded = prepared(own) if own.device == "cpu" else None
     while first < last:
         child = os.fork()
         if child == 0:
-            run_cases(first, last, own.device, cases, folder, own.patience)
-            os._exit(0)
+            status = 1
+            try:
+                run_cases(first, last, own.device, loaded or prepared(own), folder, own.patience)
+                status = 0
+            except Exception:
+                traceback.print_exc()
+            finally:
+                os._exit(status)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         if status == 0:
             return

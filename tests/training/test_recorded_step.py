@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import weakref
 from collections.abc import Callable
 from functools import partial
@@ -30,6 +31,8 @@ MODELS = {
     "hexplane": {"motion": {"model": "hexplane"}, "coarse": 6},
     "static": {"motion": {"model": "static"}},
 }
+PRETENDED = bool(os.environ.get("SCGS_PRETENDED_CUDA"))
+"""Whether the GPU is the pretended one, which adds in one order."""
 
 
 @pytest.fixture(autouse=True)
@@ -85,6 +88,11 @@ def run(
     return results, steps
 
 
+def adds_in_any_order(model: str, device: str) -> bool:
+    """Return whether two runs of the model differ: torch's ``grid_sample`` adds gradients by atomics on a GPU."""
+    return model == "hexplane" and device == "cuda" and not PRETENDED
+
+
 def compare(device: str, steps: int, before: Callable[[TrainState], None] = lambda state: None, **changes: Any):
     """Run both forms, assert that they agree to the bit, and return the recorded one with its results."""
     plain, recorded = begin(device, steps, **changes), begin(device, steps, **changes)
@@ -104,9 +112,22 @@ def compare(device: str, steps: int, before: Callable[[TrainState], None] = lamb
 
 @pytest.mark.parametrize("model", MODELS)
 def test_same_bits_through_both_stages_and_densification(model, device):
+    if adds_in_any_order(model, device):
+        pytest.skip("torch adds this model's gradients in any order on a GPU")
     steps = 200 if model == "control-points" else 60
     taker, _, state = compare(device, steps, **MODELS[model])
     assert taker.recordings >= 3 and len(state.gaussians) > 0
+
+
+def test_the_same_losses_where_gradients_are_added_in_any_order(device):
+    """Sums in another order differ in their last bits, and training magnifies that: compare early losses alone."""
+    plain, recorded = (begin(device, 60, **MODELS["hexplane"]) for _ in range(2))
+    expected, _ = run(*plain, 12, False)
+    found, taker = run(*recorded, 12, True)
+    assert taker is not None and taker.failure is None and taker.recordings >= 1
+    for name in ("loss", "l1", "ssim", "regulariser"):
+        ours, theirs = ([float(getattr(result, name)) for result in results] for results in (found, expected))
+        assert ours == pytest.approx(theirs, rel=1e-4, abs=1e-7), name
 
 
 @pytest.mark.parametrize(
