@@ -32,7 +32,8 @@ skinning     skinning     skinning          node_sums           kernels/test_ski
                           skinning_palette
 correctives  correctives  correctives                           kernels/test_correctives
 shading      shading      shading                               kernels/test_shading
-harmonics    harmonics    harmonics                             kernels/test_harmonics
+harmonics    harmonics    harmonics         harmonics           kernels/test_harmonics
+                                                                kernels/cuda/test_harmonics
 ssim         ssim         ssim              ssim                kernels/test_ssim
                                                                 kernels/cuda/test_ssim
 adam         adam         adam                                  kernels/test_adam

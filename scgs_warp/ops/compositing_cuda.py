@@ -97,5 +97,5 @@ def launch_native(kernel: Any, blocks: int, *args: Any, begin: int = 0) -> None:
     """
     device: torch.device = args[0].device
     if device.type != "cuda":
-        raise RuntimeError(f"form cuda needs a GPU, got tensors on {device}; form pixel runs everywhere")
+        raise RuntimeError(f"form cuda needs a GPU, got tensors on {device}")
     launch_blocks(kernel, blocks, *args, block_dim=native.BLOCK_DIM, begin=begin)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
+import warp as wp
 from torch import Tensor
 
 from ..kernels import harmonics as kernels
 from ..kernels.cpu import harmonics as cpu_kernels
+from ..kernels.cuda import harmonics as cuda_kernels
 from ..kernels.types import LANES
 from ..runtime.launch import launch
+from . import compositing_cuda
 from .reduction import sum_rows
 
 MAX_DEGREE = 3
-Form = Literal["auto", "plain", "cpu"]
+Form = Literal["auto", "plain", "cpu", "cuda"]
 
 
 class _SphericalHarmonics(torch.autograd.Function):
@@ -27,6 +30,8 @@ class _SphericalHarmonics(torch.autograd.Function):
         if form == "cpu":
             blocks = -(-count // LANES)
             launch(cpu_kernels.spherical_harmonics, blocks, sh_dc, flat, rest, *seen, grain=32)
+        elif form == "cuda":
+            _launch_blocks(cuda_kernels.spherical_harmonics, count, sh_dc, flat, rest, 0, *seen)
         else:
             launch(kernels.spherical_harmonics, count, sh_dc, 1, flat, rest, 0, *seen)
         ctx.save_for_backward(sh_rest, means, camera, colors)
@@ -50,6 +55,8 @@ class _SphericalHarmonics(torch.autograd.Function):
         if ctx.form == "cpu":
             blocks = -(-count // LANES)
             launch(cpu_kernels.spherical_harmonics_adjoint, blocks, flat, rest, *seen, *outputs, grain=32)
+        elif ctx.form == "cuda":
+            _launch_blocks(cuda_kernels.spherical_harmonics_adjoint, count, flat, rest, 0, *seen, *outputs)
         else:
             launch(kernels.spherical_harmonics_adjoint, count, flat, 1, rest, 0, *seen, *outputs)
         return v_dc, v_rest, v_means, _camera_gradient(v_means, wants_camera), None, None
@@ -59,12 +66,16 @@ class _WholeHarmonics(torch.autograd.Function):
     """As :class:`_SphericalHarmonics`, with all coefficients in one tensor, [N, K, 3], which is not cut or copied."""
 
     @staticmethod
-    def forward(ctx: Any, sh: Tensor, means: Tensor, camera: Tensor, degree: int):
+    def forward(ctx: Any, sh: Tensor, means: Tensor, camera: Tensor, degree: int, form: Form):
         count, row = sh.shape[:2]
         colors, flat = torch.empty_like(means), sh.view(count * row, 3)
-        launch(kernels.spherical_harmonics, count, flat, row, flat, row, 1, means, camera[None], degree, colors)
+        rows = flat, row, 1, means, camera[None], degree, colors
+        if form == "cuda":
+            _launch_blocks(cuda_kernels.spherical_harmonics, count, flat, *rows)
+        else:
+            launch(kernels.spherical_harmonics, count, flat, row, *rows)
         ctx.save_for_backward(sh, means, camera, colors)
-        ctx.degree = degree
+        ctx.degree, ctx.form = degree, form
         return colors
 
     @staticmethod
@@ -72,14 +83,30 @@ class _WholeHarmonics(torch.autograd.Function):
     def backward(ctx: Any, v_colors: Tensor):  # type: ignore[override]
         sh, means, camera, colors = ctx.saved_tensors
         count, row = sh.shape[:2]
-        _, wants_means, wants_camera, _ = ctx.needs_input_grad
+        _, wants_means, wants_camera, _, _ = ctx.needs_input_grad
         wants_means = (wants_means or wants_camera) and ctx.degree > 0
         v_sh, v_means = torch.empty_like(sh), torch.empty_like(means) if wants_means else None
-        v_flat = v_sh.view(count * row, 3)
+        flat, v_flat = sh.view(count * row, 3), v_sh.view(count * row, 3)
         seen = means, camera[None], ctx.degree, colors, v_colors.contiguous(), 1, int(wants_means)
-        rows = sh.view(count * row, 3), row, row, 1
-        launch(kernels.spherical_harmonics_adjoint, count, *rows, *seen, v_flat, v_flat, v_means)
-        return v_sh, v_means, _camera_gradient(v_means, wants_camera), None
+        outputs = v_flat, v_flat, v_means
+        if ctx.form == "cuda":
+            _launch_blocks(cuda_kernels.spherical_harmonics_adjoint, count, flat, row, 1, *seen, *outputs)
+        else:
+            launch(kernels.spherical_harmonics_adjoint, count, flat, row, row, 1, *seen, *outputs)
+        return v_sh, v_means, _camera_gradient(v_means, wants_camera), None, None
+
+
+def _launch_blocks(kernel: wp.Kernel, count: int, *args: Any) -> None:
+    """Launch a kernel of the form ``cuda`` for ``count`` Gaussians."""
+    compositing_cuda.launch_native(kernel, -(-count // cuda_kernels.GAUSSIANS), *args)
+
+
+def _resolve_form(form: Form, device: torch.device) -> Form:
+    if form not in get_args(Form):
+        raise ValueError(f"form must be auto, plain, cpu or cuda, got {form!r}")
+    if form != "auto":
+        return form
+    return "cpu" if device.type == "cpu" else "cuda" if device.type == "cuda" else "plain"
 
 
 def _camera_gradient(v_means: Tensor | None, wanted: bool) -> Tensor | None:
@@ -99,7 +126,8 @@ def whole_harmonics(sh: Tensor, means: Tensor, camera_position: Tensor, degree: 
         return spherical_harmonics(sh[:, 0], sh[:, 1:], means, camera_position, degree)
     _validate(sh[:, 0], sh[:, 1:], means, degree)
     _validate_camera(camera_position)
-    return _WholeHarmonics.apply(sh, means.contiguous(), camera_position.contiguous(), degree)  # type: ignore
+    form = _resolve_form("auto", sh.device)
+    return _WholeHarmonics.apply(sh, means.contiguous(), camera_position.contiguous(), degree, form)  # type: ignore
 
 
 def spherical_harmonics(
@@ -114,7 +142,8 @@ def spherical_harmonics(
         means: [N, 3] float32, world.
         camera_position: [3] float32, world.
         degree: 0 to 3.
-        form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
+        form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD, ``cuda`` on a GPU; ``auto`` takes the fastest
+            for the device.
 
     Returns:
         [N, 3] colours >= 0, or non-finite where a used coefficient is non-finite; ``composite`` leaves such Gaussians
@@ -127,9 +156,7 @@ def spherical_harmonics(
     _validate(sh_dc, sh_rest, means, degree)
     _validate_camera(camera_position)
     tensors = (x.contiguous() for x in (sh_dc, sh_rest, means, camera_position))
-    if form == "auto":
-        form = "cpu" if sh_dc.device.type == "cpu" else "plain"
-    return _SphericalHarmonics.apply(*tensors, degree, form)  # type: ignore[return-value]
+    return _SphericalHarmonics.apply(*tensors, degree, _resolve_form(form, sh_dc.device))  # type: ignore[return-value]
 
 
 @torch.no_grad()
@@ -152,12 +179,17 @@ def colors_and_depths(
         raise ValueError(f"viewmat must be [4, 4] and depths [{count}], got {[*viewmat.shape]} and {[*depths.shape]}")
     channels = sh_dc.new_empty(count, 4)
     tensors = sh_dc.contiguous(), sh_rest.contiguous().view(count * rest, 3), rest, means.contiguous()
-    if form == "cpu" or (form == "auto" and sh_dc.device.type == "cpu"):
+    form = _resolve_form(form, sh_dc.device)
+    if form == "cpu":
         position = -viewmat[:3, :3].T @ viewmat[:3, 3]
         rows = position[None], depths.contiguous(), degree, channels
         launch(cpu_kernels.channels_with_depth, -(-count // LANES), *tensors, *rows, grain=32)
         return channels
-    launch(kernels.channels_with_depth, count, *tensors, viewmat.contiguous(), depths.contiguous(), degree, channels)
+    rows = viewmat.contiguous(), depths.contiguous(), degree, channels
+    if form == "cuda":
+        _launch_blocks(cuda_kernels.channels_with_depth, count, *tensors, *rows)
+    else:
+        launch(kernels.channels_with_depth, count, *tensors, *rows)
     return channels
 
 

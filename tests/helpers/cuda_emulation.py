@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from scgs_warp.kernels import native
-from scgs_warp.kernels.cuda import compositing, neighbors, ssim
+from scgs_warp.kernels.cuda import compositing, harmonics, neighbors, ssim
 
 SHIM = Path(__file__).resolve().parent / "cuda_shim.h"
 COMPILER = shutil.which("g++") if sys.platform == "linux" else None
@@ -24,6 +24,11 @@ FUNCTIONS = {
     "compositing_cuda.h": {
         "composite": compositing.composite_tile,
         "composite_adjoint": compositing.composite_tile_adjoint,
+    },
+    "harmonics_cuda.h": {
+        "spherical_harmonics": harmonics.harmonics_of_block,
+        "channels_with_depth": harmonics.channels_of_block,
+        "spherical_harmonics_adjoint": harmonics.harmonics_of_block_adjoint,
     },
     "neighbors_cuda.h": {"nearest": neighbors.nearest_of_block},
     "ssim_cuda.h": {

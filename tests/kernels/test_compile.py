@@ -30,6 +30,7 @@ REGISTERS = {
     "compositing": {"finite_opacities": 24, "add_stats": 32},
     "cuda.binning": {"count_pairs": 32, "emit_by_depth": 40, "tile_ranges": 20},
     "cuda.compositing": {"composite": 40, "composite_adjoint": 64},
+    "cuda.harmonics": {"spherical_harmonics": 40, "spherical_harmonics_adjoint": 40, "channels_with_depth": 40},
     "cuda.neighbors": {"nearest": 52},
     "cuda.node_sums": {"skin_segments": 64, "rbf_segments": 127, "sum_segments": 32},
     "cuda.slots": {"sum_slots": 32},

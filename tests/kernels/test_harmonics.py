@@ -13,18 +13,21 @@ from scgs_warp.ops import harmonics
 from scgs_warp.runtime import environment
 
 
-@pytest.fixture(params=["plain", "cpu", "whole"])
+def skip_elsewhere(form, device):
+    if form in ("cpu", "cuda") and device != form:
+        pytest.skip("SIMD is for the CPU" if form == "cpu" else "blocks of threads are for CUDA")
+
+
+@pytest.fixture(params=["plain", "cpu", "cuda", "whole plain", "whole cuda"])
 def spherical_harmonics(request, device):
-    if request.param == "cpu" and device != "cpu":
-        pytest.skip("SIMD is for the CPU")
-    if request.param == "whole":
-        return whole
-    return functools.partial(harmonics.spherical_harmonics, form=request.param)
+    *of_whole, form = request.param.split()
+    skip_elsewhere(form, device)
+    return functools.partial(whole if of_whole else harmonics.spherical_harmonics, form=form)
 
 
-def whole(dc, rest, means, camera, degree):
+def whole(dc, rest, means, camera, degree, form):
     """With all coefficients in one tensor."""
-    return harmonics._WholeHarmonics.apply(torch.cat([dc[:, None], rest], 1), means, camera, degree)
+    return harmonics._WholeHarmonics.apply(torch.cat([dc[:, None], rest], 1), means, camera, degree, form)
 
 
 CAMERA = (0.5, -3.0, 2.0)
@@ -124,14 +127,15 @@ def test_wrong_arguments_are_named():
         harmonics.spherical_harmonics(dc, rest, means, camera[None], 1)
     with pytest.raises(ValueError, match="means"):
         harmonics.spherical_harmonics(dc, rest, means[:2], camera, 1)
+    with pytest.raises(ValueError, match="form must be auto, plain, cpu or cuda, got 'pixel'"):
+        harmonics.spherical_harmonics(dc, rest, means, camera, 1, form="pixel")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("n", [0, 1, 333])
-@pytest.mark.parametrize("form", ["plain", "cpu"])
+@pytest.mark.parametrize("form", ["plain", "cpu", "cuda"])
 def test_colours_beside_depths(form, n, degree, device):
-    if form == "cpu" and device != "cpu":
-        pytest.skip("SIMD is for the CPU")
+    skip_elsewhere(form, device)
     dc, rest, means, _ = inputs_of(4, n, device)
     camera = random_camera(4, 60, 40, device)
     depths = torch.rand(n, generator=torch.Generator().manual_seed(n)).to(device)
