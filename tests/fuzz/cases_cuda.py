@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fuzz.cases_render import check_composite, splats_of
+from fuzz.cases_render import case_harmonics, check_composite, splats_of
 from fuzz.cases_training import case_loss
 from fuzz.poison import Draw
 from helpers.cuda_emulation import COMPILER, build, launcher
@@ -73,5 +73,17 @@ def case_native_loss(d: Draw, device: str) -> None:
         case_loss(d, device, "cuda")
 
 
-NATIVE = {"cuda bodies": (case_native_compositing, 1), "cuda loss": (case_native_loss, 1)}
+def case_native_harmonics(d: Draw, device: str) -> None:
+    if device != "cpu":
+        case_harmonics(d, device, "cuda")
+        return
+    with emulated(d.seed % 1000):
+        case_harmonics(d, device, "cuda")
+
+
+NATIVE = {
+    "cuda bodies": (case_native_compositing, 1),
+    "cuda harmonics": (case_native_harmonics, 1),
+    "cuda loss": (case_native_loss, 1),
+}
 CASES = NATIVE if COMPILER is not None else {}

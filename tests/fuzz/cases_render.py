@@ -13,7 +13,7 @@ from helpers.splats import random_splats
 from scgs_warp.ops.binning import BandBinning, bin_splats
 from scgs_warp.ops.binning_cuda import RadixBinning, bin_within, geometry_of
 from scgs_warp.ops.compositing import composite
-from scgs_warp.ops.harmonics import spherical_harmonics
+from scgs_warp.ops.harmonics import Form, spherical_harmonics
 from scgs_warp.ops.projection import project
 from scgs_warp.rendering.render import draw as draw_image
 from scgs_warp.rendering.render import render
@@ -104,14 +104,14 @@ def case_projection(d: Draw, device: str) -> None:
         laws.equal(f"{name} of the valid", getattr(splats, name)[whole], getattr(alone, name))
 
 
-def case_harmonics(d: Draw, device: str) -> None:
+def case_harmonics(d: Draw, device: str, form: Form | None = None) -> None:
     """No colour is negative; an invalid row affects itself alone and passes no gradient."""
     count, degree = d.count(), int(d.rng.integers(4))
     g, camera = poisoned_gaussians(d, count, max(degree, int(d.rng.integers(4)))), d.normal(3)
     if d.chance(0.2):
         d.poison(camera)
     inputs = [leaf(x) for x in on(device, g.sh_dc, g.sh_rest, g.means, camera)]
-    form = "plain" if device != "cpu" or d.chance(0.3) else "cpu"
+    form = form or ("plain" if d.chance(0.3) else "cpu" if device == "cpu" else "cuda")
     colors = spherical_harmonics(*inputs, degree, form=form)
     used = inputs[1][:, : (degree + 1) ** 2 - 1]
     whole = finite_rows(inputs[0], used).to(device)

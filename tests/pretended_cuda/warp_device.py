@@ -15,8 +15,8 @@ from . import ledger
 from .torch_device import Graph
 
 native_bodies = True
-"""Whether native bodies run, thread by thread in the emulation. Otherwise, in tests of whole training runs, the form
-``pixel`` takes their place, which is a hundred times as fast."""
+"""Whether native bodies run, thread by thread in the emulation. Otherwise, in tests of whole training runs, the
+portable forms take their place, which are a hundred times as fast."""
 
 
 def _run(name: str, call: Callable[[], None]) -> None:
@@ -41,7 +41,7 @@ def install(native: Path) -> None:
     Args:
         native: folder for the compiled native bodies.
     """
-    from scgs_warp.ops import compositing, compositing_cuda, radix, ssim
+    from scgs_warp.ops import compositing, compositing_cuda, harmonics, radix, ssim
     from scgs_warp.runtime import cuda_launch
 
     to_warp = wp.device_from_torch
@@ -80,15 +80,15 @@ def install(native: Path) -> None:
             sort(keys, values, count, bits)
 
     radix.radix_sort = sorted_on_device
-    for op in (compositing, ssim):
-        op._resolve_form = _portable_on_demand(op._resolve_form)
+    for op, portable in ((compositing, "pixel"), (harmonics, "plain"), (ssim, "pixel")):
+        op._resolve_form = _portable_on_demand(op._resolve_form, portable)
     compositing_cuda.launch_native = _native(compositing_cuda.launch_native, native)
 
 
-def _portable_on_demand(resolve: Callable[..., str]) -> Callable[..., str]:
+def _portable_on_demand(resolve: Callable[..., str], portable: str) -> Callable[..., str]:
     def resolve_form(form: str, *args: Any) -> str:
         found = resolve(form, *args)
-        return "pixel" if found == "cuda" and form == "auto" and not native_bodies else found
+        return portable if found == "cuda" and form == "auto" and not native_bodies else found
 
     return resolve_form
 
