@@ -12,6 +12,9 @@ import torch
 import warp as wp
 import warp._src.context as warp_context
 
+_raw_stream: Callable[[int], int] | None = getattr(torch._C, "_cuda_getCurrentRawStream", None)
+"""Returns the handle of torch's current stream of a device, without an object for it, which takes ten times as long
+and is made at every launch. None: this torch has no such function."""
 _streams: dict[int, dict[int, wp.Stream]] = {}
 _recording_streams: dict[int, tuple[torch.cuda.Stream, torch.cuda.Stream]] = {}
 _current_stream = threading.RLock()
@@ -64,6 +67,10 @@ def warp_stream(device: torch.device) -> wp.Stream:
     Warp keeps a stream's state (an event, the radix sort's memory, a capture in progress) only as long as this object
     lives, so a new object for each launch would discard the state. Torch's streams live as long as the process.
     """
+    if _raw_stream is not None and device.index is not None:
+        known = _streams.get(device.index, {}).get(_raw_stream(device.index))
+        if known is not None:
+            return known
     stream = torch.cuda.current_stream(device)
     of_device = _streams.setdefault(stream.device_index, {})
     if stream.cuda_stream not in of_device:
