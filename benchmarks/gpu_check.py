@@ -77,7 +77,9 @@ def options_of(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=float("inf"), help="duration of this call")
     parser.add_argument("--data", type=Path, help="data set of the parts that train; by default the built-in scene")
     parser.add_argument("--build-gsplat", action="store_true", help="compile gsplat in the background, in minutes")
-    parser.add_argument("--output", type=Path, help=f"JSON; by default benchmarks/{MEASURED}, without a GPU in runs/")
+    parser.add_argument(
+        "--output", type=Path, help=f"JSON; by default benchmarks/results/{MEASURED}, without a GPU in runs/"
+    )
     parser.add_argument("--work", type=Path, help="folder of runs to continue; by default runs/gpu_check-OUTPUT")
     parser.add_argument("--commit", help="commit of a copy that has no .git")
     parser.add_argument("--inside", help=argparse.SUPPRESS)
@@ -117,7 +119,7 @@ def places(options: argparse.Namespace, gpu: str | None) -> tuple[Path, Path]:
     real = gpu not in (None, PRETENDED) and not options.quick
     kind = PRETENDED if gpu == PRETENDED else options.device
     name = MEASURED if real else f"gpu_check_{kind}{'_quick' if options.quick else ''}.json"
-    output = options.output or (ROOT / "benchmarks" if real else ROOT / "runs") / name
+    output = options.output or ROOT / ("benchmarks/results" if real else "runs") / name
     if output.name == MEASURED and not real:
         raise UserError(f"{output}: only figures of a real GPU at full size may have this name; give another --output")
     work = options.work or ROOT / "runs" / f"gpu_check-{output.stem}"

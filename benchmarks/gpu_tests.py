@@ -22,7 +22,7 @@ from gpu_session import ROOT, Call, NotRun, Report, Unfinished
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.progress import Progress, progress
 
-MOST_PROCESSES, CORES_OF_ONE = 4, 4
+MOST_PROCESSES, CORES_OF_ONE = 8, 2
 HANGS_AFTER = 200
 """Seconds after which a single test has failed."""
 RESERVE = 5.0

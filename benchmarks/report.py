@@ -19,6 +19,8 @@ from pathlib import Path
 
 from format_tables import NAMES as FORMATS
 from format_tables import format_table
+from gpu_table import NAME as GPU
+from gpu_table import gpu_table
 from kernel_tables import WRITERS as KERNELS
 from kernel_tables import kernel_table
 from mutation_table import NAME as MUTATION
@@ -43,6 +45,7 @@ def table_names(results: Path) -> list[str]:
         *(f"quality-{name}" for name in WRITERS),
         *sorted(reported | set(REPEATABLE)),
         MUTATION,
+        GPU,
     ]
 
 
@@ -56,6 +59,8 @@ def section(name: str, results: Path) -> str:
         return timing_table(name, results)
     if name == MUTATION:
         return mutation_table(results)
+    if name == GPU:
+        return gpu_table(results)
     if name == "speed-overview":
         return speed_overview(results)
     if name in KERNELS:

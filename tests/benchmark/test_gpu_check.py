@@ -178,12 +178,12 @@ def test_only_a_gpu_writes_the_file_of_measured_figures(tmp_path, monkeypatch):
         options = check.options_of(["--device", "cpu" if gpu is None else "cuda", *words])
         return check.places(options, gpu)[0].relative_to(tmp_path).as_posix()
 
-    assert place("NVIDIA H200") == "benchmarks/gpu_check_cuda.json"
+    assert place("NVIDIA H200") == "benchmarks/results/gpu_check_cuda.json"
     assert place("NVIDIA H200", "--quick") == "runs/gpu_check_cuda_quick.json"
     assert place("pretended") == "runs/gpu_check_pretended.json"
     assert place(None) == "runs/gpu_check_cpu.json"
-    assert not (ROOT / "benchmarks" / "gpu_check_cuda.json").exists() or json.loads(
-        (ROOT / "benchmarks" / "gpu_check_cuda.json").read_text(encoding="utf-8")
+    assert not (ROOT / "benchmarks" / "results" / "gpu_check_cuda.json").exists() or json.loads(
+        (ROOT / "benchmarks" / "results" / "gpu_check_cuda.json").read_text(encoding="utf-8")
     )["gpu"] not in (None, "pretended")
     for gpu, words in (("pretended", ()), ("NVIDIA H200", ("--quick",)), (None, ())):
         with pytest.raises(UserError, match="only figures of a real GPU"):
