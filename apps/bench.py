@@ -52,6 +52,8 @@ class Options(Common):
 class Frame(Options):
     """Measure a frame of the moving scene: network, skinning, projection, harmonics, binning, compositing."""
 
+    playback: bool = False
+    """Keep the motion's poses and interpolate them, as for a scene that is played again and again."""
     table_s2: bool = False
     """Measure all four motion models, and compare their relative speeds with the paper's Table S2."""
 
@@ -103,6 +105,8 @@ def check(options: Common) -> None:
             raise UserError(f"--{name.replace('_', '-')}: the run in --run has its own; leave one of the two out")
     if getattr(options, "table_s2", False) and options.motion is not None:
         raise UserError("--motion: --table-s2 measures all four models; leave one of the two out")
+    if getattr(options, "playback", False) and options.device == "cuda":
+        raise UserError("--playback: on a GPU frames are recorded with the network; leave the option out")
     least = MotionConfig().neighbors + 1
     nodes = 512 if options.nodes is None else options.nodes
     gaussians = 49_000 if options.gaussians is None else options.gaussians
@@ -228,6 +232,7 @@ def main(args: list[str] | None) -> None:
         threads=bench.thread_counts(options.threads, device),
         seconds=options.seconds,
         against=getattr(options, "against", None),
+        playback=getattr(options, "playback", False),
         report=lambda text: print(text, file=sys.stderr, flush=True),
     )
     if isinstance(options, Scaling):

@@ -171,6 +171,7 @@ def speed_overview(results: Path) -> str:
     for text, name, whole in (
         ("a whole dynamic frame, 512 control points, the network evaluated for every frame", "frame-cpu", "frame"),
         ("of which motion (network and skinning)", "frame-cpu", None),
+        ("the same frame with poses kept and interpolated (`Scene.prepare_playback`)", "playback-cpu", "frame"),
         ("rasterising, forward", "raster-cpu", "raster/forward"),
         ("rasterising, forward and all gradients", "raster-cpu", "raster/both"),
         ("a training step, 40,000 Gaussians, 400 x 400", "step-cpu", "step"),
@@ -205,6 +206,7 @@ class Benchmark(NamedTuple):
 
 BENCHMARKS = {
     "frame-cpu": Benchmark(stages, "apps/bench.py frame --motion control-points,static"),
+    "playback-cpu": Benchmark(stages, "apps/bench.py frame --playback --motion control-points,static"),
     "raster-cpu": Benchmark(stages, "apps/bench.py raster"),
     "step-cpu": Benchmark(stages, "apps/bench.py step --gaussians 40000 --size 400", TRAINING),
     "edit-cpu": Benchmark(stages, "apps/bench.py edit", EDITING),

@@ -38,6 +38,8 @@ class BenchPlan:
     threads: tuple[int, ...]
     seconds: float
     against: str | None = None
+    playback: bool = False
+    """Whether poses are kept and interpolated (``Scene.prepare_playback``)."""
     report: Callable[[str], None] = field(default=lambda text: None)
 
 

@@ -42,7 +42,8 @@ def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
         JSON.
 
     Raises:
-        UserError: the run cannot be read, gsplat is asked for and not usable, or the renderers disagree.
+        UserError: the run cannot be read, gsplat is asked for and not usable, the renderers disagree, or the poses of a
+            scene with control points cannot be interpolated as asked.
     """
     measure = {"frame": frame_rows, "raster": raster_rows, "step": step_rows, "edit": edit_rows}[what]
     peers = Peers.find(plan) if plan.against else None
@@ -52,6 +53,8 @@ def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
     before = environment.thread_count()
     try:
         for scene in scenes(plan, what):
+            if plan.playback and scene.motion_name == "control-points" and not scene.prepare_playback():
+                raise UserError("--playback: this motion cannot be interpolated well enough; leave the option out")
             resident = resident_mib(plan.device)
             load = load_of(*posed(scene, plan.size, MIDDLE), scene.config.antialiased and what != "raster")
             for threads in plan.threads:
@@ -66,7 +69,7 @@ def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
             compared += compare_frames(drawn, threads, plan.seconds, plan.device)
     finally:
         environment.configure(before)
-    report = {**provenance(plan.device), "what": what, "rows": rows}
+    report = {**provenance(plan.device), "what": what, "playback": plan.playback, "rows": rows}
     return {**report, "motion": motion_costs(rows, compared), "compared": compared} if what == "frame" else report
 
 

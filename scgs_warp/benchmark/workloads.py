@@ -45,7 +45,7 @@ def motion_stages(motion: Motion, training: bool = False) -> dict[str, list[tupl
     control points add ``skin``, which in training includes the search for neighbours, and in training ``arap``.
     """
     if isinstance(motion, ControlPoints):
-        stages: dict[str, list[tuple[Any, str]]] = {"network": [(motion, "poses")]}
+        stages: dict[str, list[tuple[Any, str]]] = {"network": [(motion, "poses" if training else "pose_at")]}
         stages["skin"] = [(motion, "bind_and_pose"), (motion, "apply_pose")]
         if training:
             stages["arap"] = [(motion, "refresh_graph"), (control_points, "rigidity")]
@@ -79,7 +79,8 @@ def frames_of(scene: Scene, size: Size) -> Callable[[int], None]:
 
 
 def frame_rows(case: BenchCase) -> list[dict[str, Any]]:
-    """Measure frames of the moving scene, each at another time, so that the network runs; neighbours are cached.
+    """Measure frames of the moving scene, each at another time, so that the network runs unless poses are kept;
+    neighbours are cached.
 
     On CUDA the whole is a recorded graph, in which nothing can be timed, so its stages are those of a frame drawn step
     by step.

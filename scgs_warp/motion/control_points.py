@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import torch
@@ -22,10 +23,25 @@ from ..types import Gaussians, Pose
 from .base import Motion, MotionStep, TrainingPose, network_rate
 from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
+from .pose_track import PoseTrack
 from .rigidity import Graph, arap_times, arap_weight, build_graph, rigidity
 
 NODE_NAMES = ("positions", "log_radii", "hyper", "strength_logits")
 """Parameters with one row per control point."""
+
+
+TensorState = tuple[Tensor, int, int]
+"""What tells whether a tensor was replaced or changed in place."""
+
+
+def states_of(tensors: Sequence[Tensor]) -> list[TensorState]:
+    """Return the states of tensors: a result made of them stays equal as long as the states do."""
+    return [(x, x.data_ptr(), 0 if x.is_inference() else x._version) for x in tensors]
+
+
+def same_states(before: list[TensorState], now: list[TensorState]) -> bool:
+    pairs = zip(before, now, strict=True)
+    return all(old[0] is new[0] and old[1:] == new[1:] for old, new in pairs)
 
 
 def heads_of(config: MotionConfig) -> dict[str, int]:
@@ -125,8 +141,10 @@ class ControlPoints(Motion):
         self.takes_time_tensor = isinstance(network, DeformationNetwork)
         self.graph: Graph | None = None
         self._cached: tuple[Tensor, Tensor] | None = None
-        self._cached_for: list[tuple[Tensor, int, int]] | None = None
+        self._cached_for: list[TensorState] | None = None
         self._search = NeighborSearch()
+        self._track: PoseTrack | None = None
+        self._track_of: list[TensorState] = []
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -225,22 +243,44 @@ class ControlPoints(Motion):
             self._cached = None if gaussians is None else self.binding(gaussians)
         self._cached_for = None if gaussians is None else self._binding_state(gaussians)
 
-    def _binding_state(self, gaussians: GaussianParameters) -> list[tuple[Tensor, int, int]]:
-        """Identify the inputs of :meth:`binding`: the result stays equal as long as no tensor is replaced or changed in
-        place."""
+    def _binding_state(self, gaussians: GaussianParameters) -> list[TensorState]:
+        """Identify the inputs of :meth:`binding`."""
         own = self.positions, self.log_radii, self.hyper, self.strength_logits
-        return [
-            (x, x.data_ptr(), 0 if x.is_inference() else x._version) for x in (gaussians.means, gaussians.hyper, *own)
-        ]
+        return states_of((gaussians.means, gaussians.hyper, *own))
 
     def _cache_holds(self, gaussians: GaussianParameters) -> bool:
-        if self._cached_for is None:
-            return False
-        pairs = zip(self._cached_for, self._binding_state(gaussians), strict=True)
-        return all(old[0] is new[0] and old[1:] == new[1:] for old, new in pairs)
+        return self._cached_for is not None and same_states(self._cached_for, self._binding_state(gaussians))
+
+    def keep_poses(self, tolerance: float, tell: Callable[[int, int], None] = lambda done, total: None) -> bool:
+        """Sample the motion once, so that later poses are interpolated, without gradients and on a CPU.
+
+        A pose that changes with the parameters is computed anew as soon as one of them is replaced or changed.
+
+        Args:
+            tolerance: largest error of a position, as a share of the control points' extent.
+            tell: told how many of how many instants are sampled.
+
+        Returns:
+            Whether the motion can be interpolated that well; otherwise every pose is the network's.
+        """
+        with torch.no_grad():
+            extent = float((self.positions.amax(0) - self.positions.amin(0)).max()) or 1.0
+            reach = float(self.log_radii.exp().max())
+            self._track = PoseTrack.of(self.poses, reach, tolerance * extent, tell)
+        self._track_of = states_of(tuple(self.parameters()))
+        return self._track is not None
+
+    def pose_at(self, time: float | Tensor) -> Pose:
+        """Return the pose at a time in [0, 1]: interpolated if poses are kept and the host knows the time."""
+        track = self._track
+        if track is not None and not isinstance(time, Tensor) and not torch.is_grad_enabled():
+            if same_states(self._track_of, states_of(tuple(self.parameters()))):
+                return track.at(time)
+            self._track = None
+        return self.poses(time if isinstance(time, Tensor) else torch.tensor([time]))[0]
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
-        pose = self.poses(time if isinstance(time, Tensor) else torch.tensor([time]))[0]
+        pose = self.pose_at(time)
         if self._cached is None or torch.is_grad_enabled():
             return self.bind_and_pose(gaussians, pose, frozen=False)
         if not self._cache_holds(gaussians):

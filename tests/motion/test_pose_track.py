@@ -1,0 +1,120 @@
+"""Kept poses: exact where they were sampled, within the error they state in between, and dropped with the motion."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from scgs_warp.benchmark.scenes import scene_camera, synthetic_scene
+from scgs_warp.motion.pose_track import BATCH, FIRST, MOST, PoseTrack
+from scgs_warp.types import Pose
+
+COUNT = 5
+TOLERANCE = 1e-3
+
+
+def turned(angle: torch.Tensor) -> torch.Tensor:
+    """Return unit quaternions [..., 4] about z."""
+    half, zero = 0.5 * angle, torch.zeros_like(angle)
+    return torch.stack([half.cos(), zero, zero, half.sin()], dim=-1)
+
+
+def swing(times: torch.Tensor, sign: float = 1.0) -> list[Pose]:
+    """Return poses that swing and turn, with the quaternions of every second instant negated if ``sign`` is -1."""
+    phase = torch.arange(COUNT)
+    poses = []
+    for time in times:
+        shift = torch.stack([torch.sin(6.0 * time + phase), torch.cos(5.0 * time + phase), time * phase], dim=1)
+        rotations = turned(2.0 * time + 0.1 * phase)
+        flip = sign if int(torch.floor(128.0 * time)) % 2 else 1.0
+        poses.append(Pose(shift, flip * rotations, tints=0.1 * shift))
+    return poses
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_interpolated_poses_err_by_no_more_than_they_state(sign: float):
+    track = PoseTrack.of(lambda times: swing(times, sign), 0.5, TOLERANCE)
+    assert track is not None and track.error <= TOLERANCE and track.intervals % FIRST == 0
+    generator = torch.Generator().manual_seed(1)
+    times = [0.0, 1.0, 0.5, *torch.rand(200, generator=generator).tolist()]
+    for time, truth in zip(times, swing(torch.tensor(times))):
+        pose = track.at(time)
+        assert float((pose.translations - truth.translations).norm(dim=1).max()) <= TOLERANCE
+        alike = (pose.rotations * truth.rotations).sum(1).abs().clamp(max=1.0)
+        assert float(2.0 * torch.acos(alike.double()).max()) * 0.5 <= TOLERANCE + 1e-3
+        assert torch.allclose(pose.rotations.norm(dim=1), torch.ones(COUNT), atol=1e-6)
+        assert pose.tints is not None and torch.allclose(pose.tints, truth.tints, atol=TOLERANCE)
+        assert pose.shape_rotations is None and pose.log_scales is None
+
+
+def test_samples_are_exact_and_more_are_taken_for_a_smaller_error():
+    tracks = [PoseTrack.of(swing, 0.5, tolerance) for tolerance in (1e-2, 1e-3, 1e-4)]
+    assert all(track is not None for track in tracks)
+    counts = [track.intervals for track in tracks if track]
+    assert counts == sorted(counts) and counts[0] < counts[-1]
+    track = tracks[0]
+    assert track is not None
+    for index in (0, 1, 37, track.intervals):
+        (truth,) = swing(torch.tensor([index / track.intervals]))
+        assert torch.equal(track.at(index / track.intervals).translations, truth.translations)
+
+
+def test_a_jump_is_not_interpolated():
+    def jumping(times: torch.Tensor) -> list[Pose]:
+        rest = turned(torch.zeros(COUNT))
+        return [Pose(torch.full((COUNT, 3), float(time > 0.3)), rest) for time in times]
+
+    told: list[tuple[int, int]] = []
+    assert PoseTrack.of(jumping, 0.5, TOLERANCE, lambda done, total: told.append((done, total))) is None
+    assert [done for done, _ in told] == [FIRST * 2**k + 1 for k in range(int(math.log2(MOST / FIRST)))]
+
+
+def test_the_network_is_asked_in_batches():
+    sizes: list[int] = []
+
+    def counted(times: torch.Tensor) -> list[Pose]:
+        sizes.append(len(times))
+        return swing(times)
+
+    PoseTrack.of(counted, 0.5, 1e-2)
+    assert max(sizes) == BATCH
+
+
+def test_a_scene_plays_kept_poses_until_its_motion_changes():
+    scene = synthetic_scene("control-points", 600, 40, "cpu")
+    scene.freeze_binding()
+    camera = scene_camera(scene, (64, 64))
+    exact = [scene.render(camera, time).rgb for time in (0.111, 0.512, 0.9)]
+    assert scene.prepare_playback(1e-3)
+    motion = scene.motion
+    asked: list[int] = []
+    network = motion.poses  # type: ignore[attr-defined]
+    motion.poses = lambda times: asked.append(len(times)) or network(times)  # type: ignore[attr-defined]
+    played = [scene.render(camera, time).rgb for time in (0.111, 0.512, 0.9)]
+    assert not asked
+    assert any(not torch.equal(a, b) for a, b in zip(played, exact))
+    assert all(float((a - b).abs().max()) < 0.02 for a, b in zip(played, exact))
+    with torch.no_grad():
+        motion.network.head.weight.mul_(3.0)  # type: ignore[union-attr]
+    changed = scene.render(camera, 0.512).rgb
+    assert asked == [1]
+    scene.prepare_playback(1e-9)
+    assert torch.equal(scene.render(camera, 0.512).rgb, changed)
+
+
+def test_gradients_are_those_of_the_network():
+    scene = synthetic_scene("control-points", 300, 20, "cpu")
+    assert scene.prepare_playback(1e-3)
+    scene.motion.gaussians_at(scene.gaussians, 0.3).means.sum().backward()
+    assert float(scene.motion.network.head.weight.grad.abs().max()) > 0.0  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("motion", ["static", "hexplane", "per-gaussian"])
+def test_models_without_control_points_have_nothing_to_keep(motion: str):
+    scene = synthetic_scene(motion, 300, 20, "cpu")
+    camera = scene_camera(scene, (48, 48))
+    before = scene.render(camera, 0.4).rgb
+    assert not scene.prepare_playback()
+    assert torch.equal(scene.render(camera, 0.4).rgb, before)
