@@ -145,6 +145,7 @@ class ControlPoints(Motion):
         self._search = NeighborSearch()
         self._track: PoseTrack | None = None
         self._track_of: list[TensorState] = []
+        self._layers: tuple[nn.Module, list[dict[str, nn.Parameter | None]]] | None = None
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -267,14 +268,22 @@ class ControlPoints(Motion):
             extent = float((self.positions.amax(0) - self.positions.amin(0)).max()) or 1.0
             reach = float(self.log_radii.exp().max())
             self._track = PoseTrack.of(self.poses, reach, tolerance * extent, tell)
-        self._track_of = states_of(tuple(self.parameters()))
+        self._track_of = self._motion_state()
         return self._track is not None
+
+    def _motion_state(self) -> list[TensorState]:
+        """Identify the parameters of :meth:`poses`. Walking over all modules would take as long as interpolating."""
+        network = self.network
+        if self._layers is None or self._layers[0] is not network:
+            self._layers = network, [layer._parameters for layer in network.modules() if layer._parameters]
+        layers = self._layers[1]
+        return states_of([self.positions, *(x for layer in layers for x in layer.values() if x is not None)])
 
     def pose_at(self, time: float | Tensor) -> Pose:
         """Return the pose at a time in [0, 1]: interpolated if poses are kept and the host knows the time."""
         track = self._track
         if track is not None and not isinstance(time, Tensor) and not torch.is_grad_enabled():
-            if same_states(self._track_of, states_of(tuple(self.parameters()))):
+            if same_states(self._track_of, self._motion_state()):
                 return track.at(time)
             self._track = None
         return self.poses(time if isinstance(time, Tensor) else torch.tensor([time]))[0]

@@ -100,8 +100,12 @@ def test_a_scene_plays_kept_poses_until_its_motion_changes():
         motion.network.head.weight.mul_(3.0)  # type: ignore[union-attr]
     changed = scene.render(camera, 0.512).rgb
     assert asked == [1]
+    assert scene.prepare_playback(1e-2) and not torch.equal(scene.render(camera, 0.512).rgb, changed)
+    motion.network.head.bias = torch.nn.Parameter(motion.network.head.bias + 0.01)  # type: ignore[union-attr]
+    replaced = scene.render(camera, 0.512).rgb
+    assert asked[-1] == 1 and not torch.equal(replaced, changed)
     scene.prepare_playback(1e-9)
-    assert torch.equal(scene.render(camera, 0.512).rgb, changed)
+    assert torch.equal(scene.render(camera, 0.512).rgb, replaced)
 
 
 def test_gradients_are_those_of_the_network():
