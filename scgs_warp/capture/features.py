@@ -196,19 +196,25 @@ def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
     ratio test."""
     if len(one) < 2 or len(two) < 2:
         return np.zeros((0, 2), np.uint32)
-    cosines = (one.float() @ two.float().T) / DESCRIPTOR_LENGTH**2
-    forth, best_of_one = _distinct(cosines)
-    back, best_of_two = _distinct(cosines.T)
-    mutual = forth & back[best_of_one] & (best_of_two[best_of_one] == torch.arange(len(one), device=one.device))
-    chosen = mutual.nonzero()[:, 0]
-    return torch.stack([chosen, best_of_one[chosen]], 1).cpu().numpy().astype(np.uint32)
+    products = one.float() @ two.float().T
+    rows = torch.arange(len(one), device=one.device)
+    best, where = products.max(1)
+    # Torch finds the largest of each column far faster than its place, which only mutual neighbours need.
+    mutual = products.amax(0)[where] == best
+    products[rows, where] = -1.0
+    second_of_row = products.amax(1)
+    products[rows[~mutual], where[~mutual]] = best[~mutual]
+    second_of_column = products.amax(0)[where]
+    # Equal descriptors are all nearest to the same one, which is then nearest to none in particular.
+    alone = torch.bincount(where[mutual], minlength=len(two))[where] == 1
+    chosen = rows[mutual & alone & _distinct(best, torch.maximum(second_of_row, second_of_column))]
+    return torch.stack([chosen, where[chosen]], 1).cpu().numpy().astype(np.uint32)
 
 
-def _distinct(cosines: Tensor) -> tuple[Tensor, Tensor]:
-    """Return, for each row, whether its best column passes the angle and ratio tests, and the index of that column."""
-    best, where = cosines.topk(2, dim=1)
-    angles = best.clamp(-1.0, 1.0).acos()
-    return (angles[:, 0] <= MAX_ANGLE) & (angles[:, 0] <= MAX_ANGLE_RATIO * angles[:, 1]), where[:, 0]
+def _distinct(best: Tensor, second: Tensor) -> Tensor:
+    """Return whether the best of two products of descriptors passes the angle and ratio tests."""
+    angles, others = ((product / DESCRIPTOR_LENGTH**2).clamp(-1.0, 1.0).acos() for product in (best, second))
+    return (best > second) & (angles <= MAX_ANGLE) & (angles <= MAX_ANGLE_RATIO * others)
 
 
 class Links(NamedTuple):
