@@ -62,6 +62,7 @@ def test_every_table_from_tiny_results(report, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(roofline, "BLOCKS", 2)
     commands = {
         "frame-cpu": ["frame", *TINY, "--motion", "control-points,static", "--threads", "1"],
+        "playback-cpu": ["frame", *TINY, "--playback", "--threads", "1"],
         "raster-cpu": ["raster", *TINY],
         "step-cpu": ["step", *TINY, "--threads", "1"],
         "edit-cpu": ["edit", *TINY, "--threads", "1"],
