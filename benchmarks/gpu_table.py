@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+from gpu_session import FAILED, NOT_RUN, PASSED
 from markdown_table import duration, number, table
-from provenance import OLDER, RENDERING, changed_since
+from provenance import OLDER, RENDERING, changed_since, older_note
 
 NAME = "gpu-check"
 FILE = "gpu_check_cuda.json"
+EARLIER = "gpu_check_cuda-*.json"
 SUBJECTS = {
     "agreement": "images and gradients against the CPU's, all motion models",
     "bits": "two runs, recorded against plain frames and steps: the same bits",
@@ -29,8 +31,9 @@ def gpu_table(results: Path) -> str:
     if not path.is_file():
         return "Not measured yet."
     report = json.loads(path.read_text(encoding="utf-8"))
-    parts, machine = report["parts"], report["machine"]
-    mark = f" {OLDER}" if changed_since(report["commit"], RENDERING) else ""
+    parts, machine = with_earlier(report, results), report["machine"]
+    older = changed_since(report["commit"], RENDERING)
+    mark = f" {OLDER}" if older else ""
     head = (
         f"`python benchmarks/gpu_check.py` at commit {report['commit'][:7]}{mark}: {report['gpu']}, "
         f"torch {machine['torch']}, Warp {machine['warp']}."
@@ -43,7 +46,26 @@ def gpu_table(results: Path) -> str:
     blocks = [head, table(["check", "outcome", "time"], checks, numbers=False)]
     if rows := times(parts):
         blocks.append(table(["what", "milliseconds", "note"], rows, numbers=False))
-    return "\n\n".join(blocks)
+    return "\n\n".join([*blocks, older_note([report["commit"]])] if older else blocks)
+
+
+def with_earlier(report: dict[str, Any], results: Path) -> dict[str, dict[str, Any]]:
+    """Return the parts of a report, and for those that it has not run the newest earlier ones, with their ``commit``.
+
+    Earlier reports are those that gpu_check.py moved aside when it met another commit.
+    """
+    parts = {name: part for name, part in report["parts"].items() if part.get("state") != NOT_RUN}
+    earlier = [json.loads(path.read_text(encoding="utf-8")) for path in results.glob(EARLIER)]
+    for old in sorted(earlier, key=lambda one: one["date"], reverse=True):
+        for name, part in old["parts"].items():
+            if part["state"] in (PASSED, FAILED):
+                parts.setdefault(name, {**part, "commit": old["commit"]})
+    return parts
+
+
+def at_commit(part: dict[str, Any]) -> str:
+    """Name the commit of a part from an earlier report."""
+    return f", at {part['commit'][:7]}" if "commit" in part else ""
 
 
 def lasted(seconds: float | None) -> str:
@@ -60,7 +82,7 @@ def outcome(part: dict[str, Any]) -> str:
         counts += [f"{len(part['failures'])} failed"] if part["failures"] else []
     elif "cases" in part:
         counts = [f"{part['cases']:,} cases"]
-    return f"{part['state']}{': ' if counts else ''}{', '.join(counts)}"
+    return f"{part['state']}{': ' if counts else ''}{', '.join(counts)}{at_commit(part)}"
 
 
 def times(parts: dict[str, Any]) -> list[list[str]]:
@@ -79,6 +101,7 @@ def times(parts: dict[str, Any]) -> list[list[str]]:
             for kind, label in (("forward", "image"), ("both", "image and gradients")):
                 ours, theirs = (row[kind][name]["ms_median"] for name in ("ours", "theirs"))
                 note = f"gsplat {version}: {number(theirs, 2)}, {number(row['ratio'][kind], 2)} times ours"
+                note += at_commit(parts["gsplat"])
                 rows.append([f"`rasterization`, {scene} Gaussians, {label}", number(ours, 2), note])
     for name in ("paper", "best"):
         if name in parts and parts[name].get("of"):

@@ -34,8 +34,9 @@ MOST_SEATS = 255
 """Largest number of helpers that share a grid; a job has eight bits for it."""
 FIRST_SIZE = 4
 """Size in bytes of a kernel's first argument."""
-LOOKS = 4000
-"""Number of looks in vain after which a helper sleeps: 0.1 to 0.2 ms."""
+LOOKS = 40_000
+"""Number of looks in vain after which a helper sleeps: about a millisecond. Python takes up to 0.3 ms between two
+kernels of a frame, and waking a helper costs the caller 0.15 ms, since both need the interpreter."""
 
 CHUNKS_PER_SHARE = 3
 """Number of chunks in a thread's fair share of the remaining grid. More than one, because costs are estimates and the

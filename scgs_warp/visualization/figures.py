@@ -77,13 +77,18 @@ def _put_text(canvas: np.ndarray, text: str, x: int, y: int, width: int) -> None
     cv2.putText(canvas, text, (x + 2, y + CAPTION - 7), font, scale, INK, 1, cv2.LINE_AA)
 
 
+def _reduced(image: np.ndarray, width: int, height: int) -> tuple[int, int]:
+    """Return the width and height of a picture that is reduced to fit into a cell but never enlarged."""
+    scale = min(1.0, width / image.shape[1], height / image.shape[0])
+    return max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+
+
 def _fit(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """Centre the picture in a cell, reduced to fit but never enlarged."""
     import cv2
 
-    scale = min(1.0, width / image.shape[1], height / image.shape[0])
-    if scale < 1.0:
-        size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    size = _reduced(image, width, height)
+    if size != (image.shape[1], image.shape[0]):
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     cell = np.full((height, width, 3), PAPER, np.uint8)
     top, left = (height - image.shape[0]) // 2, (width - image.shape[1]) // 2
@@ -150,8 +155,8 @@ def contact_sheet(
             raise ValueError(f"truth {list(truth.shape)} and render {list(render.shape)} must both be [H, W, 3]")
     pairs = [alphas[index] if index < len(alphas) else None for index in range(len(rows))]
     drawn = [_pictures(truth, render, pair, background) for (truth, render), pair in zip(rows, pairs)]
-    width = min(cell, max(pictures[0].shape[1] for pictures in drawn))
-    height = min(cell, max(pictures[0].shape[0] for pictures in drawn))
+    sizes = [_reduced(pictures[0], cell, cell) for pictures in drawn]
+    width, height = max(size[0] for size in sizes), max(size[1] for size in sizes)
     heads = ["truth", "render", f"error (0 .. {ERROR_RANGE:g})"]
     if any(pair is not None for pair in pairs):
         heads.append("alpha: red missing, blue extra")

@@ -52,3 +52,14 @@ def test_times_stand_beside_what_they_are_compared_with(tmp_path):
         line.endswith("1,000 of 1,000 steps in 1 s; 43.01 dB, 93,873 Gaussians |")
         for line in written(tmp_path, best=done)
     )
+
+
+def test_parts_not_run_are_taken_from_the_newest_earlier_report(tmp_path):
+    for commit, date, state in (("a" * 40, "2026-01-01", "failed"), ("b" * 40, "2026-02-01", "passed")):
+        parts = {"sanitizer": {"state": state, "seconds": 50.0}, "bits": {"state": "failed", "seconds": 1.0}}
+        report = {"commit": commit, "date": date, "gpu": "NVIDIA H200", "machine": MACHINE, "parts": parts}
+        (tmp_path / f"gpu_check_cuda-{commit[:7]}-1.json").write_text(json.dumps(report), encoding="utf-8")
+    lines = written(tmp_path, sanitizer={"state": "not run"}, bits={"state": "passed", "seconds": 9.0})
+    subject = "compute-sanitizer, memcheck and racecheck: a frame and a training step"
+    assert f"| {subject} | passed, at bbbbbbb | 50 s |" in lines
+    assert any("the same bits | passed | 9 s |" in line for line in lines)

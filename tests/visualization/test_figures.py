@@ -38,6 +38,14 @@ def test_contact_sheet_shrinks_and_centres() -> None:
     assert (row[95:105, 96:104] == 0).all() and (row[:80] == 255).all()
 
 
+def test_rows_of_wide_pictures_are_no_higher_than_the_pictures() -> None:
+    wide, flat = torch.rand(240, 480, 3), torch.rand(100, 480, 3)
+    rows = [(wide, wide), (flat, flat)]
+    sheet = figures.contact_sheet(rows, cell=200)
+    expected = figures.CAPTION + 2 * (100 + figures.CAPTION + figures.GAP)
+    assert sheet.shape[:2] == (expected, 3 * (200 + figures.GAP) + figures.GAP)
+
+
 def test_contact_sheet_shows_the_content_on_grey() -> None:
     """Rows with alpha are cropped to it; the scores are those of the whole pictures."""
     alpha, wide = torch.zeros(100, 200), torch.zeros(100, 200)
