@@ -129,6 +129,17 @@ def rig(source: Source) -> str:
     return table(["angle between neighbours", "PSNR", "worst", "SSIM"], lines)
 
 
+def clips(source: Source) -> str:
+    """Write the scores of real clips, of which every eighth frame is held out."""
+    lines = []
+    for clip in ("duck", "train"):
+        run = source.run("cpu", clip)
+        found = f"{run['registered']} of {run['frames']}" if "frames" in run else ""
+        scores = (number(run.get(key), 2) for key in ("psnr", "psnr_worst"))
+        lines.append([source.label("cpu", clip), found, *scores, number(run.get("ssim"), 3)])
+    return table(["clip", "cameras found", "PSNR", "worst", "SSIM"], lines)
+
+
 def exposure(source: Source) -> str:
     """Write what affine colours per frame do for a film whose exposure changes."""
     keys, lines = ("psnr", "psnr_fitted", "psnr_interpolated"), []
