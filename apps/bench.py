@@ -105,8 +105,6 @@ def check(options: Common) -> None:
             raise UserError(f"--{name.replace('_', '-')}: the run in --run has its own; leave one of the two out")
     if getattr(options, "table_s2", False) and options.motion is not None:
         raise UserError("--motion: --table-s2 measures all four models; leave one of the two out")
-    if getattr(options, "playback", False) and options.device == "cuda":
-        raise UserError("--playback: on a GPU frames are recorded with the network; leave the option out")
     least = MotionConfig().neighbors + 1
     nodes = 512 if options.nodes is None else options.nodes
     gaussians = 49_000 if options.gaussians is None else options.gaussians
@@ -214,6 +212,10 @@ def main(args: list[str] | None) -> None:
         )
     check(options)
     device = prepare(options.device, options.threads, options.memory_gib)
+    if getattr(options, "playback", False) and device == "cuda":
+        from scgs_warp.errors import UserError
+
+        raise UserError("--playback: on a GPU frames are recorded with the network; leave the option out")
 
     from scgs_warp.benchmark import plot, scaling
     from scgs_warp.benchmark import run as bench

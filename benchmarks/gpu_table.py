@@ -16,7 +16,7 @@ EARLIER = "gpu_check_cuda-*.json"
 SUBJECTS = {
     "agreement": "images and gradients against the CPU's, all motion models",
     "bits": "two runs, recorded against plain frames and steps: the same bits",
-    "sanitizer": "compute-sanitizer, memcheck and racecheck: a frame and a training step",
+    "sanitizer": "compute-sanitizer, memcheck and racecheck: a frame and a step, operation by operation",
     "tests": "all tests that need a GPU",
     "fuzz": "poisoned inputs of every operation",
     "crowded": "a million Gaussians that all fill a screen of 1920 x 1080, within 4 GiB",
@@ -65,7 +65,9 @@ def with_earlier(report: dict[str, Any], results: Path) -> dict[str, dict[str, A
 
 def at_commit(part: dict[str, Any]) -> str:
     """Name the commit of a part from an earlier report."""
-    return f", at {part['commit'][:7]}" if "commit" in part else ""
+    if "commit" not in part:
+        return ""
+    return f", at {part['commit'][:7]}" + (f" {OLDER}" if changed_since(part["commit"], RENDERING) else "")
 
 
 def lasted(seconds: float | None) -> str:
@@ -100,13 +102,19 @@ def times(parts: dict[str, Any]) -> list[list[str]]:
         for scene, row in own["rows"].items():
             for kind, label in (("forward", "image"), ("both", "image and gradients")):
                 ours, theirs = (row[kind][name]["ms_median"] for name in ("ours", "theirs"))
-                note = f"gsplat {version}: {number(theirs, 2)}, {number(row['ratio'][kind], 2)} times ours"
-                note += at_commit(parts["gsplat"])
+                note = f"gsplat {version} takes {number(theirs, 2)}, {number(row['ratio'][kind], 2)} of our time"
+                note += missed(parts["gsplat"], f"{kind} at {scene}, gsplat's time / ours") + at_commit(parts["gsplat"])
                 rows.append([f"`rasterization`, {scene} Gaussians, {label}", number(ours, 2), note])
     for name in ("paper", "best"):
         if name in parts and parts[name].get("of"):
             rows.append(training_row(name, parts[name]))
     return rows
+
+
+def missed(part: dict[str, Any], goal: str) -> str:
+    """Say that a goal of a part was missed, if so."""
+    own = part.get("goals", {}).get(goal)
+    return "" if own is None or own["met"] else f" (goal: {own.get('least', own.get('most'))}, missed)"
 
 
 def training_row(preset: str, part: dict[str, Any]) -> list[str]:

@@ -133,10 +133,10 @@ def clips(source: Source) -> str:
     """Write the scores of real clips, of which every eighth frame is held out."""
     lines = []
     for clip in ("duck", "train"):
-        run = source.run("cpu", clip)
+        run = source.run("gpu", clip)
         found = f"{run['registered']} of {run['frames']}" if "frames" in run else ""
         scores = (number(run.get(key), 2) for key in ("psnr", "psnr_worst"))
-        lines.append([source.label("cpu", clip), found, *scores, number(run.get("ssim"), 3)])
+        lines.append([source.label("gpu", clip), found, *scores, number(run.get("ssim"), 3)])
     return table(["clip", "cameras found", "PSNR", "worst", "SSIM"], lines)
 
 

@@ -199,9 +199,9 @@ def nearest_mutual(one: Tensor, two: Tensor) -> np.ndarray:
     products = one.float() @ two.float().T
     rows = torch.arange(len(one), device=one.device)
     best, where = products.max(1)
-    # Torch finds the largest of each column far faster than its place, which only mutual neighbours need.
+    # Only mutual neighbours need the place of a column's largest product, which torch finds slowly.
     mutual = products.amax(0)[where] == best
-    products[rows, where] = -1.0
+    products[rows, where] = -torch.inf
     second_of_row = products.amax(1)
     products[rows[~mutual], where[~mutual]] = best[~mutual]
     second_of_column = products.amax(0)[where]

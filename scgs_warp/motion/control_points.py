@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 
 import torch
@@ -25,23 +25,12 @@ from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
 from .pose_track import PoseTrack
 from .rigidity import Graph, arap_times, arap_weight, build_graph, rigidity
+from .tensor_states import Layers, TensorState, same_states, states_of
 
+WITHIN_REACH = 0.999
+"""Share of the pairs of a Gaussian and one of its control points that are no farther apart than a turn's reach."""
 NODE_NAMES = ("positions", "log_radii", "hyper", "strength_logits")
 """Parameters with one row per control point."""
-
-
-TensorState = tuple[Tensor, int, int]
-"""What tells whether a tensor was replaced or changed in place."""
-
-
-def states_of(tensors: Sequence[Tensor]) -> list[TensorState]:
-    """Return the states of tensors: a result made of them stays equal as long as the states do."""
-    return [(x, x.data_ptr(), 0 if x.is_inference() else x._version) for x in tensors]
-
-
-def same_states(before: list[TensorState], now: list[TensorState]) -> bool:
-    pairs = zip(before, now, strict=True)
-    return all(old[0] is new[0] and old[1:] == new[1:] for old, new in pairs)
 
 
 def heads_of(config: MotionConfig) -> dict[str, int]:
@@ -143,9 +132,8 @@ class ControlPoints(Motion):
         self._cached: tuple[Tensor, Tensor] | None = None
         self._cached_for: list[TensorState] | None = None
         self._search = NeighborSearch()
-        self._track: PoseTrack | None = None
-        self._track_of: list[TensorState] = []
-        self._layers: tuple[nn.Module, list[dict[str, nn.Parameter | None]]] | None = None
+        self._kept: tuple[PoseTrack, list[TensorState]] | None = None
+        self._layers: Layers | None = None
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -252,40 +240,60 @@ class ControlPoints(Motion):
     def _cache_holds(self, gaussians: GaussianParameters) -> bool:
         return self._cached_for is not None and same_states(self._cached_for, self._binding_state(gaussians))
 
-    def keep_poses(self, tolerance: float, tell: Callable[[int, int], None] = lambda done, total: None) -> bool:
-        """Sample the motion once, so that later poses are interpolated, without gradients and on a CPU.
+    def keep_poses(
+        self,
+        gaussians: GaussianParameters,
+        tolerance: float,
+        tell: Callable[[int, int], None] = lambda done, total: None,
+    ) -> bool:
+        """Sample the motion once, so that later poses are interpolated: on a CPU, without gradients.
 
-        A pose that changes with the parameters is computed anew as soon as one of them is replaced or changed.
+        As soon as a parameter or a layer is replaced, or a parameter is changed in place, poses are the network's
+        again. Changes through ``.data`` are not noticed.
 
         Args:
+            gaussians: those that the control points move.
             tolerance: largest error of a position, as a share of the control points' extent.
             tell: told how many of how many instants are sampled.
 
         Returns:
-            Whether the motion can be interpolated that well; otherwise every pose is the network's.
+            Whether poses are kept. False: on a GPU, for parameters that count no changes (inference tensors), if a
+            parameter changed meanwhile, and if the tolerance is not met.
         """
+        self._kept = None
+        if self.positions.is_cuda or any(x.is_inference() for x in self.parameters()):
+            return False
+        state = self._motion_state()
         with torch.no_grad():
             extent = float((self.positions.amax(0) - self.positions.amin(0)).max()) or 1.0
-            reach = float(self.log_radii.exp().max())
-            self._track = PoseTrack.of(self.poses, reach, tolerance * extent, tell)
-        self._track_of = self._motion_state()
-        return self._track is not None
+            offsets = gaussians.means[:, None] - self.positions[self.neighbors(gaussians).long()]
+            distances = offsets.norm(dim=-1).flatten()
+            reach = float(distances.kthvalue(max(1, int(WITHIN_REACH * len(distances)))).values)
+            track = PoseTrack.of(self.poses, reach, tolerance * extent, tell)
+        if track is not None and same_states(state, self._motion_state()):
+            self._kept = track, state
+        return self._kept is not None
+
+    @property
+    def kept_poses(self) -> PoseTrack | None:
+        """The track that poses are interpolated from, if they are kept."""
+        return None if self._kept is None else self._kept[0]
 
     def _motion_state(self) -> list[TensorState]:
         """Identify the parameters of :meth:`poses`. Walking over all modules would take as long as interpolating."""
         network = self.network
-        if self._layers is None or self._layers[0] is not network:
-            self._layers = network, [layer._parameters for layer in network.modules() if layer._parameters]
-        layers = self._layers[1]
-        return states_of([self.positions, *(x for layer in layers for x in layer.values() if x is not None)])
+        if self._layers is None or self._layers.network is not network or not self._layers.hold():
+            self._layers = Layers(network)
+        return states_of([self.positions, self.log_radii, *self._layers.parameters()])
 
     def pose_at(self, time: float | Tensor) -> Pose:
         """Return the pose at a time in [0, 1]: interpolated if poses are kept and the host knows the time."""
-        track = self._track
-        if track is not None and not isinstance(time, Tensor) and not torch.is_grad_enabled():
-            if same_states(self._track_of, self._motion_state()):
+        kept = self._kept
+        if kept is not None and not isinstance(time, Tensor) and not torch.is_grad_enabled():
+            track, state = kept
+            if same_states(state, self._motion_state()):
                 return track.at(time)
-            self._track = None
+            self._kept = None
         return self.poses(time if isinstance(time, Tensor) else torch.tensor([time]))[0]
 
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:

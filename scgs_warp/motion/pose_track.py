@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,12 +10,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..runtime import memory
 from ..types import Pose
 
 FIRST = 64
 """Number of intervals of the first attempt."""
 MOST = 2048
-"""Largest number of intervals: a network of ReLUs has corners, whose error falls with the interval alone."""
+"""Largest number of intervals. At a kink of a ReLU the error falls linearly with the interval, so many are needed."""
+RELATIVE = 3e-3
+"""Largest error of the logarithm of a scale or a colour."""
 BATCH = 16
 """Number of instants of one evaluation of the network."""
 FIELDS = {"translations": 3, "rotations": 4, "shape_rotations": 4, "log_scales": 3, "tints": 3}
@@ -30,7 +34,8 @@ class PoseTrack:
     fields: dict[str, slice]
     """Columns of each field that the poses have."""
     error: float
-    """Largest error found: of an interpolated position, or of a turn times ``reach``, in units of the positions."""
+    """Largest error found with intervals twice as long: of a position, or of a turn times ``reach``, in units of the
+    positions."""
 
     @staticmethod
     def of(
@@ -39,16 +44,19 @@ class PoseTrack:
         tolerance: float,
         tell: Callable[[int, int], None] = lambda done, total: None,
     ) -> PoseTrack | None:
-        """Sample a motion, more densely until interpolation errs by at most ``tolerance``; None if it never does.
+        """Sample a motion, more densely until interpolation errs by at most ``tolerance``.
 
-        The error is measured at the middles of all intervals, which then become samples themselves, so that the track
-        returned has half the interval at which the tolerance was met.
+        The error is measured at the middles of all intervals, which then become samples themselves: the track returned
+        has half the interval at which the tolerance was met.
 
         Args:
             poses_at: returns one pose for each time [T].
             reach: distance at which a control point's turn acts, in units of the positions.
-            tolerance: in units of the positions.
+            tolerance: in units of the positions; scales and colours have ``RELATIVE``.
             tell: told how many of how many instants are sampled.
+
+        Returns:
+            The track, or None if half of ``MOST`` intervals are too few or there is no memory for more.
         """
         fields, first = _columns(poses_at(torch.zeros(1))[0])
         intervals, rows = FIRST, _sampled(poses_at, torch.arange(FIRST + 1) / FIRST, fields)
@@ -56,14 +64,15 @@ class PoseTrack:
         while True:
             tell(len(rows), MOST + 1)
             middles = _sampled(poses_at, (torch.arange(intervals) + 0.5) / intervals, fields)
-            error = _error(rows, middles, fields, reach)
+            error, relative = _errors(rows, middles, fields, reach)
             intervals *= 2
             both = rows.new_empty(intervals + 1, *rows.shape[1:])
             both[::2], both[1::2] = rows, middles
             rows = _aligned(both, fields)
-            if error <= tolerance:
+            if error <= tolerance and relative <= RELATIVE:
+                tell(len(rows), len(rows))
                 return PoseTrack(rows, fields, error)
-            if intervals >= MOST:
+            if intervals >= MOST or not memory.fits(3 * rows.nbytes, rows.device):
                 return None
 
     @property
@@ -113,14 +122,18 @@ def _aligned(rows: Tensor, fields: dict[str, slice]) -> Tensor:
     return rows
 
 
-def _error(rows: Tensor, middles: Tensor, fields: dict[str, slice], reach: float) -> float:
-    """Return the largest error of interpolation in the middles of the intervals."""
+def _errors(rows: Tensor, middles: Tensor, fields: dict[str, slice], reach: float) -> tuple[float, float]:
+    """Return the largest errors of interpolation in the middles of the intervals: as a distance, and of logarithms."""
     means = torch.lerp(_aligned(rows, fields)[:-1], rows[1:], 0.5)
-    columns = fields["translations"]
-    error = (means[..., columns] - middles[..., columns]).norm(dim=-1).max()
-    for name in TURNS:
-        if name in fields:
-            ours, truth = F.normalize(means[..., fields[name]], dim=-1), middles[..., fields[name]]
-            apart = torch.minimum((ours - truth).norm(dim=-1), (ours + truth).norm(dim=-1))
-            error = torch.maximum(error, reach * 4.0 * torch.asin((0.5 * apart.max()).clamp(max=1.0)))
-    return float(error)
+    distance = relative = 0.0
+    for name, columns in fields.items():
+        ours, truth = means[..., columns], middles[..., columns]
+        if name in TURNS:
+            ours = F.normalize(ours, dim=-1)
+            apart = float(torch.minimum((ours - truth).norm(dim=-1), (ours + truth).norm(dim=-1)).max())
+            distance = max(distance, reach * 4.0 * math.asin(min(0.5 * apart, 1.0)))
+        elif name == "translations":
+            distance = max(distance, float((ours - truth).norm(dim=-1).max()))
+        else:
+            relative = max(relative, float((ours - truth).abs().max()))
+    return distance, relative

@@ -35,8 +35,8 @@ MOST_SEATS = 255
 FIRST_SIZE = 4
 """Size in bytes of a kernel's first argument."""
 LOOKS = 40_000
-"""Number of looks in vain after which a helper sleeps: about a millisecond. Python takes up to 0.3 ms between two
-kernels of a frame, and waking a helper costs the caller 0.15 ms, since both need the interpreter."""
+"""Number of looks in vain after which a helper sleeps: about a millisecond, more than Python takes between two kernels
+of a frame. Waking a helper costs the caller more than a short kernel takes, since both need the interpreter."""
 
 CHUNKS_PER_SHARE = 3
 """Number of chunks in a thread's fair share of the remaining grid. More than one, because costs are estimates and the
@@ -107,7 +107,7 @@ def _between(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class HelperThreads:
     """Threads that take chunks of the same job (``kernels/native/sharing.h``).
 
-    A helper without work looks for the next job for a fraction of a millisecond, because a short kernel would be over
+    A helper without work looks for the next job for about a millisecond, because a short kernel would be over
     before it woke up; then it sleeps.
     """
 

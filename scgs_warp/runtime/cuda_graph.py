@@ -13,8 +13,8 @@ import warp as wp
 import warp._src.context as warp_context
 
 _raw_stream: Callable[[int], int] | None = getattr(torch._C, "_cuda_getCurrentRawStream", None)
-"""Returns the handle of torch's current stream of a device, without an object for it, which takes ten times as long
-and is made at every launch. None: this torch has no such function."""
+"""Returns the handle alone of torch's current stream of a device: making torch's stream object at each launch costs
+more. None: this torch has no such function."""
 _streams: dict[int, dict[int, wp.Stream]] = {}
 _recording_streams: dict[int, tuple[torch.cuda.Stream, torch.cuda.Stream]] = {}
 _current_stream = threading.RLock()

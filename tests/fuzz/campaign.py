@@ -95,6 +95,7 @@ def work(own: argparse.Namespace) -> None:
     """Run all cases in child processes; a child that a case crashes is replaced."""
     folder: Path = own.worker
     first, last = own.seed, own.seed + own.cases
+    (folder / "place").touch()
     # CUDA cannot be used in the child of a process that has initialised it, so there every child loads for itself.
     loaded = prepared(own) if own.device == "cpu" else None
     while first < last:
@@ -102,7 +103,7 @@ def work(own: argparse.Namespace) -> None:
         if child == 0:
             status = 1
             try:
-                run_cases(first, last, own.device, loaded or prepared(own), folder, own.patience)
+                run_cases(first, last, own.device, prepared(own) if loaded is None else loaded, folder, own.patience)
                 status = 0
             except Exception:
                 traceback.print_exc()

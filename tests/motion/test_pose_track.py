@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from scgs_warp.benchmark.scenes import scene_camera, synthetic_scene
-from scgs_warp.motion.pose_track import BATCH, FIRST, MOST, PoseTrack
+from scgs_warp.motion.pose_track import BATCH, FIRST, MOST, RELATIVE, PoseTrack
 from scgs_warp.types import Pose
 
 COUNT = 5
@@ -68,7 +68,50 @@ def test_a_jump_is_not_interpolated():
 
     told: list[tuple[int, int]] = []
     assert PoseTrack.of(jumping, 0.5, TOLERANCE, lambda done, total: told.append((done, total))) is None
-    assert [done for done, _ in told] == [FIRST * 2**k + 1 for k in range(int(math.log2(MOST / FIRST)))]
+    assert told == [(FIRST * 2**k + 1, MOST + 1) for k in range(int(math.log2(MOST / FIRST)))]
+
+
+def turning(times: torch.Tensor) -> list[Pose]:
+    """Return poses that stay in place and turn, faster and faster."""
+    rest = torch.zeros(COUNT, 3)
+    return [Pose(rest, turned(8.0 * time * time + torch.zeros(COUNT))) for time in times]
+
+
+def tinted(times: torch.Tensor) -> list[Pose]:
+    """Return poses that stay in place and change colour."""
+    rest, still = torch.zeros(COUNT, 3), turned(torch.zeros(COUNT))
+    return [Pose(rest, still, tints=torch.sin(9.0 * time).expand(COUNT, 3)) for time in times]
+
+
+def test_turns_count_by_how_far_they_reach():
+    near, far = (PoseTrack.of(turning, reach, 1e-5) for reach in (0.01, 10.0))
+    assert near is not None and near.intervals == 2 * FIRST and 0.0 < near.error <= 1e-5
+    assert far is None or far.intervals > near.intervals
+    times = [(index + 0.37) / 50 for index in range(50)]
+    for time, truth in zip(times, turning(torch.tensor(times))):
+        alike = (near.at(time).rotations.double() * truth.rotations.double()).sum(1).abs().clamp(max=1.0)
+        assert 0.01 * float(2.0 * torch.acos(alike).max()) <= 2e-5
+
+
+def test_colours_have_an_error_of_their_own():
+    track = PoseTrack.of(tinted, 1.0, 1e-9)
+    assert track is not None and track.error == 0.0
+    times = [(index + 0.37) / 50 for index in range(50)]
+    for time, truth in zip(times, tinted(torch.tensor(times))):
+        tints = track.at(time).tints
+        assert tints is not None and float((tints - truth.tints).abs().max()) <= RELATIVE
+
+    def flickering(times: torch.Tensor) -> list[Pose]:
+        rest, still = torch.zeros(COUNT, 3), turned(torch.zeros(COUNT))
+        return [Pose(rest, still, tints=torch.full((COUNT, 3), float(time > 0.3))) for time in times]
+
+    assert PoseTrack.of(flickering, 1.0, 1e-3) is None
+
+
+def test_nothing_is_kept_without_memory(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("scgs_warp.motion.pose_track.memory.fits", lambda need, device: False)
+    assert PoseTrack.of(turning, 1.0, 1e-9) is None
+    assert PoseTrack.of(tinted, 1.0, 1.0) is not None
 
 
 def test_the_network_is_asked_in_batches():
@@ -104,8 +147,58 @@ def test_a_scene_plays_kept_poses_until_its_motion_changes():
     motion.network.head.bias = torch.nn.Parameter(motion.network.head.bias + 0.01)  # type: ignore[union-attr]
     replaced = scene.render(camera, 0.512).rgb
     assert asked[-1] == 1 and not torch.equal(replaced, changed)
-    scene.prepare_playback(1e-9)
+    assert not scene.prepare_playback(1e-9)
     assert torch.equal(scene.render(camera, 0.512).rgb, replaced)
+
+
+def changed_position(motion) -> None:
+    with torch.no_grad():
+        motion.positions.add_(0.01)
+
+
+def replaced_layer(motion) -> None:
+    motion.network.head = torch.nn.Linear(motion.network.head.in_features, motion.network.head.out_features)
+
+
+@pytest.mark.parametrize("change", [changed_position, replaced_layer])
+def test_kept_poses_do_not_outlive_a_change(change):
+    motion, before = kept_motion()
+    with torch.no_grad():
+        motion.pose_at(0.31)
+    assert motion.kept_poses is before
+    change(motion)
+    with torch.no_grad():
+        pose = motion.pose_at(0.31)
+        assert motion.kept_poses is None
+        assert torch.equal(pose.translations, motion.poses(torch.tensor([0.31]))[0].translations)
+
+
+def kept_motion():
+    scene = synthetic_scene("control-points", 300, 20, "cpu")
+    assert scene.prepare_playback(1e-3)
+    return scene.motion, scene.motion.kept_poses  # type: ignore[union-attr]
+
+
+def test_a_change_while_sampling_keeps_nothing():
+    scene = synthetic_scene("control-points", 300, 20, "cpu")
+
+    def tell(done: int, total: int) -> None:
+        changed_position(scene.motion)
+
+    assert not scene.prepare_playback(1e-3, tell) and scene.motion.kept_poses is None  # type: ignore[union-attr]
+
+
+def test_inference_tensors_are_not_kept():
+    """They count no changes, so a change would go unnoticed."""
+    with torch.inference_mode():
+        scene = synthetic_scene("control-points", 300, 20, "cpu")
+    assert not scene.prepare_playback(1e-3)
+
+
+def test_times_beyond_the_ends_are_the_ends():
+    _, track = kept_motion()
+    for time, end in ((-0.5, 0.0), (1.5, 1.0)):
+        assert torch.equal(track.at(time).translations, track.at(end).translations)
 
 
 def test_gradients_are_those_of_the_network():
