@@ -72,9 +72,17 @@ static inline Pixels read_pixels(const Band& band, long long at, int column, boo
     return p;
 }
 
+// Return true if a bit of one of the maps is set in any of 16 pixels.
+ALWAYS_INLINE bool any_set(const vf* maps, int count) {
+    vi all = (vi)maps[0];
+    for (int map = 1; map < count; ++map) all |= (vi)maps[map];
+    return bits(all != vi{}) != 0;
+}
+
 // Return a function that processes a band downwards. ``read(maps, at, column, whole)`` gives the maps of 16 pixels.
 // Each row is blurred horizontally into a ring of 11 rows, which stays in the first-level cache. As soon as the ring is
-// full, ``finish(row, left, vectors, blur)`` finishes its middle row; in it ``blur(v, maps)`` blurs vertically.
+// full, ``finish(row, left, vectors, blur)`` finishes its middle row; in it ``blur(v, maps)`` blurs vertically, and
+// returns false if all windows of the 16 pixels hold nothing but zeros: most of the picture of a subject on black.
 static inline auto band_walk() {
     FUSE_WITHIN_EXPRESSIONS
     return [](auto map_count, const Band& band, auto read, auto finish) __attribute__((always_inline)) {
@@ -82,24 +90,32 @@ static inline auto band_walk() {
         const float w[6] = {SSIM_TAP_0, SSIM_TAP_1, SSIM_TAP_2, SSIM_TAP_3, SSIM_TAP_4, SSIM_TAP_5};
         const int width = band.width;
         alignas(64) float ring[MAPS][11][BLOCK];
+        unsigned filled[11];  // one bit for each vector of a row of the ring that is not zero
+        static_assert(BLOCK <= 16 * 32, "one bit for each vector");
         for (int left = 0; left < width; left += band.block) {
             const int columns = left + band.block < width ? band.block : width - left;
             const int vectors = (columns + 15) / 16;
             for (int row = band.top - 5; row < band.bottom + 5; ++row) {
                 const int slot = (row - band.top + 5) % 11;
+                filled[slot] = 0;
                 if (row < 0 || row >= band.height) {
                     for (int map = 0; map < MAPS; ++map)
                         for (int v = 0; v < vectors; ++v) store(ring[map][slot] + 16 * v, vf{}, 16);
                 } else {
                     vf past[2][MAPS];
+                    unsigned nonzero = 0;  // of the last three vectors, the last one in bit 0
                     for (int v = 0; v < vectors + 2; ++v) {
                         const int column = left - 16 + 16 * v;
                         vf fresh[MAPS] = {};
                         if (column > -16 && column < width)
                             read(fresh, (long long)row * width + column, column, column >= 0 && column + 16 <= width);
+                        nonzero = (nonzero << 1 | any_set(fresh, MAPS)) & 7;
                         // Blur the vector before the last one. Neighbours are shifted in registers, because a load that
                         // crosses a cache line costs as much as two.
-                        if (v >= 2)
+                        if (v >= 2 && !nonzero)
+                            for (int map = 0; map < MAPS; ++map) store(ring[map][slot] + 16 * (v - 2), vf{}, 16);
+                        else if (v >= 2) {
+                            filled[slot] |= 1u << (v - 2);
                             for (int map = 0; map < MAPS; ++map) {
                                 const vf a = past[0][map], b = past[1][map], c = fresh[map];
                                 vf sum = w[0] * b + w[1] * (NEIGHBOURS(a, b, 15) + NEIGHBOURS(b, c, 1));
@@ -109,6 +125,7 @@ static inline auto band_walk() {
                                 sum += w[5] * (NEIGHBOURS(a, b, 11) + NEIGHBOURS(b, c, 5));
                                 store(ring[map][slot] + 16 * (v - 2), sum, 16);
                             }
+                        }
                         for (int map = 0; map < MAPS; ++map) {
                             past[0][map] = past[1][map];
                             past[1][map] = fresh[map];
@@ -117,9 +134,17 @@ static inline auto band_walk() {
                 }
                 const int out = row - 5;
                 if (out < band.top) continue;
-                int order[11];  // offset of row out - 5 + k in the ring
-                for (int k = 0; k < 11; ++k) order[k] = (slot + 1 + k) % 11 * BLOCK;
+                int order[11];         // offset of row out - 5 + k in the ring
+                unsigned windows = 0;  // one bit for each vector whose windows are not zero
+                for (int k = 0; k < 11; ++k) {
+                    order[k] = (slot + 1 + k) % 11 * BLOCK;
+                    windows |= filled[k];
+                }
                 auto blur = [&](int v, vf* blurred) __attribute__((always_inline)) {
+                    if (!(windows >> v & 1)) {
+                        for (int map = 0; map < MAPS; ++map) blurred[map] = vf{};
+                        return false;
+                    }
 #pragma unroll
                     for (int map = 0; map < MAPS; ++map) {
                         const float* at = ring[map][0] + 16 * v;
@@ -130,6 +155,7 @@ static inline auto band_walk() {
                             sum += w[k] * (load(at + order[5 - k], 16) + load(at + order[5 + k], 16));
                         blurred[map] = sum;
                     }
+                    return true;
                 };
                 finish(out, left, vectors, blur);
             }
@@ -146,6 +172,8 @@ static inline void photometric_band(
         enum { value = 4 };
     };
     const Band band = Band(index, image, truth, mask);
+    // 1, as far as it is rounded to 1 below.
+    const float c1 = SSIM_C1, c2 = SSIM_C2, ssim_of_nothing = c1 * c2 * (1.0f / (c1 * c2));
     auto read = [&](vf* fresh, long long at, int column, bool whole) __attribute__((always_inline)) {
         const Pixels p = read_pixels(band, at, column, whole);
         fresh[0] = p.x;
@@ -158,10 +186,17 @@ static inline void photometric_band(
         vf l1_sum = {}, ssim_sum = {}, square_sum = {};
         for (int v = 0; v < vectors; ++v) {
             vf blurred[4];
-            blur(v, blurred);
+            const bool something = blur(v, blurred);
             const int column = left + 16 * v;
             const long long at = (long long)row * band.width + column;
             const int count = column + 16 <= band.width ? 16 : band.width - column;
+            if (!something && !band.mask && count == 16) {
+                // Image and truth are zero: so are differences and derivatives.
+                ssim_sum += ssim_of_nothing;
+                for (int j = 0; j < 3 && partials.data; ++j)
+                    store(partials.data + (j * (long long)band.channels + band.channel) * band.plane + at, ZERO, 16);
+                continue;
+            }
             const Pixels p = read_pixels(band, at, column, count == 16);
             const vf cross = blurred[0] * blurred[1];
             const vf squares = blurred[0] * blurred[0] + blurred[1] * blurred[1];

@@ -75,6 +75,34 @@ def test_value_and_gradient_with_mask(shape, seed, device):
 
 
 @pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("shape", [(3, 70, 150), (2, SSIM_BAND + 40, 2 * SSIM_BLOCK + 21)], ids=str)
+def test_subjects_on_black(shape, masked, device):
+    """Parts of both images are black: around a subject, between its limbs, and where only one of them shows it. The
+    cpu form skips windows that are black in both."""
+    image, truth = _pair(shape, 12)
+    rows, columns = torch.arange(shape[1])[:, None], torch.arange(shape[2])
+    for picture, shift in ((image, 0), (truth, 3)):
+        limbs = ((columns + shift) % 61 < 17) & (rows > 20 + shift) | (rows > shape[1] - 3)
+        speck = (rows == 9) & (columns == shape[2] - 19 - shift)
+        picture *= limbs | speck
+    mask = torch.rand(shape[1:], generator=torch.Generator().manual_seed(12)) > 0.3 if masked else None
+    assert (torch.nn.functional.max_pool2d((image + truth).sum(0)[None], 11, 1, 5) == 0).float().mean() > 0.2
+    for form in _forms(device):
+        _compare(image, truth, mask, 0.2, device, form, log_weight=0.002)
+
+
+def test_black_images_are_alike(device):
+    black = torch.zeros(3, 40, 70, device=device)
+    for form in _forms(device):
+        leaf = black.clone().requires_grad_()
+        loss, l1, similarity = photometric_loss(leaf, black, form=form)
+        loss.backward()
+        assert abs(float(loss.detach())) < 1e-6 and float(l1.detach()) == 0.0
+        assert abs(float(similarity.detach()) - 1.0) < 1e-6
+        assert not leaf.grad.any()
+
+
+@pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 def test_logarithm_of_the_squared_error(shape, masked, device):
     image, truth = _pair(shape, 9)
