@@ -8,11 +8,14 @@ import functools
 import gc
 import math
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 _threads: int | None = None
 _configured = False
+_torch_spins = False
+"""True if torch was imported before this package, so that its OpenMP threads spin between torch calls."""
 
 
 def prepare_environment() -> None:
@@ -22,7 +25,11 @@ def prepare_environment() -> None:
     a workspace of fixed size, which makes its sums reproducible. MKL is set to a mode whose results do not depend on
     the number of threads; otherwise the gradient of a layer narrower than 64 would. On processors of other makers than
     Intel MKL ignores that mode; there the project's own kernels, which run the networks on the CPU, keep the promise.
+
+    If torch is loaded already, its OpenMP has chosen to spin. :func:`configure` then gives torch a single thread.
     """
+    global _torch_spins
+    _torch_spins = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("KMP_BLOCKTIME", "0")
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
@@ -128,7 +135,8 @@ def configure(threads: int | None = None) -> None:
     starts them. Denormals can make training steps 20 times slower.
 
     Args:
-        threads: number of CPU threads. None: all available ones.
+        threads: number of CPU threads. None: all available ones. Torch gets one if it was imported before this package:
+            kernels would share their cores with its spinning threads, and take twice as long.
 
     Raises:
         NotEnoughMemory: the limit of addresses (``ulimit -v``) leaves too little to work with.
@@ -145,7 +153,7 @@ def configure(threads: int | None = None) -> None:
     _threads, _configured = threads, True
     _keep_freed_memory()
     torch.set_flush_denormal(True)
-    torch.set_num_threads(thread_count())
+    torch.set_num_threads(1 if _torch_spins else thread_count())
     torch.set_deterministic_debug_mode("warn")  # use_deterministic_algorithms would import the compiler, for a second
     # This switch would make torch.empty fill every buffer with NaN; the kernels write all they allocate.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]

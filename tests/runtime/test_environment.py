@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
+import os
 import subprocess
 import sys
 
@@ -89,3 +90,18 @@ def test_an_app_collects_garbage_again_once_its_libraries_are_loaded():
     finally:
         gc.enable()
         environment.configure()
+
+
+@pytest.mark.parametrize(
+    "first, policy, expected", [("scgs_warp", None, 2), ("torch", None, 1), ("torch", "passive", 2)]
+)
+def test_torch_that_spins_gets_one_thread(first, policy, expected):
+    """Torch's OpenMP spins between calls if it was loaded before the package could ask it to sleep; kernels, which use
+    the same cores, took twice as long."""
+    code = f"import {first}, scgs_warp, torch\nfrom scgs_warp.runtime import environment\n"
+    code += "environment.configure(2)\nprint(torch.get_num_threads(), environment.thread_count())"
+    variables = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    if policy is not None:
+        variables["OMP_WAIT_POLICY"] = policy
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables, check=True)
+    assert result.stdout.split() == [str(expected), "2"]
