@@ -71,13 +71,11 @@ def _fit(patches: Patches, labels: np.ndarray, motions: Motions, pair: list[int]
     boundary's extent.
     """
     first, second = pair
-    rotations, shifts = motions
-    turned = np.einsum("tki,tkj->tij", rotations[first], rotations[second])
-    moved = np.einsum("tki,tk->ti", rotations[first], shifts[second] - shifts[first])
+    seen = motions.seen_from(first, second)
+    turned, times = seen.rotations, len(seen.rotations)
     middle, extent = _boundary(patches, labels, pair)
-    times = len(turned)
-    A = (turned - turned.mean(0)).reshape(-1, 3)
-    b = -(moved - moved.mean(0)).reshape(-1) - A @ middle
+    A, b = seen.wandering()
+    b = b - A @ middle
     normal, right = A.T @ A / times, A.T @ b / times
     play2 = float(((A @ np.linalg.lstsq(A, b, rcond=1e-6)[0] - b) ** 2).sum() / times)
     known = float(np.linalg.eigvalsh(normal)[1])  # a hinge leaves the position along its axis open
@@ -86,7 +84,7 @@ def _fit(patches: Patches, labels: np.ndarray, motions: Motions, pair: list[int]
     play = math.sqrt(float(((A @ offset - b) ** 2).sum() / times))
     if turn < LEAST_TURN:
         return Joint(-1, middle + patches.centre, None, turn, play, 0.0)
-    return Joint(-1, middle + offset + patches.centre, _axis(turned, rotations[first, 0]), turn, play,
+    return Joint(-1, middle + offset + patches.centre, _axis(turned, motions.rotations[first, 0]), turn, play,
                  known / (known + prior))  # fmt: skip
 
 

@@ -3,19 +3,22 @@
 Patches merge in three stages. First those whose union moves most rigidly (Ward's criterion), pairwise in rounds, down
 to a few dozen parts. Then patches change to a neighbouring part whose motion explains theirs better, so that early
 mistakes do not last. Last, neighbouring parts merge in the order of the angle by which they turn against each other,
-until every pair turns by more than ``LEAST_TURN``. An angle, other than a distance, neither favours large parts nor
-splits a body whose surface drifts slowly, and so the number of parts follows from the motion.
+until every pair turns by more than ``LEAST_TURN``, and bands of skin at joints (``joint_bands``) go to the parts beside
+them. An angle, other than a distance, neither favours large parts nor splits a body whose surface drifts slowly, and so
+the number of parts follows from the motion.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from .joint_bands import find_band, without_band
 from .patches import Moments, Motions, Patches
 
 LEAST_TURN = math.radians(15.0)
@@ -65,7 +68,12 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
         small = np.minimum(sizes[pairs[:, 0]], sizes[pairs[:, 1]]) < least
         chosen = int(np.where(small, turns - 2.0 * math.pi, turns).argmin())
         if count is None and turns[chosen] > LEAST_TURN and not small[chosen]:
-            break
+            pooled, motions = fits.robust(labels)
+            band = find_band(pooled, motions, pairs, partial(relative_turns, pooled, motions))
+            if band is None:
+                break
+            labels = _renumbered(without_band(labels, patches.moments.errors_under(motions), band))
+            continue
         labels = _renumbered(np.where(labels == pairs[chosen, 1], pairs[chosen, 0], labels))
     sizes = np.bincount(labels, weights=patches.moments.count)
     rank = np.empty(len(sizes), np.int64)

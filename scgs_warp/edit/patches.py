@@ -31,6 +31,19 @@ class Motions(NamedTuple):
     shifts: np.ndarray
     """[B, T, 3]"""
 
+    def seen_from(self, base: int, own: int) -> Motions:
+        """Return the motion ``x -> Q_t x + s_t`` of one body as seen from another; rotations [T, 3, 3], shifts
+        [T, 3]."""
+        back = np.swapaxes(self.rotations[base], 1, 2)
+        shifts = np.einsum("tij,tj->ti", back, self.shifts[own] - self.shifts[base])
+        return Motions(back @ self.rotations[own], shifts)
+
+    def wandering(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return A [3 T, 3] and b of a single motion over time: a point x moves by the rows of ``A x - b`` about its
+        mean."""
+        A = (self.rotations - self.rotations.mean(0)).reshape(-1, 3)
+        return A, -(self.shifts - self.shifts.mean(0)).reshape(-1)
+
 
 class Moments(NamedTuple):
     """Sums over the points of B bodies, from which the best rigid motions and their errors follow. Moments of a union

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from helpers.edit_scenes import bar_scene, figure_scene
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
 from scgs_warp.edit import EditSession, parts
+from scgs_warp.edit.joint_bands import Band, find_band, without_band
 from scgs_warp.edit.joints import find_joints
 from scgs_warp.edit.parts import LEAST_TURN, find_parts, fit_parts, relative_turns
 from scgs_warp.edit.patches import Moments, Patches, make_patches
@@ -109,6 +111,58 @@ def test_a_chain_falls_into_its_segments(noise):
         assert joint.confidence > 0.9 and joint.play < 0.03
 
 
+def bent_rod(cuts: list[float], joints: list[float], angles: list[float]) -> tuple[Patches, np.ndarray]:
+    """A rod along x of length 4 whose pieces, between the cuts, turn about y: each at its joint, against the piece
+    before. Patches are 10 in each unit of length. Returns patches and the piece of each patch."""
+    random = np.random.default_rng(0)
+    rest = random.random((2400, 3)) * [4.0, 0.6, 0.6] - [0.0, 0.3, 0.3]
+    piece = np.searchsorted(cuts, rest[:, 0])
+    tracks = []
+    for time in TIMES:
+        points, place = rest.copy(), np.eye(4)
+        for index, (joint, angle) in enumerate(zip(joints, angles)):
+            turn, there = np.eye(4), np.eye(4)
+            turn[:3, :3] = to_matrix(from_axis((0, 1, 0), angle * 0.5 * (1.0 - math.cos(2.0 * math.pi * time))))
+            there[0, 3] = joint
+            place = place @ there @ turn @ np.linalg.inv(there)
+            own = piece == index + 1
+            points[own] = rest[own] @ place[:3, :3].T + place[:3, 3]
+        tracks.append(points)
+    nearest = np.minimum((rest[:, 0] * 10.0).astype(np.int64), 39)
+    beside = np.clip(nearest + np.where(rest[:, 0] * 10.0 % 1.0 < 0.5, -1, 1), 0, 39)
+    patches = make_patches(np.stack(tracks), np.stack([nearest, beside], 1), np.tile([0.7, 0.3], (2400, 1)))
+    return patches, np.searchsorted(cuts, (np.arange(40) + 0.5) / 10.0)
+
+
+def test_a_band_of_skin_that_turns_half_is_no_part():
+    """Pieces of 1.8 and 1.8, and between them one of 0.4 that turns half, about the same joint."""
+    patches, piece = bent_rod([1.8, 2.2], [2.0, 2.0], [50.0, 50.0])
+    labels = find_parts(patches)
+    assert labels.max() == 1
+    assert same_partition(labels[piece != 1], piece[piece != 1])
+    assert same_partition(find_parts(patches, 3), piece), "three are asked for"
+
+
+def test_patches_of_a_band_go_to_the_motion_that_explains_them():
+    errors = np.array([[1.0, 9.0, 0.0], [5.0, 4.0, 0.0], [1.0, 9.0, 8.0], [3.0, 3.0, 0.0]])
+    labels = without_band(np.array([2, 2, 1, 2]), errors, Band(2, 0, 1))
+    assert labels.tolist() == [0, 1, 1, 0]
+
+
+@pytest.mark.parametrize(
+    "cuts, joints, angles",
+    [
+        ([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [35.0, 35.0, 35.0]),  # a tail that rolls up
+        ([1.7, 2.3], [1.7, 2.3], [40.0, 40.0]),  # a short bone with a joint at either end
+        ([1.1, 2.9], [2.0, 2.0], [50.0, 50.0]),  # a trunk that turns half as far as what sticks out on either side
+        ([1.8, 2.2], [2.0, 2.0], [80.0, -40.0]),  # a ring that turns farther than what follows
+    ],
+)
+def test_bones_between_two_others_remain(cuts, joints, angles):
+    patches, piece = bent_rod(cuts, joints, angles)
+    assert same_partition(find_parts(patches), piece)
+
+
 def merged_plainly(patches: Patches) -> np.ndarray:
     """Merge as ``find_parts`` does, every round and every fit anew."""
     labels = parts._merge_by_cost(patches, parts.FIRST_PARTS)
@@ -121,7 +175,12 @@ def merged_plainly(patches: Patches) -> np.ndarray:
         small = (np.bincount(labels)[pairs] < least).any(1)
         best = int((turns - 2.0 * math.pi * small).argmin())
         if turns[best] > LEAST_TURN and not small[best]:
-            break
+            pooled, motions = fit_parts(patches.moments, labels)
+            band = find_band(pooled, motions, pairs, partial(relative_turns, pooled, motions))
+            if band is None:
+                break
+            labels = parts._renumbered(without_band(labels, patches.moments.errors_under(motions), band))
+            continue
         labels = parts._renumbered(np.where(labels == pairs[best, 1], pairs[best, 0], labels))
     return labels
 
