@@ -15,7 +15,7 @@ import numpy as np
 from .patches import Moments, Motions
 
 MOST_DETOUR = 1.15
-"""Sum of the angles by which a band turns against its two parts, relative to their angle against each other, at most."""
+"""Sum of the angles by which a band turns against its two parts, at most, relative to their angle to each other."""
 MOST_WANDER = 0.5
 """Distance by which the joint of the two parts moves, seen from one of them, if it is taken along by the band; relative
 to the distance by which the band's own points move, at most."""
