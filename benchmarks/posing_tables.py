@@ -1,15 +1,21 @@
-"""Writers of the tables of docs/editing.md on parts and poses. Runs are those of the built-in figure with three seeds:
+"""Writers of the tables of docs/editing.md on parts and poses. Runs are those of the built-in figure with three seeds,
+of the default number of steps (``fig``) and of three times as many (``long``):
 
-    python apps/train.py --seed S --nodes 256 --threads 1 --output fig-S
+    python apps/train.py --preset quick --seed S --threads 1 --output fig-S
     python benchmarks/parts.py --run fig-0 fig-1 fig-2 --data data/figure --json benchmarks/results/parts-figure.json
     python benchmarks/posing.py --run fig-0 fig-1 fig-2 --json benchmarks/results/posing-figure.json
-    python benchmarks/posing_pictures.py --run fig-0 fig-1 fig-2 --size 200 \\
+    python apps/train.py --preset quick --steps 21000 --seed S --threads 1 --output long-S
+    python benchmarks/parts.py --run long-0 long-1 long-2 --data data/figure --json benchmarks/results/parts-long.json
+    python benchmarks/posing.py --run long-0 long-1 long-2 --json benchmarks/results/posing-long.json
+    python benchmarks/posing_pictures.py --run long-0 long-1 long-2 --size 200 \\
         --json benchmarks/results/posing-pictures.json
 
 and of two glTF characters, ``man`` and ``robot``, filmed by ``apps/synthesize.py --size 200 --train 150`` (``robot``
-with ``--clip Robot_Dance``) and trained with ``--preset cpu --steps 6000 --threads 1``:
+with ``--clip Robot_Dance``) and trained with ``--preset cpu --steps 6000 --threads 1`` (``man-long`` without
+``--steps``):
 
-    python benchmarks/parts.py --run man --data data/man --mesh CesiumMan.glb --json benchmarks/results/parts-man.json
+    python benchmarks/parts.py --run man man-long --data data/man --mesh CesiumMan.glb \\
+        --json benchmarks/results/parts-man.json
     python benchmarks/parts.py --run robot --data data/robot --mesh RobotExpressive.glb \\
         --json benchmarks/results/parts-robot.json
 """
@@ -48,7 +54,8 @@ def parts_found(results: Results) -> str:
 
 def bones_shown(results: Results) -> str:
     """Write, for each bone of the figure, what the trained motion shows of it, for each run."""
-    rows, lines = results["parts-figure"]["rows"], []
+    (result,), lines = results.values(), []
+    rows = result["rows"]
     for bone in dict.fromkeys(row["bone"] for row in rows if row["bone"] != "all"):
         own = [row for row in rows if row["bone"] == bone]
         shares = [" ".join(f"{100 * row[name]:.0f}" for row in own) for name in ("tracked", "agreement")]
@@ -70,7 +77,8 @@ def _spread(values: list[float], unit: str) -> str:
 
 def gestures(results: Results) -> str:
     """Write what the gestures do to the limbs, for each run."""
-    rows, lines = results["posing-figure"]["rows"], []
+    (result,), lines = results.values(), []
+    rows = result["rows"]
     for gesture, text in GESTURES.items():
         for limb in ("arm", "leg"):
             for degrees in sorted({row["degrees"] for row in rows}):

@@ -294,10 +294,11 @@ def levers(source: Source) -> str:
 def overview(source: Source) -> str:
     """Write the overview from the runs of the other tables."""
     lines = []
-    arap_runs, published = Source(source.runs, "arap"), Source(source.runs, "published")
+    owners = {name: Source(source.runs, name) for name in ("arap", "published", "overview")}
     source.label("figure", "")
     for row, scene, text in (
         ("arap/on", "figure", "built-in scene, 400 x 400, `quick` (7,000 steps)"),
+        ("overview/long", "figure", "built-in scene, 400 x 400, `quick --steps 21000`"),
         *(("published/cpu", scene, f"D-NeRF {scene}, `--downscale 2`, `cpu` (24,000 steps)") for scene in DNERF),
         *(
             ("published/best-40000", scene, f"D-NeRF {scene}, `--downscale 2`, `best` (40,000 steps)")
@@ -307,19 +308,18 @@ def overview(source: Source) -> str:
     ):
         name, _, own = row.partition("/")
         run = source.runs.get((name, own, scene), {})
-        owner = arap_runs if name == "arap" else published
         motion = f"{percent(run['epe'], 2)}, jitter {percent(run['jitter'], 3)}" if "epe" in run else ""
         timed = run if "seconds" in run else source.run(scene, scene)
         lines.append(
             [
-                owner.label(own, text),
+                owners[name].label(own, text),
                 f"{number(run['psnr'])} dB" if run else "",
                 number(run.get("ssim"), 3),
                 motion,
                 training_time(timed),
             ]
         )
-    for owner in (arap_runs, published):
+    for owner in owners.values():
         source.reported += owner.reported
         source.older += owner.older
     return table(["", "PSNR", "SSIM", "motion error", "training"], lines)

@@ -193,9 +193,10 @@ REPEATABLE = {
     "capture-long-films": Repeatable(
         long_film_memory, ("long-film-memory",), ("scgs_warp/training/silhouettes.py", "scgs_warp/data/cache.py")
     ),
-    "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-man", "parts-robot"), EDITING),
-    "posing-bones": Repeatable(bones_shown, ("parts-figure",), EDITING),
+    "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-long", "parts-man", "parts-robot"), EDITING),
+    "posing-bones": Repeatable(bones_shown, ("parts-long",), EDITING),
     "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
+    "posing-gestures-long": Repeatable(gestures, ("posing-long",), EDITING),
     "posing-pictures": Repeatable(pictures, ("posing-pictures",), EDITING),
     "page-million": Repeatable(page_million, ("page-million",), ("scgs_warp/export/web",)),
     "live-cost": Repeatable(live_cost, ("live-cost",), ("scgs_warp/live", "scgs_warp/training")),
