@@ -136,7 +136,7 @@ def configure(threads: int | None = None) -> None:
 
     Args:
         threads: number of CPU threads. None: all available ones. Torch gets one if it was imported before this package:
-            kernels would share their cores with its spinning threads, and take twice as long.
+            kernels would share their cores with its spinning threads.
 
     Raises:
         NotEnoughMemory: the limit of addresses (``ulimit -v``) leaves too little to work with.
