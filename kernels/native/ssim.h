@@ -172,7 +172,7 @@ static inline void photometric_band(
         enum { value = 4 };
     };
     const Band band = Band(index, image, truth, mask);
-    // 1, as far as it is rounded to 1 below.
+    // What the sum of SSIM gets below where all blurred values are 0.
     const float c1 = SSIM_C1, c2 = SSIM_C2, ssim_of_nothing = c1 * c2 * (1.0f / (c1 * c2));
     auto read = [&](vf* fresh, long long at, int column, bool whole) __attribute__((always_inline)) {
         const Pixels p = read_pixels(band, at, column, whole);
@@ -191,7 +191,7 @@ static inline void photometric_band(
             const long long at = (long long)row * band.width + column;
             const int count = column + 16 <= band.width ? 16 : band.width - column;
             if (!something && !band.mask && count == 16) {
-                // Image and truth are zero: so are differences and derivatives.
+                // Image and truth are zero in these windows. The derivatives would only meet pixels that are zero.
                 ssim_sum += ssim_of_nothing;
                 for (int j = 0; j < 3 && partials.data; ++j)
                     store(partials.data + (j * (long long)band.channels + band.channel) * band.plane + at, ZERO, 16);

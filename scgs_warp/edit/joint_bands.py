@@ -1,8 +1,8 @@
 """Bands of skin at joints, which turn half with each of two parts and are no parts of their own.
 
-If a joint bends far, the skin around it is wide enough to look like a part between two others. It is smaller than both,
-and turns about the same point as they turn against each other, by a share of the same angle. A bone between two others
-has a joint at either end instead.
+If a joint bends far, the skin around it is wide enough to look like a part between two others. It is no larger than
+either, and turns about the same point as they turn against each other, by a share of the same angle. A bone between two
+others has a joint at either end instead.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from .patches import Moments, Motions
 MOST_DETOUR = 1.15
 """Sum of the angles by which a band turns against its two parts, at most, relative to their angle to each other."""
 MOST_WANDER = 0.5
-"""Distance by which the joint of the two parts moves, seen from one of them, if it is taken along by the band; relative
-to the distance by which the band's own points move, at most."""
+"""Distance by which the joint of the two parts moves against either of them when the band takes it along, at most,
+relative to the distance by which the band's own points move."""
 RIDGE = 1e-2
 """Weight of the band's centre in the position of the joint, relative to the motion: a hinge leaves the position along
 its axis open."""
@@ -38,12 +38,12 @@ def find_band(
     pairs: np.ndarray,
     turns: Callable[[np.ndarray], np.ndarray],
 ) -> Band | None:
-    """Return a band of skin among parts, the smallest; None if there is none.
+    """Return a band of skin among parts, that with the fewest points; None if there is none.
 
     Args:
         moments, motions: of the parts.
         pairs: [E, 2] neighbouring parts.
-        turns: function: largest angles [E] between the parts of pairs [E, 2].
+        turns: returns the largest angles [E] between the parts of pairs [E, 2].
     """
     near: dict[int, list[int]] = {}
     for first, second in pairs.tolist():

@@ -32,8 +32,8 @@ MIN_PATCHES, MIN_SHARE = 3, 0.01
 half with each."""
 SWEEPS = 10
 MAX_ROUNDS = 4
-"""Number of merges, relative to the first number of parts, after which patches stay in their parts: where a few patches
-keep moving back and forth, this may split off as many pieces as merge."""
+"""Number of merges, relative to the first number of parts, after which patches no longer change parts one by one: where
+a few patches keep moving back and forth, this may split off as many pieces as merge."""
 ROBUST_FITS = 2
 
 _Fit = Callable[[Moments, np.ndarray], tuple[Moments, Motions]]

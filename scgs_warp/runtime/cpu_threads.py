@@ -149,6 +149,7 @@ class HelperThreads:
 
     def _prepare(self) -> bool:
         """Compile the kernels that share a job; return False if there is no room for them."""
+        environment.quiet_torch()
         calls = {}
         with suppress(NotEnoughMemory):
             for kernel in (kernels.share_job, kernels.finish_job, kernels.serve_job):

@@ -16,6 +16,8 @@ _threads: int | None = None
 _configured = False
 _torch_spins = False
 """True if torch was imported before this package, so that its OpenMP threads spin between torch calls."""
+_shares_grids = False
+"""True once several threads share the grids of kernels."""
 
 
 def prepare_environment() -> None:
@@ -26,10 +28,10 @@ def prepare_environment() -> None:
     the number of threads; otherwise the gradient of a layer narrower than 64 would. On processors of other makers than
     Intel MKL ignores that mode; there the project's own kernels, which run the networks on the CPU, keep the promise.
 
-    If torch is loaded already, its OpenMP has chosen to spin. :func:`configure` then gives torch a single thread.
+    If torch is loaded already, its OpenMP has chosen to spin; see :func:`quiet_torch`.
     """
     global _torch_spins
-    _torch_spins = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
+    _torch_spins = _torch_spins or ("torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("KMP_BLOCKTIME", "0")
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
@@ -135,8 +137,7 @@ def configure(threads: int | None = None) -> None:
     starts them. Denormals can make training steps 20 times slower.
 
     Args:
-        threads: number of CPU threads. None: all available ones. Torch gets one if it was imported before this package:
-            kernels would share their cores with its spinning threads.
+        threads: number of CPU threads. None: all available ones.
 
     Raises:
         NotEnoughMemory: the limit of addresses (``ulimit -v``) leaves too little to work with.
@@ -153,10 +154,23 @@ def configure(threads: int | None = None) -> None:
     _threads, _configured = threads, True
     _keep_freed_memory()
     torch.set_flush_denormal(True)
-    torch.set_num_threads(1 if _torch_spins else thread_count())
+    torch.set_num_threads(thread_count())
+    if _shares_grids:
+        quiet_torch()
     torch.set_deterministic_debug_mode("warn")  # use_deterministic_algorithms would import the compiler, for a second
     # This switch would make torch.empty fill every buffer with NaN; the kernels write all they allocate.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+
+
+def quiet_torch() -> None:
+    """Give torch's own operations a single thread if its threads spin between them: called before several threads share
+    the grids of kernels, which need the same cores."""
+    global _shares_grids
+    import torch
+
+    _shares_grids = True
+    if _torch_spins:
+        torch.set_num_threads(1)
 
 
 @contextlib.contextmanager

@@ -93,15 +93,31 @@ def test_an_app_collects_garbage_again_once_its_libraries_are_loaded():
 
 
 @pytest.mark.parametrize(
-    "first, policy, expected", [("scgs_warp", None, 2), ("torch", None, 1), ("torch", "passive", 2)]
+    "begins, policy, expected",
+    [
+        ("import scgs_warp, torch", None, 2),
+        ("import torch, scgs_warp", None, 1),
+        ("import importlib, torch, scgs_warp; importlib.reload(scgs_warp)", None, 1),
+        ("import torch, scgs_warp", "passive", 2),
+    ],
 )
-def test_torch_that_spins_gets_one_thread(first, policy, expected):
-    """Torch's OpenMP spins between calls if it was loaded before the package could ask it to sleep; kernels, which use
-    the same cores, took twice as long."""
-    code = f"import {first}, scgs_warp, torch\nfrom scgs_warp.runtime import environment\n"
-    code += "environment.configure(2)\nprint(torch.get_num_threads(), environment.thread_count())"
+def test_torch_that_spins_gets_one_thread(begins, policy, expected):
+    """Torch's OpenMP spins between calls if it was loaded before the package could ask it to sleep; kernels use the
+    same cores. It keeps its threads until several threads share a kernel."""
+    code = f"""{begins}
+from scgs_warp.ops.shading import tint
+from scgs_warp.runtime import environment
+torch.set_num_threads(2)
+environment._threads = 2
+before = torch.get_num_threads()
+tint(torch.ones(100_000, 3), torch.zeros(100_000, 3))
+print(before, torch.get_num_threads())
+environment.configure(2)
+print(torch.get_num_threads())
+"""
     variables = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     if policy is not None:
         variables["OMP_WAIT_POLICY"] = policy
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables, check=True)
-    assert result.stdout.split() == [str(expected), "2"]
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, env=variables, check=True)
+    assert result.stdout.split() == ["2", str(expected), str(expected)]
