@@ -7,7 +7,10 @@ of the default number of steps (``fig``) and of three times as many (``long``):
     python apps/train.py --preset quick --steps 21000 --seed S --threads 1 --output long-S
     python benchmarks/parts.py --run long-0 long-1 long-2 --data data/figure --json benchmarks/results/parts-long.json
     python benchmarks/posing.py --run long-0 long-1 long-2 --json benchmarks/results/posing-long.json
-    python benchmarks/posing_pictures.py --run long-0 long-1 long-2 --size 200 \\
+
+with pictures, here of the first three and of the last three alike:
+
+    python benchmarks/posing_pictures.py --run fig-0 fig-1 fig-2 --size 200 \\
         --json benchmarks/results/posing-pictures.json
 
 and of two glTF characters, ``man`` and ``robot``, filmed by ``apps/synthesize.py --size 200 --train 150`` (``robot``
@@ -102,7 +105,8 @@ def _percent(value: float) -> str:
 
 def pictures(results: Results) -> str:
     """Write the PSNR of posed runs against ray-cast pictures of the same pose."""
-    rows = results["posing-pictures"]["rows"]
+    (result,) = results.values()
+    rows = result["rows"]
     runs = list(dict.fromkeys(row["run"] for row in rows))
     unedited = {row["run"]: row["psnr_unedited"] for row in rows}
     lines = [["not posed", *[" ".join(f"{unedited[run]:.1f}" for run in runs)] * 3]]

@@ -198,6 +198,7 @@ REPEATABLE = {
     "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
     "posing-gestures-long": Repeatable(gestures, ("posing-long",), EDITING),
     "posing-pictures": Repeatable(pictures, ("posing-pictures",), EDITING),
+    "posing-pictures-long": Repeatable(pictures, ("posing-pictures-long",), EDITING),
     "page-million": Repeatable(page_million, ("page-million",), ("scgs_warp/export/web",)),
     "live-cost": Repeatable(live_cost, ("live-cost",), ("scgs_warp/live", "scgs_warp/training")),
     "trust-soaks": Repeatable(

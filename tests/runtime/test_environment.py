@@ -103,7 +103,7 @@ def test_an_app_collects_garbage_again_once_its_libraries_are_loaded():
 )
 def test_torch_that_spins_gets_one_thread(begins, policy, expected):
     """Torch's OpenMP spins between calls if it was loaded before the package could ask it to sleep; kernels use the
-    same cores. It keeps its threads until several threads share a kernel."""
+    same cores. Torch keeps its threads until several threads share a kernel."""
     code = f"""{begins}
 from scgs_warp.ops.shading import tint
 from scgs_warp.runtime import environment
