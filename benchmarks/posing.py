@@ -39,6 +39,7 @@ DEGREES = (45, 90, 135)
 def rows_of(run: Path) -> list[dict[str, Any]]:
     """Measure all gestures on one run."""
     session = EditSession(Scene.load(run, device="cpu"))
+    session._found[None] = session._find(None)  # the run's own may be of another version
     node_bones, solid, bones = bones_of(session)
     points = session.node_positions(0.0)
     rows = []

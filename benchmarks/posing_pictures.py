@@ -86,6 +86,7 @@ def part_of(session: EditSession, node_bones: np.ndarray, bone: str) -> str:
 
 def rows_of(run: Path, size: int, bones: bool, sheet: list[np.ndarray]) -> list[dict[str, Any]]:
     session = EditSession(Scene.load(run, device="cpu"))
+    session._found[None] = session._find(None)  # the run's own may be of another version
     node_bones = bones_of(session)[0]
     if bones:
         session.edit = dataclasses.replace(session.edit, skeleton=bone_skeleton(node_bones.tolist()))

@@ -7,11 +7,10 @@ of the default number of steps (``fig``) and of three times as many (``long``):
     python apps/train.py --preset quick --steps 21000 --seed S --threads 1 --output long-S
     python benchmarks/parts.py --run long-0 long-1 long-2 --data data/figure --json benchmarks/results/parts-long.json
     python benchmarks/posing.py --run long-0 long-1 long-2 --json benchmarks/results/posing-long.json
-
-with pictures, here of the first three and of the last three alike:
-
     python benchmarks/posing_pictures.py --run fig-0 fig-1 fig-2 --size 200 \\
         --json benchmarks/results/posing-pictures.json
+    python benchmarks/posing_pictures.py --run long-0 long-1 long-2 --size 200 \\
+        --json benchmarks/results/posing-pictures-long.json
 
 and of two glTF characters, ``man`` and ``robot``, filmed by ``apps/synthesize.py --size 200 --train 150`` (``robot``
 with ``--clip Robot_Dance``) and trained with ``--preset cpu --steps 6000 --threads 1`` (``man-long`` without

@@ -91,6 +91,6 @@ def _wander(moments: Moments, motions: Motions, part: int, base: int, end: int) 
     ridge = RIDGE * float(np.linalg.eigvalsh(normal)[1]) + 1e-12
     joint = centre + np.linalg.solve(normal + ridge * np.eye(3), A.T @ (b - A @ centre))
     A, b = motions.seen_from(base, part).wandering()
-    spread = moments.covariance()[part]
+    spread = moments.take(np.array([part])).covariance()[0]
     moved = float(((A @ centre - b) ** 2).sum() + np.trace(A @ spread @ A.T))
     return float(np.sqrt(((A @ joint - b) ** 2).sum() / max(moved, 1e-24)))

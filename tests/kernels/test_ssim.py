@@ -95,8 +95,8 @@ def test_subjects_on_black(shape, masked, device):
 
 @pytest.mark.parametrize("shape", [(3, 90, 150), (2, SSIM_BAND + 60, 2 * SSIM_BLOCK + 21)], ids=str)
 def test_skipped_windows_change_no_bit(shape):
-    """Without a mask, the cpu form skips windows that are black in image and truth. With one, it
-    computes their pixels."""
+    """Without a mask, the cpu form skips windows that are black in image and truth. With one, it computes
+    their pixels."""
     image, truth = _on_black(shape)
     results = []
     for mask in (None, torch.ones(shape[1:], dtype=torch.bool)):
