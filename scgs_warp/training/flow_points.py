@@ -55,7 +55,7 @@ AROUND = 3
 """Number of sparse points nearest to a pixel; their median depth is used as that of the pixel's surroundings."""
 
 
-class FlowPoints(NamedTuple):
+class InstantPoints(NamedTuple):
     """Points that one frame sees."""
 
     points: Tensor
@@ -68,7 +68,7 @@ class FlowPoints(NamedTuple):
     """Index of the frame."""
 
 
-def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> FlowPoints | None:
+def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> InstantPoints | None:
     """Find up to ``count`` points of the frame in which flow tells most depths.
 
     Args:
@@ -100,7 +100,7 @@ def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -
     scale = torch.tensor([image.shape[1], image.shape[0]]) / torch.tensor(flows.size(index))
     columns, rows = ((pixels[chosen] + 0.5) * scale).long().T
     colors = image[rows.clamp(0, image.shape[0] - 1), columns.clamp(0, image.shape[1] - 1)]
-    return FlowPoints(points[chosen].float(), colors, moves[chosen], index)
+    return InstantPoints(points[chosen].float(), colors, moves[chosen], index)
 
 
 def _spread(moves: Tensor, count: int) -> Tensor:
@@ -174,13 +174,12 @@ def _coherent(pixels: np.ndarray, moves: np.ndarray, shape: tuple[int, int]) -> 
     return np.isin(labels[rows, columns], large)
 
 
-def _stray(points: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """Tell which of the moving points [P, 3] are far from others, [P] bool."""
-    stray = np.zeros(len(points), bool)
-    if moves.sum() > CLOSE:
-        distances = KDTree(points[moves]).query(points[moves], k=CLOSE + 1)[0][:, -1]
-        stray[moves] = distances > STRAY * np.median(distances)
-    return stray
+def strays(points: np.ndarray) -> np.ndarray:
+    """Tell which of the points [P, 3] are far from others, [P] bool."""
+    if len(points) <= CLOSE:
+        return np.zeros(len(points), bool)
+    distances = KDTree(points).query(points, k=CLOSE + 1)[0][:, -1]
+    return distances > STRAY * np.median(distances)
 
 
 def _seen(index: int, known: Tensor, flows: Flows, views: list[Camera]) -> _Seen | None:
@@ -212,7 +211,7 @@ def _seen(index: int, known: Tensor, flows: Flows, views: list[Camera]) -> _Seen
     depth = pixels_of(camera, points)[1] / around[rows, columns]
     plausible &= (depth > NEARER) & (depth < FARTHER)
     moves = _coherent(here[plausible], _moves(index, here[plausible], flows), sure.shape)
-    moves &= ~_stray(points[plausible], moves)
+    moves[moves] = ~strays(points[plausible][moves])
     values = points[plausible], here[plausible], moves, depth[plausible] < BEFORE
     return _Seen(*(torch.from_numpy(each) for each in values))
 

@@ -30,9 +30,9 @@ from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .exposure import Exposure
 from .flow import follow_each_other
-from .flow_points import flow_points
 from .frames import first_frames
 from .initial_points import random_points, sample_initial_points
+from .points_on_movers import points_on_movers
 from .pretrain import (
     control_points_from_spheres,
     initial_gaussians,
@@ -342,12 +342,11 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     moves = torch.zeros(len(points), dtype=torch.bool)
     if cube or data.with_alpha:  # with alpha, no background lies behind the points
         return points, colors, moves
-    known, room = points, count - len(points)
-    if config.flow_points and room > 0 and config.motion.model != "static" and follow_each_other(data):
-        views = [normalisation.apply_camera(camera) for camera in data.cameras]
-        seen = flow_points(min(config.flow_points, room), known, data, views)
-        if seen is not None:
-            points, colors = torch.cat([points, seen.points]), torch.cat([colors, seen.colors])
-            moves = torch.cat([moves, seen.moves])
+    known, most = points, min(config.flow_points, count - len(points))
+    if most > 0 and config.motion.model != "static":
+        seen, rests = points_on_movers(most, points, data, normalisation, config.seed, 36)
+        known, colors = points[rests], colors[rests]
+        points, colors = torch.cat([known, seen.points]), torch.cat([colors, seen.colors])
+        moves = torch.cat([moves[rests], seen.moves])
     behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
     return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves

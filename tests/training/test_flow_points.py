@@ -3,80 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import pytest
 import torch
 
-from helpers.scenes import look_at
+from helpers.ball_and_wall import SIZE, ball, filmed, walking_camera
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
-from scgs_warp.rendering.render import render
 from scgs_warp.training.flow_points import flow_points
 from scgs_warp.training.state import TrainState
-from scgs_warp.types import Camera, Frame, Gaussians
 
-SIZE, COUNT = 160, 30
-
-
-def wall() -> Gaussians:
-    """A textured wall at y = 2, of small Gaussians in many colours."""
-    generator = torch.Generator().manual_seed(3)
-    x, z = torch.meshgrid(torch.linspace(-4, 4, 56), torch.linspace(-3, 3, 42), indexing="ij")
-    means = torch.stack([x.flatten(), torch.full((x.numel(),), 2.0), z.flatten()], 1)
-    means = means + 0.03 * torch.randn(means.shape, generator=generator)
-    return _made(means, _pattern(means), 0.09)
+COUNT = 30
+TIMES = [index / (COUNT - 1) for index in range(COUNT)]
 
 
-def mover(time: float) -> Gaussians:
-    """A patterned ball of radius 0.5, which rises by 0.15, a little to the right, and comes back."""
-    generator = torch.Generator().manual_seed(5)
-    means = torch.randn(700, 3, generator=generator)
-    means = 0.5 * means / means.norm(dim=1, keepdim=True)
-    way = 1 - abs(2 * time - 1)
-    colors = _pattern(1.7 * means + 1.0)
-    return _made(means + way * torch.tensor([0.03, 0.0, 0.15]), colors, 0.05)
-
-
-def _pattern(places: torch.Tensor) -> torch.Tensor:
-    """Colours [N, 3] that change smoothly in space, never twice the same way."""
-    directions = torch.randn(3, 6, 3, generator=torch.Generator().manual_seed(2)) * 3.0
-    return (0.5 + 0.12 * torch.einsum("nd,ckd->nck", places, directions).sin().sum(2)).clamp(0.02, 0.98)
-
-
-def _made(means: torch.Tensor, colors: torch.Tensor, scale: float) -> Gaussians:
-    quats = torch.zeros(len(means), 4)
-    quats[:, 0] = 1.0
-    count = len(means)
-    color = (colors - 0.5) / 0.28209479177387814
-    return Gaussians(
-        means, quats, torch.full((count, 3), scale), torch.full((count,), 0.95), color, torch.zeros(count, 0, 3)
-    )
-
-
-def film_camera(share: float) -> Camera:
-    """A camera that walks by 1.6 units and looks at the ball."""
-    eye = torch.tensor([-0.8 + 1.6 * share, -4.0, 0.3], dtype=torch.float64)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    K = torch.tensor([[1.2 * SIZE, 0, SIZE / 2], [0, 1.2 * SIZE, SIZE / 2], [0, 0, 1]])
-    return Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), up).float(), K, SIZE, SIZE)
+def place_at(time: float) -> torch.Tensor:
+    """The ball rises by 0.15, a little to the right, and comes back."""
+    return (1 - abs(2 * time - 1)) * torch.tensor([0.03, 0.0, 0.15])
 
 
 @pytest.fixture(scope="module")
 def film() -> Dataset:
     """Frames of wall and ball, with a tenth of the wall as sparse points."""
-    frames = []
-    for index in range(COUNT):
-        time = index / (COUNT - 1)
-        parts = [dataclasses.asdict(part) for part in (wall(), mover(time))]
-        both = {name: torch.cat([part[name] for part in parts]) for name in parts[0] if name != "sharpness"}
-        with torch.no_grad():
-            image = render(Gaussians(**both), film_camera(time), torch.full((3,), 0.5))
-        frames.append(Frame(film_camera(time), time, image.rgb.clamp(0, 1), None, None, f"{index:03d}"))
-    sparse = wall()
-    colors = (sparse.sh_dc * 0.28209479177387814 + 0.5).clamp(0, 1)
-    return Dataset(frames, folder=Path("film"), split="train", points=sparse.means[::10], colors=colors[::10])
+    return filmed([(walking_camera(time), time) for time in TIMES], place_at)
 
 
 def found_in(film: Dataset, count: int = 1000):
@@ -91,7 +41,7 @@ def found_in(film: Dataset, count: int = 1000):
 def test_points_lie_on_the_wall_and_on_the_ball_of_one_instant(film):
     found, places = found_in(film)
     time = film.entries[found.index].time
-    centre = mover(time).means.double().mean(0)
+    centre = place_at(time).double()
     moving, still = places[found.moves], places[~found.moves]
     assert len(moving) > 200 and len(still) > 200
     # Those at the ball's outline may lie between ball and wall.
@@ -124,20 +74,14 @@ def test_cameras_that_rest_give_none(film):
 
 
 def test_a_mover_that_has_sparse_points_needs_no_others(film):
-    ball = mover(0.5)
-    points = torch.cat([film.points, ball.means[::3]])
+    points = torch.cat([film.points, ball(place_at(0.5)).means[::3]])
     normalisation = Normalisation.fit(film.cameras, film.points)
     views = [normalisation.apply_camera(camera) for camera in film.cameras]
     assert flow_points(100, normalisation.apply(points).float(), film, views) is None
 
 
-def test_a_film_of_what_stands_still_needs_none(film):
-    frames = []
-    for entry in film.entries:
-        with torch.no_grad():
-            image = render(wall(), entry.camera, torch.full((3,), 0.5))
-        frames.append(Frame(entry.camera, entry.time, image.rgb.clamp(0, 1), None, None, entry.name))
-    still = Dataset(frames, folder=Path("still"), split="train", points=film.points, colors=film.colors)
+def test_a_film_of_what_stands_still_needs_none():
+    still = filmed([(walking_camera(time), time) for time in TIMES], None)
     normalisation = Normalisation.fit(still.cameras, still.points)
     views = [normalisation.apply_camera(camera) for camera in still.cameras]
     assert flow_points(100, normalisation.apply(still.points).float(), still, views) is None

@@ -1,0 +1,175 @@
+"""Initial points of what moves before standing cameras: which cameras stand, what moves, where points lie."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from helpers.ball_and_wall import SIZE, ball, filmed, standing_camera, walking_camera, wall
+from helpers.tiny import tiny_config
+from scgs_warp.data.dataset import Dataset
+from scgs_warp.geometry.normalisation import Normalisation
+from scgs_warp.training.points_on_movers import points_on_movers
+from scgs_warp.training.standing_cameras import standing_cameras
+from scgs_warp.training.state import TrainState
+from scgs_warp.training.stereo_points import moving_points, stereo_points
+from scgs_warp.types import Camera
+
+ANGLES = (-20.0, -10.0, 0.0, 10.0, 20.0)
+HEIGHTS = (0.3, 0.8, 0.3, 0.8, 0.3)
+MOMENTS = 7
+
+
+def place_at(time: float) -> torch.Tensor:
+    """The ball crosses from left to right in a low arc."""
+    return torch.tensor([1.2 * time - 0.6, 0.0, 0.3 * time * (1 - time)])
+
+
+def rig_views(angles=ANGLES, heights=HEIGHTS, moments: int = MOMENTS) -> list[tuple[Camera, float]]:
+    return [
+        (standing_camera(angle, height), moment / (moments - 1))
+        for angle, height in zip(angles, heights)
+        for moment in range(moments)
+    ]
+
+
+@pytest.fixture(scope="module")
+def film() -> Dataset:
+    return filmed(rig_views(), place_at)
+
+
+def standing_in(film: Dataset):
+    normalisation = Normalisation.fit(film.cameras, film.points)
+    views = [normalisation.apply_camera(camera) for camera in film.cameras]
+    return normalisation, standing_cameras(film, views)
+
+
+def found_in(film: Dataset, count: int = 800):
+    normalisation, standing = standing_in(film)
+    found = stereo_points(count, normalisation.apply(film.points).float(), film, standing, 0, 1)
+    assert found is not None
+    return found, found.points.double() / normalisation.scale + torch.as_tensor(normalisation.centre)
+
+
+def test_standing_cameras_have_their_frames_in_order_of_time(film):
+    shuffled = torch.randperm(len(film), generator=torch.Generator().manual_seed(1)).tolist()
+    mixed = film.subset(shuffled)
+    _, standing = standing_in(mixed)
+    assert len(standing) == len(ANGLES)
+    assert sorted(index for one in standing for index in one.frames) == list(range(len(film)))
+    for one in standing:
+        times = [mixed.entries[index].time for index in one.frames]
+        assert times == sorted(times) and len(times) == MOMENTS
+        assert len({mixed.cameras[index].viewmat.sum().item() for index in one.frames}) == 1
+        assert mixed.entries[one.frame_at(0.49, mixed)].time == 0.5
+
+
+@pytest.mark.parametrize("lack", ["moves", "alone", "few"])
+def test_other_cameras_do_not_stand(lack):
+    views = {
+        "moves": [(walking_camera(moment / 6), moment / 6) for moment in range(7)],
+        "alone": rig_views((0.0,), (0.3,)),
+        "few": rig_views(moments=3),
+    }[lack]
+    assert standing_in(filmed(views, place_at))[1] == []
+
+
+def test_regions_that_move_are_the_path_of_the_ball(film):
+    normalisation, standing = standing_in(film)
+    for one in standing:
+        for time in (0.0, 0.5, 1.0):
+            centre = normalisation.apply(place_at(time)[None]).double().numpy()
+            inside, moving = one.sees(centre, one.moves)
+            assert inside[0] and moving[0], "the ball's place at the time"
+        assert 0.05 < one.moves.mean() < 0.5
+        behind = normalisation.apply(torch.tensor([[0.0, -50.0, 0.0]])).double().numpy()
+        assert not one.sees(behind, one.moves)[0][0], "a point behind the camera is not in view"
+
+
+def test_a_change_of_exposure_is_no_motion():
+    still = filmed(rig_views(), None)
+    dim = [dataclasses.replace(frame, image=frame.image * (0.8 + 0.05 * (k % 7))) for k, frame in enumerate(still)]
+    data = Dataset(dim, folder=still.folder, split="train", points=still.points, colors=still.colors)
+    _, standing = standing_in(data)
+    assert len(standing) == len(ANGLES) and max(one.moves.mean() for one in standing) < 0.01
+
+
+def test_points_lie_on_the_ball_at_one_moment(film):
+    found, places = found_in(film)
+    assert len(found.points) > 300 and bool(found.moves.all())
+    centre = place_at(film.entries[found.index].time).double()
+    distance = (places - centre).norm(dim=1)
+    assert float(((distance - 0.5).abs() < 0.12).double().mean()) > 0.85, "on the sphere of radius 0.5"
+    assert float((places[:, 1] > 1.5).double().mean()) < 0.02, "not on the wall"
+
+
+def test_points_have_the_colours_of_their_pixels(film):
+    found, places = found_in(film)
+    camera, image = film[found.index].camera, film[found.index].image
+    local = places @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
+    flat = local @ camera.K.double().T
+    columns, rows = (flat[:, :2] / flat[:, 2:]).long().T
+    seen = image[rows.clamp(0, SIZE - 1), columns.clamp(0, SIZE - 1)]
+    assert float((seen - found.colors).abs().mean(1).median()) < 0.05
+
+
+def test_the_number_is_bounded_and_the_choice_repeatable(film):
+    (found, _), (again, _) = found_in(film, 200), found_in(film, 200)
+    assert len(found.points) == 200 and torch.equal(found.points, again.points)
+    assert torch.equal(found.colors, again.colors) and found.index == again.index
+
+
+def test_cameras_above_one_another_are_matched_too():
+    views = rig_views((0.0, 0.0, 0.0), (-0.5, 0.3, 1.1))
+    film = filmed(views, place_at)
+    found, places = found_in(film)
+    centre = place_at(film.entries[found.index].time).double()
+    assert len(found.points) > 150
+    assert float((((places - centre).norm(dim=1) - 0.5).abs() < 0.15).double().mean()) > 0.8
+
+
+def test_where_nothing_moves_there_are_none():
+    still = filmed(rig_views(), None)
+    normalisation, standing = standing_in(still)
+    assert stereo_points(100, normalisation.apply(still.points).float(), still, standing, 0, 1) is None
+
+
+def test_a_point_on_the_wall_behind_the_ball_does_not_move(film):
+    normalisation, standing = standing_in(film)
+    points = torch.cat([wall().means[::7], ball(place_at(0.5)).means])
+    moves = moving_points(normalisation.apply(points).double().numpy(), standing)
+    walls = len(wall().means[::7])
+    assert moves[:walls].mean() < 0.1 and moves[walls:].mean() > 0.98
+
+
+def test_half_of_the_control_points_begin_on_the_ball(film):
+    config = tiny_config(40, init_points=1500, flow_points=600, motion={"nodes": 64})
+    state = TrainState.begin(config, film, "cpu")
+
+    def before_the_wall(state: TrainState) -> int:
+        places = state.motion.control_points_at(0.0).double() / state.normalisation.scale
+        return int(((places + torch.as_tensor(state.normalisation.centre))[:, 1] < 1.0).sum())
+
+    assert before_the_wall(state) >= 30
+    without = TrainState.begin(dataclasses.replace(config, flow_points=0), film, "cpu")
+    assert before_the_wall(without) == 0, "all are on the wall, as the sparse points are"
+
+
+def test_sparse_points_on_the_ball_are_replaced(film):
+    stale = ball(place_at(0.0)).means[::4]
+    points = torch.cat([film.points, stale])
+    data = Dataset(tuple(film), folder=film.folder, split="train", points=points, colors=torch.full_like(points, 0.5))
+    normalisation = Normalisation.fit(data.cameras, data.points)
+    known = normalisation.apply(points).float()
+    seen, keep = points_on_movers(300, known, data, normalisation, 0, 1)
+    assert len(seen.points) == 300 and bool(seen.moves.all())
+    assert keep[len(film.points) :].float().mean() < 0.2 and keep[: len(film.points)].float().mean() > 0.85
+
+
+def test_without_depth_all_sparse_points_are_kept():
+    still = filmed(rig_views(), None)
+    normalisation = Normalisation.fit(still.cameras, still.points)
+    seen, keep = points_on_movers(300, normalisation.apply(still.points).float(), still, normalisation, 0, 1)
+    assert len(seen.points) == len(seen.colors) == len(seen.moves) == 0 and bool(keep.all())
