@@ -335,8 +335,8 @@ class TrainConfig:
     """Number of steps to which ``freeze``, ``coarse`` and ``densify.opacity_reset_every`` shrink at most in a shorter
     run: Gaussians need about so many to turn transparent or opaque."""
     flow_points: int = newer(4_000, before=0, least=0, most=10_000_000)
-    """Number of initial points that optical flow gives for one instant of a film, so that control points and Gaussians
-    begin on what moves, too (only with initial points, and without alpha). 0: none."""
+    """Number of initial points for one instant of a film (by optical flow) or of a rig (by stereo), so that control
+    points and Gaussians begin on what moves, too (only with initial points, and without alpha). 0: none."""
     init_points: int = bounded(20_000, 1, 10_000_000)
     """Number of initial Gaussians. If the data has more points, only this many are used; if it has fewer and the images
     have no alpha, points behind the data's points are added up to this number."""
