@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from .ops.activations import exponential, sigmoid
 from .ops.correctives import COLUMNS as CORRECTIVE_COLUMNS
 from .ops.shading import COLUMNS as SHADING_COLUMNS
 from .runtime.environment import one_piece
+from .runtime.search_tree import search_tree
 from .types import Gaussians
 
 SH_C0 = 0.28209479177387814
@@ -110,7 +110,7 @@ def neighbor_distance(points: Tensor) -> Tensor:
         return torch.full((total,), 1e-2, device=points.device)
     count = min(3, total - 1)
     array = points.detach().cpu().double().numpy()
-    distances, _ = KDTree(array).query(array, k=count + 1)
+    distances, _ = search_tree(array).query(array, k=count + 1)
     mean = torch.from_numpy((distances[:, 1:] ** 2).mean(axis=1) ** 0.5)
     return mean.float().clamp_(min=1e-3).to(points.device)
 

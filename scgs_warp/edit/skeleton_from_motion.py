@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from ..errors import UserError
+from ..runtime.search_tree import search_tree
 from ..scene.scene import Scene
 from .joints import Joint, find_joints
 from .necks import find_necks
@@ -80,7 +80,7 @@ def _labels_of_nodes(scene: Scene, patches: Patches, labels: np.ndarray) -> np.n
     """Return the part of every control point, [M]; one without Gaussians has that of the nearest one with some."""
     with torch.no_grad():
         points = scene.motion.control_points_at(0.0).cpu().double().numpy()
-    found = labels[KDTree(points[patches.nodes]).query(points)[1]]
+    found = labels[search_tree(points[patches.nodes]).query(points)[1]]
     found[patches.nodes] = labels  # two control points may coincide
     return found
 

@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 
 from ..edit import EditSession
 from ..edit.rotations import conjugate, multiply, rotate, unit
 from ..errors import UserError
 from ..gaussians import SH_C0
 from ..ops.sampling import farthest_points
+from ..runtime.search_tree import search_tree
 from ..scene.scene import Scene
 from ..storage.files import read_bytes, write_atomically
 from .gltf import VERTICES, GltfDocument, linear_colors, upright
@@ -112,7 +112,7 @@ def build_tracks(
     means, quats = start.means.cpu().double().numpy(), unit(start.quats.cpu().double().numpy())
     offsets = None
     if isinstance(chosen, np.ndarray):
-        surface = surface[KDTree(means[surface]).query(chosen)[1]]
+        surface = surface[search_tree(means[surface]).query(chosen)[1]]
         offsets = chosen - means[surface]
     elif chosen is not None and chosen < len(surface):
         surface = surface[np.sort(farthest_points(start.means[surface].cpu(), chosen).numpy())]

@@ -7,11 +7,11 @@ import math
 from collections.abc import Sequence
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..data.dataset import spread
 from ..geometry.normalisation import Normalisation
+from ..runtime.search_tree import search_tree
 from ..seeding import generator
 from ..types import Camera, Frame
 
@@ -75,7 +75,7 @@ def background_points(
             continue
         rows, columns = cells // camera.width, cells % camera.width
         pixels = torch.stack([columns, rows], 1) + torch.rand(share, 2, generator=random)
-        _, nearest = KDTree(known.double().numpy()).query(pixels.double().numpy(), k=min(NEAREST, len(known)))
+        _, nearest = search_tree(known.double().numpy()).query(pixels.double().numpy(), k=min(NEAREST, len(known)))
         depth = depths[torch.from_numpy(nearest).reshape(share, -1)].median(dim=1).values
         depth = depth * torch.exp(torch.rand(share, generator=random) * math.log(FARTHEST))
         rays = torch.cat([pixels, torch.ones(share, 1)], 1) @ torch.linalg.inv(camera.K).T * depth[:, None]

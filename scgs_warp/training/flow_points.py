@@ -12,12 +12,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..data.dataset import Dataset, spread
 from ..geometry.optical_flow import targets_of
 from ..runtime.progress import progress
+from ..runtime.search_tree import search_tree
 from ..types import Camera
 from .flow import Flows
 from .view_rays import pixels_of, ray_of
@@ -178,7 +178,7 @@ def strays(points: np.ndarray) -> np.ndarray:
     """Tell which of the points [P, 3] are far from others, [P] bool."""
     if len(points) <= CLOSE:
         return np.zeros(len(points), bool)
-    distances = KDTree(points).query(points, k=CLOSE + 1)[0][:, -1]
+    distances = search_tree(points).query(points, k=CLOSE + 1)[0][:, -1]
     return distances > STRAY * np.median(distances)
 
 
@@ -236,7 +236,7 @@ def _depths_around(known: Tensor, camera: Camera) -> np.ndarray | None:
         return None
     rows, columns = np.mgrid[: camera.height, : camera.width]
     where = np.stack([columns, rows], 2).reshape(-1, 2)
-    _, nearest = KDTree(pixels[inside]).query(where, k=AROUND)
+    _, nearest = search_tree(pixels[inside]).query(where, k=AROUND)
     return np.median(depths[inside][nearest], 1).reshape(camera.height, camera.width)
 
 

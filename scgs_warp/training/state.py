@@ -17,6 +17,7 @@ from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..geometry.cameras import Overview, overview
 from ..geometry.normalisation import COMMON_RADIUS, FEWEST_POINTS, Normalisation
+from ..motion import ControlPoints
 from ..motion.base import Motion
 from ..motion.spheres import Spheres
 from ..optim import Adam
@@ -45,6 +46,8 @@ from .pretrain import (
 from .process_group import ProcessGroup
 from .resuming import check_same_configuration, check_steps
 from .silhouettes import half_thickness, is_in_parts, is_thin
+from .stereo_motion import learn_motion
+from .stereo_points import MovingCloud
 
 Stage = Literal["pretrain", "main"]
 THICKEST = 2.0
@@ -119,8 +122,8 @@ class TrainState:
         """Make the state at step 0."""
         normalisation = Normalisation.fit(data.cameras, data.points)
         config = resolve_auto(config, data)
-        points, colors, moves = _initial_points(config, data, normalisation)
-        points, colors = points.to(device), colors.to(device)
+        initial = _initial_points(config, data, normalisation)
+        points, colors = initial.points.to(device), initial.colors.to(device)
         # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
         rest = (normalisation, overview(data.cameras), extent, points, colors)
@@ -131,8 +134,10 @@ class TrainState:
             return TrainState(config, *spheres, *rest, stage="pretrain", **identity)
         gaussians = initial_gaussians(config, points, colors)
         # Control points start on what is seen, not on bare walls.
-        moves = moves.to(device)
-        motion = initial_motion(config, points[: len(moves)], len(data.times.unique()), moves).to(device)
+        moves, shown = initial.moves.to(device), points[: len(initial.moves)]
+        motion = initial_motion(config, shown, len(data.times.unique()), moves).to(device)
+        if isinstance(motion, ControlPoints) and len(initial.clouds) > 1:
+            learn_motion(motion, initial.clouds, shown[~moves].cpu(), config)
         return TrainState(config, gaussians, motion, *rest, stage="main", **identity)
 
     def begin_main(self) -> None:
@@ -316,37 +321,46 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     return config
 
 
-def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose initial points [P, 3], normalised, and colours [P, 3]: the data's own in random order, followed by those
-    that the flow of a film gives for one instant, and by points behind them for surfaces without texture; without
-    points in the data, points sampled where the images are covered. With ``init_random`` cube, nothing follows the
-    data's own points, and others are random in a cube.
+class InitialPoints(NamedTuple):
+    """Where Gaussians and control points begin."""
 
-    Returns:
-        points, colours, and [Q] bool for the leading Q points, which lie on what is seen: True if known to move.
+    points: Tensor
+    """[P, 3] normalised."""
+    colors: Tensor
+    """[P, 3]"""
+    moves: Tensor
+    """[Q] bool for the leading Q points, which lie on what is seen: True if known to move."""
+    clouds: list[MovingCloud]
+    """What moves before standing cameras, at several moments."""
+
+
+def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
+    """Choose initial points: the data's own in random order, followed by those on what moves at one instant, and by
+    points behind them for surfaces without texture; without points in the data, points sampled where the images are
+    covered. With ``init_random`` cube, nothing follows the data's own points, and others are random in a cube.
     """
     count = max(config.init_points, round(sphere_unit(config) * config.pretrain.start_ratio))
     cube = config.init_random == "cube"
     if data.points is None or not has_initial_points(data, config):
         if cube:
             points = random_points(count, config.seed, 31)
-            return points, torch.full_like(points, 0.5), torch.zeros(count, dtype=torch.bool)
+            return InitialPoints(points, torch.full_like(points, 0.5), torch.zeros(count, dtype=torch.bool), [])
         # Spheres that start in the pose of the first frames are sampled from these frames only.
         frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
         points, colors = sample_initial_points(count, frames, normalisation, config.seed, 31)
         colors = torch.full_like(points, 0.5) if colors is None else colors
-        return points, colors, torch.zeros(len(points), dtype=torch.bool)
+        return InitialPoints(points, colors, torch.zeros(len(points), dtype=torch.bool), [])
     order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
     points = normalisation.apply(data.points)[order].float().contiguous()
     colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
     moves = torch.zeros(len(points), dtype=torch.bool)
     if cube or data.with_alpha:  # with alpha, no background lies behind the points
-        return points, colors, moves
-    known, most = points, min(config.flow_points, count - len(points))
+        return InitialPoints(points, colors, moves, [])
+    known, clouds, most = points, [], min(config.flow_points, count - len(points))
     if most > 0 and config.motion.model != "static":
-        seen, rests = points_on_movers(most, points, data, normalisation, config.seed, 36)
-        known, colors = points[rests], colors[rests]
+        seen, keep, clouds = points_on_movers(most, points, data, normalisation, config.seed, 36)
+        known, colors = points[keep], colors[keep]
         points, colors = torch.cat([known, seen.points]), torch.cat([colors, seen.colors])
-        moves = torch.cat([moves[rests], seen.moves])
+        moves = torch.cat([moves[keep], seen.moves])
     behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
-    return torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves
+    return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, clouds)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import pytest
 import torch
 
@@ -14,7 +15,8 @@ from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.standing_cameras import standing_cameras
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.stereo_points import moving_points, stereo_points
+from scgs_warp.training.stereo_motion import start_cloud
+from scgs_warp.training.stereo_points import Stereo, moving_points
 from scgs_warp.types import Camera
 
 ANGLES = (-20.0, -10.0, 0.0, 10.0, 20.0)
@@ -46,10 +48,10 @@ def standing_in(film: Dataset):
     return normalisation, standing_cameras(film, views)
 
 
-def found_in(film: Dataset, count: int = 800):
+def found_in(film: Dataset, count: int = 800, time: float = 0.5):
     normalisation, standing = standing_in(film)
-    found = stereo_points(count, normalisation.apply(film.points).float(), film, standing, 0, 1)
-    assert found is not None
+    stereo = Stereo(normalisation.apply(film.points).float(), film, standing)
+    found = stereo.points_at(time, count, 0, 1)
     return found, found.points.double() / normalisation.scale + torch.as_tensor(normalisation.centre)
 
 
@@ -130,10 +132,47 @@ def test_cameras_above_one_another_are_matched_too():
     assert float((((places - centre).norm(dim=1) - 0.5).abs() < 0.15).double().mean()) > 0.8
 
 
+def test_threads_of_opencv_do_not_change_the_points(film):
+    before = cv2.getNumThreads()
+    try:
+        seen = []
+        for threads in (1, 3):
+            cv2.setNumThreads(threads)
+            seen.append(found_in(film)[0])
+    finally:
+        cv2.setNumThreads(before)
+    assert torch.equal(seen[0].points, seen[1].points) and torch.equal(seen[0].colors, seen[1].colors)
+
+
+def test_clouds_follow_the_ball(film):
+    normalisation, standing = standing_in(film)
+    clouds = Stereo(normalisation.apply(film.points).float(), film, standing).clouds(300, 0, 1)
+    assert [cloud.time for cloud in clouds] == [moment / (MOMENTS - 1) for moment in range(MOMENTS)]
+    for cloud in clouds:
+        places = cloud.seen.points.double() / normalisation.scale + torch.as_tensor(normalisation.centre)
+        distance = (places - place_at(cloud.time).double()).norm(dim=1)
+        assert float(((distance - 0.5).abs() < 0.15).double().mean()) > 0.8, cloud.time
+    assert start_cloud(clouds).time == 0.5
+
+
+def test_moments_without_enough_points_are_left_out():
+    away = torch.tensor([0.0, 0.0, 50.0])
+    late = filmed(rig_views(moments=9), lambda time: place_at(time) if time > 0.6 else away)
+    normalisation, standing = standing_in(late)
+    clouds = Stereo(normalisation.apply(late.points).float(), late, standing).clouds(300, 0, 1)
+    assert [cloud.time for cloud in clouds] == [0.625, 0.75, 0.875, 1.0]
+
+
 def test_where_nothing_moves_there_are_none():
     still = filmed(rig_views(), None)
     normalisation, standing = standing_in(still)
-    assert stereo_points(100, normalisation.apply(still.points).float(), still, standing, 0, 1) is None
+    assert Stereo(normalisation.apply(still.points).float(), still, standing).clouds(100, 0, 1) == []
+
+
+def test_cameras_too_far_apart_are_not_paired():
+    film = filmed(rig_views((-60.0, 0.0, 60.0), (0.3, 0.3, 0.3)), place_at)
+    normalisation, standing = standing_in(film)
+    assert len(standing) == 3 and Stereo(normalisation.apply(film.points).float(), film, standing).pairs == {}
 
 
 def test_a_point_on_the_wall_behind_the_ball_does_not_move(film):
@@ -163,13 +202,14 @@ def test_sparse_points_on_the_ball_are_replaced(film):
     data = Dataset(tuple(film), folder=film.folder, split="train", points=points, colors=torch.full_like(points, 0.5))
     normalisation = Normalisation.fit(data.cameras, data.points)
     known = normalisation.apply(points).float()
-    seen, keep = points_on_movers(300, known, data, normalisation, 0, 1)
-    assert len(seen.points) == 300 and bool(seen.moves.all())
+    seen, keep, clouds = points_on_movers(300, known, data, normalisation, 0, 1)
+    assert len(seen.points) == 300 and bool(seen.moves.all()) and len(clouds) == MOMENTS
     assert keep[len(film.points) :].float().mean() < 0.2 and keep[: len(film.points)].float().mean() > 0.85
 
 
 def test_without_depth_all_sparse_points_are_kept():
     still = filmed(rig_views(), None)
     normalisation = Normalisation.fit(still.cameras, still.points)
-    seen, keep = points_on_movers(300, normalisation.apply(still.points).float(), still, normalisation, 0, 1)
-    assert len(seen.points) == len(seen.colors) == len(seen.moves) == 0 and bool(keep.all())
+    movers = points_on_movers(300, normalisation.apply(still.points).float(), still, normalisation, 0, 1)
+    assert len(movers.seen.points) == len(movers.seen.colors) == len(movers.seen.moves) == 0
+    assert bool(movers.keep.all()) and movers.clouds == []

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix, diags
-from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from ...edit.rotations import conjugate, multiply, rotate
+from ...runtime.search_tree import search_tree
 from ..skeleton import Skeleton
 from .surface import Surface
 
@@ -47,7 +47,7 @@ def clearest_frame(skeleton: Skeleton) -> int:
     """
     positions = skeleton.positions
     frames = sample_frames(len(positions), 4 * SAMPLES)
-    tree = KDTree(positions[0])
+    tree = search_tree(positions[0])
     if positions.shape[1] < 2 or len(frames) < 2:
         return 0
     near = CONTACT * float(np.median(tree.query(positions[0], 2)[0][:, 1]))
@@ -78,7 +78,7 @@ def bind(surface: Surface, tracks: np.ndarray, skeleton: Skeleton) -> Skeleton:
         The skeleton with the binding of the vertices; each has at most ``INFLUENCES`` joints.
     """
     vertices, count = surface.vertices, min(NEIGHBORS, tracks.shape[1])
-    distance, around = KDTree(tracks[0]).query(vertices, count)
+    distance, around = search_tree(tracks[0]).query(vertices, count)
     distance, around = distance.reshape(-1, count), around.reshape(-1, count)
     reach = np.maximum(distance[:, -1:], 1e-12)
     share = np.exp(-((2.0 * distance / reach) ** 2))

@@ -1,0 +1,140 @@
+"""Motion of what moves before standing cameras, learnt from its points at several moments before the first step.
+
+The photometric loss moves Gaussians only as far as they overlap with what they show. An arm that waves or a leg that
+walks has left them after a few frames, and fades instead. Clouds of points show where it is at each moment. The motion
+carries the points of one moment to the clouds of the others: to nearest points of like colour, at first of moments
+close by; neighbours keep their distances, and what stands still stays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..config.presets import TrainConfig
+from ..gaussians import GaussianParameters, gaussians_from_points
+from ..motion import ControlPoints
+from ..optim import Adam
+from ..runtime.progress import progress
+from ..runtime.search_tree import search_tree
+from ..seeding import generator
+from .flow_points import InstantPoints
+from .stereo_points import MovingCloud
+
+STEPS = 600
+POINTS, RESTING = 1500, 600
+"""Largest numbers of moving points of a cloud, and of resting points."""
+RATE = 1e-3
+"""Learning rate of the network."""
+COLOR = 0.7
+"""Distance for which a difference of colour of 1 counts, in sizes of the mover."""
+FAR = 0.5
+"""Distance, in sizes of the mover, beyond which pairs of points hardly pull."""
+HIDDEN = 0.5
+"""Weight of the points that a cloud may not show, because no two cameras see them."""
+NEIGHBORS, STIFF = 8, 0.05
+"""Number of neighbours to which a point keeps its distance, and weight of this term."""
+NEAR, SPREAD = 0.08, 0.6
+"""Span of time about the first cloud from which clouds are drawn at first, and share of the steps until all are."""
+
+
+def start_cloud(clouds: list[MovingCloud]) -> MovingCloud:
+    """Choose the cloud nearest to the middle of the time; its pose is the rest pose."""
+    return min(clouds, key=lambda cloud: abs(cloud.time - 0.5))
+
+
+def learn_motion(motion: ControlPoints, clouds: list[MovingCloud], resting: Tensor, config: TrainConfig) -> None:
+    """Train the network in place.
+
+    Args:
+        clouds: of at least two moments, normalised.
+        resting: [P, 3] points of what stands still, normalised.
+    """
+    device = motion.positions.device
+    targets = [_Target(cloud.seen, config.seed, number) for number, cloud in enumerate(clouds)]
+    first = start_cloud(clouds)
+    source = targets[clouds.index(first)]
+    size = max(source.size, 1e-6)
+    for target in targets:
+        target.prepare(COLOR * size)
+    chosen = torch.randperm(len(resting), generator=generator(config.seed, 51))[:RESTING]
+    gaussians = _carried(source, resting[chosen].float(), config).to(device)
+    count = len(source.points)
+    body = _Body(source.points)
+    network = dict(motion.network.named_parameters())
+    optimizer = Adam(network, dict.fromkeys(network, RATE))
+    draws = generator(config.seed, 52)
+    with progress(STEPS, "motion of what moves") as bar:
+        for step in range(STEPS):
+            span = NEAR + step / (SPREAD * STEPS)
+            near = [k for k, cloud in enumerate(clouds) if abs(cloud.time - first.time) <= span]
+            number = near[int(torch.randint(len(near), (1,), generator=draws))]
+            pose = motion.poses(torch.tensor([clouds[number].time]))[0]
+            means = motion.bind_and_pose(gaussians, pose, frozen=True).means
+            pulled = targets[number].distance(means[:count], source.colors, FAR * size) / size**2
+            held = (means[count:] - gaussians.means[count:]).square().sum(1).mean() / size**2
+            loss = pulled + STIFF * body.stretch(means[:count]) + (held if len(chosen) else 0.0)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            bar.advance()
+    optimizer.zero_grad()
+
+
+def _carried(source: _Target, resting: Tensor, config: TrainConfig) -> GaussianParameters:
+    """Make Gaussians at the points that move and those that do not; they get no gradients."""
+    points = torch.cat([source.points, resting])
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=config.motion.hyper_columns)
+    gaussians.hyper.data[:, : config.motion.hyper_dim] *= config.motion.hyper_stretch
+    return gaussians.requires_grad_(False)
+
+
+class _Body:
+    """Distances between neighbouring points."""
+
+    def __init__(self, points: Tensor) -> None:
+        count = min(NEIGHBORS, len(points) - 1)
+        _, nearest = search_tree(points.numpy()).query(points.numpy(), k=count + 1)
+        self.neighbors = torch.from_numpy(nearest.reshape(len(points), -1)[:, 1:].copy())
+        self.lengths = self._lengths(points)
+
+    def _lengths(self, points: Tensor) -> Tensor:
+        return (points[:, None] - points[self.neighbors.to(points.device)]).square().sum(-1).add(1e-12).sqrt()
+
+    def stretch(self, points: Tensor) -> Tensor:
+        """Return the mean squared change of the distances, as a share of their mean square."""
+        rest = self.lengths.to(points.device)
+        return (self._lengths(points) - rest).square().mean() / rest.square().mean().clamp(min=1e-12)
+
+
+class _Target:
+    """The points of one cloud, to which others are drawn."""
+
+    def __init__(self, seen: InstantPoints, seed: int, number: int) -> None:
+        chosen = torch.randperm(len(seen.points), generator=generator(seed, 53, number))[:POINTS]
+        self.points, self.colors = seen.points[chosen], seen.colors[chosen]
+        self.size = float((self.points - self.points.median(0).values).norm(dim=1).median())
+
+    def prepare(self, color_unit: float) -> None:
+        """Build the search; ``color_unit`` is the length of a unit of colour."""
+        self._unit = color_unit
+        self._features = self._joined(self.points, self.colors)
+        self._tree = search_tree(self._features)
+
+    def _joined(self, points: Tensor, colors: Tensor) -> np.ndarray:
+        return torch.cat([points.detach().cpu(), self._unit * colors], 1).double().numpy()
+
+    def distance(self, points: Tensor, colors: Tensor, far: float) -> Tensor:
+        """Return the mean squared distance of points [P, 3] of given colours to this cloud and back, in which distances
+        beyond ``far`` count less and less (Geman and McClure)."""
+        moved = self._joined(points, colors)
+        own = self.points.to(points.device)
+        nearest = torch.from_numpy(search_tree(moved).query(self._features)[1]).to(points.device)
+        there = torch.from_numpy(self._tree.query(moved)[1]).to(points.device)
+        to_cloud, back = (points[nearest] - own).square().sum(1), (points - own[there]).square().sum(1)
+        return _robust(to_cloud, far).mean() + HIDDEN * _robust(back, far).mean()
+
+
+def _robust(squares: Tensor, far: float) -> Tensor:
+    return squares / (1.0 + squares / far**2)

@@ -1,0 +1,114 @@
+"""Motion learnt from clouds of points: it carries what moves, holds what rests, and is the same at every run."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from helpers.tiny import tiny_config
+from scgs_warp.training.flow_points import InstantPoints
+from scgs_warp.training.pretrain import initial_motion
+from scgs_warp.training.stereo_motion import _carried, _Target, learn_motion, start_cloud
+from scgs_warp.training.stereo_points import MovingCloud
+
+TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
+TURN = 100.0
+
+
+def arm() -> torch.Tensor:
+    """A rod of length 0.5 along x, of radius 0.05."""
+    generator = torch.Generator().manual_seed(1)
+    along = torch.rand(500, 1, generator=generator) * 0.5
+    across = torch.randn(500, 2, generator=generator)
+    return torch.cat([along, 0.05 * across / across.norm(dim=1, keepdim=True)], 1)
+
+
+def turned(points: torch.Tensor, time: float) -> torch.Tensor:
+    """Turn about y by ``TURN`` degrees in all, the middle of the time at rest."""
+    angle = math.radians(TURN) * (time - 0.5)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    matrix = torch.tensor([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    return points @ matrix.T
+
+
+def colors_of(points: torch.Tensor) -> torch.Tensor:
+    """Bright at one end, with one colour on each side."""
+    return torch.stack([points[:, 0] * 2, (points[:, 1] > 0).float(), (points[:, 2] > 0).float()], 1)
+
+
+def clouds(times=TIMES) -> list[MovingCloud]:
+    """Clouds in which each moment has lost another fifth of the points, as hidden parts are."""
+    found = []
+    for number, time in enumerate(times):
+        kept = torch.arange(len(arm())) % 5 != number
+        points = turned(arm(), time)[kept]
+        found.append(
+            MovingCloud(time, InstantPoints(points, colors_of(arm())[kept], torch.ones(len(points)) > 0, number))
+        )
+    return found
+
+
+def wall() -> torch.Tensor:
+    x, z = torch.meshgrid(torch.linspace(-1, 1, 15), torch.linspace(-1, 1, 15), indexing="ij")
+    return torch.stack([x.flatten(), torch.full((x.numel(),), 0.8), z.flatten()], 1)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    config = tiny_config(40, motion={"nodes": 80})
+    points = torch.cat([arm(), wall()])
+    motion = initial_motion(config, points, moves=torch.arange(len(points)) < len(arm()))
+    learn_motion(motion, clouds(), wall(), config)
+    return config, motion
+
+
+def carried(learnt, points: torch.Tensor, time: float) -> torch.Tensor:
+    config, motion = learnt
+    seen = InstantPoints(points, colors_of(points), torch.ones(len(points)) > 0, 0)
+    source = _Target(seen, 0, 0)
+    source.points = points
+    gaussians = _carried(source, torch.zeros(0, 3), config)
+    with torch.no_grad():
+        return motion.gaussians_at(gaussians, time).means
+
+
+@pytest.mark.parametrize("time", TIMES)
+def test_points_are_carried_to_where_they_are_seen(learnt, time):
+    error = (carried(learnt, arm(), time) - turned(arm(), time)).norm(dim=1)
+    moved = (turned(arm(), time) - arm()).norm(dim=1).mean()
+    assert float(error.mean()) < max(0.02, 0.15 * float(moved)), (float(error.mean()), float(moved))
+
+
+def test_between_moments_points_are_near_their_path(learnt):
+    error = (carried(learnt, arm(), 0.62) - turned(arm(), 0.62)).norm(dim=1)
+    assert float(error.mean()) < 0.05
+
+
+def test_what_rests_is_held(learnt):
+    for time in TIMES:
+        assert float((carried(learnt, wall(), time) - wall()).norm(dim=1).max()) < 0.03
+
+
+def test_two_runs_give_the_same_bits(learnt):
+    config, motion = learnt
+    points = torch.cat([arm(), wall()])
+    again = initial_motion(config, points, moves=torch.arange(len(points)) < len(arm()))
+    learn_motion(again, clouds(), wall(), config)
+    one, two = motion.state_dict(), again.state_dict()
+    assert [name for name in one if not torch.equal(one[name], two[name])] == []
+    assert all(parameter.grad is None for parameter in again.parameters())
+
+
+def test_a_few_points_and_nothing_at_rest_suffice():
+    config = tiny_config(40, motion={"nodes": 12})
+    points = arm()[:12]
+    pair = [MovingCloud(t, InstantPoints(points[:2] + t, points[:2], torch.ones(2) > 0, 0)) for t in (0.0, 1.0)]
+    motion = initial_motion(config, points, moves=torch.ones(12) > 0)
+    learn_motion(motion, pair, torch.zeros(0, 3), config)
+    assert all(torch.isfinite(value).all() for value in motion.state_dict().values())
+
+
+def test_the_start_is_the_middle_of_the_time():
+    assert start_cloud(clouds()).time == 0.5 and start_cloud(clouds((0.1, 0.45, 0.9))).time == 0.45
