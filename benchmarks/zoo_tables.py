@@ -121,11 +121,18 @@ def films(source: Source) -> str:
 
 def rig(source: Source) -> str:
     """Write how good the view of a camera that was held out is, by the angle between the cameras of a rig."""
+    rows = {
+        "20-before": "20 degrees, without stereo",
+        "20": "20 degrees",
+        "8-before": "8 degrees, without stereo",
+        "8": "8 degrees",
+        "8-long": "8 degrees, 12,000 steps",
+    }
     lines = []
-    for angle in (20, 8):
-        run = source.run(str(angle), "robot")
+    for row, label in rows.items():
+        run = source.run(row, "robot")
         scores = (number(run.get(key), 2) for key in ("psnr", "psnr_worst"))
-        lines.append([source.label(str(angle), f"{angle} degrees"), *scores, number(run.get("ssim"), 3)])
+        lines.append([source.label(row, label), *scores, number(run.get("ssim"), 3)])
     return table(["angle between neighbours", "PSNR", "worst", "SSIM"], lines)
 
 

@@ -27,8 +27,9 @@ NARROWEST, WIDEST = 1.0, 40.0
 """Range of the angle between two paired cameras, as seen from the content, degrees."""
 NEARER, FARTHER = 0.5, 1.2
 """Factors on the depth of the nearest and the farthest known points, between which depth is sought."""
-MOST_MOMENTS = 24
-"""Number of moments at which depth is sought."""
+MOST_MOMENTS, MOST_MATCHES, LEAST_MOMENTS = 24, 160, 6
+"""Largest number of moments at which depth is sought; of pairs that are matched, over all moments; and the number of
+moments that are sought even so."""
 ENOUGH = 0.4
 """Least number of a moment's points, as a share of the largest."""
 SEEING_PER_BLIND = 4
@@ -75,7 +76,8 @@ class Stereo:
         """Find up to ``count`` moving points at each of several moments, from the first to the last; moments without
         enough are left out."""
         every = sorted({self.data.entries[index].time for one in self.standing for index in one.frames})
-        moments = [every[index] for index in spread(len(every), MOST_MOMENTS)] if self.pairs else []
+        most = min(MOST_MOMENTS, max(LEAST_MOMENTS, MOST_MATCHES // max(len(self.pairs), 1)))
+        moments = [every[index] for index in spread(len(every), most)] if self.pairs else []
         found = []
         with progress(len(moments), "depth of what moves") as bar:
             for time in moments:
