@@ -2,8 +2,8 @@
 
 The photometric loss moves Gaussians only as far as they overlap with what they show. An arm that waves or a leg that
 walks has left them after a few frames, and fades instead. Clouds of points show where it is at each moment. The motion
-carries the points of one moment to the clouds of the others: to nearest points of like colour, at first of moments
-close by; neighbours keep their distances, and what stands still stays.
+carries the points of one moment to the clouds of the others: to nearest points of like colour. Neighbours keep their
+distances, and what stands still stays.
 """
 
 from __future__ import annotations
@@ -35,8 +35,6 @@ HIDDEN = 0.5
 """Weight of the points that a cloud may not show, because no two cameras see them."""
 NEIGHBORS, STIFF = 8, 0.05
 """Number of neighbours to which a point keeps its distance, and weight of this term."""
-NEAR, SPREAD = 0.08, 0.6
-"""Span of time about the first cloud from which clouds are drawn at first, and share of the steps until all are."""
 
 
 def start_cloud(clouds: list[MovingCloud]) -> MovingCloud:
@@ -66,10 +64,8 @@ def learn_motion(motion: ControlPoints, clouds: list[MovingCloud], resting: Tens
     optimizer = Adam(network, dict.fromkeys(network, RATE))
     draws = generator(config.seed, 52)
     with progress(STEPS, "motion of what moves") as bar:
-        for step in range(STEPS):
-            span = NEAR + step / (SPREAD * STEPS)
-            near = [k for k, cloud in enumerate(clouds) if abs(cloud.time - first.time) <= span]
-            number = near[int(torch.randint(len(near), (1,), generator=draws))]
+        for _ in range(STEPS):
+            number = int(torch.randint(len(clouds), (1,), generator=draws))
             pose = motion.poses(torch.tensor([clouds[number].time]))[0]
             means = motion.bind_and_pose(gaussians, pose, frozen=True).means
             pulled = targets[number].distance(means[:count], source.colors, FAR * size) / size**2
