@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..data.dataset import Dataset, spread
+from ..runtime.progress import progress
 from ..types import Camera
 from .view_rays import pixels_of
 
@@ -62,8 +63,8 @@ class StandingCamera(NamedTuple):
 
 
 def levels(image: Tensor) -> np.ndarray:
-    """Return an image [H, W, 3] in [0, 1] as uint8."""
-    return (image.numpy() * 255.0).round().clip(0, 255).astype(np.uint8)
+    """Return an image [H, W, 3] in [0, 1] as uint8; pixels that are not numbers, outside a mask, are black."""
+    return (np.nan_to_num(image.numpy(), nan=0.0) * 255.0).round().clip(0, 255).astype(np.uint8)
 
 
 def standing_cameras(data: Dataset, views: list[Camera]) -> list[StandingCamera]:
@@ -83,17 +84,23 @@ def standing_cameras(data: Dataset, views: list[Camera]) -> list[StandingCamera]
     if len(groups) < 2 or min(map(len, groups.values())) < LEAST_MOMENTS:
         return []
     standing = []
-    for indices in groups.values():
-        indices.sort(key=lambda index: data.entries[index].time)
-        chosen = [indices[each] for each in spread(len(indices), MOST_MOMENTS)]
-        stack = np.stack([levels(data[index].image) for index in chosen])
-        still = np.median(stack, axis=0).astype(np.float32)
-        often = np.zeros(still.shape[:2], np.int32)
-        for image in stack:
-            often += _differs(image.astype(np.float32), still)
-        moves = _widened(often >= max(2, OFTEN * len(stack)))
-        standing.append(StandingCamera(views[indices[0]], indices, still, moves))
+    with progress(len(groups), "looking for what moves") as bar:
+        for indices in groups.values():
+            indices.sort(key=lambda index: data.entries[index].time)
+            still, moves = _still_and_moving(data, [indices[each] for each in spread(len(indices), MOST_MOMENTS)])
+            standing.append(StandingCamera(views[indices[0]], indices, still, moves))
+            bar.advance()
     return standing
+
+
+def _still_and_moving(data: Dataset, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the median [H, W, 3] of a camera's frames, and where they change, [H, W] bool."""
+    stack = np.stack([levels(data[index].image) for index in frames])
+    still = np.median(stack, axis=0).astype(np.float32)
+    often = np.zeros(still.shape[:2], np.int32)
+    for image in stack:
+        often += _differs(image.astype(np.float32), still)
+    return still, _widened(often >= max(2, OFTEN * len(stack)))
 
 
 def _differs(image: np.ndarray, still: np.ndarray) -> np.ndarray:

@@ -90,6 +90,18 @@ def test_regions_that_move_are_the_path_of_the_ball(film):
         assert not one.sees(behind, one.moves)[0][0], "a point behind the camera is not in view"
 
 
+def test_pixels_outside_a_mask_do_not_move():
+    hidden = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    hidden[:40] = True
+    still = filmed(rig_views(), None)
+    cut = [
+        dataclasses.replace(frame, image=frame.image.masked_fill(hidden[..., None], torch.nan), mask=~hidden)
+        for frame in still
+    ]
+    data = Dataset(cut, folder=still.folder, split="train", points=still.points, colors=still.colors)
+    assert not any(one.moves.any() for one in standing_in(data)[1])
+
+
 def test_a_change_of_exposure_is_no_motion():
     still = filmed(rig_views(), None)
     dim = [dataclasses.replace(frame, image=frame.image * (0.8 + 0.05 * (k % 7))) for k, frame in enumerate(still)]
