@@ -56,16 +56,15 @@ AROUND = 3
 
 
 class InstantPoints(NamedTuple):
-    """Points that one frame sees."""
+    """Points of one instant, from a frame of a film or from the frames of several cameras."""
 
     points: Tensor
     """[P, 3] normalised."""
     colors: Tensor
     """[P, 3]"""
     moves: Tensor
-    """[P] bool: flow to other frames leaves the place where a point at rest would be seen."""
-    index: int
-    """Index of the frame."""
+    """[P] bool: known to move."""
+    time: float
 
 
 def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> InstantPoints | None:
@@ -100,7 +99,7 @@ def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -
     scale = torch.tensor([image.shape[1], image.shape[0]]) / torch.tensor(flows.size(index))
     columns, rows = ((pixels[chosen] + 0.5) * scale).long().T
     colors = image[rows.clamp(0, image.shape[0] - 1), columns.clamp(0, image.shape[1] - 1)]
-    return InstantPoints(points[chosen].float(), colors, moves[chosen], index)
+    return InstantPoints(points[chosen].float(), colors, moves[chosen], data.entries[index].time)
 
 
 def _spread(moves: Tensor, count: int) -> Tensor:

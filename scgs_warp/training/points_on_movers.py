@@ -8,12 +8,18 @@ import torch
 from torch import Tensor
 
 from ..data.dataset import Dataset
-from ..geometry.normalisation import Normalisation
+from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from .flow import follow_each_other
 from .flow_points import InstantPoints, flow_points
 from .standing_cameras import standing_cameras
 from .stereo_motion import start_cloud
-from .stereo_points import MovingCloud, Stereo, moving_points
+from .stereo_points import Stereo, moving_points
+
+KEY = 36
+"""Of the random choice."""
+
+SHARE = 0.5
+"""Largest share of all initial points that stereo gives, and least share of the sparse points that must stay."""
 
 
 class Movers(NamedTuple):
@@ -24,29 +30,34 @@ class Movers(NamedTuple):
     keep: Tensor
     """[P] bool: the sparse points to keep. Those on what moves before standing cameras are of any instant, and are
     replaced."""
-    clouds: list[MovingCloud]
+    clouds: list[InstantPoints]
     """Points at several moments, before standing cameras."""
 
 
 def points_on_movers(
-    count: int, known: Tensor, data: Dataset, normalisation: Normalisation, seed: int, key: int
+    most: int, count: int, known: Tensor, data: Dataset, normalisation: Normalisation, seed: int
 ) -> Movers:
-    """Find up to ``count`` points of one instant.
+    """Find points of one instant.
 
     Args:
+        most: largest number of points.
+        count: number of all initial points. Flow gives only as many as the sparse points leave.
         known: [P, 3] sparse points of the data, normalised.
-        seed, key: of the choice among points of stereo.
+        seed: of the choice among points of stereo.
     """
     views = [normalisation.apply_camera(camera) for camera in data.cameras]
     keep, found, clouds = torch.ones(len(known), dtype=torch.bool), None, []
     standing = standing_cameras(data, views)
     if standing:
-        clouds = Stereo(known, data, standing).clouds(count, seed, key)
+        most = min(most, int(SHARE * count))
+        stereo = Stereo(known, data, standing)
+        clouds = stereo.clouds(most, seed, KEY)
         if clouds:
-            found = start_cloud(clouds).seen
-            keep = torch.from_numpy(~moving_points(known.double().numpy(), standing))
-    elif follow_each_other(data):
-        found = flow_points(count, known, data, views)
+            found = stereo.points_at(start_cloud(clouds).time, most, seed, KEY)
+            rests = torch.from_numpy(~moving_points(known.double().numpy(), standing))
+            keep = rests if int(rests.sum()) >= max(FEWEST_POINTS, SHARE * len(known)) else keep
+    elif len(known) < count and follow_each_other(data):
+        found = flow_points(min(most, count - len(known)), known, data, views)
     if found is None:
-        found = InstantPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), 0)
+        found = InstantPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), 0.0)
     return Movers(found, keep, clouds)

@@ -31,6 +31,7 @@ from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .exposure import Exposure
 from .flow import follow_each_other
+from .flow_points import InstantPoints
 from .frames import first_frames
 from .initial_points import random_points, sample_initial_points
 from .points_on_movers import points_on_movers
@@ -47,7 +48,6 @@ from .process_group import ProcessGroup
 from .resuming import check_same_configuration, check_steps
 from .silhouettes import half_thickness, is_in_parts, is_thin
 from .stereo_motion import learn_motion
-from .stereo_points import MovingCloud
 
 Stage = Literal["pretrain", "main"]
 THICKEST = 2.0
@@ -330,7 +330,7 @@ class InitialPoints(NamedTuple):
     """[P, 3]"""
     moves: Tensor
     """[Q] bool for the leading Q points, which lie on what is seen: True if known to move."""
-    clouds: list[MovingCloud]
+    clouds: list[InstantPoints]
     """What moves before standing cameras, at several moments."""
 
 
@@ -356,11 +356,12 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     moves = torch.zeros(len(points), dtype=torch.bool)
     if cube or data.with_alpha:  # with alpha, no background lies behind the points
         return InitialPoints(points, colors, moves, [])
-    known, clouds, most = points, [], min(config.flow_points, count - len(points))
-    if most > 0 and config.motion.model != "static":
-        seen, keep, clouds = points_on_movers(most, points, data, normalisation, config.seed, 36)
-        known, colors = points[keep], colors[keep]
-        points, colors = torch.cat([known, seen.points]), torch.cat([colors, seen.colors])
-        moves = torch.cat([moves[keep], seen.moves])
+    known, clouds = points, []
+    if config.flow_points and config.motion.model != "static":
+        used = min(config.init_points, config.densify.max_gaussians)
+        seen, keep, clouds = points_on_movers(config.flow_points, used, points, data, normalisation, config.seed)
+        known, room = points[keep], used - len(seen.points)
+        points, colors = torch.cat([known[:room], seen.points]), torch.cat([colors[keep][:room], seen.colors])
+        moves = torch.cat([moves[keep][:room], seen.moves])
     behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
     return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, clouds)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from ..types import Camera
+from .view_rays import pixels_of
 
 ENLARGED, LARGEST_SIDE = 2.0, 1280
 """Factor by which images are enlarged for matching, because disparities are whole pixels at first; and the longer side
@@ -20,8 +21,16 @@ BLOCK = 3
 SMOOTH, SMOOTH_EDGES, UNIQUE, SPECKLE = 4, 24, 8, 60
 """Penalties of the matcher on disparities that differ by one and by more, per channel and pixel of the square; the
 least lead of the best disparity, in percent; and the area of regions that are dropped, pixels."""
-LEAST_COSINE = 0.1
-"""Cosine of the angle to the common axis up to which an image is used."""
+LEAST_REDUCED = 0.5
+"""Least focal length, as a share of the first camera's: below, depth is sought from farther on instead."""
+WIDEST_TURN = 50.0
+"""Largest angle, degrees, by which a camera is turned: where one stands behind the other, nothing can be matched."""
+LEAST_COSINE = 0.3
+"""Cosine of the angle between a ray and the common axis that bounds the picture."""
+NEARER, FARTHER = 0.5, 1.2
+"""Factors on the depth of the nearest and the farthest known points in view, between which depth is sought."""
+FEWEST_KNOWN = 10
+"""Least number of known points in view."""
 LEAST_SIDE = 16
 """Least width and height of a region that is matched, pixels."""
 
@@ -42,29 +51,35 @@ class StereoPair(NamedTuple):
     """Number of disparities, a multiple of 16. As many columns on the left are empty, since the matcher skips them."""
 
     @staticmethod
-    def of(one: Camera, two: Camera, depths: tuple[float, float]) -> StereoPair | None:
+    def of(one: Camera, two: Camera, known: np.ndarray) -> StereoPair | None:
         """Rectify two cameras.
 
         Args:
-            depths: the range in which points are sought.
+            known: [P, 3] points between whose depths others are sought.
 
         Returns:
-            None if the pictures have no row in common.
+            None if a camera would be turned too far, the pictures do not overlap, or too few known points are in view.
         """
         start, end = (camera.position.double().numpy() for camera in (one, two))
-        baseline = float(np.linalg.norm(end - start))
+        baseline = max(float(np.linalg.norm(end - start)), 1e-12)
         x = (end - start) / baseline
-        y = np.cross(sum(camera.viewmat[2, :3].double().numpy() for camera in (one, two)), x)
+        axes = [camera.viewmat[2, :3].double().numpy() for camera in (one, two)]
+        y = np.cross(axes[0] + axes[1], x)
         y /= max(float(np.linalg.norm(y)), 1e-12)
         rotation = np.stack([x, y, np.cross(x, y)])
+        if min(float(axis @ rotation[2]) for axis in axes) < math.cos(math.radians(WIDEST_TURN)):
+            return None
+        depths = _depths(one, two, known, start, rotation[2])
         (left, top), (right, bottom) = _outline(one, rotation)
         (_, other_top), (_, other_bottom) = _outline(two, rotation)
         top, bottom = max(top, other_top), min(bottom, other_bottom)
-        if bottom <= top or right <= left:
+        if depths is None or bottom <= top or right <= left:
             return None
         nearest, farthest = baseline / depths[0], baseline / depths[1]
+        native = float(one.K[0, 0])
+        nearest = min(nearest, farthest + MOST_DISPARITIES / (LEAST_REDUCED * native))
         enlarged = min(ENLARGED, LARGEST_SIDE / max(one.width, one.height))
-        focal = min(enlarged * float(one.K[0, 0]), MOST_DISPARITIES / (nearest - farthest))
+        focal = min(enlarged * native, MOST_DISPARITIES / (nearest - farthest))
         disparities = 16 * max(1, math.ceil(focal * (nearest - farthest) / 16.0))
         size = math.ceil(focal * (right - left)) + disparities, math.ceil(focal * (bottom - top))
         shift = disparities - focal * left
@@ -84,13 +99,14 @@ class StereoPair(NamedTuple):
         rows, columns = (np.nonzero(sought.any(axis))[0] for axis in (1, 0))
         if not len(rows):
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-        top, bottom = rows[0], max(rows[-1] + 1, rows[0] + LEAST_SIDE)
-        left, right = columns[0] - self.disparities, max(columns[-1] + 1, columns[0] + LEAST_SIDE)
-        left = max(left, 0)
+        top, bottom = max(rows[0] - LEAST_SIDE, 0), rows[-1] + LEAST_SIDE
+        left, right = max(columns[0] - self.disparities - LEAST_SIDE, 0), columns[-1] + LEAST_SIDE
         one, two = (
             np.ascontiguousarray(self._rectified(k, image, cv2.INTER_CUBIC)[top:bottom, left:right])
             for k, image in enumerate(images)
         )
+        if one.shape[1] < self.disparities + LEAST_SIDE or one.shape[0] < LEAST_SIDE:
+            return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
         disparity = self._matcher().compute(one, two).astype(np.float64) / 16.0
         parallax = disparity - (self.offsets[0, 0] - self.offsets[1, 0])
         found = (disparity >= 0.0) & (parallax > 1e-6) & (sought[top:bottom, left:right] > 0)
@@ -128,8 +144,24 @@ class StereoPair(NamedTuple):
         )
 
 
+def _depths(
+    one: Camera, two: Camera, known: np.ndarray, start: np.ndarray, axis: np.ndarray
+) -> tuple[float, float] | None:
+    """Return the range of depths along the common axis in which points are sought; None if too few are in view."""
+    seen = np.zeros(len(known), bool)
+    for camera in (one, two):
+        pixels, depths = pixels_of(camera, known)
+        with np.errstate(invalid="ignore"):
+            seen |= (depths > 0) & (pixels > -0.5).all(1) & (pixels < [camera.width - 0.5, camera.height - 0.5]).all(1)
+    depths = (known[seen] - start) @ axis
+    depths = depths[depths > 0]
+    if len(depths) < FEWEST_KNOWN:
+        return None
+    return NEARER * float(np.quantile(depths, 0.01)), FARTHER * float(np.quantile(depths, 0.99))
+
+
 def _outline(camera: Camera, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest x/z and y/z of a camera's pixels, as seen with other axes."""
+    """Return the least and the largest x/z and y/z of a camera's pixels, as seen with other axes, in bounds."""
     width, height = camera.width, camera.height
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64)
     rays = corners @ np.linalg.inv(camera.K.double().numpy()).T @ camera.viewmat[:3, :3].double().numpy() @ rotation.T

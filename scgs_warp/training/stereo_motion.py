@@ -20,7 +20,6 @@ from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import generator
 from .flow_points import InstantPoints
-from .stereo_points import MovingCloud
 
 STEPS = 600
 POINTS, RESTING = 1500, 600
@@ -37,12 +36,12 @@ NEIGHBORS, STIFF = 8, 0.05
 """Number of neighbours to which a point keeps its distance, and weight of this term."""
 
 
-def start_cloud(clouds: list[MovingCloud]) -> MovingCloud:
+def start_cloud(clouds: list[InstantPoints]) -> InstantPoints:
     """Choose the cloud nearest to the middle of the time; its pose is the rest pose."""
     return min(clouds, key=lambda cloud: abs(cloud.time - 0.5))
 
 
-def learn_motion(motion: ControlPoints, clouds: list[MovingCloud], resting: Tensor, config: TrainConfig) -> None:
+def learn_motion(motion: ControlPoints, clouds: list[InstantPoints], resting: Tensor, config: TrainConfig) -> None:
     """Train the network in place.
 
     Args:
@@ -50,9 +49,9 @@ def learn_motion(motion: ControlPoints, clouds: list[MovingCloud], resting: Tens
         resting: [P, 3] points of what stands still, normalised.
     """
     device = motion.positions.device
-    targets = [_Target(cloud.seen, config.seed, number) for number, cloud in enumerate(clouds)]
+    targets = [_Target(cloud, config.seed, number) for number, cloud in enumerate(clouds)]
     first = start_cloud(clouds)
-    source = targets[clouds.index(first)]
+    source = targets[[cloud is first for cloud in clouds].index(True)]
     size = max(source.size, 1e-6)
     for target in targets:
         target.prepare(COLOR * size)

