@@ -12,8 +12,8 @@ from . import environment
 def search_tree(points: np.ndarray) -> KDTree:
     """Build the search for nearest neighbours among points [P, D].
 
-    SciPy divides points at the number next to a coordinate. While denormals are flushed to zero, the number next to 0
-    is 0 again, and SciPy recurses until the process crashes; they are therefore kept meanwhile.
+    SciPy splits points at the floating-point number next to a coordinate. While denormals are flushed to zero, the
+    number next to 0 is 0 again, and SciPy recurses until the process crashes; they are therefore kept meanwhile.
     """
     if not environment.configured():
         return KDTree(points)

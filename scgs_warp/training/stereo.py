@@ -26,7 +26,7 @@ LEAST_REDUCED = 0.5
 WIDEST_TURN = 50.0
 """Largest angle, degrees, by which a camera is turned: where one stands behind the other, nothing can be matched."""
 LEAST_COSINE = 0.3
-"""Cosine of the angle between a ray and the common axis that bounds the picture."""
+"""Cosine, of the angle between a ray and the common axis, at which a picture is cut off at the latest."""
 NEARER, FARTHER = 0.5, 1.2
 """Factors on the depth of the nearest and the farthest known points in view, between which depth is sought."""
 FEWEST_KNOWN = 10
