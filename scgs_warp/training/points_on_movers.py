@@ -50,10 +50,9 @@ def points_on_movers(
     standing = standing_cameras(data, views)
     if standing:
         most = min(most, int(SHARE * count))
-        stereo = Stereo(known, data, standing)
-        clouds = stereo.clouds(most, seed, KEY)
+        clouds = Stereo(known, data, standing).clouds(most, seed, KEY)
         if clouds:
-            found = stereo.points_at(start_cloud(clouds).time, most, seed, KEY)
+            found = start_cloud(clouds)
             rests = torch.from_numpy(~moving_points(known.double().numpy(), standing))
             keep = rests if int(rests.sum()) >= max(FEWEST_POINTS, SHARE * len(known)) else keep
     elif len(known) < count and follow_each_other(data):

@@ -138,7 +138,7 @@ def _difference(image: np.ndarray, valid: np.ndarray, still: np.ndarray) -> np.n
     bright = valid & (still.min(2) > BRIGHT)
     exposure = np.median((image.sum(2) + 1.0)[bright] / (still.sum(2) + 1.0)[bright]) if bright.any() else 1.0
     difference = np.abs(image / max(float(exposure), 1e-3) - still).max(2) * valid
-    return cv2.blur(difference, (3, 3)) * valid
+    return cv2.blur(difference, (3, 3))
 
 
 def _widened(region: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ NARROWEST, WIDEST = 1.0, 40.0
 """Range of the angle between two paired cameras, as seen from the content, degrees."""
 MOST_MOMENTS, MOST_MATCHES = 24, 160
 """Largest number of moments at which depth is sought, and about the largest number of matches in all. With more pairs
-of cameras, moments take turns with them."""
+of cameras, moments take turns with them, except the middle one, where Gaussians begin."""
 SPARE = 4
 """Number of points of a pair that are looked at, for each that is wanted."""
 FEWEST, ENOUGH = 50, 0.4
@@ -65,8 +65,10 @@ class Stereo:
             for two in others:
                 key = min(one, two), max(one, two)
                 pair = self.pairs.get(key) or StereoPair.of(standing[key[0]].camera, standing[key[1]].camera, places)
-                if pair is not None and found < NEIGHBORS:
+                if pair is not None:
                     self.pairs[key], found = pair, found + 1
+                if found == NEIGHBORS:
+                    break
 
     def clouds(self, count: int, seed: int, key: int) -> list[InstantPoints]:
         """Find up to ``count`` moving points at each of several moments, from the first to the last; moments without
@@ -74,10 +76,11 @@ class Stereo:
         every = sorted({self.data.entries[index].time for one in self.standing for index in one.frames})
         moments = [every[index] for index in spread(len(every), MOST_MOMENTS)] if self.pairs else []
         turns = math.ceil(len(self.pairs) * len(moments) / MOST_MATCHES)
+        middle = min(moments, key=lambda time: abs(time - 0.5), default=0.0)
         found = []
         with progress(len(moments), "depth of what moves") as bar:
             for number, time in enumerate(moments):
-                pairs = list(self.pairs)[number % turns :: turns]
+                pairs = list(self.pairs) if time == middle else list(self.pairs)[number % turns :: turns]
                 found.append(self.points_at(time, count, seed, key, pairs))
                 bar.advance()
         least = max(float(FEWEST), ENOUGH * max((len(cloud.points) for cloud in found), default=0))
@@ -96,11 +99,11 @@ class Stereo:
         here = {number: index for number, index in at.items() if index is not None}
         chosen = [pair for pair in pairs or self.pairs if pair[0] in here and pair[1] in here]
         frames = {number: self.data[here[number]] for number in sorted({one for pair in chosen for one in pair})}
+        images = {number: levels(frame.image) for number, frame in frames.items()}
         changed = {number: self.standing[number].changed(frame) for number, frame in frames.items()}
         for one, two in chosen:
             own = self.standing[one]
-            images = levels(frames[one].image), levels(frames[two].image)
-            placed, shades = self.pairs[one, two].match(images, own.whole(own.moves & changed[one]))
+            placed, shades = self.pairs[one, two].match((images[one], images[two]), own.whole(own.moves & changed[one]))
             few = _some(len(placed), SPARE * count, seed, key, here[one], one, two)
             placed, shades = placed[few], shades[few]
             # What stands still behind a mover's path looks as usual.
