@@ -42,7 +42,10 @@ class FilmOptions:
     sound: bool = True
     """Record claps in the room, by which the cameras of a rig can be synchronised."""
     maps: bool = False
-    """Also write the depth, the flow to the next frame and a mask of the subject for every frame of a film."""
+    """Also write the depth, the flow to the next frame and a mask of the subject for every frame of a film. The data
+    set of a phone's film then names the depth maps."""
+    depth_error: float = 0.0
+    """Relative error of the depth maps of the data set, smooth over each image, for example 0.04; needs --maps."""
 
 
 @dataclass(frozen=True)

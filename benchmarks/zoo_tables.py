@@ -119,6 +119,22 @@ def films(source: Source) -> str:
     return table(head, lines)
 
 
+def depth(source: Source) -> str:
+    """Write what depth maps do for a figure that walks before one camera."""
+    rows = {
+        "off": "maps are ignored (`loss.depth=0`, `flow_points=0`)",
+        "points": "true maps, before the first step only (`loss.depth=0`)",
+        "true": "true maps",
+        "wrong": "maps that are 4 % wrong",
+    }
+    lines = []
+    for row, label in rows.items():
+        run = source.run(row, "phone")
+        scores = (number(run.get(key), 2) for key in ("psnr", "psnr_worst"))
+        lines.append([source.label(row, label), f"{number(run.get('epe'), 1)} %", *scores])
+    return table(["", "motion error", "PSNR", "worst"], lines)
+
+
 def rig(source: Source) -> str:
     """Write how good the view of a camera that was held out is, by the angle between the cameras of a rig."""
     rows = {

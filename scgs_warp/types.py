@@ -55,6 +55,9 @@ class Frame:
     """[H, W] bool, True for valid pixels. None: all are valid."""
     name: str = ""
     """Stem of the image file's name."""
+    depth: Tensor | None = None
+    """[h, w] float32 depth along the camera's z, world units, 0 where unknown, of any size with the proportions of the
+    image. None: no depth map. Frames that a data set reads have none; ask it for ``Dataset.depth``."""
 
 
 @dataclass(frozen=True)

@@ -307,6 +307,10 @@ class LossConfig:
     """Share of the main stage until which the term applies."""
     flow_every: int = newer(2, before=2, least=1)
     """Apply the term in every n-th step only, with n times the weight."""
+    depth: float = newer(0.2, before=0.0, least=0, most=1e6)
+    """Weight of the relative error of inverse depth where the data has depth maps (not in the paper)."""
+    depth_until: float = newer(0.8, before=0.8, least=0, most=1)
+    """Share of the main stage until which ``depth`` fades linearly."""
     frame_colors: float = newer(1e-3, before=1e-3, least=0, most=1e6)
     """Weight of the squared distance between a frame's affine colour (``optim.frame_colors``) and the identity."""
     frame_colors_smooth: float = newer(1e-3, before=1e-3, least=0, most=1e6)
@@ -335,8 +339,8 @@ class TrainConfig:
     """Number of steps to which ``freeze``, ``coarse`` and ``densify.opacity_reset_every`` shrink at most in a shorter
     run: Gaussians need about so many to turn transparent or opaque."""
     flow_points: int = newer(4_000, before=0, least=0, most=10_000_000)
-    """Number of initial points for one instant of a film (by optical flow) or of a rig (by stereo), so that control
-    points and Gaussians begin on what moves, too (only with initial points, and without alpha). 0: none."""
+    """Number of initial points on what moves, found by optical flow, stereo of a rig or depth maps (only with initial
+    points, and without alpha). 0: none."""
     init_points: int = bounded(20_000, 1, 10_000_000)
     """Number of initial Gaussians. If the data has more points, only this many are used; if it has fewer and the images
     have no alpha, points behind the data's points are added up to this number."""

@@ -18,6 +18,7 @@ from ..types import Camera
 from .borders import border_mask, reduce_mask
 from .cache import ImageCache, Pixels
 from .dataset import Dataset, StoredFrame, spread
+from .depth_maps import DepthFile, read_depth_map
 from .images import Decoded, ReadOptions, decode, is_transparent, parallel_map, read_image, size_text
 from .lens import Lens
 from .points import finite_points
@@ -44,6 +45,7 @@ class FrameRecord:
     """Path of the frame's own mask, an image that is black where the frame is not valid; None without a mask."""
     states_size: bool = True
     """Whether the camera states the size of its images, which decides on the EXIF orientation."""
+    depth: DepthFile | None = None
 
 
 @dataclass(frozen=True)
@@ -116,9 +118,8 @@ def assemble(
                 f"{size_text((fact.camera.width, fact.camera.height))}; "
                 "correct mask_path or the lens, give a smaller downscale or drop the frame"
             )
-        views.append(
-            StoredFrame(fact.camera, record.time, record.name, _reader(record, options), has_alpha, common, key)
-        )
+        read, depth = _reader(record, options), _depth_reader(record, fact)
+        views.append(StoredFrame(fact.camera, record.time, record.name, read, has_alpha, common, key, depth))
     return Dataset(views, folder=folder, split=split, background=options.background, cache=cache, notes=notes)
 
 
@@ -139,6 +140,14 @@ def _decode(record: FrameRecord, options: ReadOptions) -> Decoded:
 
 def _reader(record: FrameRecord, options: ReadOptions) -> Callable[[], Pixels]:
     return lambda: _decode(record, options).pixels
+
+
+def _depth_reader(record: FrameRecord, fact: _Facts) -> Callable[[], Tensor] | None:
+    file = record.depth
+    if file is None:
+        return None
+    lens = record.lens(fact.source) if fact.distorted else None
+    return lambda: read_depth_map(file, fact.source, lens)
 
 
 def _facts(record: FrameRecord, decoded: Decoded, border: np.ndarray | None) -> _Facts:

@@ -41,6 +41,8 @@ class StoredFrame:
     """[H, W] bool, to be combined with the frame's own mask."""
     key: object = field(default_factory=object)
     """Key of the pixels in the cache."""
+    depth: Callable[[], Tensor] | None = None
+    """Function that reads the frame's depth map, as ``Frame.depth``; None without one."""
 
     def frame(self, cache: ImageCache) -> Frame:
         """Read the pixels.
@@ -139,6 +141,20 @@ class Dataset(Sequence[Frame]):
         entry = self.entries[index]
         if isinstance(entry, StoredFrame):
             self.cache.expect(entry.key, entry.read)
+
+    def depth(self, index: int) -> Tensor | None:
+        """Return the depth map of a frame, as ``Frame.depth``. It is read anew at each access.
+
+        Raises:
+            UserError: the file is missing or no depth map, or does not fit its image.
+        """
+        depth = self.entries[index].depth
+        return depth() if callable(depth) else depth
+
+    @property
+    def with_depth(self) -> list[int]:
+        """Indices of the frames with a depth map."""
+        return [index for index, entry in enumerate(self.entries) if entry.depth is not None]
 
     @property
     def with_alpha(self) -> list[int]:

@@ -82,6 +82,8 @@ class Survey:
     """Median angle in degrees between cameras that are ``BRIEFLY`` apart in time, seen from the centre of the scene."""
     look_away: bool = False
     """True if the content lies behind most cameras."""
+    depth_maps: int = 0
+    """Number of frames with a depth map."""
 
 
 def survey(data: Dataset) -> Survey:
@@ -113,6 +115,7 @@ def survey(data: Dataset) -> Survey:
         points=0 if data.points is None else len(data.points),
         sweep=_sweep(near, times[order]),
         look_away=looks_away(data),
+        depth_maps=len(data.with_depth),
     )
 
 
@@ -184,6 +187,7 @@ def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str
         else f"one camera, {facts.turn:.0f} degrees from frame to frame"
     )
     points = f"{facts.points:,} points" if facts.points else "no points"
+    points += f", {facts.depth_maps:,} depth maps" if facts.depth_maps else ""
     first = (
         f"data: {facts.frames:,} frames of {facts.width} x {facts.height} at {facts.instants:,} times; {cameras}, "
         f"{facts.arc:.0f} in all; {_content(facts)}; {points}"
@@ -208,7 +212,7 @@ def _expectation(facts: Survey) -> str:
         )
     if facts.instants < 2:
         return "a scene at rest: all frames are of one instant"
-    if facts.arc < LITTLE_PARALLAX:
+    if facts.arc < LITTLE_PARALLAX and not facts.depth_maps:
         return f"good views near the cameras only: they lie within {facts.arc:.1f} degrees, which leaves depth unknown"
     if facts.gap[1] - facts.gap[0] > max(GAP * facts.typical_gap, 0.05):
         return f"guessed motion from time {facts.gap[0]:.2f} to {facts.gap[1]:.2f}, where there is no frame"
@@ -218,6 +222,8 @@ def _expectation(facts: Survey) -> str:
         return "good views between the cameras at all times: each instant is seen from several sides"
     if facts.turn > JUMPS:
         return "good views from all around: the camera stands elsewhere at each instant"
+    if facts.depth_maps:
+        return "good views near the camera's path; motion along the line of sight is as good as the depth maps"
     if facts.sweep < LITTLE_PARALLAX:
         return (
             f"good views near the camera's path; it moves by {facts.sweep:.1f} degrees within a tenth of the time, so "

@@ -121,6 +121,16 @@ class Flows:
             path.append(following)
         return path
 
+    def between_frames(self, one: int, two: int) -> list[int] | None:
+        """Return the path from a frame to a later one; None if there is none of one size."""
+        path = [one]
+        while path[-1] != two:
+            following = self.path(path[-1], 1, 1)
+            if len(following) == 1 or self._data.entries[following[1]].time > self._data.entries[two].time:
+                return None
+            path.append(following[1])
+        return path
+
     def along(self, path: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Compose the flow of neighbours: vectors [h, w, 2], and [h, w] bool where all of it is certain."""
         vectors, certain = self._pair(path[0], path[1])

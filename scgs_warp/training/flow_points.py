@@ -65,6 +65,8 @@ class InstantPoints(NamedTuple):
     moves: Tensor
     """[P] bool: known to move."""
     time: float
+    later: Tensor | None = None
+    """[P, 3] where the points are at the time of the following cloud of a film; NaN where that is not known."""
 
 
 def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> InstantPoints | None:

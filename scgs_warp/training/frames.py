@@ -17,6 +17,7 @@ from ..geometry.normalisation import Normalisation
 from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Camera, Frame
+from .depth import Depths
 from .device_images import DeviceImages
 from .flow import Flows
 from .silhouettes import Silhouette, Silhouettes
@@ -87,6 +88,9 @@ class Frames:
         self.random_background = data.background == "random"
         self.silhouettes = Silhouettes(device)
         self.flows = Flows(data, self.views)
+        self.depths = Depths(data, self.views, normalisation.scale)
+        if config.loss.depth > 0.0 and data.with_depth:
+            self.depths.read()
         self._parts: dict[tuple[int, bool], Parts] = {}
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
         self.by_time = sorted(range(len(self.frames)), key=lambda i: data.entries[i].time)

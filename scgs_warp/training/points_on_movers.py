@@ -9,11 +9,14 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
+from .depth import Depths
+from .depth_points import depth_clouds, on_movers
 from .flow import follow_each_other
 from .flow_points import InstantPoints, flow_points
 from .standing_cameras import standing_cameras
-from .stereo_motion import start_cloud
+from .start_motion import SeenMotion, start_cloud
 from .stereo_points import Stereo, moving_points
+from .tracks import gather
 
 KEY = 36
 """Of the random choice."""
@@ -30,8 +33,8 @@ class Movers(NamedTuple):
     keep: Tensor
     """[P] bool: the sparse points to keep. Those on what moves before standing cameras are of any instant, and are
     replaced."""
-    clouds: list[InstantPoints]
-    """Points at several moments, before standing cameras."""
+    motion: SeenMotion | None = None
+    """What stereo or depth maps show of the motion."""
 
 
 def points_on_movers(
@@ -46,17 +49,30 @@ def points_on_movers(
         seed: of the choice among points of stereo.
     """
     views = [normalisation.apply_camera(camera) for camera in data.cameras]
-    keep, found, clouds = torch.ones(len(known), dtype=torch.bool), None, []
+    keep, found, motion = torch.ones(len(known), dtype=torch.bool), None, None
     standing = standing_cameras(data, views)
     if standing:
         most = min(most, int(SHARE * count))
         clouds = Stereo(known, data, standing).clouds(most, seed, KEY)
         if clouds:
             found = start_cloud(clouds)
-            rests = torch.from_numpy(~moving_points(known.double().numpy(), standing))
-            keep = rests if int(rests.sum()) >= max(FEWEST_POINTS, SHARE * len(known)) else keep
+            motion = SeenMotion(found, clouds, None)
+            keep = _kept(known, torch.from_numpy(~moving_points(known.double().numpy(), standing)))
+    elif data.with_depth and follow_each_other(data):
+        most = min(most, int(SHARE * count))
+        clouds = depth_clouds(most, data, views, Depths(data, views, normalisation.scale), seed, KEY)
+        if clouds:
+            start = [cloud.time for cloud in clouds].index(start_cloud(clouds).time)
+            found, tracks = gather(clouds, start, most, seed, KEY)
+            motion = SeenMotion(found, clouds, tracks)
+            keep = _kept(known, ~on_movers(known, clouds))
     elif len(known) < count and follow_each_other(data):
         found = flow_points(min(most, count - len(known)), known, data, views)
     if found is None:
         found = InstantPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), 0.0)
-    return Movers(found, keep, clouds)
+    return Movers(found, keep, motion)
+
+
+def _kept(known: Tensor, rests: Tensor) -> Tensor:
+    """Return the sparse points to keep, [P] bool: those that rest, unless these are too few."""
+    return rests if int(rests.sum()) >= max(FEWEST_POINTS, SHARE * len(known)) else torch.ones_like(rests)

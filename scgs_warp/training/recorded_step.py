@@ -23,6 +23,7 @@ from ..kernels.types import STEP_FINE, STEP_GRADIENT, STEP_HALTED, STEP_LOSS, TI
 from ..ops.binning_cuda import MAX_ROOM, bytes_within
 from ..runtime import debug, memory
 from ..runtime.cuda_graph import GraphMemory
+from .depth import depth_applies
 from .flow import flow_applies
 from .frames import Frames
 from .recorded_update import Kind, RecordedUpdate
@@ -116,12 +117,11 @@ class RecordedSteps:
         """Return True if the present step can be taken without the host, as far as is known beforehand."""
         state = self._state
         ready = state.motion.takes_time_tensor and not state.refines_cameras and not len(state.exposure)
-        ready = (
-            ready
-            and not debug.enabled()
-            and not (state.stage == "main" and flow_applies(state.stage_step, state.config))
-        )
-        if not ready:
+        if state.stage == "main":
+            step, config = state.stage_step, state.config
+            compares_depth = bool(self._frames.frames.with_depth) and depth_applies(step, config)
+            ready = ready and not flow_applies(step, config) and not compares_depth
+        if not ready or debug.enabled():
             return False
         if self.capacity > 0 and self._update is not None and self._update.holds():
             return True

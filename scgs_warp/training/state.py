@@ -31,7 +31,6 @@ from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .exposure import Exposure
 from .flow import follow_each_other
-from .flow_points import InstantPoints
 from .frames import first_frames
 from .initial_points import random_points, sample_initial_points
 from .points_on_movers import points_on_movers
@@ -47,7 +46,7 @@ from .pretrain import (
 from .process_group import ProcessGroup
 from .resuming import check_same_configuration, check_steps
 from .silhouettes import half_thickness, is_in_parts, is_thin
-from .stereo_motion import learn_motion
+from .start_motion import SeenMotion, learn_motion
 
 Stage = Literal["pretrain", "main"]
 THICKEST = 2.0
@@ -136,8 +135,8 @@ class TrainState:
         # Control points start on what is seen, not on bare walls.
         moves, shown = initial.moves.to(device), points[: len(initial.moves)]
         motion = initial_motion(config, shown, len(data.times.unique()), moves).to(device)
-        if isinstance(motion, ControlPoints) and len(initial.clouds) > 1:
-            learn_motion(motion, initial.clouds, shown[~moves].cpu(), config)
+        if isinstance(motion, ControlPoints) and initial.motion is not None and len(initial.motion.clouds) > 1:
+            learn_motion(motion, initial.motion, shown[~moves].cpu(), config)
         return TrainState(config, gaussians, motion, *rest, stage="main", **identity)
 
     def begin_main(self) -> None:
@@ -330,8 +329,8 @@ class InitialPoints(NamedTuple):
     """[P, 3]"""
     moves: Tensor
     """[Q] bool for the leading Q points, which lie on what is seen: True if known to move."""
-    clouds: list[InstantPoints]
-    """What moves before standing cameras, at several moments."""
+    motion: SeenMotion | None = None
+    """What is seen of the motion."""
 
 
 def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
@@ -344,24 +343,24 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     if data.points is None or not has_initial_points(data, config):
         if cube:
             points = random_points(count, config.seed, 31)
-            return InitialPoints(points, torch.full_like(points, 0.5), torch.zeros(count, dtype=torch.bool), [])
+            return InitialPoints(points, torch.full_like(points, 0.5), torch.zeros(count, dtype=torch.bool))
         # Spheres that start in the pose of the first frames are sampled from these frames only.
         frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
         points, colors = sample_initial_points(count, frames, normalisation, config.seed, 31)
         colors = torch.full_like(points, 0.5) if colors is None else colors
-        return InitialPoints(points, colors, torch.zeros(len(points), dtype=torch.bool), [])
+        return InitialPoints(points, colors, torch.zeros(len(points), dtype=torch.bool))
     order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
     points = normalisation.apply(data.points)[order].float().contiguous()
     colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
     moves = torch.zeros(len(points), dtype=torch.bool)
     if cube or data.with_alpha:  # with alpha, no background lies behind the points
-        return InitialPoints(points, colors, moves, [])
-    known, clouds = points, []
+        return InitialPoints(points, colors, moves)
+    known, motion = points, None
     if config.flow_points and config.motion.model != "static":
         used = min(config.init_points, config.densify.max_gaussians)
-        seen, keep, clouds = points_on_movers(config.flow_points, used, points, data, normalisation, config.seed)
+        seen, keep, motion = points_on_movers(config.flow_points, used, points, data, normalisation, config.seed)
         known, room = points[keep], used - len(seen.points)
         points, colors = torch.cat([known[:room], seen.points]), torch.cat([colors[keep][:room], seen.colors])
         moves = torch.cat([moves[keep][:room], seen.moves])
     behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
-    return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, clouds)
+    return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, motion)

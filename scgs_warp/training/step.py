@@ -13,6 +13,7 @@ from ..optim import log_linear
 from ..runtime.device_copies import sent
 from ..types import Camera, Stats
 from .camera_refinement import camera_rate
+from .depth import SeenDepth
 from .flow import FlowNumbers, flow_weight
 from .frames import Frames
 from .multi_view import all_views
@@ -73,7 +74,8 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
         camera = state.cameras.apply(camera, prepared.index)
     times = sent(torch.tensor(plan.times), device)
     color = state.exposure.color(prepared.index) if len(state.exposure) else None
-    numbers = Numbers(camera, sent(prepared.background, device), times, plan.weight, color, _flow(state, prepared))
+    flow, depth = _flow(state, prepared), _depth(state, prepared)
+    numbers = Numbers(camera, sent(prepared.background, device), times, plan.weight, color, flow, depth)
     compared = compare(state, prepared, numbers, stats)
     if color is not None:
         compared = compared.with_penalty(state.exposure.penalty(prepared.index, state.config.loss))
@@ -101,6 +103,17 @@ def _flow(state: TrainState, prepared: View) -> FlowNumbers | None:
             other = state.cameras.apply(other, flow.other)
     weight = flow_weight(state.stage_step, state.config)
     return FlowNumbers(camera, other, sent(flow.vectors, device), sent(flow.certain, device), weight)
+
+
+def _depth(state: TrainState, prepared: View) -> SeenDepth | None:
+    """Send the depth that the step compares to the device. Its camera is the one that is learnt, if it is."""
+    seen, device = prepared.depth, state.device
+    if seen is None:
+        return None
+    camera = seen.camera.to(device)
+    if state.refines_cameras:
+        camera = state.cameras.apply(camera, prepared.index)
+    return SeenDepth(camera, sent(seen.inverse, device))
 
 
 def least_logit(state: TrainState) -> float | None:

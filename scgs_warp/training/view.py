@@ -19,6 +19,7 @@ from ..ops.ssim import photometric_loss
 from ..rendering.render import draw
 from ..seeding import generator
 from ..types import Camera, Splats, Stats, Tiles
+from .depth import SeenDepth, depth_term, depth_weight
 from .exposure import exposed
 from .flow import Flow, FlowNumbers, flow_term, flow_weight
 from .frames import Frames, view_number
@@ -45,6 +46,8 @@ class View(NamedTuple):
     """Part of the image's silhouette, on the device."""
     flow: Flow | None = None
     """Optical flow to another frame, in steps that compare it."""
+    depth: SeenDepth | None = None
+    """Depth map of the frame, on the host, in steps that compare it."""
 
 
 class Form(NamedTuple):
@@ -71,6 +74,8 @@ class Numbers(NamedTuple):
     """[3, 4] affine colour of the frame; None: frames have none."""
     flow: FlowNumbers | None = None
     """None: the step compares no flow."""
+    depth: SeenDepth | None = None
+    """None: the step compares no depth."""
 
 
 class Compared(NamedTuple):
@@ -117,7 +122,8 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     flow = None
     if state.stage == "main" and flow_weight(step, config) > 0.0:
         flow = frames.flows.between(index, generator(config.seed, 46, view_number(state.step, config, view)))
-    return View(index, loaded.camera, loaded.background, plan, form, loaded.truth, loaded.mask, sample, flow)
+    seen = frames.depths.of(index) if state.stage == "main" and depth_weight(step, config) > 0.0 else None
+    return View(index, loaded.camera, loaded.background, plan, form, loaded.truth, loaded.mask, sample, flow, seen)
 
 
 def compare(
@@ -159,6 +165,9 @@ def compare(
         there = state.motion.means_at(state.gaussians, view.flow.time)
         moved = numbers.flow.weight * flow_term(posed, there, numbers.flow)
         regulariser = moved if regulariser is None else regulariser + moved
+    if numbers.depth is not None:
+        placed = depth_weight(state.stage_step, config) * depth_term(posed, numbers.depth)
+        regulariser = placed if regulariser is None else regulariser + placed
     loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
     if form.pooled:
         loss = loss + pooled_residual(picture, view.truth, view.mask)

@@ -56,6 +56,15 @@ def test_depth_of_movers_that_cannot_be_known():
     assert survey(handheld(1)).sweep == 180.0
 
 
+def test_depth_maps_tell_what_one_camera_cannot():
+    for arc in (0.5, 0.01):
+        data = handheld(41, arc)
+        mapped = [dataclasses.replace(frame, depth=torch.ones(24, 32)) for frame in data[1:]]
+        first, second = lines(Dataset([data[0], *mapped], folder=Path("mapped"), split="train"))
+        assert "40 depth maps" in first and "as good as the depth maps" in second
+        assert "depth maps" not in lines(data)[0]
+
+
 def test_exposure():
     assert "brightness changes by 20 %" in lines(handheld(exposure=0.2))[1]
     assert "brightness" not in lines(handheld(exposure=0.04))[1]

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import pytest
 import torch
 
-from helpers.scenes import look_at
+from helpers.filmed_blobs import SIZE, film, film_camera, on_device
 from helpers.steps import before_each_step
 from helpers.tiny import blobs, tiny_config, tiny_dataset
 from reference.compositing import composite
 from reference.projection import project
 from reference.render import tile_lists
 from scgs_warp.config.presets import preset
-from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.cameras import scaled_camera
 from scgs_warp.rendering.render import render
 from scgs_warp.runtime import environment
@@ -34,36 +32,9 @@ from scgs_warp.training.loop import fit
 from scgs_warp.training.state import resolve_auto
 from scgs_warp.types import Camera, Frame, Gaussians, Splats
 
-SIZE = 96
-
-
-def film_camera(share: float, size: int = SIZE) -> Camera:
-    """A camera that moves by 20 degrees in a film."""
-    angle = torch.deg2rad(torch.tensor(20.0 * share, dtype=torch.float64))
-    eye = torch.stack([4 * angle.sin(), -4 * angle.cos(), angle.new_tensor(1.0)])
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    K = torch.tensor([[1.4 * size, 0, size / 2], [0, 1.4 * size, size / 2], [0, 0, 1]])
-    return Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), up).float(), K, size, size)
-
-
-def film(count: int = 12, size: int = SIZE) -> Dataset:
-    """The swinging blobs of ``helpers.tiny``, filmed by a camera that moves slowly; frames without alpha."""
-    frames = []
-    for index in range(count):
-        time = index / (count - 1)
-        with torch.no_grad():
-            image = render(blobs(time), film_camera(time, size), torch.zeros(3))
-        frames.append(Frame(film_camera(time, size), time, image.rgb.clamp(0, 1), None, None, f"{index:03d}"))
-    return Dataset(frames, folder=Path("film"), split="train")
-
 
 def numbers(camera: Camera, other: Camera, vectors: torch.Tensor, certain: torch.Tensor, device: str) -> FlowNumbers:
     return FlowNumbers(camera.to(device), other.to(device), vectors.to(device), certain.to(device), 1.0)
-
-
-def on_device(gaussians: Gaussians, device: str) -> Gaussians:
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    return Gaussians(*(t.to(device) for t in tensors), gaussians.sh_dc.to(device), gaussians.sh_rest.to(device))
 
 
 def slow_term(here: Gaussians, means: torch.Tensor, there: torch.Tensor, seen: FlowNumbers) -> torch.Tensor:

@@ -15,9 +15,9 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.standing_cameras import levels, standing_cameras
+from scgs_warp.training.start_motion import start_cloud
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.stereo import StereoPair
-from scgs_warp.training.stereo_motion import start_cloud
 from scgs_warp.training.stereo_points import Stereo, moving_points
 from scgs_warp.types import Camera
 
@@ -285,8 +285,9 @@ def test_sparse_points_on_the_ball_are_replaced(film):
     data = Dataset(tuple(film), folder=film.folder, split="train", points=points, colors=torch.full_like(points, 0.5))
     normalisation = Normalisation.fit(data.cameras, data.points)
     known = normalisation.apply(points).float()
-    seen, keep, clouds = points_on_movers(300, 1000, known, data, normalisation, 0)
-    assert len(seen.points) == 300 and bool(seen.moves.all()) and len(clouds) == MOMENTS
+    seen, keep, motion = points_on_movers(300, 1000, known, data, normalisation, 0)
+    assert len(seen.points) == 300 and bool(seen.moves.all())
+    assert motion is not None and motion.tracks is None and len(motion.clouds) == MOMENTS
     assert keep[len(film.points) :].float().mean() < 0.2 and keep[: len(film.points)].float().mean() > 0.85
 
 
@@ -310,4 +311,4 @@ def test_without_depth_all_sparse_points_are_kept():
     normalisation = Normalisation.fit(still.cameras, still.points)
     movers = points_on_movers(300, 1000, normalisation.apply(still.points).float(), still, normalisation, 0)
     assert len(movers.seen.points) == len(movers.seen.colors) == len(movers.seen.moves) == 0
-    assert bool(movers.keep.all()) and movers.clouds == []
+    assert bool(movers.keep.all()) and movers.motion is None

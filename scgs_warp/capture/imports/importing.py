@@ -25,6 +25,7 @@ from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
 from . import agreement, arrays, monst3r, phone_apps
+from .depth_writing import DepthWriter, checked_depth, known_depth
 from .scene import MAX_NUMBER, OPENGL_TO_OPENCV, ImportedFrame, ImportedScene
 
 FILE, POINTS = "transforms.json", "points.ply"
@@ -111,7 +112,7 @@ def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> 
     frames = scene.frames
     chosen = set(spread(len(frames), POINT_FRAMES))
     share = POINT_COUNT // len(chosen)
-    names, sizes, clouds = [], [], []
+    names, sizes, clouds, maps, depths = [], [], [], [], DepthWriter(work)
     with show(len(frames), f"importing from {scene.program}") as bar:
         for index, frame in enumerate(frames):
             image, name = _write_image(work / "images", frame, f"frame_{index:05d}")
@@ -123,8 +124,13 @@ def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> 
                     f"{where}: is {size_text(sizes[-1])}, but the first image is {size_text(sizes[0])}; export images "
                     "of one size"
                 )
-            if frame.depth is not None and index in chosen:
-                clouds.append(_cloud(frame, frame.depth(), image, share, f"frame {index}"))
+            if frame.depth is not None:
+                depth = checked_depth(frame.depth(), f"frame {index}")
+                maps.append(depths.write(Path(name).stem, depth))
+                if index in chosen:
+                    clouds.append(_cloud(frame, depth, image, share))
+            else:
+                maps.append(None)
             bar.advance()
     points = np.concatenate([np.zeros((0, 3)), *(cloud[0] for cloud in clouds)])
     colors = np.concatenate([np.zeros((0, 3), np.uint8), *(cloud[1] for cloud in clouds)])
@@ -136,6 +142,10 @@ def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> 
     if len(points):
         write_points(work / POINTS, points, colors)
     content = _transforms(work, frames, names, sizes, viewmats, bool(len(points)))
+    for entry, depth_file in zip(content["frames"], maps):
+        if depth_file is not None:
+            entry["depth_file_path"] = depth_file
+            content["depth_unit_scale_factor"] = depths.unit * moved.scale
     (work / FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     with show(len(agreement.pairs(len(frames))), "comparing the poses with the images") as bar:
         lenses = [frame.K for frame in frames]
@@ -157,13 +167,9 @@ def _write_image(folder: Path, frame: ImportedFrame, stem: str) -> tuple[np.ndar
     return image, f"{stem}.png"
 
 
-def _cloud(
-    frame: ImportedFrame, depth: np.ndarray, image: np.ndarray, most: int, where: str
-) -> tuple[np.ndarray, np.ndarray]:
+def _cloud(frame: ImportedFrame, depth: np.ndarray, image: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Return points [P, 3] in the world of the frame and their colours [P, 3] uint8, evenly over the image."""
-    if depth.ndim != 2 or min(depth.shape) < 2:
-        raise UserError(f"{where}: its depth is {list(depth.shape)}, not [h, w]; export the scene again")
-    known = np.isfinite(depth) & (depth > 0) & (depth < MAX_NUMBER)
+    known = known_depth(depth) > 0
     middle = float(np.median(depth[known])) if known.any() else 0.0
     known &= (depth > middle / RANGE) & (depth < middle * RANGE)
     safe = np.where(known, depth, np.inf).astype(np.float32)

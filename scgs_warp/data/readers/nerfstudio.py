@@ -1,10 +1,10 @@
 """Reader of the nerfstudio layout: one ``transforms.json`` for all frames, with intrinsics, poses and optional points.
 
 ``fl_x, fl_y, cx, cy, w, h`` (pixels; for all frames or in each), per frame ``file_path``, ``transform_matrix``
-(camera-to-world, OpenGL), ``time`` in [0, 1] and ``mask_path``; ``ply_file_path``, sparse points in the frame of the
-poses; ``train_filenames``, ``val_filenames``, ``test_filenames``; ``camera_model`` and ``k1`` ... ``k6, p1, p2``, or
-``distortion_params``, for all frames or in each (images with distortion are undistorted). Layout: Tancik et al.,
-Nerfstudio, SIGGRAPH 2023.
+(camera-to-world, OpenGL), ``time`` in [0, 1], ``mask_path`` and ``depth_file_path`` (``depth_maps``);
+``ply_file_path``, sparse points in the frame of the poses; ``train_filenames``, ``val_filenames``,
+``test_filenames``; ``camera_model`` and ``k1`` ... ``k6, p1, p2``, or ``distortion_params``, for all frames or in each
+(images with distortion are undistorted). Layout: Tancik et al., Nerfstudio, SIGGRAPH 2023.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from ...types import Camera
 from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..choice import choose
 from ..dataset import Dataset
+from ..depth_maps import MILLIMETRE, DepthFile
 from ..held_out import held_out
 from ..images import ReadOptions
 from ..natural_order import by_name
@@ -76,7 +77,21 @@ def _record(path: Path, folder: Path, content: dict[str, Any], index: int, file:
         file.stem,
         None if mask is None else inside(folder, mask, f"{path}: frames[{index}].mask_path", "mask"),
         "w" in fields or "h" in fields,
+        _depth(path, folder, content, index),
     )
+
+
+def _depth(path: Path, folder: Path, content: dict[str, Any], index: int) -> DepthFile | None:
+    """Return the depth map that a frame names."""
+    name = content["frames"][index].get("depth_file_path")
+    if name is None:
+        return None
+    if not (isinstance(name, str) and name):
+        raise UserError(f"{path}: frames[{index}].depth_file_path is not text; name the depth map or leave it out")
+    unit = as_number(content.get("depth_unit_scale_factor", MILLIMETRE))
+    if unit is None or unit <= 0.0:
+        raise UserError(f"{path}: depth_unit_scale_factor is no positive number; give the unit of the depth maps")
+    return DepthFile(inside(folder, name, f"{path}: frames[{index}].depth_file_path", "depth map"), unit)
 
 
 def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list[float]:

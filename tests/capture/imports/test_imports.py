@@ -27,6 +27,7 @@ from helpers.foreign_scenes import (
 )
 from scgs_warp.apps import capture as app
 from scgs_warp.capture import import_scene
+from scgs_warp.capture.imports.depth_writing import DepthWriter
 from scgs_warp.capture.imports.stacks import Stack
 from scgs_warp.capture.similarity import align, centres
 from scgs_warp.data import load
@@ -94,6 +95,47 @@ def test_depth_gives_points_where_the_wall_is(imported):
     assert inside.sum() > 200 and error.median() < 0.08
     if program in METRIC:
         assert np.median(np.abs(data.points[:, 1].numpy() - WALL)) < 0.02
+
+
+def test_depth_maps_are_those_of_the_wall(imported):
+    """In the units of the written cameras, at every frame; Record3D has none."""
+    program, folder, _ = imported
+    data, truth = load(folder), wall()
+    if program == "Record3D":
+        assert not data.with_depth
+        return
+    assert data.with_depth == list(range(len(data)))
+    scale = 1.0
+    if program not in METRIC:
+        found = torch.stack([e.camera.viewmat for e in entries(folder)]).double().numpy()
+        scale = align(centres(found), centres(truth.viewmats)).scale
+    order = {round(entry.time, 3): index for index, entry in enumerate(entries(folder))}
+    for index, entry in enumerate(data.entries):
+        depth, true = data.depth(index), truth.depths[order[round(entry.time, 3)]]
+        assert depth is not None
+        every = len(true) // len(depth)  # Polycam's maps are smaller than its images
+        true = true[::every, ::every]
+        assert depth.shape == true.shape
+        known = depth > 0
+        assert float(known.float().mean()) > 0.5
+        error = (depth.double().numpy() * scale - true)[known.numpy()]
+        assert np.abs(error).max() < 0.01 * true.max(), program
+
+
+def test_depth_of_any_scale_and_size_is_written(tmp_path):
+    """float16 holds it in units of the first map's median; large maps are reduced; unknown ones are left out."""
+    for scale in (1e-7, 1.0, 1e7):
+        writer = DepthWriter(tmp_path / f"{scale}")
+        (tmp_path / f"{scale}").mkdir()
+        assert writer.write("none", np.zeros((4, 4))) is None
+        depth = scale * np.linspace(1.0, 3.0, 1024 * 768).reshape(768, 1024)
+        depth[0] = np.nan
+        name = writer.write("a", depth)
+        assert name == "depths/a.npy"
+        found = np.load(tmp_path / f"{scale}" / name)
+        assert found.shape == (384, 512) and found.dtype == np.float16
+        np.testing.assert_allclose(found[1:].astype(np.float64) * writer.unit, depth[2::2, ::2], rtol=2e-3)
+        assert not found[0].any()
 
 
 def test_the_app_imports(tmp_path, capsys):

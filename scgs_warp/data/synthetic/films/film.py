@@ -91,7 +91,7 @@ def _write(work: Path, plan: FilmPlan, done: Callable[[], object]) -> None:
     for take in shooting.takes:
         shooting.shoot(stage, take, work / take.file, done)
         if request.maps:
-            write_maps(work / "maps" / take.name, stage, shooting, take)
+            write_maps(work, stage, shooting, take)
     write_truth(work, shooting)
     if request.kind == "phone":
         write_data_set(work, stage, shooting, request, rng, done)

@@ -49,7 +49,9 @@ class FilmRequest:
     test: int = 20
     """Number of held-out views of a phone's data set."""
     maps: bool = False
-    """Also write depth, flow and masks of every frame."""
+    """Also write depth, flow and masks of every frame; a phone's data set names the depth maps."""
+    depth_error: float = 0.0
+    """Relative error of the depth maps of a phone's data set."""
     seed: int = 0
 
 
@@ -72,6 +74,9 @@ def check(request: FilmRequest) -> None:
     for name, most in (("shake", 10.0), ("blur", 1.0), ("rolling", 1.0), ("exposure", 1.0), ("balance", 1.0)):
         if not 0.0 <= getattr(request, name) <= most:
             raise UserError(f"--{name} {getattr(request, name):g}: give 0 to {most:g}")
+    has_maps = request.maps and request.kind == "phone"
+    if not 0.0 <= request.depth_error <= 1.0 or (request.depth_error and not has_maps):
+        raise UserError(f"--depth-error {request.depth_error:g}: give 0 to 1, with --film phone --maps")
     if not 0 <= request.crf <= 51:
         raise UserError(f"--crf {request.crf}: give 0 (lossless) to 51")
     if request.kind == "rig" and not 2 <= request.views <= 100:

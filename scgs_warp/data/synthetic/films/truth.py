@@ -30,6 +30,8 @@ POINT_NOISE = 0.004
 """Standard deviation of their positions, world units: about that of structure from motion."""
 VISIBLE_EVERY = 6
 """Stride of the frames whose visible points are determined."""
+BUMPS, DEPTH_BLUR = (6, 8), 2.0
+"""Rows and columns of the errors of a depth map; standard deviation by which its outlines are blurred, pixels."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -51,14 +53,19 @@ def write_truth(folder: Path, shooting: Shooting) -> None:
     )
 
 
+def map_of(take: Take, index: int) -> str:
+    """Return the name of the maps of a frame."""
+    return f"maps/{take.name}/{index:05d}.npz"
+
+
 def write_maps(folder: Path, stage: Stage, shooting: Shooting, take: Take) -> None:
-    """Write ``00000.npz`` and so on for every frame of a take.
+    """Write ``map_of`` every frame of a take.
 
     Each holds ``depth [H, W]`` float32; ``moves [H, W]`` bool, True on the subject; ``flow [H, W, 2]`` float16, the
     motion of surface points to the next frame in pixels; and ``seen [H, W]`` bool, True where the point is visible in
     the next frame. The last frame has no flow.
     """
-    folder.mkdir(parents=True)
+    (folder / map_of(take, 0)).parent.mkdir(parents=True)
     moments = take.seconds.tolist()
     for index, second in enumerate(moments):
         camera = take.view.camera(second)
@@ -72,7 +79,7 @@ def write_maps(folder: Path, stage: Stage, shooting: Shooting, take: Take) -> No
             visible = stage.caster.visible(there, seen, places.reshape(-1, 3).contiguous())
             content["seen"] = visible.view(hits.face.shape) & (hits.face >= 0)
         arrays: dict[str, Any] = {name: value.cpu().numpy() for name, value in content.items()}
-        np.savez_compressed(folder / f"{index:05d}.npz", **arrays)
+        np.savez_compressed(folder / map_of(take, index), **arrays)
 
 
 def flow_to(places: Tensor, camera: Camera) -> Tensor:
@@ -107,7 +114,10 @@ def write_data_set(
         if index % VISIBLE_EVERY == 0:
             some[index] = picture
         second = float(take.seconds[index])
-        frames.append(_entry(name, take.view.viewmat(second), shooting.time_of(second)))
+        entry = _entry(name, take.view.viewmat(second), shooting.time_of(second))
+        if request.maps:
+            entry["depth_file_path"] = _depth_of(folder, take, index, request)
+        frames.append(entry)
         train.append(name)
     test = _write_held_out(folder, stage, shooting, take.view, request, rng, frames, done)
     _write_points(folder / POINTS_FILE, stage, shooting, take, some, rng)
@@ -116,11 +126,27 @@ def write_data_set(
         "camera_model": "PINHOLE",
         **{"w": take.view.width, "h": take.view.height, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
         "ply_file_path": POINTS_FILE,
+        **({"depth_unit_scale_factor": 1.0} if request.maps else {}),
         "frames": frames,
         "train_filenames": train,
         "test_filenames": test,
     }
     (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n")
+
+
+def _depth_of(folder: Path, take: Take, index: int, request: FilmRequest) -> str:
+    """Return the name of a frame's depth map: the true one, or one that is wrong, as a network's is: blurred, and by a
+    factor that changes smoothly over the image and from frame to frame."""
+    if request.depth_error == 0.0:
+        return map_of(take, index)
+    depth = np.load(folder / map_of(take, index))["depth"]
+    rng = np.random.default_rng([request.seed, 8, index])
+    bumps = cv2.resize(rng.normal(size=BUMPS), depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    factor = np.exp(request.depth_error * (bumps + 0.5 * rng.normal()))
+    name = f"depths/{index:05d}.npy"
+    (folder / name).parent.mkdir(exist_ok=True)
+    np.save(folder / name, (cv2.GaussianBlur(depth, (0, 0), DEPTH_BLUR) * factor).astype(np.float32))
+    return name
 
 
 def _entry(name: str, viewmat: np.ndarray, time: float) -> dict[str, object]:

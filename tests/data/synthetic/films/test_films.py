@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -56,6 +57,39 @@ def test_the_folder_trains_with_true_cameras(filmed):
     assert plan_film(folder, SMALL).made and not plan.made
     with pytest.raises(UserError, match="holds something else"):
         plan_film(folder, replace(SMALL, seed=1))
+
+
+def test_the_data_set_names_its_depth_maps(filmed):
+    """Those of the frames of the film; they place the sparse points of the room where these are."""
+    _, folder = filmed
+    train = load(folder)
+    assert train.with_depth == list(range(8)) and not load(folder, "test").with_depth
+    depth, camera = train.depth(3), train.entries[3].camera
+    assert depth is not None and train.points is not None
+    np.testing.assert_array_equal(depth.numpy(), np.load(folder / "maps/film/00003.npz")["depth"])
+    local = train.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
+    inside = (local[:, 2] > 0) & ((pixels >= 0) & (pixels < torch.tensor([96.0, 64.0]))).all(1)
+    columns, rows = pixels[inside].long().T
+    assert float(((depth[rows, columns] - local[inside, 2]).abs() < 0.1).float().mean()) > 0.5
+
+
+def test_depth_maps_that_are_wrong_are_wrong_by_as_much_as_asked(tmp_path):
+    plan = plan_film(tmp_path / "film", replace(SMALL, depth_error=0.05, test=1))
+    make_film(plan)
+    train, errors = load(tmp_path / "film"), []
+    for index in train.with_depth:
+        true = np.load(tmp_path / f"film/maps/film/{index:05d}.npz")["depth"]
+        found = train.depth(index)
+        assert found is not None
+        errors.append(np.log(found.numpy() / cv2.GaussianBlur(true, (0, 0), 2.0)))
+    spread = float(np.std(errors))
+    assert 0.025 < spread < 0.07 and float(np.abs(np.diff(errors, axis=2)).max()) < 0.02, "smooth in the image"
+    for wrong in (replace(SMALL, depth_error=0.05, maps=False), replace(SMALL, depth_error=-1.0)):
+        with pytest.raises(UserError, match="--depth-error"):
+            plan_film(tmp_path / "other", wrong)
+    with pytest.raises(UserError, match="--depth-error"):
+        plan_film(tmp_path / "other", replace(SMALL, kind="rig", depth_error=0.05))
 
 
 def test_points_lie_on_the_room(filmed):

@@ -1,12 +1,14 @@
-"""Motion of what moves before standing cameras, learnt from its points at several moments before the first step.
+"""Motion of what moves, learnt from its points at several moments before the first step.
 
 The photometric loss moves Gaussians only as far as they overlap with what they show. An arm that waves or a leg that
-walks has left them after a few frames, and fades instead. Clouds of points show where it is at each moment. The motion
-carries the points of one moment to the clouds of the others: to nearest points of like colour. Neighbours keep their
-distances, and what stands still stays.
+walks has left them after a few frames, and fades instead. Clouds of points, by stereo or from depth maps, show where it
+is at each moment. The motion carries the points of one moment to the clouds of the others: to their tracks where there
+are any, and to nearest points of like colour. Neighbours keep their distances, and what stands still stays.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,23 +17,27 @@ from torch import Tensor
 from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters, gaussians_from_points
 from ..motion import ControlPoints
-from ..optim import Adam
+from ..optim import Adam, log_linear
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import generator
 from .flow_points import InstantPoints
+from .tracks import Tracks
 
-STEPS = 600
+STEPS, STEPS_TRACKED = 600, 1500
+"""Numbers of steps without and with tracks, which lead farther."""
 POINTS, RESTING = 1500, 600
 """Largest numbers of moving points of a cloud, and of resting points."""
-RATE = 1e-3
-"""Learning rate of the network."""
+RATE, RATE_END = 1e-3, 1e-4
+"""Learning rate of the network at the first and the last step."""
 COLOR = 0.7
 """Distance for which a difference of colour of 1 counts, in sizes of the mover."""
 FAR = 0.5
 """Distance, in sizes of the mover, beyond which pairs of points hardly pull."""
 HIDDEN = 0.5
 """Weight of the points that a cloud may not show, because no two cameras see them."""
+LED, BESIDE = 4.0, 0.2
+"""Weight of the distance to tracks, and then of the distance to nearest points, which pulls hidden points astray."""
 NEIGHBORS, STIFF = 8, 0.05
 """Number of neighbours to which a point keeps its distance, and weight of this term."""
 
@@ -41,18 +47,29 @@ def start_cloud(clouds: list[InstantPoints]) -> InstantPoints:
     return min(clouds, key=lambda cloud: abs(cloud.time - 0.5))
 
 
-def learn_motion(motion: ControlPoints, clouds: list[InstantPoints], resting: Tensor, config: TrainConfig) -> None:
+class SeenMotion(NamedTuple):
+    """What is seen of the motion before the first step."""
+
+    source: InstantPoints
+    """Points of what moves, in the rest pose."""
+    clouds: list[InstantPoints]
+    """Points at several moments, that of the source among them; normalised."""
+    tracks: Tracks | None
+    """Where the points of the source are at the time of each cloud, if that is known."""
+
+
+def learn_motion(motion: ControlPoints, seen: SeenMotion, resting: Tensor, config: TrainConfig) -> None:
     """Train the network in place.
 
     Args:
-        clouds: of at least two moments, normalised.
         resting: [P, 3] points of what stands still, normalised.
     """
-    device = motion.positions.device
+    device, clouds = motion.positions.device, seen.clouds
     targets = [_Target(cloud, config.seed, number) for number, cloud in enumerate(clouds)]
-    first = start_cloud(clouds)
-    source = targets[[cloud is first for cloud in clouds].index(True)]
+    start = [cloud.time for cloud in clouds].index(seen.source.time)
+    source = _Target(seen.source, config.seed, start)
     size = max(source.size, 1e-6)
+    tracks = None if seen.tracks is None else seen.tracks.of(source.chosen).to(device)
     for target in targets:
         target.prepare(COLOR * size)
     chosen = torch.randperm(len(resting), generator=generator(config.seed, 51))[:RESTING]
@@ -62,13 +79,20 @@ def learn_motion(motion: ControlPoints, clouds: list[InstantPoints], resting: Te
     network = dict(motion.network.named_parameters())
     optimizer = Adam(network, dict.fromkeys(network, RATE))
     draws = generator(config.seed, 52)
-    with progress(STEPS, "motion of what moves") as bar:
-        for _ in range(STEPS):
+    steps = STEPS if tracks is None else STEPS_TRACKED
+    with progress(steps, "motion of what moves") as bar:
+        for step in range(steps):
+            for group in optimizer.groups.values():
+                group.rate = log_linear(RATE, RATE_END, step, steps)
             number = int(torch.randint(len(clouds), (1,), generator=draws))
             pose = motion.poses(torch.tensor([clouds[number].time]))[0]
             means = motion.bind_and_pose(gaussians, pose, frozen=True).means
             pulled = targets[number].distance(means[:count], source.colors, FAR * size) / size**2
             held = (means[count:] - gaussians.means[count:]).square().sum(1).mean() / size**2
+            if tracks is not None:
+                apart = (means[:count] - tracks.places[number]).square().sum(1)
+                led = (tracks.weights[number] * _robust(apart, FAR * size)).mean() / size**2
+                pulled = BESIDE * pulled + LED * led
             loss = pulled + STIFF * body.stretch(means[:count]) + (held if len(chosen) else 0.0)
             optimizer.zero_grad()
             loss.backward()
@@ -107,8 +131,8 @@ class _Target:
     """The points of one cloud, to which others are drawn."""
 
     def __init__(self, seen: InstantPoints, seed: int, number: int) -> None:
-        chosen = torch.randperm(len(seen.points), generator=generator(seed, 53, number))[:POINTS]
-        self.points, self.colors = seen.points[chosen], seen.colors[chosen]
+        self.chosen = torch.randperm(len(seen.points), generator=generator(seed, 53, number))[:POINTS]
+        self.points, self.colors = seen.points[self.chosen], seen.colors[self.chosen]
         self.size = float((self.points - self.points.median(0).values).norm(dim=1).median())
 
     def prepare(self, color_unit: float) -> None:

@@ -1,0 +1,69 @@
+"""Depth maps of frames, as nerfstudio's layout names them: ``depth_file_path`` of a frame, a PNG, ``.npy``,
+or ``.npz`` with an array ``depth``.
+
+Values along the camera's z are multiplied by ``depth_unit_scale_factor`` (0.001 if it is absent: 16-bit PNG in
+millimetres) and are then in the units of the poses; 0 and non-finite values are unknown.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import UserError
+from ..storage.numpy_files import read_npy
+from .images import decode
+from .lens import Lens, undistortion_maps
+
+MILLIMETRE = 0.001
+"""Unit of maps that state none, in units of the poses."""
+MOST_DIFFERENT = 0.02
+"""Largest relative difference between the proportions of a map and of its image."""
+
+
+class DepthFile(NamedTuple):
+    """Where a depth map is."""
+
+    path: Path
+    unit: float
+    """Factor on the values of the file."""
+
+
+def read_depth_map(file: DepthFile, size: tuple[int, int], lens: Lens | None = None) -> Tensor:
+    """Read a depth map: [h, w] float32 in the units of the poses, 0 where unknown.
+
+    Args:
+        size: (width, height) of the image, whose proportions the map must have.
+        lens: lens of an image with distortion; the map is then undistorted as its image is, and gets its size.
+
+    Raises:
+        UserError: the file is missing or no depth map, or does not fit the image.
+    """
+    path = file.path
+    read = {".npy": read_npy, ".npz": partial(read_npy, member="depth")}.get(path.suffix.lower(), decode)
+    values = read(path)
+    if values.ndim == 3 and values.size and (values == values[..., :1]).all():
+        values = values[..., 0]
+    if values.ndim != 2 or not values.size:
+        raise UserError(
+            f"{path}: is no depth map of one number per pixel; save it as 16-bit grey PNG or as .npy [h, w]"
+        )
+    height, width = values.shape
+    if abs(width * size[1] / (height * size[0]) - 1.0) > MOST_DIFFERENT:
+        raise UserError(
+            f"{path}: is {width} x {height}, but its image {size[0]} x {size[1]}; give it the proportions of the image"
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = values.astype(np.float32) * np.float32(file.unit)
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
+    if lens is not None:
+        columns, rows, valid = undistortion_maps(lens, *size)
+        whole = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+        depth = np.where(valid, cv2.remap(whole, columns, rows, cv2.INTER_NEAREST), np.float32(0.0))
+    return torch.from_numpy(np.ascontiguousarray(depth))

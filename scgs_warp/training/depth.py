@@ -1,0 +1,156 @@
+"""Depth maps as a term of the loss: Gaussians gather about the surfaces that the maps show.
+
+Where a surface has no texture, or too few cameras see it, the photometric loss leaves its distance open. The term
+compares inverse depths, whose errors are alike near and far, of everything that covers a pixel, so that fog before a
+surface counts as well as a surface at the wrong distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..config.presets import TrainConfig
+from ..data.dataset import Dataset
+from ..errors import FrameError, UserError
+from ..geometry.cameras import scaled_camera
+from ..ops.binning import bin_splats
+from ..ops.compositing import composite
+from ..ops.projection import project
+from ..runtime.environment import one_piece
+from ..runtime.progress import progress
+from ..types import Camera, Gaussians
+from .flow import flow_size
+
+EVERY = 2
+"""The term applies in every second step, with twice the weight."""
+NEAREST = 1e-2
+"""Depth, normalised, below which a Gaussian counts as being so near."""
+SMOOTH = 1e-3
+"""Relative error of inverse depth below which the term is quadratic."""
+KEPT_MIB = 128
+"""Memory for the depth of a run; maps beyond it are read again at each use."""
+EDGE = 0.05
+"""Relative difference of depth within 3 x 3 pixels beyond which they lie on an outline, which is not compared: its
+pixels show two surfaces."""
+
+
+class SeenDepth(NamedTuple):
+    """Depth of a frame, compared at a reduced size."""
+
+    camera: Camera
+    """Of the frame, normalised, with the size of the depth."""
+    inverse: Tensor
+    """[h, w] inverse of the depth along z, normalised; 0 where it is unknown."""
+
+
+class Depths:
+    """Depth maps of the training frames."""
+
+    def __init__(self, data: Dataset, views: Sequence[Camera], scale: float) -> None:
+        """
+        Args:
+            views: normalised cameras of the frames, on the host.
+            scale: factor on depths by which they are normalised.
+        """
+        self._data, self._views, self._scale = data, views, scale
+        self._kept: dict[int, SeenDepth] = {}
+
+    def read(self) -> None:
+        """Read all maps once, so that a damaged one is found before training begins, and keep what fits.
+
+        Raises:
+            UserError: a file is missing or no depth map, or does not fit its image.
+        """
+        used, listed = 0, self._data.with_depth
+        with progress(len(listed), "reading depth maps") as bar:
+            for index in listed:
+                seen = self._reduced(index)
+                used += seen.inverse.nbytes
+                if used <= KEPT_MIB * 2**20:
+                    self._kept[index] = seen
+                bar.advance()
+
+    def of(self, index: int) -> SeenDepth | None:
+        """Return the depth of a frame, on the host; None if it has none.
+
+        Raises:
+            FrameError: the file is no longer readable.
+        """
+        if index in self._kept or self._data.entries[index].depth is None:
+            return self._kept.get(index)
+        try:
+            return self._reduced(index)
+        except UserError as error:
+            raise FrameError(str(error)) from error
+
+    def _reduced(self, index: int) -> SeenDepth:
+        depth = self._data.depth(index)
+        assert depth is not None, "asked for frames with a depth map only"
+        return seen_depth(depth.numpy() * np.float32(self._scale), self._views[index])
+
+
+def seen_depth(depth: np.ndarray, camera: Camera) -> SeenDepth:
+    """Reduce a depth map [h, w] of any size to the size at which it is compared, without its outlines.
+
+    Args:
+        depth: along z, in the units of the camera; 0 or not finite where unknown.
+    """
+    size = flow_size(camera.width, camera.height)
+    known = np.isfinite(depth) & (depth > 0)
+    safe = np.where(known, depth, 0.0).astype(np.float32)
+    low = cv2.erode(np.where(known, safe, np.inf).astype(np.float32), np.ones((3, 3)))
+    high = cv2.dilate(safe, np.ones((3, 3)))
+    known &= (high - low) <= EDGE * safe
+    taken = cv2.resize(np.where(known, safe, 0.0), size, interpolation=cv2.INTER_NEAREST)
+    with np.errstate(divide="ignore"):
+        inverse = np.where(taken > 0, 1.0 / np.maximum(taken, 1e-30), 0.0)
+    return SeenDepth(scaled_camera(camera, *size), torch.from_numpy(inverse.astype(np.float32)))
+
+
+def depth_term(posed: Gaussians, seen: SeenDepth) -> Tensor:
+    """Return the mean relative error of the inverse depths of what covers the pixels whose depth is known.
+
+    A pixel's error is the root of the mean square over its splats, weighted as their colours are.
+
+    Args:
+        posed: N Gaussians at the time of the frame.
+        seen: depth, on their device.
+
+    Returns:
+        Scalar; gradients flow to all that places and covers.
+    """
+    camera = seen.camera
+    shape = posed.quats, posed.scales, posed.opacities
+    size = camera.width, camera.height
+    splats = project(posed.means, *shape, camera.viewmat, camera.K, *size, sharpness=posed.sharpness)
+    with one_piece():
+        known = seen.inverse > 0
+        typical = seen.inverse.sum() / known.sum().clamp_min(1)
+        inverse = 1.0 / (splats.depths.clamp_min(NEAREST) * typical.clamp_min(1e-6))
+        channels = torch.stack([inverse, inverse.square()], 1)
+    image, alpha = composite(splats, channels, bin_splats(splats))
+    with one_piece():
+        here = torch.where(known, seen.inverse / typical.clamp_min(1e-6), 1.0)
+        squares = (image[1] - 2.0 * here * image[0] + here.square() * alpha).clamp_min(0.0) / here.square()
+        errors = (squares + SMOOTH**2).sqrt() - SMOOTH
+        return torch.where(known, errors, 0.0).sum() / known.sum().clamp_min(1)
+
+
+def depth_weight(step: int, config: TrainConfig) -> float:
+    """Return the weight of the term at a main step; 0 in steps without it. It fades linearly until
+    ``loss.depth_until``."""
+    loss, until = config.loss, config.loss.depth_until * config.main_steps
+    if not depth_applies(step, config) or step % EVERY:
+        return 0.0
+    return loss.depth * EVERY * (1.0 - step / until)
+
+
+def depth_applies(step: int, config: TrainConfig) -> bool:
+    """Return True during the main steps some of which compare depth."""
+    return config.loss.depth > 0.0 and step < config.loss.depth_until * config.main_steps

@@ -1,0 +1,193 @@
+"""Points of what moves in a film with depth maps, moment by moment.
+
+The depth of a pixel says where it would be seen in the frames around if it stood still. It moves if flow leads
+elsewhere, in most of the pixels around it as well.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..data.dataset import Dataset, spread
+from ..geometry.optical_flow import targets_of
+from ..runtime.progress import progress
+from ..runtime.search_tree import search_tree
+from ..seeding import generator
+from ..types import Camera
+from .depth import Depths, SeenDepth
+from .flow import Flows
+from .flow_points import LEAST_REGION, InstantPoints, strays
+from .view_rays import pixels_of, ray_of
+
+MOST_MOMENTS = 24
+"""Largest number of moments at which points are sought."""
+FOLLOWED = (2, 4, 8, 16)
+"""Numbers of frames after which a point at rest must be where flow leads."""
+LEFT, OF_PARALLAX = 0.006, 0.15
+"""Distance from which it is not: a share of the image's longer side, and a share of its parallax against what is far
+away, since depth is not exact."""
+TWICE = 0.2
+"""Least share of a region that is not there in two frames, since flow errs."""
+AROUND, SAME_DEPTH = 0.055, 0.04
+"""Distance, as a share of the longer side of the image, and difference of the logarithm of depth, within which pixels
+decide together."""
+BLEEDS, NEARER = 0.05, 0.85
+"""Distance from an outline, as a share of the longer side, at which flow is still that of the nearer side; and the
+depth of what is nearer, as a share of a pixel's own, at most."""
+UNSURE = 0.3
+"""Weight of the pixels there; others count as 1."""
+MAJORITY = 0.5
+"""Least share of these that move."""
+FEWEST, ENOUGH = 50, 0.4
+"""Least number of a moment's points, and as a share of the largest."""
+GHOST = 3.0
+"""Distance to a moving point, in distances between neighbouring ones, up to which a sparse point lies on what moves."""
+
+
+def depth_clouds(
+    count: int, data: Dataset, views: list[Camera], depths: Depths, seed: int, key: int
+) -> list[InstantPoints]:
+    """Find up to ``count`` moving points at each of several moments; moments without enough are left out.
+
+    Args:
+        views: normalised cameras of the frames, on the host.
+        key: of the random choice.
+    """
+    flows, found = Flows(data, views), []
+    ordered = sorted(data.with_depth, key=lambda index: data.entries[index].time)
+    chosen = [ordered[each] for each in spread(len(ordered), MOST_MOMENTS)]
+    with progress(len(chosen), "depth of what moves") as bar:
+        for index in chosen:
+            found.append(_cloud(index, count, data, flows, depths, seed, key))
+            bar.advance()
+    least = max(float(FEWEST), ENOUGH * max((len(each.cloud.points) for each in found), default=0))
+    kept = [each for each in found if len(each.cloud.points) >= least]
+    later = [_later(one, two, flows, depths) for one, two in itertools.pairwise(kept)]
+    return [each.cloud._replace(later=there) for each, there in zip(kept, [*later, None])]
+
+
+class _Seen(NamedTuple):
+    """The moving points of a frame."""
+
+    index: int
+    pixels: np.ndarray
+    """[P, 2] where they are seen, at the size of the flow."""
+    cloud: InstantPoints
+
+
+def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int, key: int) -> _Seen:
+    """Find the moving points of a frame, up to ``count`` of them, chosen at random."""
+    seen = depths.of(index)
+    assert seen is not None, "asked for frames with a depth map only"
+    inverse = seen.inverse.numpy()
+    rows, columns = np.nonzero(inverse > 0)
+    pixels = np.stack([columns, rows], 1).astype(np.float64)
+    points = _placed(seen, pixels, inverse[rows, columns])
+    moves = _region(pixels, *_moves(index, points, pixels, flows), inverse)
+    moves[moves] = ~strays(points[moves])
+    kept = moves.nonzero()[0]
+    kept = kept[torch.randperm(len(kept), generator=generator(seed, key, index))[:count].numpy()]
+    image = data[index].image
+    height, width = inverse.shape
+    scale = np.array([image.shape[1] / width, image.shape[0] / height])
+    x, y = ((pixels[kept] + 0.5) * scale).astype(int).T
+    colors = image[y.clip(0, image.shape[0] - 1), x.clip(0, image.shape[1] - 1)]
+    found = torch.from_numpy(points[kept]).float(), colors, torch.ones(len(kept), dtype=torch.bool)
+    return _Seen(index, pixels[kept], InstantPoints(*found, data.entries[index].time))
+
+
+def _placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Return the points [P, 3] at pixels [P, 2] with inverse depths [P]."""
+    start, directions = ray_of(seen.camera, pixels)
+    along = directions @ seen.camera.viewmat[2, :3].double().numpy()
+    return start + directions / (inverse * along)[:, None]
+
+
+def _later(one: _Seen, two: _Seen, flows: Flows, depths: Depths) -> Tensor:
+    """Return where the points of a frame are in a later one, [P, 3]: at the depth of the pixel to which flow leads; NaN
+    where flow or depth is not known."""
+    there = np.full((len(one.pixels), 3), np.nan)
+    path, seen = flows.between_frames(one.index, two.index), depths.of(two.index)
+    if path is None or seen is None:
+        return torch.from_numpy(there).float()
+    vectors, certain = flows.along(path)
+    columns, rows = one.pixels.astype(int).T
+    targets = targets_of(vectors)[rows, columns].astype(np.float64)
+    x, y = targets.round().astype(int).T
+    height, width = seen.inverse.shape
+    inverse = seen.inverse.numpy()[y.clip(0, height - 1), x.clip(0, width - 1)]
+    known = certain[rows, columns] & (inverse > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    there[known] = _placed(seen, targets[known], inverse[known])
+    return torch.from_numpy(there).float()
+
+
+def _moves(index: int, points: np.ndarray, pixels: np.ndarray, flows: Flows) -> tuple[np.ndarray, np.ndarray]:
+    """Follow the points [P, 3], seen at pixels [P, 2] of a frame: the number [P] of frames in which they are not where
+    flow leads, and [P] bool where flow is certain in any."""
+    columns, rows = pixels.astype(int).T
+    far = ray_of(flows.camera(index), pixels)[1]
+    left, certain = np.zeros(len(points), int), np.zeros(len(points), bool)
+    for side in (0, 1):
+        for span in FOLLOWED:
+            path = flows.path(index, span, side)
+            if len(path) <= span:
+                break
+            vectors, sure = flows.along(path)
+            other, targets = flows.camera(path[-1]), targets_of(vectors)[rows, columns]
+            at, depth = pixels_of(other, points)
+            distant = pixels_of(other, other.position.double().numpy() + far)[0]
+            here = sure[rows, columns] & (depth > 0)
+            with np.errstate(invalid="ignore"):
+                tolerance = LEFT * max(other.width, other.height) + OF_PARALLAX * np.linalg.norm(at - distant, axis=1)
+                left += here & (np.linalg.norm(at - targets, axis=1) > tolerance)
+            certain |= here
+    return left, certain
+
+
+def _region(pixels: np.ndarray, left: np.ndarray, certain: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Tell which pixels [P, 2] lie where most of those around, of about the same depth and with certain flow, move, in
+    regions of some size, [P] bool.
+
+    Args:
+        inverse: [h, w] inverse depths; 0 where unknown.
+    """
+    columns, rows = pixels.astype(int).T
+    sure, moving = np.zeros(inverse.shape, np.float32), np.zeros(inverse.shape, np.float32)
+    weights = np.where(_beside_nearer(inverse)[rows, columns], UNSURE, 1.0) * certain
+    sure[rows, columns], moving[rows, columns] = weights, (left > 0) * weights
+    guide = np.log(np.maximum(inverse, 1e-12)).astype(np.float32)
+    near = AROUND * max(inverse.shape)
+    most, some = (
+        cv2.ximgproc.jointBilateralFilter(guide, each, -1, SAME_DEPTH, near, borderType=cv2.BORDER_REPLICATE)
+        for each in (moving, sure)
+    )
+    region = ((most > MAJORITY * some) & (inverse > 0)).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(region)
+    large = stats[:, cv2.CC_STAT_AREA] >= LEAST_REGION * region.size
+    twice = np.bincount(labels[rows, columns], left > 1, minlength=len(stats))
+    large &= twice >= TWICE * stats[:, cv2.CC_STAT_AREA]
+    large[0] = False
+    return np.isin(labels[rows, columns], large.nonzero()[0])
+
+
+def _beside_nearer(inverse: np.ndarray) -> np.ndarray:
+    """Tell which pixels of inverse depth [h, w] are close to something clearly nearer, whose flow they have."""
+    side = 2 * round(BLEEDS * max(inverse.shape)) + 1
+    nearest = cv2.dilate(inverse, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
+    return nearest * NEARER > inverse
+
+
+def on_movers(points: Tensor, clouds: list[InstantPoints]) -> Tensor:
+    """Tell which sparse points [P, 3] lie where something that moves is at some moment, [P] bool."""
+    near = np.zeros(len(points), bool)
+    for cloud in clouds:
+        tree = search_tree(cloud.points.double().numpy())
+        spacing = float(np.median(tree.query(cloud.points.double().numpy(), k=2)[0][:, 1]))
+        near |= tree.query(points.double().numpy())[0] < GHOST * max(spacing, 1e-9)
+    return torch.from_numpy(near)
