@@ -7,7 +7,6 @@ millimetres) and are then in the units of the poses; 0 and non-finite values are
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +22,7 @@ from .lens import Lens, undistortion_maps
 
 MILLIMETRE = 0.001
 """Unit of maps that state none, in units of the poses."""
+REMEDY = "save it as 16-bit grey PNG or as .npy [h, w]"
 MOST_DIFFERENT = 0.02
 """Largest relative difference between the proportions of a map and of its image."""
 
@@ -46,16 +46,13 @@ def read_depth_map(file: DepthFile, size: tuple[int, int], lens: Lens | None = N
         UserError: the file is missing or no depth map, or does not fit the image.
     """
     path = file.path
-    read = {".npy": read_npy, ".npz": partial(read_npy, member="depth")}.get(path.suffix.lower(), decode)
-    values = read(path)
-    if values.ndim == 3 and values.size and (values == values[..., :1]).all():
+    values = _values(path)
+    if values.ndim == 3 and (values.shape[2] == 1 or (values == values[..., :1]).all()):
         values = values[..., 0]
-    if values.ndim != 2 or not values.size:
-        raise UserError(
-            f"{path}: is no depth map of one number per pixel; save it as 16-bit grey PNG or as .npy [h, w]"
-        )
+    if values.ndim != 2 or not values.size or values.dtype == np.uint8:
+        raise UserError(f"{path}: is no depth map of one number per pixel; {REMEDY}")
     height, width = values.shape
-    if abs(width * size[1] / (height * size[0]) - 1.0) > MOST_DIFFERENT:
+    if not has_proportions((width, height), size):
         raise UserError(
             f"{path}: is {width} x {height}, but its image {size[0]} x {size[1]}; give it the proportions of the image"
         )
@@ -64,6 +61,22 @@ def read_depth_map(file: DepthFile, size: tuple[int, int], lens: Lens | None = N
         depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
     if lens is not None:
         columns, rows, valid = undistortion_maps(lens, *size)
-        whole = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+        whole = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
         depth = np.where(valid, cv2.remap(whole, columns, rows, cv2.INTER_NEAREST), np.float32(0.0))
     return torch.from_numpy(np.ascontiguousarray(depth))
+
+
+def has_proportions(size: tuple[int, int], image: tuple[int, int]) -> bool:
+    """Tell whether a map of (width, height) has the proportions of its image."""
+    return abs(size[0] * image[1] / (size[1] * image[0]) - 1.0) <= MOST_DIFFERENT
+
+
+def _values(path: Path) -> np.ndarray:
+    if not path.is_file():
+        raise UserError(f"{path}: no such depth map, though a frame names it; restore it or remove depth_file_path")
+    if path.suffix.lower() in (".npy", ".npz"):
+        return read_npy(path, "depth" if path.suffix.lower() == ".npz" else None)
+    try:
+        return decode(path)
+    except UserError:
+        raise UserError(f"{path}: does not decode as a depth map; {REMEDY}") from None

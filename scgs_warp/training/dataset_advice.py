@@ -26,6 +26,8 @@ SAME_PLACE = 5.0
 """Largest angle in degrees between two cameras that see a surface in the same light."""
 LITTLE_PARALLAX = 5.0
 """Angle in degrees, seen from the scene. If all cameras lie within it, depth cannot be determined reliably."""
+MOSTLY_MAPPED = 0.5
+"""Share of the frames with depth maps from which depth counts as known."""
 BRIEFLY = 0.1
 """Share of the film within which a mover hardly changes its shape, so that several frames together show its depth."""
 JUMPS = 10.0
@@ -192,7 +194,8 @@ def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str
         f"data: {facts.frames:,} frames of {facts.width} x {facts.height} at {facts.instants:,} times; {cameras}, "
         f"{facts.arc:.0f} in all; {_content(facts)}; {points}"
     )
-    return first, f"expect {_expectation(facts)}; {_help(facts, config, device)}"
+    compares = config.loss.depth > 0.0 and facts.depth_maps >= MOSTLY_MAPPED * facts.frames
+    return first, f"expect {_expectation(facts, compares)}; {_help(facts, config, device)}"
 
 
 def _content(facts: Survey) -> str:
@@ -204,7 +207,7 @@ def _content(facts: Survey) -> str:
     return "cut out by alpha, a subject in parts" if facts.in_parts else "cut out by alpha"
 
 
-def _expectation(facts: Survey) -> str:
+def _expectation(facts: Survey, compares_depth: bool) -> str:
     if facts.look_away:
         return (
             "nothing: the cameras look away from the content; poses in transforms.json are OpenGL's (y up, z backward),"
@@ -212,7 +215,7 @@ def _expectation(facts: Survey) -> str:
         )
     if facts.instants < 2:
         return "a scene at rest: all frames are of one instant"
-    if facts.arc < LITTLE_PARALLAX and not facts.depth_maps:
+    if facts.arc < LITTLE_PARALLAX and not compares_depth:
         return f"good views near the cameras only: they lie within {facts.arc:.1f} degrees, which leaves depth unknown"
     if facts.gap[1] - facts.gap[0] > max(GAP * facts.typical_gap, 0.05):
         return f"guessed motion from time {facts.gap[0]:.2f} to {facts.gap[1]:.2f}, where there is no frame"
@@ -222,7 +225,7 @@ def _expectation(facts: Survey) -> str:
         return "good views between the cameras at all times: each instant is seen from several sides"
     if facts.turn > JUMPS:
         return "good views from all around: the camera stands elsewhere at each instant"
-    if facts.depth_maps:
+    if compares_depth:
         return "good views near the camera's path; motion along the line of sight is as good as the depth maps"
     if facts.sweep < LITTLE_PARALLAX:
         return (

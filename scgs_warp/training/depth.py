@@ -1,8 +1,8 @@
 """Depth maps as a term of the loss: Gaussians gather about the surfaces that the maps show.
 
 Where a surface has no texture, or too few cameras see it, the photometric loss leaves its distance open. The term
-compares inverse depths, whose errors are alike near and far, of everything that covers a pixel, so that fog before a
-surface counts as well as a surface at the wrong distance.
+compares inverse depths of everything that covers a pixel, so that fog before a surface counts as well as a surface at
+the wrong distance.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..ops.projection import project
 from ..runtime.environment import one_piece
 from ..runtime.progress import progress
 from ..types import Camera, Gaussians
-from .flow import flow_size
+from .flow import OPAQUE, flow_size
 
 EVERY = 2
 """The term applies in every second step, with twice the weight."""
@@ -36,8 +36,11 @@ SMOOTH = 1e-3
 KEPT_MIB = 128
 """Memory for the depth of a run; maps beyond it are read again at each use."""
 EDGE = 0.05
-"""Relative difference of depth within 3 x 3 pixels beyond which they lie on an outline, which is not compared: its
-pixels show two surfaces."""
+"""Relative difference of depth within 3 x 3 compared pixels beyond which they lie on an outline, which is not compared:
+its pixels show two surfaces."""
+LEAST_INVERSE = 0.25
+"""Inverse depth, as a share of the view's mean weighted by itself, below which errors are no longer relative to it: a
+sky at any distance would otherwise outweigh everything."""
 
 
 class SeenDepth(NamedTuple):
@@ -90,9 +93,15 @@ class Depths:
             raise FrameError(str(error)) from error
 
     def _reduced(self, index: int) -> SeenDepth:
-        depth = self._data.depth(index)
+        depth, frame = self._data.depth(index), self._data[index]
         assert depth is not None, "asked for frames with a depth map only"
-        return seen_depth(depth.numpy() * np.float32(self._scale), self._views[index])
+        seen = seen_depth(depth.numpy() * np.float32(self._scale), self._views[index])
+        size = seen.inverse.shape[1], seen.inverse.shape[0]
+        for plane, least in ((frame.mask, 1.0 - 1e-4), (frame.alpha, OPAQUE)):
+            if plane is not None:
+                shown = cv2.resize(plane.numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA)
+                seen.inverse[torch.from_numpy(shown <= least)] = 0.0
+        return seen
 
 
 def seen_depth(depth: np.ndarray, camera: Camera) -> SeenDepth:
@@ -104,10 +113,11 @@ def seen_depth(depth: np.ndarray, camera: Camera) -> SeenDepth:
     size = flow_size(camera.width, camera.height)
     known = np.isfinite(depth) & (depth > 0)
     safe = np.where(known, depth, 0.0).astype(np.float32)
-    low = cv2.erode(np.where(known, safe, np.inf).astype(np.float32), np.ones((3, 3)))
-    high = cv2.dilate(safe, np.ones((3, 3)))
+    around = np.ones((2 * max(1, round(depth.shape[1] / size[0])) + 1,) * 2)
+    low = cv2.erode(np.where(known, safe, np.inf).astype(np.float32), around)
+    high = cv2.dilate(safe, around)
     known &= (high - low) <= EDGE * safe
-    taken = cv2.resize(np.where(known, safe, 0.0), size, interpolation=cv2.INTER_NEAREST)
+    taken = cv2.resize(np.where(known, safe, 0.0), size, interpolation=cv2.INTER_NEAREST_EXACT)
     with np.errstate(divide="ignore"):
         inverse = np.where(taken > 0, 1.0 / np.maximum(taken, 1e-30), 0.0)
     return SeenDepth(scaled_camera(camera, *size), torch.from_numpy(inverse.astype(np.float32)))
@@ -131,13 +141,14 @@ def depth_term(posed: Gaussians, seen: SeenDepth) -> Tensor:
     splats = project(posed.means, *shape, camera.viewmat, camera.K, *size, sharpness=posed.sharpness)
     with one_piece():
         known = seen.inverse > 0
-        typical = seen.inverse.sum() / known.sum().clamp_min(1)
-        inverse = 1.0 / (splats.depths.clamp_min(NEAREST) * typical.clamp_min(1e-6))
+        typical = (seen.inverse.square().sum() / seen.inverse.sum().clamp_min(1e-12)).clamp_min(1e-6)
+        inverse = 1.0 / (splats.depths.clamp_min(NEAREST) * typical)
         channels = torch.stack([inverse, inverse.square()], 1)
     image, alpha = composite(splats, channels, bin_splats(splats))
     with one_piece():
-        here = torch.where(known, seen.inverse / typical.clamp_min(1e-6), 1.0)
-        squares = (image[1] - 2.0 * here * image[0] + here.square() * alpha).clamp_min(0.0) / here.square()
+        here = torch.where(known, seen.inverse / typical, 1.0)
+        squares = (image[1] - 2.0 * here * image[0] + here.square() * alpha).clamp_min(0.0)
+        squares = squares / here.clamp_min(LEAST_INVERSE).square()
         errors = (squares + SMOOTH**2).sqrt() - SMOOTH
         return torch.where(known, errors, 0.0).sum() / known.sum().clamp_min(1)
 

@@ -22,7 +22,7 @@ from ..seeding import generator
 from ..types import Camera
 from .depth import Depths, SeenDepth
 from .flow import Flows
-from .flow_points import LEAST_REGION, InstantPoints, strays
+from .flow_points import LEAST_REGION, InstantPoints, colors_at, strays
 from .view_rays import pixels_of, ray_of
 
 MOST_MOMENTS = 24
@@ -62,13 +62,17 @@ def depth_clouds(
     flows, found = Flows(data, views), []
     ordered = sorted(data.with_depth, key=lambda index: data.entries[index].time)
     chosen = [ordered[each] for each in spread(len(ordered), MOST_MOMENTS)]
-    with progress(len(chosen), "depth of what moves") as bar:
+    later: list[Tensor | None] = []
+    with progress(2 * len(chosen), "depth of what moves") as bar:
         for index in chosen:
             found.append(_cloud(index, count, data, flows, depths, seed, key))
             bar.advance()
-    least = max(float(FEWEST), ENOUGH * max((len(each.cloud.points) for each in found), default=0))
-    kept = [each for each in found if len(each.cloud.points) >= least]
-    later = [_later(one, two, flows, depths) for one, two in itertools.pairwise(kept)]
+        least = max(float(FEWEST), ENOUGH * max((each.count for each in found), default=0))
+        kept = [each for each in found if each.count >= least]
+        for one, two in itertools.pairwise(kept):
+            later.append(_later(one, two, flows, depths))
+            bar.advance()
+        bar.advance(2 * len(chosen) - len(found) - len(later))
     return [each.cloud._replace(later=there) for each, there in zip(kept, [*later, None])]
 
 
@@ -78,6 +82,8 @@ class _Seen(NamedTuple):
     index: int
     pixels: np.ndarray
     """[P, 2] where they are seen, at the size of the flow."""
+    count: int
+    """Number of moving pixels, of which the cloud may hold some only."""
     cloud: InstantPoints
 
 
@@ -91,15 +97,11 @@ def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, 
     points = _placed(seen, pixels, inverse[rows, columns])
     moves = _region(pixels, *_moves(index, points, pixels, flows), inverse)
     moves[moves] = ~strays(points[moves])
-    kept = moves.nonzero()[0]
-    kept = kept[torch.randperm(len(kept), generator=generator(seed, key, index))[:count].numpy()]
-    image = data[index].image
-    height, width = inverse.shape
-    scale = np.array([image.shape[1] / width, image.shape[0] / height])
-    x, y = ((pixels[kept] + 0.5) * scale).astype(int).T
-    colors = image[y.clip(0, image.shape[0] - 1), x.clip(0, image.shape[1] - 1)]
+    every = moves.nonzero()[0]
+    kept = every[torch.randperm(len(every), generator=generator(seed, key, index))[:count].numpy()]
+    colors = colors_at(data[index].image, pixels[kept], (inverse.shape[1], inverse.shape[0]))
     found = torch.from_numpy(points[kept]).float(), colors, torch.ones(len(kept), dtype=torch.bool)
-    return _Seen(index, pixels[kept], InstantPoints(*found, data.entries[index].time))
+    return _Seen(index, pixels[kept], len(every), InstantPoints(*found, data.entries[index].time))
 
 
 def _placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:

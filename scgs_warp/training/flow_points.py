@@ -97,11 +97,15 @@ def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -
     index, seen = sorted(large, key=lambda pair: pair[1].size())[len(large) // 2]
     points, pixels, moves = seen.points, seen.pixels, seen.moves
     chosen = _spread(moves, count)
-    image = data[index].image
-    scale = torch.tensor([image.shape[1], image.shape[0]]) / torch.tensor(flows.size(index))
-    columns, rows = ((pixels[chosen] + 0.5) * scale).long().T
-    colors = image[rows.clamp(0, image.shape[0] - 1), columns.clamp(0, image.shape[1] - 1)]
+    colors = colors_at(data[index].image, pixels[chosen].numpy(), flows.size(index))
     return InstantPoints(points[chosen].float(), colors, moves[chosen], data.entries[index].time)
+
+
+def colors_at(image: Tensor, pixels: np.ndarray, size: tuple[int, int]) -> Tensor:
+    """Return the colours [P, 3] of an image [H, W, 3] at pixels [P, 2] of a reduced version of (width, height)."""
+    height, width = image.shape[:2]
+    columns, rows = ((pixels + 0.5) * (np.array([width, height]) / size)).astype(int).T
+    return image[rows.clip(0, height - 1), columns.clip(0, width - 1)]
 
 
 def _spread(moves: Tensor, count: int) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
+from ..types import Camera
 from .depth import Depths
 from .depth_points import depth_clouds, on_movers
 from .flow import follow_each_other
@@ -58,16 +59,12 @@ def points_on_movers(
             found = start_cloud(clouds)
             motion = SeenMotion(found, clouds, None)
             keep = _kept(known, torch.from_numpy(~moving_points(known.double().numpy(), standing)))
-    elif data.with_depth and follow_each_other(data):
-        most = min(most, int(SHARE * count))
-        clouds = depth_clouds(most, data, views, Depths(data, views, normalisation.scale), seed, KEY)
-        if clouds:
-            start = [cloud.time for cloud in clouds].index(start_cloud(clouds).time)
-            found, tracks = gather(clouds, start, most, seed, KEY)
-            motion = SeenMotion(found, clouds, tracks)
-            keep = _kept(known, ~on_movers(known, clouds))
-    elif len(known) < count and follow_each_other(data):
-        found = flow_points(min(most, count - len(known)), known, data, views)
+    elif (data.with_depth or len(known) < count) and follow_each_other(data):
+        if data.with_depth:
+            found, motion = _by_depth(min(most, int(SHARE * count)), data, views, normalisation.scale, seed)
+            keep = keep if motion is None else _kept(known, ~on_movers(known, motion.clouds))
+        if found is None and len(known) < count:
+            found = flow_points(min(most, count - len(known)), known, data, views)
     if found is None:
         found = InstantPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), 0.0)
     return Movers(found, keep, motion)
@@ -76,3 +73,17 @@ def points_on_movers(
 def _kept(known: Tensor, rests: Tensor) -> Tensor:
     """Return the sparse points to keep, [P] bool: those that rest, unless these are too few."""
     return rests if int(rests.sum()) >= max(FEWEST_POINTS, SHARE * len(known)) else torch.ones_like(rests)
+
+
+def _by_depth(
+    most: int, data: Dataset, views: list[Camera], scale: float, seed: int
+) -> tuple[InstantPoints | None, SeenMotion | None]:
+    """Find up to ``most`` points, and what depth maps show of their motion; None if nothing moves."""
+    depths = Depths(data, views, scale)
+    depths.read()
+    clouds = depth_clouds(most, data, views, depths, seed, KEY)
+    if not clouds:
+        return None, None
+    start = [cloud.time for cloud in clouds].index(start_cloud(clouds).time)
+    found, tracks = gather(clouds, start, most, seed, KEY)
+    return found, None if found is None else SeenMotion(found, clouds, tracks)

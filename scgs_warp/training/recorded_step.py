@@ -119,7 +119,7 @@ class RecordedSteps:
         ready = state.motion.takes_time_tensor and not state.refines_cameras and not len(state.exposure)
         if state.stage == "main":
             step, config = state.stage_step, state.config
-            compares_depth = bool(self._frames.frames.with_depth) and depth_applies(step, config)
+            compares_depth = depth_applies(step, config) and bool(self._frames.frames.with_depth)
             ready = ready and not flow_applies(step, config) and not compares_depth
         if not ready or debug.enabled():
             return False

@@ -54,7 +54,7 @@ class Tracks(NamedTuple):
 
 def gather(
     clouds: list[InstantPoints], start: int, count: int, seed: int, key: int
-) -> tuple[InstantPoints, Tracks | None]:
+) -> tuple[InstantPoints | None, Tracks | None]:
     """Carry the points of all clouds to the pose of cloud ``start``, so that surfaces hidden then are there, too.
 
     Args:
@@ -63,7 +63,7 @@ def gather(
 
     Returns:
         The points of the cloud and those of others that lie beside them, the nearest in time first; and their tracks,
-        if the clouds have any.
+        if the clouds have any. None if tracks show that nothing moves.
     """
     first = clouds[start]
     middle = first.points.median(0).values
@@ -87,10 +87,12 @@ def gather(
         places.append(found.places[:, kept])
         weights.append(found.weights[:, kept])
     gathered, tracks = torch.cat(points), Tracks(torch.cat(places, 1), torch.cat(weights, 1))
-    moved = ((tracks.places - gathered).norm(dim=2) * (tracks.weights > LEAST_SURE)).amax(0) > STILL * unit
-    some = moved.nonzero()[:, 0]
-    if not len(some):
+    sure = tracks.weights > LEAST_SURE
+    if int(sure.sum(0).max()) < 2:
         return first, None
+    some = (((tracks.places - gathered).norm(dim=2) * sure).amax(0) > STILL * unit).nonzero()[:, 0]
+    if not len(some):
+        return None, None
     some = some[torch.randperm(len(some), generator=generator(seed, key, start))[:count]]
     moves = torch.ones(len(some), dtype=torch.bool)
     everywhere = InstantPoints(gathered[some], torch.cat(colors)[some], moves, first.time)

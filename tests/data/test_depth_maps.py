@@ -52,9 +52,10 @@ def test_every_format_gives_the_same_depth(tmp_path, name, values, unit):
 def test_unknown_depth_is_zero(tmp_path):
     values = ramp().astype(np.float32)
     values[0, :4] = np.nan, np.inf, -1.0, 0.0
-    depth = read_depth_map(DepthFile(saved(tmp_path, "a.npy", values), 2.0), SIZE)
-    assert depth[0, :4].tolist() == [0.0] * 4 and bool((depth[1:] > 0).all())
-    assert bool(depth.isfinite().all())
+    for shaped in (values, values[..., None]):
+        depth = read_depth_map(DepthFile(saved(tmp_path, "a.npy", shaped), 2.0), SIZE)
+        assert depth[0, :4].tolist() == [0.0] * 4 and bool((depth[1:] > 0).all())
+        assert bool(depth.isfinite().all())
 
 
 def test_maps_may_be_smaller_or_larger_but_must_have_the_proportions(tmp_path):
@@ -85,12 +86,13 @@ def test_maps_of_a_distorted_image_are_undistorted_with_it(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.png", None, "no such image"),
-        ("a.npy", None, "no such file"),
+        ("a.png", None, "no such depth map"),
+        ("a.npy", None, "no such depth map"),
         ("a.npy", b"not numpy", "no sound numpy file"),
-        ("a.png", b"not png", "not an image"),
+        ("a.png", b"not png", "does not decode as a depth map"),
         ("a.png", np.dstack([np.zeros((30, 40)), np.ones((30, 40)), np.ones((30, 40))]).astype(np.uint8), "no depth"),
         ("a.npy", np.arange(2400.0).reshape(2, 30, 40), "no depth map"),
+        ("a.png", np.full((30, 40), 90, np.uint8), "no depth map"),
         ("a.npy", np.zeros((0, 40)), "no depth map"),
         ("a.npy", np.zeros(40), "no depth map"),
     ],

@@ -50,6 +50,12 @@ def _made(means: torch.Tensor, colors: torch.Tensor, scale: float) -> Gaussians:
     )
 
 
+def scene(place: torch.Tensor | None) -> Gaussians:
+    """The wall, and the ball about ``place`` [3] unless it is None."""
+    fields = [dataclasses.asdict(part) for part in ([wall()] if place is None else [wall(), ball(place)])]
+    return Gaussians(**{name: torch.cat([part[name] for part in fields]) for name in fields[0] if name != "sharpness"})
+
+
 def walking_camera(share: float) -> Camera:
     """A camera that walks by 1.6 units and looks at the ball."""
     return _camera([-0.8 + 1.6 * share, -4.0, 0.3])
@@ -76,11 +82,8 @@ def filmed(views: list[tuple[Camera, float]], place_at: Callable[[float], torch.
     """
     frames = []
     for index, (camera, time) in enumerate(views):
-        parts = [wall()] + ([] if place_at is None else [ball(place_at(time))])
-        fields = [dataclasses.asdict(part) for part in parts]
-        both = {name: torch.cat([part[name] for part in fields]) for name in fields[0] if name != "sharpness"}
         with torch.no_grad():
-            image = render(Gaussians(**both), camera, torch.full((3,), 0.5))
+            image = render(scene(None if place_at is None else place_at(time)), camera, torch.full((3,), 0.5))
         frames.append(Frame(camera, time, image.rgb.clamp(0, 1), None, None, f"{index:03d}"))
     sparse = wall()
     colors = (sparse.sh_dc * SH_C0 + 0.5).clamp(0, 1)

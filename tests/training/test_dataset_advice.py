@@ -63,6 +63,10 @@ def test_depth_maps_tell_what_one_camera_cannot():
         first, second = lines(Dataset([data[0], *mapped], folder=Path("mapped"), split="train"))
         assert "40 depth maps" in first and "as good as the depth maps" in second
         assert "depth maps" not in lines(data)[0]
+        off = dataclasses.replace(preset("cpu").loss, depth=0.0)
+        few = Dataset([*data[:30], *mapped[29:]], folder=Path("few"), split="train")
+        for unlike, changes in ((few, {}), (Dataset(mapped, folder=Path("off"), split="train"), {"loss": off})):
+            assert "as good as the depth maps" not in lines(unlike, **changes)[1]
 
 
 def test_exposure():

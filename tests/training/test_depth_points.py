@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from helpers.ball_and_wall import ball, filmed, walking_camera, wall
+from helpers.ball_and_wall import ball, filmed, scene, walking_camera, wall
 from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.rendering.render import render
+from scgs_warp.training import points_on_movers as module
 from scgs_warp.training.depth import Depths
 from scgs_warp.training.depth_points import GHOST, depth_clouds, on_movers
 from scgs_warp.training.flow_points import InstantPoints
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.state import TrainState
-from scgs_warp.types import Gaussians
 
 COUNT = 24
 WALKS = [(walking_camera(0.3 * index / (COUNT - 1)), index / (COUNT - 1)) for index in range(COUNT)]
@@ -32,10 +32,8 @@ def place_at(time: float) -> torch.Tensor:
 def with_depth(data: Dataset, factor: float = 1.0) -> Dataset:
     frames = []
     for frame in data:
-        fields = [dataclasses.asdict(part) for part in (wall(), ball(place_at(frame.time)))]
-        both = {name: torch.cat([part[name] for part in fields]) for name in fields[0] if name != "sharpness"}
         with torch.no_grad():
-            image = render(Gaussians(**both), frame.camera)
+            image = render(scene(place_at(frame.time)), frame.camera)
         depth = torch.where(image.alpha > 0.9, factor * image.depth, 0.0)
         frames.append(dataclasses.replace(frame, depth=depth))
     return Dataset(frames, folder=data.folder, split="train", points=data.points, colors=data.colors)
@@ -78,10 +76,8 @@ def test_nothing_moves_where_nothing_does():
 
     frames = []
     for frame in filmed(WALKS, resting):
-        fields = [dataclasses.asdict(part) for part in (wall(), ball(resting(0.0)))]
-        both = {name: torch.cat([part[name] for part in fields]) for name in fields[0] if name != "sharpness"}
         with torch.no_grad():
-            frames.append(dataclasses.replace(frame, depth=render(Gaussians(**both), frame.camera).depth))
+            frames.append(dataclasses.replace(frame, depth=render(scene(resting(0.0)), frame.camera).depth))
     still = Dataset(frames, folder=Path("film"), split="train", points=wall().means[::10])
     assert clouds_of(still)[0] == []
 
@@ -145,3 +141,21 @@ def test_training_begins_with_the_cloud_of_the_middle_and_without_ghosts(film):
             still = state.gaussians.means[own].median(0).values
             errors.append(float(((moved - still) - (there - here)).norm() / (there - here).norm()))
     assert max(errors) < 0.3, "the points of the ball go where it goes"
+
+
+def test_a_few_useless_maps_do_not_replace_flow(film, monkeypatch):
+    """Without a cloud from maps, points come from flow as they would without any map."""
+    bare = filmed(WALKS, place_at)
+    blank = dataclasses.replace(bare[0], depth=torch.zeros(8, 8))
+    data = Dataset([blank, *bare[1:]], folder=film.folder, split="train", points=bare.points, colors=bare.colors)
+    normalisation = Normalisation.fit(data.cameras, data.points)
+    known = normalisation.apply(data.points).float()
+    asked = []
+    monkeypatch.setattr(module, "flow_points", lambda *given: asked.append(given))
+    found = points_on_movers(300, 10_000, known, data, normalisation, 0)
+    assert len(asked) == 1 and found.motion is None and bool(found.keep.all())
+
+
+def test_a_small_number_of_points_is_no_lack_of_them(film):
+    clouds, _ = clouds_of(film, 30)
+    assert len(clouds) >= 0.8 * COUNT and all(len(cloud.points) == 30 for cloud in clouds)

@@ -134,3 +134,8 @@ def test_what_rests_or_strays_is_not_gathered():
 def test_without_tracks_the_first_cloud_is_all():
     found, tracks = gather([cloud._replace(later=None) for cloud in clouds()], 3, 10, 0, 1)
     assert tracks is None and torch.equal(found.points, clouds()[3].points)
+
+
+def test_where_tracks_show_that_nothing_moves_there_is_nothing():
+    resting = [cloud._replace(points=clouds()[0].points, later=clouds()[0].points) for cloud in clouds()]
+    assert gather(resting, 4, 100, 0, 1) == (None, None)

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ...data.depth_maps import has_proportions
 from ...errors import UserError
 from .scene import MAX_NUMBER
 
@@ -25,12 +26,20 @@ class DepthWriter:
         self.unit = 0.0
         """Unit of the files, in that of the depth; 0 before the first map with known depth."""
 
-    def write(self, stem: str, depth: np.ndarray) -> str | None:
-        """Write a map [h, w], 0 or not finite where unknown; return its name in the data set, or None if all of it is
-        unknown."""
+    def write(self, stem: str, depth: np.ndarray, image: tuple[int, int]) -> str | None:
+        """Write a map [h, w], 0 or not finite where unknown.
+
+        Args:
+            image: (width, height) of its image.
+
+        Returns:
+            Name in the data set; None if all of the map is unknown, or it has other proportions than the image.
+        """
+        if not has_proportions((depth.shape[1], depth.shape[0]), image):
+            return None
         factor = min(1.0, LONGEST / max(depth.shape))
         size = max(1, round(depth.shape[1] * factor)), max(1, round(depth.shape[0] * factor))
-        taken = cv2.resize(known_depth(depth), size, interpolation=cv2.INTER_NEAREST)
+        taken = cv2.resize(known_depth(depth), size, interpolation=cv2.INTER_NEAREST_EXACT)
         if not (taken > 0).any():
             return None
         if not self.unit:

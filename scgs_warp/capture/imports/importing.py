@@ -126,7 +126,7 @@ def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> 
                 )
             if frame.depth is not None:
                 depth = checked_depth(frame.depth(), f"frame {index}")
-                maps.append(depths.write(Path(name).stem, depth))
+                maps.append(depths.write(Path(name).stem, depth, sizes[-1]))
                 if index in chosen:
                     clouds.append(_cloud(frame, depth, image, share))
             else:

@@ -127,14 +127,15 @@ def test_depth_of_any_scale_and_size_is_written(tmp_path):
     for scale in (1e-7, 1.0, 1e7):
         writer = DepthWriter(tmp_path / f"{scale}")
         (tmp_path / f"{scale}").mkdir()
-        assert writer.write("none", np.zeros((4, 4))) is None
+        assert writer.write("none", np.zeros((4, 4)), (40, 40)) is None
         depth = scale * np.linspace(1.0, 3.0, 1024 * 768).reshape(768, 1024)
-        depth[0] = np.nan
-        name = writer.write("a", depth)
+        depth[:2] = np.nan
+        assert writer.write("other", depth, (1024, 700)) is None, "other proportions"
+        name = writer.write("a", depth, (1024, 768))
         assert name == "depths/a.npy"
         found = np.load(tmp_path / f"{scale}" / name)
         assert found.shape == (384, 512) and found.dtype == np.float16
-        np.testing.assert_allclose(found[1:].astype(np.float64) * writer.unit, depth[2::2, ::2], rtol=2e-3)
+        np.testing.assert_allclose(found[1:].astype(np.float64) * writer.unit, depth[3::2, 1::2], rtol=2e-3)
         assert not found[0].any()
 
 
