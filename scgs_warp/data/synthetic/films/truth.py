@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ....storage.numpy_files import read_npy
 from ....types import Camera
 from ...points import write_points
 from ..renderer import GROUND_TRUTH_TIMES, SurfacePoints, write_png
@@ -139,7 +140,7 @@ def _depth_of(folder: Path, take: Take, index: int, request: FilmRequest) -> str
     factor that changes smoothly over the image and from frame to frame."""
     if request.depth_error == 0.0:
         return map_of(take, index)
-    depth = np.load(folder / map_of(take, index))["depth"]
+    depth = read_npy(folder / map_of(take, index), "depth")
     rng = np.random.default_rng([request.seed, 8, index])
     bumps = cv2.resize(rng.normal(size=BUMPS), depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
     factor = np.exp(request.depth_error * (bumps + 0.5 * rng.normal()))

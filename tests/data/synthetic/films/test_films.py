@@ -84,7 +84,7 @@ def test_depth_maps_that_are_wrong_are_wrong_by_as_much_as_asked(tmp_path):
         assert found is not None
         errors.append(np.log(found.numpy() / cv2.GaussianBlur(true, (0, 0), 2.0)))
     spread = float(np.std(errors))
-    assert 0.025 < spread < 0.07 and float(np.abs(np.diff(errors, axis=2)).max()) < 0.02, "smooth in the image"
+    assert 0.025 < spread < 0.07 and float(np.abs(np.diff(errors, axis=2)).max()) < 0.04, "smooth in the image"
     for wrong in (replace(SMALL, depth_error=0.05, maps=False), replace(SMALL, depth_error=-1.0)):
         with pytest.raises(UserError, match="--depth-error"):
             plan_film(tmp_path / "other", wrong)
