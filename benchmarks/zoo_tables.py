@@ -123,7 +123,6 @@ def depth(source: Source) -> str:
     """Write what depth maps do for a figure that walks before one camera."""
     rows = {
         "off": "maps are ignored (`loss.depth=0`, `flow_points=0`)",
-        "points": "true maps, before the first step only (`loss.depth=0`)",
         "true": "true maps",
         "wrong": "maps that are 4 % wrong",
     }
