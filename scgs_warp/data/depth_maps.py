@@ -47,7 +47,7 @@ def read_depth_map(file: DepthFile, size: tuple[int, int], lens: Lens | None = N
     """
     path = file.path
     values = _values(path)
-    if values.ndim == 3 and (values.shape[2] == 1 or (values == values[..., :1]).all()):
+    if values.ndim == 3 and values.size and (values.shape[2] == 1 or (values == values[..., :1]).all()):
         values = values[..., 0]
     if values.ndim != 2 or not values.size or values.dtype == np.uint8:
         raise UserError(f"{path}: is no depth map of one number per pixel; {REMEDY}")

@@ -94,6 +94,7 @@ def test_maps_of_a_distorted_image_are_undistorted_with_it(tmp_path):
         ("a.npy", np.arange(2400.0).reshape(2, 30, 40), "no depth map"),
         ("a.png", np.full((30, 40), 90, np.uint8), "no depth map"),
         ("a.npy", np.zeros((0, 40)), "no depth map"),
+        ("a.npy", np.zeros((30, 40, 0)), "no depth map"),
         ("a.npy", np.zeros(40), "no depth map"),
     ],
 )
