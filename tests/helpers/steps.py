@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
-from scgs_warp.training.loop import PlainSteps
+from scgs_warp.config.presets import TrainConfig
+from scgs_warp.data.dataset import Dataset
+from scgs_warp.runtime import environment
+from scgs_warp.training.loop import PlainSteps, fit
 from scgs_warp.training.recorded_step import RecordedSteps
 from scgs_warp.training.state import TrainState
 
@@ -21,3 +26,33 @@ def before_each_step(monkeypatch: pytest.MonkeyPatch, act: Callable[[TrainState]
             return [*results, *take(self)]
 
         monkeypatch.setattr(kind, "take", acting)
+
+
+class Crash(Exception):
+    pass
+
+
+def check_same_bits(
+    config: TrainConfig, data: Dataset, folder: Path, device: str, monkeypatch: pytest.MonkeyPatch, step: int
+) -> Path:
+    """Assert that a run gives the same bits on two, one and three threads, and if it crashes before a step and is
+    resumed. Return its checkpoint."""
+    results = {}
+    for name, threads in (("two", 2), ("one", 1), ("three", 3)):
+        environment.configure(threads)
+        fit(config, data, output=folder / name, device=device)
+        results[name] = (folder / name / "checkpoint.safetensors").read_bytes()
+    assert results["one"] == results["two"] == results["three"]
+
+    def crash(state: TrainState) -> None:
+        if state.step == step:
+            raise Crash
+
+    saving = dataclasses.replace(config, checkpoint_seconds=0.0)
+    with monkeypatch.context() as patched:
+        before_each_step(patched, crash)
+        with pytest.raises(Crash):
+            fit(saving, data, output=folder / "crashed", device=device)
+    fit(saving, data, output=folder / "crashed", device=device, resume=True)
+    assert (folder / "crashed" / "checkpoint.safetensors").read_bytes() == results["two"]
+    return folder / "two" / "checkpoint.safetensors"

@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file
 
 from helpers.filmed_blobs import SIZE, film, film_camera, on_device
-from helpers.steps import before_each_step
+from helpers.steps import check_same_bits
 from helpers.tiny import blobs, tiny_config
 from reference.compositing import composite
 from reference.projection import project
@@ -20,7 +20,6 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import UserError
 from scgs_warp.geometry.cameras import scaled_camera
 from scgs_warp.rendering.render import render
-from scgs_warp.runtime import environment
 from scgs_warp.training import depth as module
 from scgs_warp.training.depth import Depths, SeenDepth, depth_applies, depth_term, depth_weight, seen_depth
 from scgs_warp.training.loop import fit
@@ -199,37 +198,18 @@ def test_the_weight_fades_and_skips_steps():
     assert not any(depth_applies(step, off) for step in range(0, config.main_steps, 100))
 
 
-class Crash(Exception):
-    pass
-
-
 def test_the_same_bits_on_any_number_of_threads_and_after_a_crash(tmp_path, device, all_threads, monkeypatch):
     """40 steps of a film with depth in the loss; a crash in the middle; and another result than without depth."""
-    data, results = with_depth(film(6, 64), 64), {}
+    data = with_depth(film(6, 64), 64)
     config = tiny_config(40, loss={"depth": 1.0}, pretrain={"with_points": True}, freeze=2)
-    for name, threads in (("two", 2), ("one", 1), ("three", 3)):
-        environment.configure(threads)
-        fit(config, data, output=tmp_path / name, device=device)
-        results[name] = (tmp_path / name / "checkpoint.safetensors").read_bytes()
-    assert results["one"] == results["two"] == results["three"]
-
-    def crash(state):
-        if state.step == 23:
-            raise Crash
-
-    saving = dataclasses.replace(config, checkpoint_seconds=0.0)
-    with monkeypatch.context() as patched:
-        before_each_step(patched, crash)
-        with pytest.raises(Crash):
-            fit(saving, data, output=tmp_path / "crashed", device=device)
-    fit(saving, data, output=tmp_path / "crashed", device=device, resume=True)
-    assert (tmp_path / "crashed" / "checkpoint.safetensors").read_bytes() == results["two"]
+    checkpoint = check_same_bits(config, data, tmp_path, device, monkeypatch, 23)
 
     bare, off = film(6, 64), dataclasses.replace(config, loss=dataclasses.replace(config.loss, depth=0.0))
     fit(config, bare, output=tmp_path / "without", device=device)
     fit(off, data, output=tmp_path / "off", device=device)
-    one, two, three = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("without", "off", "two"))
-    means = "gaussians/means" if "gaussians/means" in one else next(name for name in one if name.endswith("means"))
+    files = [tmp_path / name / "checkpoint.safetensors" for name in ("without", "off")]
+    one, two, three = (load_file(file) for file in (*files, checkpoint))
+    means = next(name for name in one if name.endswith("means"))
     assert torch.equal(one[means], two[means]) and not torch.equal(one[means], three[means])
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from helpers.filmed_blobs import SIZE, film, film_camera, on_device
-from helpers.steps import before_each_step
+from helpers.steps import check_same_bits
 from helpers.tiny import blobs, tiny_config, tiny_dataset
 from reference.compositing import composite
 from reference.projection import project
@@ -16,7 +16,6 @@ from reference.render import tile_lists
 from scgs_warp.config.presets import preset
 from scgs_warp.geometry.cameras import scaled_camera
 from scgs_warp.rendering.render import render
-from scgs_warp.runtime import environment
 from scgs_warp.training import flow as module
 from scgs_warp.training.flow import (
     SPANS,
@@ -205,32 +204,12 @@ def test_films_have_flow_and_cameras_that_jump_have_none():
     assert resolve_auto(config, tiny_dataset(12, SIZE)).loss.flow == 0.0
 
 
-class Crash(Exception):
-    pass
-
-
 def test_the_same_bits_on_any_number_of_threads_and_after_a_crash(tmp_path, device, all_threads, monkeypatch):
     """40 steps of a film with flow in the loss; a crash in the middle; and another result than without flow."""
-    data, results = film(6, 64), {}
+    data = film(6, 64)
     config = tiny_config(40, loss={"flow": 1.0}, pretrain={"with_points": True}, freeze=2)
-    for name, threads in (("two", 2), ("one", 1), ("three", 3)):
-        environment.configure(threads)
-        fit(config, data, output=tmp_path / name, device=device)
-        results[name] = (tmp_path / name / "checkpoint.safetensors").read_bytes()
-    assert results["one"] == results["two"] == results["three"]
-
-    def crash(state):
-        if state.step == 23:
-            raise Crash
-
-    saving = dataclasses.replace(config, checkpoint_seconds=0.0)
-    with monkeypatch.context() as patched:
-        before_each_step(patched, crash)
-        with pytest.raises(Crash):
-            fit(saving, data, output=tmp_path / "crashed", device=device)
-    fit(saving, data, output=tmp_path / "crashed", device=device, resume=True)
-    assert (tmp_path / "crashed" / "checkpoint.safetensors").read_bytes() == results["two"]
+    checkpoint = check_same_bits(config, data, tmp_path, device, monkeypatch, 23)
 
     without = dataclasses.replace(config, loss=dataclasses.replace(config.loss, flow=0.0))
     fit(without, data, output=tmp_path / "without", device=device)
-    assert (tmp_path / "without" / "checkpoint.safetensors").read_bytes() != results["two"]
+    assert (tmp_path / "without" / "checkpoint.safetensors").read_bytes() != checkpoint.read_bytes()
