@@ -41,6 +41,13 @@ SLOT_BYTES = 8 + 64
 """Number of bytes that a pair takes in addition to the lists of an image without gradients."""
 
 
+MOST_FAILURES = 3
+"""Number of failed recordings after which no other is tried."""
+RETRY_AFTER = 500
+"""Number of steps from a failed recording to the next: the cause may pass, such as another program that compiles the
+same kernels or fills the memory."""
+
+
 class _Step(NamedTuple):
     """A step that can be repeated."""
 
@@ -65,7 +72,7 @@ class RecordedSteps:
     """Steps of one run whose results arrive one step late.
 
     Attributes: ``recordings`` (number of graphs recorded), ``repeats`` (number of steps repeated for lack of room),
-    ``failure`` (error of a failed recording, else None).
+    ``failure`` (error of the last recording if it failed, else None).
     """
 
     def __init__(self, state: TrainState, frames: Frames, tell: Callable[[str], None] = lambda text: None) -> None:
@@ -76,6 +83,7 @@ class RecordedSteps:
         self._state, self._frames, self._tell = state, frames, tell
         self.capacity, self.recordings, self.repeats = 0, 0, 0
         self.failure: str | None = None
+        self._failures, self._records_from = 0, 0
         self._most_pairs = 0
         self._memory = GraphMemory()
         self._pending: deque[_Submitted] = deque()
@@ -152,12 +160,14 @@ class RecordedSteps:
 
     def _submit(self, update: RecordedUpdate, step: _Step) -> None:
         before = update.recordings
-        record = self.failure is None
+        record = self._failures < MOST_FAILURES and step.number >= self._records_from
+        if record:
+            update.failure = None
         report, picture, kind = update.take(step.view, step.numbers, step.key, self.capacity, record)
-        self.recordings += update.recordings - before
-        if record and update.failure is not None:
-            self.failure = update.failure
-            self._tell(f"steps are not recorded as a CUDA graph, so each takes longer: {self.failure.splitlines()[0]}")
+        if update.recordings > before:
+            self.recordings, self.failure = self.recordings + update.recordings - before, None
+        elif record and update.failure is not None:
+            self._note_failure(update.failure, step.number)
         done, device = None, self._state.device
         if device.type == "cuda":
             host = torch.empty(report.shape, dtype=report.dtype, pin_memory=True)
@@ -167,6 +177,14 @@ class RecordedSteps:
         for group in kind.updated:
             group.steps += 1
         self._pending.append(_Submitted(step, kind, picture, report, done))
+
+    def _note_failure(self, failure: str, number: int) -> None:
+        self.failure, self._records_from = failure, number + RETRY_AFTER
+        self._failures += 1
+        if self._failures in (1, MOST_FAILURES):
+            again = f"; next attempt in {RETRY_AFTER} steps" if self._failures < MOST_FAILURES else ""
+            reason = failure.splitlines()[0]
+            self._tell(f"steps are not recorded as a CUDA graph, so each takes longer: {reason}{again}")
 
     def _oldest(self) -> list[StepResult]:
         """Wait for the oldest step and return its result. If it lacked room, repeat it and all later ones instead."""

@@ -324,18 +324,41 @@ def test_images_on_the_device_are_not_read_again(device, monkeypatch):
     assert once >= 6 and (len(reads) == 30 if device == "cpu" else len(reads) <= 2 * once), reads
 
 
-def test_a_failed_recording_is_told_once(device, monkeypatch):
+def recordings_that_fail(device, monkeypatch, failing: int, steps_taken: int):
+    """Take steps of which the first ``failing`` recordings fail; return what took them, the attempts, and the lines."""
+    record, attempts, said = RecordedUpdate._record, [], []
+    state, frames = begin(device)
+
     def refuse(self, key, body):
+        attempts.append(state.step)
+        if len(attempts) > failing:
+            return record(self, key, body)
         self.failure = "no capture\nof this"
+        self.forget_recordings()
 
     monkeypatch.setattr(RecordedUpdate, "_record", refuse)
-    state, frames = begin(device)
-    said: list[str] = []
+    monkeypatch.setattr(recorded_step, "RETRY_AFTER", 5)
     steps = RecordedSteps(state, frames, said.append)
-    for _ in range(6):
+    for _ in range(steps_taken):
         steps.take()
         state.step += 1
-    assert steps.failure is not None and len(said) == 1 and "no capture" in said[0] and "\n" not in said[0]
+    steps.settle()
+    return steps, attempts, said
+
+
+def test_a_failed_recording_is_tried_again(device, monkeypatch):
+    """The cause may have passed: one failure must not slow the whole run."""
+    steps, attempts, said = recordings_that_fail(device, monkeypatch, failing=1, steps_taken=20)
+    assert steps.failure is None and steps.recordings >= 1
+    assert attempts[1] - attempts[0] >= 5
+    assert len(said) == 1 and "no capture; next attempt in 5 steps" in said[0] and "\n" not in said[0]
+
+
+def test_recordings_that_keep_failing_are_given_up(device, monkeypatch):
+    steps, attempts, said = recordings_that_fail(device, monkeypatch, failing=100, steps_taken=60)
+    assert steps.failure is not None and steps.recordings == 0
+    assert len(attempts) == recorded_step.MOST_FAILURES
+    assert len(said) == 2 and "next attempt" in said[0] and said[1].endswith("no capture")
 
 
 def test_nothing_is_held_after_a_release(device):
