@@ -134,6 +134,7 @@ OWN_ROWS = (
     ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
     ("best-40000", "**`best`** (40,000 steps, one CPU core)"),
     ("best-40000-seed-1", "`best` with `--seed 1`"),
+    ("best-h200", "`best` on a GPU (three of the scenes beside six other runs)"),
     ("best-today", "`best` as it was with 80,000 steps (one CPU core)"),
     ("best", "`best` as it was with 80,000 steps (one CPU core)"),
     ("best-less-pruning", "`best` with `densify.min_contribution=0.02`"),

@@ -7,7 +7,7 @@ the wrong distance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -24,7 +24,7 @@ from ..ops.compositing import composite
 from ..ops.projection import project
 from ..runtime.environment import one_piece
 from ..runtime.progress import progress
-from ..types import Camera, Gaussians
+from ..types import Camera, Gaussians, Splats, Tiles
 from .flow import OPAQUE, flow_size
 
 EVERY = 2
@@ -123,7 +123,7 @@ def seen_depth(depth: np.ndarray, camera: Camera) -> SeenDepth:
     return SeenDepth(scaled_camera(camera, *size), torch.from_numpy(inverse.astype(np.float32)))
 
 
-def depth_term(posed: Gaussians, seen: SeenDepth) -> Tensor:
+def depth_term(posed: Gaussians, seen: SeenDepth, binned: Callable[[Splats], Tiles] | None = None) -> Tensor:
     """Return the mean relative error of the inverse depths of what covers the pixels whose depth is known.
 
     A pixel's error is the root of the mean square over its splats, weighted as their colours are.
@@ -131,6 +131,7 @@ def depth_term(posed: Gaussians, seen: SeenDepth) -> Tensor:
     Args:
         posed: N Gaussians at the time of the frame.
         seen: depth, on their device.
+        binned: as in ``render.draw``.
 
     Returns:
         Scalar; gradients flow to all that places and covers.
@@ -144,7 +145,7 @@ def depth_term(posed: Gaussians, seen: SeenDepth) -> Tensor:
         typical = (seen.inverse.square().sum() / seen.inverse.sum().clamp_min(1e-12)).clamp_min(1e-6)
         inverse = 1.0 / (splats.depths.clamp_min(NEAREST) * typical)
         channels = torch.stack([inverse, inverse.square()], 1)
-    image, alpha = composite(splats, channels, bin_splats(splats))
+    image, alpha = composite(splats, channels, (binned or bin_splats)(splats))
     with one_piece():
         here = torch.where(known, seen.inverse / typical, 1.0)
         squares = (image[1] - 2.0 * here * image[0] + here.square() * alpha).clamp_min(0.0)

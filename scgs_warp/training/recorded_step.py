@@ -6,8 +6,8 @@ fixed capacity: a step that needs more changes nothing, nor does its successor, 
 Steps that consist of the same operations are recorded as a CUDA graph and replayed.
 
 The result is that of ``step.training_step``, which takes the steps that cannot be taken this way: those of several
-views, of refined cameras, of frames with affine colours, with debug checks, or with lists beyond the memory. On a CPU
-the same operations run one by one, which is how they are tested.
+views, of refined cameras, of frames with affine colours, that compare flow, with debug checks, or with lists beyond the
+memory. On a CPU the same operations run one by one, which is how they are tested.
 """
 
 from __future__ import annotations
@@ -126,9 +126,7 @@ class RecordedSteps:
         state = self._state
         ready = state.motion.takes_time_tensor and not state.refines_cameras and not len(state.exposure)
         if state.stage == "main":
-            step, config = state.stage_step, state.config
-            compares_depth = depth_applies(step, config) and bool(self._frames.frames.with_depth)
-            ready = ready and not flow_applies(step, config) and not compares_depth
+            ready = ready and not flow_applies(state.stage_step, state.config)
         if not ready or debug.enabled():
             return False
         if self.capacity > 0 and self._update is not None and self._update.holds():
@@ -137,12 +135,18 @@ class RecordedSteps:
         wanted = max(seen or PAIRS_PER_GAUSSIAN * len(state.gaussians), 1)
         return self.capacity >= wanted or self._make_room(wanted)
 
+    def _compares_depth(self) -> bool:
+        state = self._state
+        applies = state.stage == "main" and depth_applies(state.stage_step, state.config)
+        return applies and bool(self._frames.frames.with_depth)
+
     def _make_room(self, pairs: int) -> bool:
         """Set the capacity for ``pairs``; return False if it exceeds the index range or the memory."""
         capacity = min(-(-max(pairs, 1) // CAPACITY_STEP) * CAPACITY_STEP, MAX_ROOM)
         largest = max((max(view.width, view.height) for view in self._frames.views), default=1)
         tiles = (-(-largest // TILE_SIZE)) ** 2
         need = bytes_within(capacity, len(self._state.gaussians), tiles) + SLOT_BYTES * capacity
+        need *= 2 if self._compares_depth() else 1  # lists of their own, of a smaller image
         if pairs > capacity or not memory.fits(need, self._state.device):
             return False
         self.capacity = capacity

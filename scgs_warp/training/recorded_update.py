@@ -16,8 +16,9 @@ from ..ops.binning_cuda import bin_within
 from ..ops.step_outcome import Moments, StepOutcome, UpdateTable
 from ..optim import ADAM_BETAS, ADAM_EPS, Group
 from ..runtime.cuda_graph import CudaGraph, GraphMemory, Steps
-from ..runtime.device_copies import pinned
+from ..runtime.device_copies import pinned, sent
 from ..types import Camera, Splats, Tiles
+from .depth import SeenDepth, depth_weight
 from .silhouettes import SilhouetteSample
 from .state import TrainState
 from .step import least_logit, motion_frozen
@@ -30,8 +31,9 @@ MOST_RECORDINGS = 8
 """Largest number of recordings at a time. Images of many sizes have as many kinds of steps."""
 MOST_TIMES = 3
 """Largest number of instants of a step: the view's and two of the regulariser."""
-CAMERA, BACKGROUND, WEIGHT, TIMES = 25, 28, 29, 29 + MOST_TIMES
-"""Index behind the last number of the camera, the background, the weight and the times; the learning rates follow."""
+CAMERA, BACKGROUND, WEIGHT, TIMES, DEPTH = 25, 28, 29, 29 + MOST_TIMES, 39 + MOST_TIMES
+"""Index behind the last number of the camera, the background, the weight, the times, and the depth map's weight and
+intrinsics; the learning rates follow."""
 
 
 class Kind(NamedTuple):
@@ -70,7 +72,7 @@ class RecordedUpdate:
         self._tensors = self._present()
         counts = torch.tensor([group.steps for group in self._groups], dtype=torch.int32)
         self._counts = counts.to(self._device)
-        self._inputs = torch.zeros(TIMES + len(self._groups), dtype=torch.float64, device=self._device)
+        self._inputs = torch.zeros(DEPTH + len(self._groups), dtype=torch.float64, device=self._device)
         self._gradients: dict[int, Tensor] = {}
         self._short = False
         """True if there was too little memory for a recording."""
@@ -103,6 +105,10 @@ class RecordedUpdate:
         camera, times = view.camera, view.plan.times
         cells = [*camera.viewmat.flatten().tolist(), *camera.K.flatten().tolist(), *view.background.tolist()]
         cells += [view.plan.weight, *times, *[0.0] * (MOST_TIMES - len(times))]
+        step, depth = self._state.stage_step, view.depth
+        cells += [0.0] * 10 if depth is None else [
+            depth_weight(step, self._state.config), *depth.camera.K.flatten().tolist()
+        ]  # fmt: skip
         return torch.tensor([*cells, *(group.rate for group in self._groups)], dtype=torch.float64)
 
     def take(self, view: View, numbers: Tensor, key: Hashable, room: int, record: bool) -> tuple[Tensor, Tensor, Kind]:
@@ -118,6 +124,9 @@ class RecordedUpdate:
             may overwrite report and picture.
         """
         self._inputs.copy_(pinned(numbers, self._device), non_blocking=True)
+        if view.depth is not None:
+            depth = view.depth._replace(inverse=sent(view.depth.inverse, self._device))
+            view = view._replace(depth=depth)
         recorded = self._recorded.get(key)
         due = self._seen[key] >= RECORD_AFTER and len(self._recorded) < MOST_RECORDINGS and self.failure is None
         self._seen[key] += 1
@@ -137,16 +146,18 @@ class RecordedUpdate:
 
     def _in_buffers(self, view: View) -> View:
         """Copy the view's images to fixed addresses, and return the view with these."""
-        shapes = view.truth.shape, view.mask is None, None if view.sample is None else view.sample.distances.shape
+        shapes = tuple(image.shape for image in _images(view)), view.mask is None, view.depth is None
         kept = self._buffers.get(shapes)
         if kept is None:
             mask = None if view.mask is None else view.mask.clone()
             sample = None if view.sample is None else SilhouetteSample(*(part.clone() for part in view.sample))
-            kept = self._buffers[shapes] = view._replace(truth=view.truth.clone(), mask=mask, sample=sample)
+            depth = None if view.depth is None else view.depth._replace(inverse=view.depth.inverse.clone())
+            kept = view._replace(truth=view.truth.clone(), mask=mask, sample=sample, depth=depth)
+            self._buffers[shapes] = kept
         else:
             for to, values in zip(_images(kept), _images(view)):
                 to.copy_(values)
-        return view._replace(truth=kept.truth, mask=kept.mask, sample=kept.sample)
+        return view._replace(truth=kept.truth, mask=kept.mask, sample=kept.sample, depth=kept.depth)
 
     def _record(self, key: Hashable, body: Callable[[], Any]) -> CudaGraph | Steps | None:
         if self._device.type != "cuda":
@@ -184,7 +195,8 @@ class RecordedUpdate:
         # 1. Compare. Statistics obey the outcome, which is known before the backward pass.
         stats = replace(state.stats, outcome=self.outcome.value)
         compared = compare(state, view, self._on_device(view), stats, binned)
-        self.outcome.judge_loss(totals[0], room, compared.loss, compared.regulariser)
+        most = totals[0] if len(totals) == 1 else torch.stack(totals).amax(0)
+        self.outcome.judge_loss(most, room, compared.loss, compared.regulariser)
         parameters = [group.parameter for group in self._groups]
         gradients = torch.autograd.grad(compared.total, parameters, allow_unused=True)
 
@@ -194,20 +206,25 @@ class RecordedUpdate:
             kind = self._kinds[key] = self._kind(gradients)
         torch._foreach_copy_(kind.gradients, [gradients[index] for index in kind.received])  # pyright: ignore[reportPrivateImportUsage]
         kind.table.judge_gradients(self.outcome)
-        kind.table.adam_step(self.outcome, self._inputs[TIMES:], self._counts, ADAM_BETAS, ADAM_EPS)
+        kind.table.adam_step(self.outcome, self._inputs[DEPTH:], self._counts, ADAM_BETAS, ADAM_EPS)
         least = least_logit(state)
         if least is not None:
             logits = state.gaussians.opacity_logits.data
             logits.copy_(torch.where(self.outcome.value == STEP_FINE, logits.clamp(min=least), logits))
         terms = compared.loss, compared.l1, compared.ssim, compared.regulariser
-        return self.outcome.report(totals[0], *terms), compared.picture.detach()
+        return self.outcome.report(most, *terms), compared.picture.detach()
 
     def _on_device(self, view: View) -> Numbers:
-        cells = self._inputs[:TIMES].float()
+        cells = self._inputs[:DEPTH].float()
         viewmat, K = cells[:16].view(4, 4), cells[16:CAMERA].view(3, 3)
         camera = Camera(viewmat, K, view.camera.width, view.camera.height)
         times = cells[WEIGHT : WEIGHT + len(view.plan.times)]
-        return Numbers(camera, cells[CAMERA:BACKGROUND], times, cells[BACKGROUND])
+        numbers = Numbers(camera, cells[CAMERA:BACKGROUND], times, cells[BACKGROUND])
+        if view.depth is None:
+            return numbers
+        reduced = view.depth.camera
+        seen = Camera(viewmat, cells[TIMES + 1 : DEPTH].view(3, 3), reduced.width, reduced.height)
+        return numbers._replace(depth=SeenDepth(seen, view.depth.inverse), depth_weight=cells[TIMES])
 
     def _kind(self, gradients: tuple[Tensor | None, ...]) -> Kind:
         state = self._state
@@ -230,5 +247,6 @@ class RecordedUpdate:
 
 
 def _images(view: View) -> list[Tensor]:
-    images = [view.truth, view.mask, *(() if view.sample is None else view.sample)]
+    depth = None if view.depth is None else view.depth.inverse
+    images = [view.truth, view.mask, *(() if view.sample is None else view.sample), depth]
     return [image for image in images if image is not None]

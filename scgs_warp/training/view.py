@@ -76,6 +76,7 @@ class Numbers(NamedTuple):
     """None: the step compares no flow."""
     depth: SeenDepth | None = None
     """None: the step compares no depth."""
+    depth_weight: float | Tensor = 0.0
 
 
 class Compared(NamedTuple):
@@ -166,7 +167,7 @@ def compare(
         moved = numbers.flow.weight * flow_term(posed, there, numbers.flow)
         regulariser = moved if regulariser is None else regulariser + moved
     if numbers.depth is not None:
-        placed = depth_weight(state.stage_step, config) * depth_term(posed, numbers.depth)
+        placed = numbers.depth_weight * depth_term(posed, numbers.depth, binned)
         regulariser = placed if regulariser is None else regulariser + placed
     loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
     if form.pooled:
@@ -178,8 +179,9 @@ def compare(
 def form_of(view: View, *others: Hashable) -> Hashable:
     """Return a key that is equal for views whose steps consist of the same operations on tensors of the same shapes."""
     distances = None if view.sample is None else view.sample.distances.shape
+    depth = None if view.depth is None else view.depth.inverse.shape
     plan = view.plan.phase, len(view.plan.times), view.plan.weight != 0.0
-    return view.form, plan, view.truth.shape, view.mask is None, distances, *others
+    return view.form, plan, view.truth.shape, view.mask is None, distances, depth, *others
 
 
 def seeks_silhouettes(state: TrainState) -> bool:

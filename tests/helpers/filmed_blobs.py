@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import torch
@@ -33,6 +34,17 @@ def film(count: int = 12, size: int = SIZE) -> Dataset:
             image = render(blobs(time), film_camera(time, size), torch.zeros(3))
         frames.append(Frame(film_camera(time, size), time, image.rgb.clamp(0, 1), None, None, f"{index:03d}"))
     return Dataset(frames, folder=Path("film"), split="train")
+
+
+def with_depth(data: Dataset, size: int = SIZE, share: float = 1.0) -> Dataset:
+    """Give the leading frames of such a film the depth of what covers their pixels."""
+    frames = []
+    for index, frame in enumerate(data):
+        with torch.no_grad():
+            image = render(blobs(frame.time), film_camera(frame.time, size), torch.zeros(3))
+        depth = torch.where(image.alpha > 0.9, image.depth, 0.0)
+        frames.append(dataclasses.replace(frame, depth=depth) if index < share * len(data) else frame)
+    return Dataset(frames, folder=data.folder, split="train")
 
 
 def on_device(gaussians: Gaussians, device: str) -> Gaussians:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from helpers.filmed_blobs import SIZE, film, film_camera, on_device
+from helpers.filmed_blobs import SIZE, film, film_camera, on_device, with_depth
 from helpers.steps import check_same_bits
 from helpers.tiny import blobs, tiny_config
 from reference.compositing import composite
@@ -26,17 +26,6 @@ from scgs_warp.training.loop import fit
 from scgs_warp.types import Gaussians, Splats
 
 SMOOTH = 1e-3
-
-
-def with_depth(data: Dataset, size: int = SIZE, share: float = 1.0) -> Dataset:
-    """The film of ``test_flow``, whose leading frames have the depth of what covers their pixels."""
-    frames = []
-    for index, frame in enumerate(data):
-        with torch.no_grad():
-            image = render(blobs(frame.time), film_camera(frame.time, size), torch.zeros(3))
-        depth = torch.where(image.alpha > 0.9, image.depth, 0.0)
-        frames.append(dataclasses.replace(frame, depth=depth) if index < share * len(data) else frame)
-    return Dataset(frames, folder=data.folder, split="train")
 
 
 def slow_term(posed: Gaussians, leaves: list[torch.Tensor], seen: SeenDepth) -> torch.Tensor:

@@ -12,12 +12,14 @@ from typing import Any
 import pytest
 import torch
 
+from helpers.filmed_blobs import film, with_depth
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp import optim
+from scgs_warp.data.dataset import Dataset
 from scgs_warp.motion import rigidity
 from scgs_warp.ops.adam import adam_step
 from scgs_warp.ops.step_outcome import UpdateTable
-from scgs_warp.training import recorded_step, recorded_update
+from scgs_warp.training import depth, recorded_step, recorded_update
 from scgs_warp.training.density_control import control_density, density_due
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.recorded_step import RecordedSteps
@@ -41,8 +43,8 @@ def _portable_adam(monkeypatch):
     monkeypatch.setattr(optim, "adam_step", partial(adam_step, form="plain"))
 
 
-def begin(device: str, steps: int = 60, **changes: Any) -> tuple[TrainState, Frames]:
-    data = tiny_dataset(6)
+def begin(device: str, steps: int = 60, data: Dataset | None = None, **changes: Any) -> tuple[TrainState, Frames]:
+    data = tiny_dataset(6) if data is None else data
     state = TrainState.begin(tiny_config(steps, **changes), data, device)
     return state, Frames(data, state.normalisation, state.config, device)
 
@@ -117,6 +119,25 @@ def test_same_bits_through_both_stages_and_densification(model, device):
     steps = 200 if model == "control-points" else 60
     taker, _, state = compare(device, steps, **MODELS[model])
     assert taker.recordings >= 3 and len(state.gaussians) > 0
+
+
+def test_steps_that_compare_depth_are_recorded(device):
+    """Two kinds of steps alternate; half of the frames have maps, which differ, and the weight fades."""
+    data = with_depth(film(6), share=0.5)
+    taker, found, state = compare(device, 120, data=data, loss={"depth": 0.5, "depth_until": 0.9})
+    assert taker.recordings >= 3 and taker.repeats <= 4
+    main = [result for result in found if result.step >= state.config.pretrain_steps + state.config.freeze]
+    assert any(result.regulariser > 0 for result in main) and any(result.regulariser == 0 for result in main)
+
+
+def test_lists_of_the_depth_count_as_room(device, monkeypatch):
+    """The map's image may have more pairs than the view's; steps without room for them are repeated."""
+    monkeypatch.setattr(depth, "flow_size", lambda width, height: (3 * width, 3 * height))
+    monkeypatch.setattr(recorded_step, "CAPACITY_STEP", 64)
+    monkeypatch.setattr(recorded_step, "PAIRS_PER_GAUSSIAN", 1)
+    model = {"pretrain": {"steps": 0}, "motion": {"model": "static"}}
+    taker, _, _ = compare(device, 40, data=with_depth(film(6, 48)), loss={"depth": 0.5}, **model)
+    assert taker.repeats > 0
 
 
 def test_the_same_losses_where_gradients_are_added_in_any_order(device):
