@@ -154,6 +154,8 @@ def _import_scene(options: Options, path: Path) -> str:
     made = import_scene(path, options.output)
     points = f"{made.points:,} points from its depth" if made.points else "no depth that could give points"
     print(f"{options.output}: {made.frames} frames of {made.program}; {points}")
+    if made.note is not None:
+        print(f"note: {made.note}")
     if made.pose_error is None or made.pose_error <= TOLERATED:
         return ""
     print(f"note: the poses differ from the images by {made.pose_error:.1f} pixels; training should correct them")

@@ -1,4 +1,4 @@
-"""Depth maps of frames, as nerfstudio's layout names them: ``depth_file_path`` of a frame, a PNG, ``.npy``,
+"""Depth maps of frames, as nerfstudio's layout names them: ``depth_file_path`` of a frame, a PNG, ``.npy``, ``.exr``,
 or ``.npz`` with an array ``depth``.
 
 Values along the camera's z are multiplied by ``depth_unit_scale_factor`` (0.001 if it is absent: 16-bit PNG in
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
+from ..storage.exr_files import read_exr
 from ..storage.numpy_files import read_npy
 from .images import decode
 from .lens import Lens, undistortion_maps
@@ -76,6 +77,8 @@ def _values(path: Path) -> np.ndarray:
         raise UserError(f"{path}: no such depth map, though a frame names it; restore it or remove depth_file_path")
     if path.suffix.lower() in (".npy", ".npz"):
         return read_npy(path, "depth" if path.suffix.lower() == ".npz" else None)
+    if path.suffix.lower() == ".exr":
+        return read_exr(path)
     try:
         return decode(path)
     except UserError:

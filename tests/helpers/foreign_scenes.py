@@ -135,6 +135,18 @@ def write_polycam(folder: Path) -> Path:
     return folder
 
 
+def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
+    """Write an OpenEXR file, if the package is there."""
+    try:
+        import OpenEXR
+    except ImportError:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+
+
 def write_record3d(folder: Path) -> Path:
     made = wall()
     poses = []
@@ -142,6 +154,7 @@ def write_record3d(folder: Path) -> Path:
         pose = arkit_pose(viewmat)
         poses.append([*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]])
         _save(folder / f"rgb/{index}.png", made.images[index])
+        write_exr(folder / f"depth/{index}.exr", {"R": made.depths[index].astype(np.float16)})
     content = {"poses": poses, "K": K.T.ravel().tolist(), "w": WIDTH, "h": HEIGHT, "fps": 30}
     content["frameTimestamps"] = [0.5 + index / 30 for index in range(COUNT)]
     (folder / "metadata.json").write_text(json.dumps(content))

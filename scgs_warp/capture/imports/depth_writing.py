@@ -52,8 +52,9 @@ class DepthWriter:
 
 def known_depth(depth: np.ndarray) -> np.ndarray:
     """Return a depth map [h, w] float64 with 0 wherever it is unknown or beyond any number in use."""
+    depth = depth.astype(np.float64)
     with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(depth) & (depth > 0) & (depth < MAX_NUMBER), depth, 0.0).astype(np.float64)
+        return np.where(np.isfinite(depth) & (depth > 0) & (depth < MAX_NUMBER), depth, 0.0)
 
 
 def checked_depth(depth: np.ndarray, where: str) -> np.ndarray:

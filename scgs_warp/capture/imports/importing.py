@@ -55,6 +55,8 @@ class ImportResult(NamedTuple):
     """Number of points that depth gave; 0 without depth."""
     pose_error: float | None
     """Distance of static features from the epipolar lines of the poses, pixels; None if too few are in common."""
+    note: str | None
+    """Line about what was left out."""
 
 
 def read_scene(path: Path) -> ImportedScene:
@@ -103,7 +105,7 @@ def import_scene(path: Path, folder: Path, show: ShowProgress = progress) -> Imp
         raise UserError(f"{path}: a frame has the time {latest:g}; export the scene again")
     made: list[tuple[int, float | None]] = []
     write_folder_atomically(folder, lambda work: made.append(_write(work, path, scene, show)))
-    return ImportResult(scene.program, len(scene.frames), *made[0])
+    return ImportResult(scene.program, len(scene.frames), *made[0], scene.note)
 
 
 def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> tuple[int, float | None]:

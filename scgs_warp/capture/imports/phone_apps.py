@@ -4,9 +4,10 @@ Polycam (raw data): ``keyframes/corrected_images/TIME.jpg`` with ``keyframes/cor
 ``images`` and ``cameras`` where poses were not optimised: ``fx, fy, cx, cy, width, height`` and the rows ``t_00`` to
 ``t_23`` of the camera-to-world matrix; ``keyframes/depth/TIME.png`` in millimetres, and ``keyframes/confidence``.
 
-Record3D (EXR + RGB sequence): ``metadata.json`` with ``poses`` (quaternion x y z w, then position, camera-to-world),
-``K`` (nine numbers by columns) or ``perFrameIntrinsicCoeffs`` (fx, fy, cx, cy), ``w, h`` and ``frameTimestamps``;
-``rgb/0.jpg`` and so on. An unpacked .r3d has ``metadata`` and ``rgbd/0.jpg``.
+Record3D (EXR + RGB sequence, ``EXR_RGBD``): ``metadata.json`` with ``poses`` (quaternion x y z w, then position,
+camera-to-world), ``K`` (nine numbers by columns) or ``perFrameIntrinsicCoeffs`` (fx, fy, cx, cy), ``w, h`` and
+``frameTimestamps``; ``rgb/0.jpg`` and so on; ``depth/0.exr`` in metres. An unpacked .r3d has ``metadata`` and
+``rgbd/0.jpg``; its depth (``rgbd/0.depth``, LZFSE) is not read.
 
 3D Scanner App (all data): ``frame_00000.json`` with ``cameraPoseARFrame`` (16 numbers by rows, camera-to-world),
 ``intrinsics`` (nine by rows) and ``time``, beside ``frame_00000.jpg``; ``depth_00000.png`` in millimetres, and
@@ -20,6 +21,7 @@ Camera axes are OpenGL's, and y is up in the world; both are converted.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ import numpy as np
 from ...data.images import header_sizes
 from ...data.natural_order import natural
 from ...errors import UserError
+from ...storage.exr_files import INSTALL, read_exr, reads_exr
 from ...storage.json_files import as_number, read_json
 from .monst3r import quaternion_matrix
 from .scene import ImportedFrame, ImportedScene, from_arkit, intrinsics, rigid
@@ -80,15 +83,16 @@ def is_record3d(path: Path) -> bool:
 
 
 def _record3d_place(path: Path) -> tuple[Path, Path] | None:
-    """Return the file of metadata and the folder of images."""
-    for name, images in (("metadata.json", "rgb"), ("metadata", "rgbd")):
-        if (path / name).is_file() and (path / images).is_dir():
-            return path / name, path / images
+    """Return the file of metadata and the folder of images, in the folder itself or in its ``EXR_RGBD``."""
+    for base in (path, path / "EXR_RGBD"):
+        for name, images in (("metadata.json", "rgb"), ("metadata", "rgbd")):
+            if (base / name).is_file() and (base / images).is_dir():
+                return base / name, base / images
     return None
 
 
 def read_record3d(path: Path) -> ImportedScene:
-    """Read an EXR + RGB sequence of Record3D, or an unpacked .r3d. Depth (.exr, .depth) is not read.
+    """Read an EXR + RGB sequence of Record3D, or an unpacked .r3d.
 
     Raises:
         UserError: a file is missing, damaged or does not fit; one line names it.
@@ -119,8 +123,11 @@ def read_record3d(path: Path) -> ImportedScene:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = quaternion_matrix(row[[3, 0, 1, 2]], where), row[4:]
         lens = _fitted(file, intrinsics(K, f"{file}: intrinsics of frame {index}"), stated, image)
-        frames.append(ImportedFrame(image, from_arkit(rigid(pose, where)), lens, float(moments[index])))
-    return ImportedScene("Record3D", frames, gravity=True)
+        depth = folder.parent / "depth" / f"{image.stem}.exr"
+        load = partial(read_exr, depth) if reads_exr() and depth.is_file() else None
+        frames.append(ImportedFrame(image, from_arkit(rigid(pose, where)), lens, float(moments[index]), load))
+    left = any((folder.parent / "depth").glob("*.exr")) and not reads_exr()
+    return ImportedScene("Record3D", frames, gravity=True, note=f"depth was not read: {INSTALL}" if left else None)
 
 
 def is_scanner(path: Path) -> bool:

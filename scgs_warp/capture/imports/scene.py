@@ -50,6 +50,8 @@ class ImportedScene:
     frames: list[ImportedFrame]
     gravity: bool
     """True if the world is metric with z up; otherwise it has any orientation and scale."""
+    note: str | None = None
+    """Line about what was left out."""
 
 
 def rigid(matrix: np.ndarray, where: str) -> np.ndarray:

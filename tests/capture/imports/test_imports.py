@@ -27,6 +27,7 @@ from helpers.foreign_scenes import (
 )
 from scgs_warp.apps import capture as app
 from scgs_warp.capture import import_scene
+from scgs_warp.capture.imports import phone_apps
 from scgs_warp.capture.imports.depth_writing import DepthWriter
 from scgs_warp.capture.imports.stacks import Stack
 from scgs_warp.capture.similarity import align, centres
@@ -74,11 +75,10 @@ def test_cameras_images_and_times(imported):
 
 def test_depth_gives_points_where_the_wall_is(imported):
     """In the frame of the cameras, at the depth of the wall, in its colours."""
-    program, folder, made = imported
+    program, folder, _ = imported
     data = load(folder)
     if program == "Record3D":
-        assert made.points == 0 and data.points is None
-        return
+        pytest.importorskip("OpenEXR")
     assert data.points is not None and len(data.points) > 500 and data.colors is not None
     camera, truth = data.entries[0].camera, wall()
     scale = 1.0
@@ -98,12 +98,11 @@ def test_depth_gives_points_where_the_wall_is(imported):
 
 
 def test_depth_maps_are_those_of_the_wall(imported):
-    """In the units of the written cameras, at every frame; Record3D has none."""
+    """In the units of the written cameras, at every frame."""
     program, folder, _ = imported
     data, truth = load(folder), wall()
     if program == "Record3D":
-        assert not data.with_depth
-        return
+        pytest.importorskip("OpenEXR")
     assert data.with_depth == list(range(len(data)))
     scale = 1.0
     if program not in METRIC:
@@ -318,6 +317,25 @@ def test_unsure_depth_gives_no_points(tmp_path):
         level[:18] = 0
         cv2.imwrite(str(file), level)
     assert import_scene(scanner, tmp_path / "after", silent).points < 0.6 * before
+
+
+def test_the_folder_above_an_export_of_record3d(tmp_path):
+    """Its depth is found there, too."""
+    pytest.importorskip("OpenEXR")
+    write_record3d(tmp_path / "capture/EXR_RGBD")
+    made = import_scene(tmp_path / "capture", tmp_path / "data", silent)
+    assert made.program == "Record3D" and made.points > 0 and len(load(tmp_path / "data").with_depth) > 0
+
+
+def test_without_openexr_the_cameras_of_record3d_are_imported(tmp_path, monkeypatch):
+    """And a line says what is missing."""
+    record = write_record3d(tmp_path / "record3d")
+    (record / "depth").mkdir(exist_ok=True)
+    (record / "depth/0.exr").touch()
+    monkeypatch.setattr(phone_apps, "reads_exr", lambda: False)
+    made = import_scene(record, tmp_path / "data", silent)
+    assert made.frames == COUNT and made.points == 0 and not load(tmp_path / "data").with_depth
+    assert made.note is not None and "depth was not read" in made.note and "scgs-warp[exr]" in made.note
 
 
 def test_an_unpacked_r3d(tmp_path):

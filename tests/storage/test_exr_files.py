@@ -1,0 +1,61 @@
+"""OpenEXR files of one number per pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from helpers.foreign_scenes import write_exr
+from scgs_warp.data.depth_maps import DepthFile, read_depth_map
+from scgs_warp.errors import UserError
+from scgs_warp.storage import exr_files
+from scgs_warp.storage.exr_files import read_exr
+
+pytest.importorskip("OpenEXR")
+DEPTH = np.random.default_rng(5).uniform(1.0, 4.0, (12, 16)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["Z", "V", "Y", "R", "distance"])
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_the_only_channel_is_read(name, kind, tmp_path):
+    write_exr(tmp_path / "a.exr", {name: DEPTH.astype(kind)})
+    found = read_exr(tmp_path / "a.exr")
+    assert found.dtype == kind and np.array_equal(found, DEPTH.astype(kind))
+
+
+def test_of_several_channels_that_of_depth_is_read(tmp_path):
+    """R is the last choice: it may be a colour beside a depth."""
+    write_exr(tmp_path / "a.exr", {"R": DEPTH + 1, "G": DEPTH + 2, "B": DEPTH + 3, "Z": DEPTH})
+    assert np.array_equal(read_exr(tmp_path / "a.exr"), DEPTH)
+    write_exr(tmp_path / "b.exr", {"R": DEPTH + 1, "G": DEPTH + 2, "B": DEPTH + 3})
+    assert np.array_equal(read_exr(tmp_path / "b.exr"), DEPTH + 1)
+
+
+def test_a_frame_may_name_one_as_its_depth_map(tmp_path):
+    write_exr(tmp_path / "a.exr", {"Z": np.where(DEPTH > 2.0, DEPTH, np.float32(np.inf))})
+    depth = read_depth_map(DepthFile(tmp_path / "a.exr", 0.5), (32, 24)).numpy()
+    assert np.array_equal(depth, np.where(DEPTH > 2.0, 0.5 * DEPTH, 0.0))
+
+
+def test_other_files_are_refused_in_one_line(tmp_path, monkeypatch, capfd):
+    write_exr(tmp_path / "a.exr", {"Z": DEPTH})
+    whole = (tmp_path / "a.exr").read_bytes()
+    for name, content in {"cut": whole[:-40], "head": whole[:100], "text": b"depth", "empty": b""}.items():
+        (tmp_path / f"{name}.exr").write_bytes(content)
+        with pytest.raises(UserError, match=rf"{name}.exr: does not decode as OpenEXR; save it again"):
+            read_exr(tmp_path / f"{name}.exr")
+    with pytest.raises(UserError, match="does not decode"):
+        read_exr(tmp_path / "none.exr")
+    write_exr(tmp_path / "b.exr", {"one": DEPTH, "two": DEPTH})
+    with pytest.raises(UserError, match="has the channels one, two; save the depth as channel Z"):
+        read_exr(tmp_path / "b.exr")
+    monkeypatch.setattr(exr_files, "MOST_PIXELS", 100)
+    with pytest.raises(UserError, match="has more than 100 pixels; reduce it"):
+        read_exr(tmp_path / "a.exr")
+    assert "Warning" not in capfd.readouterr().out
+
+
+def test_without_the_package_its_name_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(exr_files, "reads_exr", lambda: False)
+    with pytest.raises(UserError, match=r"a.exr: .*pip install \"scgs-warp\[exr\]\""):
+        read_exr(tmp_path / "a.exr")
