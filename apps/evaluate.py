@@ -21,6 +21,9 @@ class Options:
 
     run: Path
     """Run folder, as apps/train.py writes it."""
+    also: tuple[Path, ...] = ()
+    """Run folders of further trainings of the same data with other seeds: score the mean of their pictures,
+    which errs less than each."""
     split: Literal["train", "test", "val"] = "test"
     """Frames to score; training frames are rendered from their refined poses if training refined them."""
     data: Path | None = None
@@ -31,7 +34,7 @@ class Options:
     """Also score each image with the affine colour (exposure, white balance) that fits it best. A run with
     optim.frame_colors is always scored so, and with the colours of the training frames before and after."""
     json: Path | None = None
-    """File for the metrics; RUN/evaluation/SPLIT/metrics.json by default."""
+    """File for the metrics; RUN/evaluation/SPLIT/metrics.json by default, with --also SPLIT-mean."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
@@ -110,7 +113,13 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.scene.frame_colors import FrameColors
     from scgs_warp.scene.scene import Scene
 
-    scene = Scene.load(options.run, device=device)
+    runs = [options.run, *options.also]
+    if options.also:
+        from scgs_warp.scene.mean import load_mean
+
+        scene = load_mean(runs, device)
+    else:
+        scene = Scene.load(options.run, device=device)
     lpips = None
     if options.lpips_weights is not None:
         from scgs_warp.evaluation.image_metrics import LPIPS
@@ -124,12 +133,13 @@ def main(args: list[str] | None) -> None:
 
         corrected = refined(dataset, options.run, scene.normalisation)
         dataset, poses = (dataset, poses) if corrected is None else (corrected, "refined")
-    folder = options.run / "evaluation" / options.split
+    folder = options.run / "evaluation" / (f"{options.split}-mean" if options.also else options.split)
+    durations = [training_seconds(run) for run in runs]
     with progress(len(dataset), "evaluate") as shown:
         metrics = metrics_of(
             scene,
             dataset,
-            seconds=training_seconds(options.run),
+            seconds=sum(known) if len(known := [each for each in durations if each is not None]) == len(runs) else None,
             lpips=lpips,
             render_dir=folder,
             progress=lambda done, total: shown.advance(),
@@ -137,6 +147,8 @@ def main(args: list[str] | None) -> None:
             fit_color=options.fit_color,
         )
     metrics["poses"] = poses
+    if options.also:
+        metrics.update(runs=[str(run) for run in runs], epe=None, jitter=None)  # pictures have a mean, tracks have none
     target = options.json or folder / "metrics.json"
     write_metrics(metrics, target)
     show(metrics, scene.unfinished)

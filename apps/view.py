@@ -28,6 +28,9 @@ class Options:
     """Film to write: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     run: Path | None = None
     """Run folder, as apps/train.py writes it."""
+    also: tuple[Path, ...] = ()
+    """Run folders of further trainings of the same data with other seeds: the film shows the mean of their pictures,
+    which errs less than each."""
     ply: Path | None = None
     """Instead of a run: a file of Gaussians, which does not move: .ply, .compressed.ply, .splat, .spz, .sog or a SOG's
     meta.json."""
@@ -82,6 +85,8 @@ def check(options: Options) -> None:
 
     if (options.run is None) == (options.ply is None):
         raise UserError("view.py: give one of --run and --ply")
+    if options.also and (options.run is None or options.live):
+        raise UserError("--also: takes runs beside --run, for films; leave --ply and --live out")
     if options.up is not None and options.ply is None:
         raise UserError(f"--up {options.up}: belongs to --ply; a run knows from its cameras what is up")
     if options.live:
@@ -110,7 +115,7 @@ def check(options: Options) -> None:
 
 
 def open_scene(options: Options, device: str) -> Scene:
-    """Load the run or the file."""
+    """Load the run, the mean of several, or the file."""
     from scgs_warp.scene.scene import Scene
 
     if options.ply is not None:
@@ -118,6 +123,10 @@ def open_scene(options: Options, device: str) -> Scene:
 
         return open_gaussians(options.ply, device, up=options.up)
     assert options.run is not None
+    if options.also:
+        from scgs_warp.scene.mean import load_mean
+
+        return load_mean([options.run, *options.also], device)
     return Scene.load(options.run, device=device)
 
 

@@ -12,9 +12,10 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
 of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of optical flow from ``results/optical-flow.json``
-(``optical_flow.py``), that of long films from ``results/long-film-memory.json`` (``long_film.py memory``). Those of
-pages come from ``results/page-million.json`` (``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``),
-and that of soaks from ``results/chaos-PART.json`` (``chaos.py --part PART --minutes 118``).
+(``optical_flow.py``), that of means from ``results/mean-of-runs.json`` (``mean_of_runs.py``), that of long films from
+``results/long-film-memory.json`` (``long_film.py memory``). Those of pages come from ``results/page-million.json``
+(``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``), and that of soaks from
+``results/chaos-PART.json`` (``chaos.py --part PART --minutes 118``).
 """
 
 from __future__ import annotations
@@ -104,6 +105,15 @@ def mask_edges(results: Results) -> str:
     shares = {(row["masks"], row["filter"]): row["overlap"] for row in rows}
     lines = [[text, *(f"{100 * shares[kind, name]:.0f} %" for name in filters)] for kind, text in kinds.items()]
     return table(["mask", *filters.values()], lines)
+
+
+def mean_of_runs(results: Results) -> str:
+    """Write the scores of single runs and of the means of several."""
+    lines = []
+    for row in results["mean-of-runs"]["rows"]:
+        runs = "one run" if row["runs"] == 1 else f"mean of {row['runs']}"
+        lines.append([row["scene"], runs, f"{row['psnr']:.2f}", f"{row['worst']:.2f}", f"{row['ssim']:.4f}"])
+    return table(["scene", "shown", "PSNR, dB", "worst image, dB", "SSIM"], lines)
 
 
 def optical_flow(results: Results) -> str:
@@ -204,6 +214,7 @@ REPEATABLE = {
     "trust-soaks": Repeatable(
         soaks, tuple(f"chaos-{part}" for part in SOAKS), ("scgs_warp/storage", "scgs_warp/editor", "scgs_warp/live")
     ),
+    "quality-mean-of-runs": Repeatable(mean_of_runs, ("mean-of-runs",), TRAINING),
     "editing-updates": Repeatable(edit_updates, ("edit-cpu", "edit-4096-cpu"), EDITING),
 }
 

@@ -31,6 +31,11 @@ class GraphMemory:
         self._first: CudaGraph | None = None
         """A recording of one operation: torch forgets a memory pool that no recording uses."""
 
+    def renew(self) -> None:
+        """Start anew after a failed recording, which may leave the memory in an unfinished state. Recordings that exist
+        keep theirs."""
+        self._first = None
+
     def pool(self, device: torch.device) -> Any:
         if self._first is None:
             self._first = CudaGraph(lambda: torch.zeros(1, device=device), device, warm_ups=1)

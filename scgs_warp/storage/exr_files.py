@@ -6,16 +6,19 @@ import contextlib
 import importlib.util
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import UserError
 
-CHANNELS = ("Z", "depth.Z", "V", "depth.V", "Y", "R")
-"""Names of the channel that is read, in order of preference; the only one may have any name."""
+DEPTH = ("Z", "depth.Z", "V", "depth.V", "Y")
+"""Names of the channel that is read, in order of preference. A single channel may have any name."""
+MAGIC = b"\x76\x2f\x31\x01"
 INSTALL = 'reading .exr needs OpenEXR; pip install "scgs-warp[exr]"'
-MOST_PIXELS = 1 << 26
-"""Largest number of pixels, which bounds memory."""
+REMEDY = "save the depth as the only channel, or as channel Z"
+MOST_NUMBERS = 1 << 26
+"""Largest number of pixels times channels, which bounds memory."""
 
 
 def reads_exr() -> bool:
@@ -24,29 +27,49 @@ def reads_exr() -> bool:
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """Read one channel of a file as [h, w], float16, float32 or uint32.
+    """Read the depth of a file as [h, w], float16, float32 or uint32.
 
     Raises:
-        UserError: OpenEXR is not installed, the file is missing or damaged, it is too large, or none of its channels
-            is known.
+        UserError: OpenEXR is not installed, the file is missing or damaged, it is too large, or it has several channels
+            none of which is known as depth.
     """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    with open(path, "rb") as file:
+        if file.read(4) != MAGIC:
+            raise UserError(f"{path}: does not decode as OpenEXR; save it again")
     if not reads_exr():
         raise UserError(f"{path}: {INSTALL}")
-    import OpenEXR
-
     try:
-        header = OpenEXR.File(str(path), header_only=True).header()
-        low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
-        names = [channel.name for channel in header["channels"]]
-        if int(np.prod(high - low + 1)) > MOST_PIXELS:
-            raise UserError(f"{path}: has more than {MOST_PIXELS:,} pixels; reduce it")
-        chosen = next((name for name in CHANNELS if name in names), names[0] if len(names) == 1 else None)
-        if chosen is None:
-            raise UserError(f"{path}: has the channels {', '.join(names)}; save the depth as channel Z")
+        import OpenEXR
+
+        headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
+        part, channel = _choose(path, headers)
         with contextlib.redirect_stdout(io.StringIO()):  # it prints warnings about damaged files
-            pixels = OpenEXR.File(str(path), separate_channels=True).channels()[chosen].pixels
-    except (RuntimeError, ValueError, KeyError, TypeError, OSError):
+            pixels = OpenEXR.File(str(path), separate_channels=True).parts[part].channels[channel].pixels
+    except (ImportError, AttributeError):
+        raise UserError(f"{path}: {INSTALL} --upgrade") from None
+    except (RuntimeError, ValueError, KeyError, IndexError, TypeError, OSError):
         raise UserError(f"{path}: does not decode as OpenEXR; save it again") from None
     if not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or pixels.dtype.hasobject:
         raise UserError(f"{path}: does not decode as OpenEXR; save it again")
     return pixels
+
+
+def _choose(path: Path, headers: list[dict[str, Any]]) -> tuple[int, str]:
+    """Return the part that holds the depth, and its channel there."""
+    found = [(part, channel.name) for part, header in enumerate(headers) for channel in header["channels"]]
+    named = [place for name in DEPTH for place in found if place[1] == name]
+    if not named and len(found) != 1:
+        raise UserError(f"{path}: has the channels {', '.join(name for _, name in found)}; {REMEDY}")
+    place = (named or found)[0]
+    numbers = 0
+    for header in headers:
+        low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
+        numbers += int(np.prod(high - low + 1)) * len(header["channels"])
+    if numbers > MOST_NUMBERS:
+        raise UserError(f"{path}: has more than {MOST_NUMBERS:,} numbers; {REMEDY}")
+    header = headers[place[0]]
+    if any(not np.array_equal(a, b) for a, b in zip(header["dataWindow"], header["displayWindow"])):
+        raise UserError(f"{path}: its data window is not its display window; save the whole picture")
+    return place

@@ -12,7 +12,7 @@ memory. On a CPU the same operations run one by one, which is how they are teste
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
@@ -42,10 +42,10 @@ SLOT_BYTES = 8 + 64
 
 
 MOST_FAILURES = 3
-"""Number of failed recordings after which no other is tried."""
+"""Number of failed recordings of one kind of steps after which that kind is not recorded."""
 RETRY_AFTER = 500
-"""Number of steps from a failed recording to the next: the cause may pass, such as another program that compiles the
-same kernels or fills the memory."""
+"""Number of steps from a failed recording to the next of its kind: the cause may pass, such as another program that
+compiles the same kernels."""
 
 
 class _Step(NamedTuple):
@@ -83,7 +83,9 @@ class RecordedSteps:
         self._state, self._frames, self._tell = state, frames, tell
         self.capacity, self.recordings, self.repeats = 0, 0, 0
         self.failure: str | None = None
-        self._failures, self._records_from = 0, 0
+        self._failures: Counter[Hashable] = Counter()
+        self._records_from: dict[Hashable, int] = {}
+        self._told: set[bool] = set()
         self._most_pairs = 0
         self._memory = GraphMemory()
         self._pending: deque[_Submitted] = deque()
@@ -164,14 +166,15 @@ class RecordedSteps:
 
     def _submit(self, update: RecordedUpdate, step: _Step) -> None:
         before = update.recordings
-        record = self._failures < MOST_FAILURES and step.number >= self._records_from
+        waits = step.number < self._records_from.get(step.key, 0)
+        record = self._failures[step.key] < MOST_FAILURES and not waits
         if record:
             update.failure = None
         report, picture, kind = update.take(step.view, step.numbers, step.key, self.capacity, record)
         if update.recordings > before:
             self.recordings, self.failure = self.recordings + update.recordings - before, None
         elif record and update.failure is not None:
-            self._note_failure(update.failure, step.number)
+            self._note_failure(update.failure, step)
         done, device = None, self._state.device
         if device.type == "cuda":
             host = torch.empty(report.shape, dtype=report.dtype, pin_memory=True)
@@ -182,13 +185,15 @@ class RecordedSteps:
             group.steps += 1
         self._pending.append(_Submitted(step, kind, picture, report, done))
 
-    def _note_failure(self, failure: str, number: int) -> None:
-        self.failure, self._records_from = failure, number + RETRY_AFTER
-        self._failures += 1
-        if self._failures in (1, MOST_FAILURES):
-            again = f"; next attempt in {RETRY_AFTER} steps" if self._failures < MOST_FAILURES else ""
+    def _note_failure(self, failure: str, step: _Step) -> None:
+        self.failure, self._records_from[step.key] = failure, step.number + RETRY_AFTER
+        self._failures[step.key] += 1
+        last = self._failures[step.key] >= MOST_FAILURES
+        if last not in self._told:  # once each
+            self._told.add(last)
+            again = "" if last else f"; next attempt in {RETRY_AFTER} steps"
             reason = failure.splitlines()[0]
-            self._tell(f"steps are not recorded as a CUDA graph, so each takes longer: {reason}{again}")
+            self._tell(f"some steps are not recorded as a CUDA graph, so they take longer: {reason}{again}")
 
     def _oldest(self) -> list[StepResult]:
         """Wait for the oldest step and return its result. If it lacked room, repeat it and all later ones instead."""

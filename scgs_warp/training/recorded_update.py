@@ -27,7 +27,7 @@ from .view import Numbers, View, compare, form_of
 RECORD_AFTER = 2
 """Number of steps of one kind that are taken operation by operation, which loads their kernels, before one is
 recorded."""
-MOST_RECORDINGS = 8
+MOST_RECORDINGS = 16
 """Largest number of recordings at a time. Images of many sizes have as many kinds of steps."""
 MOST_TIMES = 3
 """Largest number of instants of a step: the view's and two of the regulariser."""
@@ -176,6 +176,7 @@ class RecordedUpdate:
             except RuntimeError as error:  # as are all others
                 self.failure = str(error)
                 self.forget_recordings()
+                self._memory.renew()
                 return None
             finally:
                 self.outcome.halted.copy_(halted)

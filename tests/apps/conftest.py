@@ -19,7 +19,16 @@ def dnerf(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def trained(dnerf, tmp_path_factory) -> Path:
     """The folder of a run of 60 steps."""
-    output = tmp_path_factory.mktemp("runs") / "run"
-    done = run_app("train", "--data", str(dnerf), "--output", str(output), "--steps", "60", *SMALL)
+    return train(dnerf, tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture(scope="session")
+def other_seed(dnerf, tmp_path_factory) -> Path:
+    """The folder of such a run with another seed."""
+    return train(dnerf, tmp_path_factory.mktemp("runs") / "seed-1", "--seed", "1")
+
+
+def train(data: Path, output: Path, *more: str) -> Path:
+    done = run_app("train", "--data", str(data), "--output", str(output), "--steps", "60", *SMALL, *more)
     assert done.returncode == 0, done.stderr
     return output

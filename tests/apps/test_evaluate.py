@@ -17,3 +17,13 @@ def test_evaluate(trained, tmp_path):
 def test_a_folder_without_a_run(tmp_path):
     done = run_app("evaluate", "--run", str(tmp_path))
     assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
+def test_the_mean_of_two_runs(trained, other_seed, tmp_path):
+    path = tmp_path / "metrics.json"
+    done = run_app("evaluate", "--run", str(trained), "--also", str(other_seed), "--json", str(path), "--device", "cpu")
+    assert done.returncode == 0, done.stderr
+    metrics, alone = json.loads(path.read_text()), json.loads((trained / "metrics.json").read_text())
+    assert metrics["psnr"] != alone["psnr"] and metrics["gaussians"] > alone["gaussians"]
+    assert metrics["runs"] == [str(trained), str(other_seed)] and metrics["seconds"] > alone["seconds"]
+    assert (trained / "evaluation/test-mean/contact_sheet.png").is_file()

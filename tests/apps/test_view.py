@@ -188,6 +188,22 @@ def test_a_trained_run(trained, tmp_path, show):
     assert output.stat().st_size > 100
 
 
+def test_a_film_of_the_mean_of_two_runs(trained, other_seed, tmp_path) -> None:
+    films = [tmp_path / name for name in ("one", "other", "mean")]
+    for film, runs in zip(films, ([trained], [other_seed], [trained, "--also", other_seed])):
+        words = map(str, ["--run", *runs, "--frames", 2, "--size", 32, "--output", film])
+        done = run_app("view", *words)
+        assert done.returncode == 0, done.stderr
+    one, other, mean = (np.stack(read_frames(film)).astype(float) for film in films)
+    assert np.abs(mean - (one + other) / 2).max() <= 1.0 and np.abs(one - other).max() > 8.0
+
+
+@pytest.mark.parametrize("more", [["--ply", "a.ply"], ["--run", "a", "--live"]])
+def test_a_mean_is_of_runs_and_for_films(more, capsys) -> None:
+    assert view.cli([*more, "--also", "b", *([] if "--live" in more else ["--output", "a.mp4"])]) == 2
+    assert "--also: takes runs beside --run, for films" in capsys.readouterr().err
+
+
 def test_a_folder_without_a_run(tmp_path) -> None:
     done = run_app("view", "--run", str(tmp_path), "--output", str(tmp_path / "a.gif"))
     assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
