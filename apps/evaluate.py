@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import tyro
+
 from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 
@@ -21,9 +23,9 @@ class Options:
 
     run: Path
     """Run folder, as apps/train.py writes it."""
-    also: tuple[Path, ...] = ()
-    """Run folders of further trainings of the same data with other seeds: score the mean of their pictures,
-    which errs less than each."""
+    also: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """Run folder of a further training of the same data with another seed: score the mean of their pictures. Repeat
+    it for more."""
     split: Literal["train", "test", "val"] = "test"
     """Frames to score; training frames are rendered from their refined poses if training refined them."""
     data: Path | None = None
@@ -106,6 +108,7 @@ def main(args: list[str] | None) -> None:
     options = parse(Options, "evaluate", args)
     device = prepare(options.device, options.threads, options.memory_gib)
 
+    from scgs_warp.errors import UserError
     from scgs_warp.evaluation.coverage import coverage_line
     from scgs_warp.evaluation.evaluate import metrics_of, write_metrics
     from scgs_warp.evaluation.run_time import training_seconds
@@ -113,6 +116,8 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.scene.frame_colors import FrameColors
     from scgs_warp.scene.scene import Scene
 
+    if options.also and options.split == "train":
+        raise UserError("--also: scores held-out views; leave --split train out")
     runs = [options.run, *options.also]
     if options.also:
         from scgs_warp.scene.mean import load_mean
@@ -143,7 +148,7 @@ def main(args: list[str] | None) -> None:
             lpips=lpips,
             render_dir=folder,
             progress=lambda done, total: shown.advance(),
-            colors=FrameColors.read(options.run),
+            colors=None if options.also else FrameColors.read(options.run),
             fit_color=options.fit_color,
         )
     metrics["poses"] = poses

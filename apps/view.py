@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import tyro
+
 from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 from scgs_warp.geometry.axes import Axis
@@ -28,9 +30,9 @@ class Options:
     """Film to write: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     run: Path | None = None
     """Run folder, as apps/train.py writes it."""
-    also: tuple[Path, ...] = ()
-    """Run folders of further trainings of the same data with other seeds: the film shows the mean of their pictures,
-    which errs less than each."""
+    also: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """Run folder of a further training of the same data with another seed: the film shows the mean of their pictures.
+    Repeat it for more."""
     ply: Path | None = None
     """Instead of a run: a file of Gaussians, which does not move: .ply, .compressed.ply, .splat, .spz, .sog or a SOG's
     meta.json."""
@@ -87,6 +89,8 @@ def check(options: Options) -> None:
         raise UserError("view.py: give one of --run and --ply")
     if options.also and (options.run is None or options.live):
         raise UserError("--also: takes runs beside --run, for films; leave --ply and --live out")
+    if options.also and options.show in ("nodes", "trajectories"):
+        raise UserError(f"--also: control points have no mean; leave out --show {options.show}")
     if options.up is not None and options.ply is None:
         raise UserError(f"--up {options.up}: belongs to --ply; a run knows from its cameras what is up")
     if options.live:

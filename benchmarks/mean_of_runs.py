@@ -46,6 +46,8 @@ def main() -> int:
     parser.add_argument("--scene", nargs="+", action="append", required=True, metavar="TITLE DATA RUN")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
+    if any(len(words) < 3 for words in options.scene):
+        parser.error("--scene takes a title, a data folder, and runs")
     configure(1)
     rows = []
     for title, data, *runs in options.scene:

@@ -9,20 +9,17 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
-from ..geometry.cameras import Overview
+from ..storage import checkpoint
 from ..types import Camera, Image
 from .scene import Scene
-
-SAME = 1e-3
-"""Largest difference of two summaries of the same cameras, relative to their distance."""
 
 
 class MeanScene(Scene):
     """Scene whose pictures are the means of those of several scenes.
 
     Trainings that differ in their seeds alone err in different ways, so the mean errs less than each
-    (docs/quality.md). A picture takes as long as those of all scenes together. Everything but pictures and
-    ``gaussian_count`` is that of the first scene.
+    (docs/quality.md). A picture takes as long as those of all scenes together. ``gaussian_count`` is that of all;
+    Gaussians and control points are those of the first scene, since motions have no mean.
 
     Attributes: ``scenes``.
     """
@@ -32,6 +29,15 @@ class MeanScene(Scene):
         parts = first.gaussians, first.motion, first.normalisation, first.config, first.overview
         super().__init__(*parts, step=first.step, settings=first.settings)
         self.folder, self.scenes = first.folder, tuple(scenes)
+
+    @property
+    def unfinished(self) -> str | None:
+        """As that of a single scene, for the first that has not reached its last step."""
+        return next((scene.unfinished for scene in self.scenes if scene.unfinished is not None), None)
+
+    def _repr_html_(self) -> str | None:
+        """Return None: a page shows a single scene."""
+        return None
 
     @property
     def gaussian_count(self) -> int:
@@ -53,20 +59,24 @@ class MeanScene(Scene):
         return Image(rgb / len(self.scenes), alpha / len(self.scenes), depth)
 
 
-def load_mean(runs: Sequence[Path], device: str = "cpu") -> Scene:
+def load_mean(runs: Sequence[str | Path], device: str = "cpu") -> Scene:
     """Load the mean of several runs, or the scene of a single one.
 
     Raises:
-        UserError: a run cannot be loaded (``Scene.load``), or was trained with other cameras than the first.
+        UserError: a run cannot be loaded (``Scene.load``), is given twice, or was trained on other frames than the
+            first.
     """
-    scenes = [Scene.load(run, device=device) for run in runs]
-    for run, scene in zip(runs[1:], scenes[1:]):
-        if not _same_cameras(scene.overview, scenes[0].overview):
-            raise UserError(f"{run}: was trained with other cameras than {runs[0]}; give runs of one data set")
+    folders = [Path(run) for run in runs]
+    scenes = [Scene.load(run, device=device) for run in folders]
+    for place, run in enumerate(folders):
+        if any(run.samefile(before) for before in folders[:place]):
+            raise UserError(f"{run}: is given twice; give runs with different seeds")
+        same_cameras = scenes[place].overview == scenes[0].overview
+        if not same_cameras or _frames_of(run) != _frames_of(folders[0]):
+            raise UserError(f"{run}: was trained on other frames than {folders[0]}; give runs of one data set")
     return scenes[0] if len(scenes) == 1 else MeanScene(scenes)
 
 
-def _same_cameras(one: Overview, other: Overview) -> bool:
-    apart = torch.tensor([*one.centre, one.radius]) - torch.tensor([*other.centre, other.radius])
-    turned = torch.tensor(one.up) - torch.tensor(other.up)
-    return float(apart.abs().max()) <= SAME * other.radius and float(turned.abs().max()) <= SAME
+def _frames_of(run: Path) -> str | None:
+    """Return the hash of the names, times and sizes of a run's training frames."""
+    return checkpoint.read(run, ())[1].get("frames")

@@ -5,6 +5,9 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +15,6 @@ import numpy as np
 
 from ..errors import UserError
 
-DEPTH = ("Z", "depth.Z", "V", "depth.V", "Y")
-"""Names of the channel that is read, in order of preference. A single channel may have any name."""
 MAGIC = b"\x76\x2f\x31\x01"
 INSTALL = 'reading .exr needs OpenEXR; pip install "scgs-warp[exr]"'
 REMEDY = "save the depth as the only channel, or as channel Z"
@@ -43,9 +44,10 @@ def read_exr(path: Path) -> np.ndarray:
     try:
         import OpenEXR
 
-        headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
+        with _silent():
+            headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
         part, channel = _choose(path, headers)
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints warnings about damaged files
+        with _silent():
             pixels = OpenEXR.File(str(path), separate_channels=True).parts[part].channels[channel].pixels
     except (ImportError, AttributeError):
         raise UserError(f"{path}: {INSTALL} --upgrade") from None
@@ -56,10 +58,27 @@ def read_exr(path: Path) -> np.ndarray:
     return pixels
 
 
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Keep the library's own lines about damaged files, which come from C++, from the terminal."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
 def _choose(path: Path, headers: list[dict[str, Any]]) -> tuple[int, str]:
-    """Return the part that holds the depth, and its channel there."""
+    """Return the part that holds the depth, and its channel there: the only one, one called Z (of a layer, perhaps), or
+    one with depth in its name."""
     found = [(part, channel.name) for part, header in enumerate(headers) for channel in header["channels"]]
-    named = [place for name in DEPTH for place in found if place[1] == name]
+    named = [place for place in found if place[1].split(".")[-1] == "Z"]
+    named += [place for place in found if "depth" in place[1].lower()]
     if not named and len(found) != 1:
         raise UserError(f"{path}: has the channels {', '.join(name for _, name in found)}; {REMEDY}")
     place = (named or found)[0]

@@ -72,7 +72,7 @@ class RecordedSteps:
     """Steps of one run whose results arrive one step late.
 
     Attributes: ``recordings`` (number of graphs recorded), ``repeats`` (number of steps repeated for lack of room),
-    ``failure`` (error of the last recording if it failed, else None).
+    ``failure`` (error of a kind of steps whose last recording failed, else None).
     """
 
     def __init__(self, state: TrainState, frames: Frames, tell: Callable[[str], None] = lambda text: None) -> None:
@@ -82,7 +82,7 @@ class RecordedSteps:
         """
         self._state, self._frames, self._tell = state, frames, tell
         self.capacity, self.recordings, self.repeats = 0, 0, 0
-        self.failure: str | None = None
+        self._errors: dict[Hashable, str] = {}
         self._failures: Counter[Hashable] = Counter()
         self._records_from: dict[Hashable, int] = {}
         self._told: set[bool] = set()
@@ -90,6 +90,10 @@ class RecordedSteps:
         self._memory = GraphMemory()
         self._pending: deque[_Submitted] = deque()
         self._update: RecordedUpdate | None = None
+
+    @property
+    def failure(self) -> str | None:
+        return next(reversed(self._errors.values()), None)
 
     def take(self) -> list[StepResult]:
         """Start the state's next step; return the results of the steps that have become known, in order.
@@ -172,7 +176,8 @@ class RecordedSteps:
             update.failure = None
         report, picture, kind = update.take(step.view, step.numbers, step.key, self.capacity, record)
         if update.recordings > before:
-            self.recordings, self.failure = self.recordings + update.recordings - before, None
+            self.recordings += update.recordings - before
+            self._errors.pop(step.key, None)
         elif record and update.failure is not None:
             self._note_failure(update.failure, step)
         done, device = None, self._state.device
@@ -186,7 +191,7 @@ class RecordedSteps:
         self._pending.append(_Submitted(step, kind, picture, report, done))
 
     def _note_failure(self, failure: str, step: _Step) -> None:
-        self.failure, self._records_from[step.key] = failure, step.number + RETRY_AFTER
+        self._errors[step.key], self._records_from[step.key] = failure, step.number + RETRY_AFTER
         self._failures[step.key] += 1
         last = self._failures[step.key] >= MOST_FAILURES
         if last not in self._told:  # once each

@@ -198,6 +198,12 @@ def test_a_film_of_the_mean_of_two_runs(trained, other_seed, tmp_path) -> None:
     assert np.abs(mean - (one + other) / 2).max() <= 1.0 and np.abs(one - other).max() > 8.0
 
 
+def test_control_points_have_no_mean(tmp_path, capsys) -> None:
+    words = ["--run", "a", "--also", "b", "--show", "nodes", "--output", str(tmp_path / "a.mp4")]
+    assert view.cli(words) == 2
+    assert "control points have no mean; leave out --show nodes" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("more", [["--ply", "a.ply"], ["--run", "a", "--live"]])
 def test_a_mean_is_of_runs_and_for_films(more, capsys) -> None:
     assert view.cli([*more, "--also", "b", *([] if "--live" in more else ["--output", "a.mp4"])]) == 2

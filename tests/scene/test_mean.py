@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 
 import pytest
 import torch
@@ -49,11 +50,27 @@ def test_a_single_run_is_its_scene(runs):
     assert not isinstance(load_mean(runs[:1]), MeanScene)
 
 
-def test_runs_of_other_cameras_are_refused(runs, tmp_path):
+def test_runs_that_have_no_mean_are_refused(runs, tmp_path):
+    """Those of other frames, or of frames with the same names by other cameras, and a run with itself."""
     data = tiny_dataset(6)
     moved = [dataclasses.replace(each.camera, viewmat=each.camera.viewmat.clone()) for each in data]
     for camera in moved:
         camera.viewmat[2, 3] += 1.0
-    fit(tiny_config(40), data.with_cameras(moved), output=tmp_path / "other")
-    with pytest.raises(UserError, match=r"other: was trained with other cameras than .*seed-0; give runs of one data"):
-        load_mean([runs[0], tmp_path / "other"])
+    others = {"fewer": data.subset(range(5)), "moved": data.with_cameras(moved)}
+    for name, other in others.items():
+        fit(tiny_config(40), other, output=tmp_path / name)
+        told = rf"{name}: was trained on other frames than .*seed-0; give runs of one data set"
+        with pytest.raises(UserError, match=told):
+            load_mean([runs[0], tmp_path / name])
+    with pytest.raises(UserError, match=r"seed-0: is given twice"):
+        load_mean([runs[0], runs[1], str(runs[0])])
+
+
+def test_an_unfinished_run_is_told(runs, tmp_path):
+    config = tiny_config(40)
+    shutil.copytree(runs[1], tmp_path / "part")
+    mean = load_mean([runs[0], tmp_path / "part"])
+    assert isinstance(mean, MeanScene) and mean.unfinished is None
+    mean.scenes[1].step = 35
+    assert mean.unfinished == f"step 35 of {config.steps}, unfinished"
+    assert mean._repr_html_() is None
