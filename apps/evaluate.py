@@ -114,17 +114,12 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.evaluation.run_time import training_seconds
     from scgs_warp.runtime.progress import progress
     from scgs_warp.scene.frame_colors import FrameColors
-    from scgs_warp.scene.scene import Scene
+    from scgs_warp.scene.mean import load_mean
 
     if options.also and options.split == "train":
         raise UserError("--also: scores held-out views; leave --split train out")
     runs = [options.run, *options.also]
-    if options.also:
-        from scgs_warp.scene.mean import load_mean
-
-        scene = load_mean(runs, device)
-    else:
-        scene = Scene.load(options.run, device=device)
+    scene = load_mean(runs, device)
     lpips = None
     if options.lpips_weights is not None:
         from scgs_warp.evaluation.image_metrics import LPIPS
@@ -139,12 +134,12 @@ def main(args: list[str] | None) -> None:
         corrected = refined(dataset, options.run, scene.normalisation)
         dataset, poses = (dataset, poses) if corrected is None else (corrected, "refined")
     folder = options.run / "evaluation" / (f"{options.split}-mean" if options.also else options.split)
-    durations = [training_seconds(run) for run in runs]
+    known = [seconds for run in runs if (seconds := training_seconds(run)) is not None]
     with progress(len(dataset), "evaluate") as shown:
         metrics = metrics_of(
             scene,
             dataset,
-            seconds=sum(known) if len(known := [each for each in durations if each is not None]) == len(runs) else None,
+            seconds=sum(known) if len(known) == len(runs) else None,
             lpips=lpips,
             render_dir=folder,
             progress=lambda done, total: shown.advance(),

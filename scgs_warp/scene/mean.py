@@ -50,11 +50,10 @@ class MeanScene(Scene):
     ) -> Image:
         """Render the mean of all scenes; arguments and errors are those of ``Scene.render``. Depth is weighted by
         opacity."""
-        rgb, alpha, depth = 0.0, 0.0, 0.0
+        rgb = alpha = depth = torch.zeros(())
         for scene in self.scenes:
             image = scene.render(camera, time, self.background_color if background is None else background)
             rgb, alpha, depth = rgb + image.rgb, alpha + image.alpha, depth + image.depth * image.alpha
-        assert isinstance(rgb, Tensor) and isinstance(alpha, Tensor) and isinstance(depth, Tensor)
         depth = torch.where(alpha > 0.0, depth / alpha.clamp_min(1e-12), 0.0)
         return Image(rgb / len(self.scenes), alpha / len(self.scenes), depth)
 
@@ -68,7 +67,7 @@ def load_mean(runs: Sequence[str | Path], device: str = "cpu") -> Scene:
     """
     folders = [Path(run) for run in runs]
     scenes = [Scene.load(run, device=device) for run in folders]
-    for place, run in enumerate(folders):
+    for place, run in enumerate(folders[1:], 1):
         if any(run.samefile(before) for before in folders[:place]):
             raise UserError(f"{run}: is given twice; give runs with different seeds")
         same_cameras = scenes[place].overview == scenes[0].overview

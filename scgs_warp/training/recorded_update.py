@@ -18,7 +18,7 @@ from ..optim import ADAM_BETAS, ADAM_EPS, Group
 from ..runtime.cuda_graph import CudaGraph, GraphMemory, Steps
 from ..runtime.device_copies import pinned, sent
 from ..types import Camera, Splats, Tiles
-from .depth import SeenDepth, depth_weight
+from .depth import SeenDepth
 from .silhouettes import SilhouetteSample
 from .state import TrainState
 from .step import least_logit, motion_frozen
@@ -105,10 +105,7 @@ class RecordedUpdate:
         camera, times = view.camera, view.plan.times
         cells = [*camera.viewmat.flatten().tolist(), *camera.K.flatten().tolist(), *view.background.tolist()]
         cells += [view.plan.weight, *times, *[0.0] * (MOST_TIMES - len(times))]
-        step, depth = self._state.stage_step, view.depth
-        cells += [0.0] * 10 if depth is None else [
-            depth_weight(step, self._state.config), *depth.camera.K.flatten().tolist()
-        ]  # fmt: skip
+        cells += [view.depth_weight, *([0.0] * 9 if view.depth is None else view.depth.camera.K.flatten().tolist())]
         return torch.tensor([*cells, *(group.rate for group in self._groups)], dtype=torch.float64)
 
     def take(self, view: View, numbers: Tensor, key: Hashable, room: int, record: bool) -> tuple[Tensor, Tensor, Kind]:

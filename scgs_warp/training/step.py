@@ -13,7 +13,7 @@ from ..optim import log_linear
 from ..runtime.device_copies import sent
 from ..types import Camera, Stats
 from .camera_refinement import camera_rate
-from .depth import SeenDepth, depth_weight
+from .depth import SeenDepth
 from .flow import FlowNumbers, flow_weight
 from .frames import Frames
 from .multi_view import all_views
@@ -75,8 +75,8 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     times = sent(torch.tensor(plan.times), device)
     color = state.exposure.color(prepared.index) if len(state.exposure) else None
     flow, depth = _flow(state, prepared), _depth(state, prepared)
-    placed = depth_weight(state.stage_step, state.config)
-    numbers = Numbers(camera, sent(prepared.background, device), times, plan.weight, color, flow, depth, placed)
+    background = sent(prepared.background, device)
+    numbers = Numbers(camera, background, times, plan.weight, color, flow, depth, prepared.depth_weight)
     compared = compare(state, prepared, numbers, stats)
     if color is not None:
         compared = compared.with_penalty(state.exposure.penalty(prepared.index, state.config.loss))

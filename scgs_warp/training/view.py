@@ -48,6 +48,7 @@ class View(NamedTuple):
     """Optical flow to another frame, in steps that compare it."""
     depth: SeenDepth | None = None
     """Depth map of the frame, on the host, in steps that compare it."""
+    depth_weight: float = 0.0
 
 
 class Form(NamedTuple):
@@ -123,8 +124,10 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     flow = None
     if state.stage == "main" and flow_weight(step, config) > 0.0:
         flow = frames.flows.between(index, generator(config.seed, 46, view_number(state.step, config, view)))
-    seen = frames.depths.of(index) if state.stage == "main" and depth_weight(step, config) > 0.0 else None
-    return View(index, loaded.camera, loaded.background, plan, form, loaded.truth, loaded.mask, sample, flow, seen)
+    weight = depth_weight(step, config) if state.stage == "main" else 0.0
+    depth = frames.depths.of(index) if weight > 0.0 else None
+    images = loaded.truth, loaded.mask, sample, flow, depth
+    return View(index, loaded.camera, loaded.background, plan, form, *images, depth_weight=weight)
 
 
 def compare(

@@ -1,19 +1,33 @@
-"""Act on a run between its steps."""
+"""Begin a run, and act on it between its steps."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config.presets import TrainConfig
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.runtime import environment
+from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import PlainSteps, fit
 from scgs_warp.training.recorded_step import RecordedSteps
 from scgs_warp.training.state import TrainState
+
+PRETENDED = bool(os.environ.get("SCGS_PRETENDED_CUDA"))
+"""Whether the GPU is the pretended one, which adds in one order."""
+
+
+def begin(device: str, steps: int = 60, data: Dataset | None = None, **changes: Any) -> tuple[TrainState, Frames]:
+    """Make the state of a tiny run at step 0, and its frames."""
+    data = tiny_dataset(6) if data is None else data
+    state = TrainState.begin(tiny_config(steps, **changes), data, device)
+    return state, Frames(data, state.normalisation, state.config, device)
 
 
 def before_each_step(monkeypatch: pytest.MonkeyPatch, act: Callable[[TrainState], None]) -> None:

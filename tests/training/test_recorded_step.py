@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import os
 import weakref
 from collections.abc import Callable
 from functools import partial
@@ -14,13 +13,12 @@ import pytest
 import torch
 
 from helpers.filmed_blobs import film, with_depth
-from helpers.tiny import tiny_config, tiny_dataset
+from helpers.steps import PRETENDED, begin
+from helpers.tiny import tiny_dataset
 from scgs_warp import optim
-from scgs_warp.data.dataset import Dataset
 from scgs_warp.motion import rigidity
 from scgs_warp.ops.adam import adam_step
 from scgs_warp.ops.step_outcome import UpdateTable
-from scgs_warp.runtime.cuda_graph import CudaGraph, GraphMemory
 from scgs_warp.training import depth, recorded_step, recorded_update
 from scgs_warp.training.density_control import control_density, density_due
 from scgs_warp.training.frames import Frames
@@ -35,20 +33,12 @@ MODELS = {
     "hexplane": {"motion": {"model": "hexplane"}, "coarse": 6},
     "static": {"motion": {"model": "static"}},
 }
-PRETENDED = bool(os.environ.get("SCGS_PRETENDED_CUDA"))
-"""Whether the GPU is the pretended one, which adds in one order."""
 
 
 @pytest.fixture(autouse=True)
 def _portable_adam(monkeypatch):
     """Let both forms update with the kernel that runs on any device; the one in SIMD rounds differently."""
     monkeypatch.setattr(optim, "adam_step", partial(adam_step, form="plain"))
-
-
-def begin(device: str, steps: int = 60, data: Dataset | None = None, **changes: Any) -> tuple[TrainState, Frames]:
-    data = tiny_dataset(6) if data is None else data
-    state = TrainState.begin(tiny_config(steps, **changes), data, device)
-    return state, Frames(data, state.normalisation, state.config, device)
 
 
 def tensors(state: TrainState) -> dict[str, torch.Tensor]:
@@ -349,68 +339,6 @@ def test_images_on_the_device_are_not_read_again(device, monkeypatch):
     steps.settle()
     once = len(set(reads))
     assert once >= 6 and (len(reads) == 30 if device == "cpu" else len(reads) <= 2 * once), reads
-
-
-def recordings_that_fail(device, monkeypatch, fails: Callable[[int, Any], bool], steps_taken: int, **changes):
-    """Take steps of which some recordings fail, by the number of attempts and the kind; return what took them, the
-    steps of the attempts, and the lines."""
-    record, attempts, said = RecordedUpdate._record, [], []
-    state, frames = begin(device, **changes)
-
-    def refuse(self, key, body):
-        if not fails(len(attempts), key):
-            return record(self, key, body)
-        attempts.append(state.step)
-        self.failure = "no capture\nof this"
-        self.forget_recordings()
-
-    monkeypatch.setattr(RecordedUpdate, "_record", refuse)
-    monkeypatch.setattr(recorded_step, "RETRY_AFTER", 5)
-    steps = RecordedSteps(state, frames, said.append)
-    for _ in range(steps_taken):
-        steps.take()
-        state.step += 1
-    steps.settle()
-    return steps, attempts, said
-
-
-def test_a_failed_recording_is_tried_again(device, monkeypatch):
-    """The cause may have passed: one failure must not slow the whole run."""
-    steps, attempts, said = recordings_that_fail(device, monkeypatch, lambda number, key: number < 2, 30)
-    assert steps.failure is None and steps.recordings >= 1
-    assert len(attempts) == 2 and attempts[1] - attempts[0] >= 5
-    assert len(said) == 1 and "no capture; next attempt in 5 steps" in said[0] and "\n" not in said[0]
-
-
-def test_recordings_that_keep_failing_are_given_up(device, monkeypatch):
-    steps, attempts, said = recordings_that_fail(device, monkeypatch, lambda number, key: True, 60)
-    assert steps.failure is not None and steps.recordings == 0
-    assert len(attempts) == recorded_step.MOST_FAILURES * len(steps._failures)
-    assert len(said) == 2 and "next attempt" in said[0] and said[1].endswith("no capture")
-
-
-def test_a_kind_that_cannot_be_recorded_does_not_keep_others_from_it(device, monkeypatch):
-    """Steps that compare depth fail; the other half is recorded in the end."""
-    model = {"pretrain": {"steps": 0}, "motion": {"model": "static"}, "loss": {"depth": 0.5}}
-    size = 48, 48
-    steps, _, _ = recordings_that_fail(
-        device, monkeypatch, lambda number, key: size in key, 60, data=with_depth(film(6, 48)), **model
-    )
-    assert sum(steps._failures.values()) > recorded_step.MOST_FAILURES
-    assert steps._update is not None and len(steps._update._recorded) >= 1
-
-
-@pytest.mark.skipif(PRETENDED, reason="the pretended device's captures cannot become invalid")
-def test_a_capture_that_fails_midway_leaves_room_for_the_next(device):
-    """The memory of an invalid capture cannot be used again on some versions of torch."""
-    if device != "cuda":
-        pytest.skip("needs a GPU")
-    memory, tensor = GraphMemory(), torch.ones(8, device=device)
-    with pytest.raises(RuntimeError):
-        CudaGraph(lambda: (tensor * 2).sum().item(), tensor.device, warm_ups=0, memory=memory)
-    memory.renew()
-    graph = CudaGraph(lambda: tensor * 3, tensor.device, warm_ups=1, memory=memory)
-    assert torch.equal(graph.replay(), tensor * 3)
 
 
 def test_nothing_is_held_after_a_release(device):

@@ -117,16 +117,16 @@ def read_record3d(path: Path) -> ImportedScene:
     if "frameTimestamps" in content:
         moments = _row(file, content, "frameTimestamps", len(poses))
     stated = (_number(file, content, "w"), _number(file, content, "h"))
-    frames = []
+    frames, maps, readable = [], folder.parent / "depth", reads_exr()
     for index, (row, K, image) in enumerate(zip(poses, Ks, images)):
         where = f"{file}: poses[{index}]"
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = quaternion_matrix(row[[3, 0, 1, 2]], where), row[4:]
         lens = _fitted(file, intrinsics(K, f"{file}: intrinsics of frame {index}"), stated, image)
-        depth = folder.parent / "depth" / f"{image.stem}.exr"
-        load = partial(read_exr, depth) if reads_exr() and depth.is_file() else None
+        depth = maps / f"{image.stem}.exr"
+        load = partial(read_exr, depth) if readable and depth.is_file() else None
         frames.append(ImportedFrame(image, from_arkit(rigid(pose, where)), lens, float(moments[index]), load))
-    left = any((folder.parent / "depth").glob("*.exr")) and not reads_exr()
+    left = not readable and any(maps.glob("*.exr"))
     return ImportedScene("Record3D", frames, gravity=True, note=f"depth was not read: {INSTALL}" if left else None)
 
 
