@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,19 @@ def test_clouds_lie_on_the_ball_at_every_moment(film):
         assert 100 <= len(places) <= 500 and cloud.moves.all()
         assert float((distances - 0.5).abs().median()) < 0.06, "the ball has a radius of 0.5"
         assert float((distances < 0.65).float().mean()) > 0.8, cloud.time
+
+
+def test_points_are_followed_to_the_next_moment(film):
+    """Flow and the depth there say where a point has gone: with the ball, which does not turn."""
+    clouds, normalisation = clouds_of(film)
+    for one, two in itertools.pairwise(clouds):
+        assert one.later is not None
+        known = one.later.isfinite().all(1)
+        there, here = (normalisation.undo(points[known]) for points in (one.later, one.points))
+        moved = place_at(two.time) - place_at(one.time)
+        errors = (there - here - moved).norm(dim=1) / moved.norm()
+        assert float(known.float().mean()) > 0.5 and float(errors.median()) < 0.5, one.time
+    assert clouds[-1].later is None
 
 
 def test_colours_are_those_of_the_image(film):
