@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-import types
 from pathlib import Path
 
 import numpy as np
@@ -93,15 +91,12 @@ def fake_dataset(
 def install(monkeypatch: pytest.MonkeyPatch, scene: FakeScene) -> None:
     """Have ``Scene.load`` return this scene, or refuse a missing run."""
     from scgs_warp.errors import UserError
+    from scgs_warp.scene.scene import Scene
 
-    class Scene:
-        @staticmethod
-        def load(run: Path, device: str = "cpu") -> FakeScene:
-            if not Path(run).is_dir():
-                raise UserError(f"{run}: no such run; give the folder that apps/train.py wrote")
-            return scene
+    def load(run: str | Path, device: str = "cpu") -> FakeScene:
+        if not Path(run).is_dir():
+            raise UserError(f"{run}: no such run; give the folder that apps/train.py wrote")
+        return scene
 
-    module = types.ModuleType("scgs_warp.scene.scene")
-    module.Scene = Scene  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "scgs_warp.scene.scene", module)
+    monkeypatch.setattr(Scene, "load", staticmethod(load))  # on the class, which other modules have imported already
     monkeypatch.setattr("scgs_warp.scene.frame_colors.FrameColors.read", lambda folder: None)  # has no checkpoint
