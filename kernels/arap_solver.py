@@ -77,13 +77,20 @@ def edge_sums(
     neighbors_in: wp.array[wp.int32],  # [E]
     weights_in: wp.array[wp.float64],  # [E]
     stretch: wp.float64,  # weight of keeping an edge's length, relative to that of keeping its shape
+    limit: wp.float64,  # weight of keeping an edge's length between these two parts of it, likewise
+    shortest: wp.float64,
+    longest: wp.float64,
     rotations_in: wp.array[wp.mat33d],  # [M]
     pulls_in: wp.array[wp.float64],  # [M] weight of a soft target
     targets_in: wp.array[wp.vec3d],  # [M]
     # Out:
     sums_out: wp.array[wp.vec3d],  # [F]
 ):
-    """Compute the right-hand side of the linear system: rotated edges, known neighbours and soft targets. Grid: F."""
+    """Compute the right-hand side of the linear system: rotated edges, known neighbours and soft targets. Grid: F.
+
+    The limit on lengths counts half its weight in the matrix, with the present edge as the other half of its target:
+    the least with which iterations cannot overshoot, and the fastest.
+    """
     at_row = first + wp.tid()
     i = nodes_in[at_row]
     total = pulls_in[i] * targets_in[i]
@@ -93,14 +100,19 @@ def edge_sums(
         wanted = wp.float64(0.5) * ((rotations_in[i] + rotations_in[j]) * edge)
         posed = posed_in[i] - posed_in[j]
         kept = wanted  # the edge at its old length
+        allowed = wanted  # the edge at the nearest length that the limit allows
         size = wp.length(posed)
         if size > wp.float64(0.0):
             # The weight says how well the edge's direction fits; otherwise reversed edges and folds would persist.
             cosine = wp.dot(posed, wanted) / wp.max(size * wp.length(wanted), wp.float64(1e-300))
             along = wp.max(cosine, wp.float64(0.0))
-            kept = (along * wp.length(edge) / size) * posed + (wp.float64(1.0) - along) * wanted
+            old = wp.length(edge)
+            near = wp.clamp(size, shortest * old, longest * old)
+            kept = (along * old / size) * posed + (wp.float64(1.0) - along) * wanted
+            allowed = (along * near / size) * posed + (wp.float64(1.0) - along) * wanted
         wanted += stretch * kept
-        total += (weights_in[at] / (wp.float64(1.0) + stretch)) * wanted
+        wanted += limit * (allowed - wp.float64(0.5) * posed)
+        total += (weights_in[at] / (wp.float64(1.0) + stretch + wp.float64(0.5) * limit)) * wanted
         if fixed_in[j] != 0:
             total += weights_in[at] * posed_in[j]
     sums_out[at_row] = total

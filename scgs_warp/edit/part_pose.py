@@ -27,6 +27,9 @@ of its control points are held."""
 INNER_STIFFNESS = 0.03
 """Stiffness (edges have 1) with which a short body between two others is pulled to its place. The bodies at its ends
 place it already; held firmly, it would leave the surface little room to bend."""
+LENGTH_LIMIT = 15.0
+"""Weight of changes of an edge's length beyond what is allowed (``ArapSolver``), relative to the ARAP energy: all free
+edges of a joint share a bend."""
 BOUNDARY_REACH = 1.5
 """Distance of an edge from the joint of the parts that it connects, relative to the median of all their edges, beyond
 which it bridges a gap and is cut: an arm that hung beside the trunk shares Gaussians with it."""
@@ -102,7 +105,7 @@ class PartPoser:
         centre, scale = units
         self.joints = (np.array([part.joint for part in skeleton.parts]) - centre) * scale
         self.graph = _without_bridges(graph, self.owner, self._parent, self.joints, start)
-        self.solver = ArapSolver(self.graph)
+        self.solver = ArapSolver(self.graph, limit=LENGTH_LIMIT)
         self._members = [self._with_surroundings(row) for row in range(len(skeleton.parts))]
         self._held: dict[tuple[int, ...], tuple[np.ndarray, frozenset[int]]] = {}
 

@@ -39,6 +39,27 @@ class RigidGroups(NamedTuple):
         return all(np.array_equal(mine, others) for mine, others in zip(self, other))
 
 
+class Lengths(NamedTuple):
+    """Energy that keeps the lengths of edges (kernels/arap_solver.py), relative to that of their shape."""
+
+    stretch: float
+    """Weight of any change of length."""
+    limit: float
+    """Weight of the change beyond the two lengths below."""
+    shortest: float
+    """Least length that the limit allows, relative to that at rest."""
+    longest: float
+    """Largest one."""
+
+    @property
+    def total(self) -> float:
+        """Weight in the linear system, that of the shape included."""
+        return 1.0 + self.stretch + 0.5 * self.limit
+
+
+NO_LENGTHS = Lengths(0.0, 0.0, 1.0, 1.0)
+
+
 class GroupState(NamedTuple):
     """Arrays of the solver that groups read and write in place."""
 
@@ -87,7 +108,7 @@ class GroupRotations:
         free: [F] nodes with unknown position.
         factor: factorisation of their Laplacian; None without free nodes.
         pulls: [M] weights of soft targets.
-        stretch: weight of preserving an edge's length.
+        lengths: weights of preserving the lengths of edges.
         smooth: weight of a neighbour's rotation, squared units of the positions.
     """
 
@@ -100,11 +121,11 @@ class GroupRotations:
         free: np.ndarray,
         factor: Any,
         pulls: np.ndarray,
-        stretch: float,
+        lengths: Lengths,
         smooth: float,
     ) -> None:
         self.groups, self.rest, self.free, self.pulls = groups, rest, free, pulls
-        self.stretch, self.smooth = stretch, smooth
+        self.lengths, self.smooth = lengths, smooth
         self.rotations = np.tile(np.eye(3), (len(groups.centers), 1, 1))
         self.turned = np.flatnonzero(groups.members & turned)
         self._spreads: list[_Spread] = []
@@ -125,7 +146,7 @@ class GroupRotations:
         touched = (member[i] | member[j]) & ~(inside[i] & inside[j])
         i, j, weights = i[touched], j[touched], self._weights[touched]
         positions = inside[i, None] * arms[i] - inside[j, None] * arms[j]
-        turning = 0.5 * (member[i].astype(float) + member[j])[:, None] / (1.0 + self.stretch)
+        turning = 0.5 * (member[i].astype(float) + member[j])[:, None] / self.lengths.total
         levers = positions - turning * (self.rest[i] - self.rest[j])
         sums = np.zeros((len(row), 3))
         np.add.at(sums, i, -weights[:, None] * levers)
@@ -182,17 +203,17 @@ class GroupRotations:
         state.rotations[spread.turned] = turn
         state.asked[spread.pulled] = turn
 
-    def turn(self, state: GroupState, before: np.ndarray, stretch: float) -> None:
+    def turn(self, state: GroupState, before: np.ndarray, lengths: Lengths) -> None:
         """Turn every group, one after the other, and move the free nodes with it.
 
         Args:
             state: its positions are the solution of the linear system for its rotations; updated.
             before: [M, 3] positions from which its right-hand side was computed.
-            stretch: weight of preserving an edge's length in that right-hand side.
+            lengths: weights of preserving the lengths of edges in that right-hand side.
         """
         for group, spread in enumerate(self._spreads):
             old = self.rotations[group].copy()
-            missing = self._missing(spread, state, before, stretch)
+            missing = self._missing(spread, state, before, lengths)
             slope = np.einsum("b,bi,bj->ij", spread.weights, missing, spread.levers)
             lag = state.targets[spread.pulled] - state.positions[spread.pulled]
             slope += np.einsum("p,pi,pj->ij", self.pulls[spread.pulled], lag, self.groups.arms[spread.pulled])
@@ -202,7 +223,7 @@ class GroupRotations:
             state.positions[self.free] += spread.moved @ (self.rotations[group] - old).T
             self._place(group, state)
 
-    def _missing(self, spread: _Spread, state: GroupState, before: np.ndarray, stretch: float) -> np.ndarray:
+    def _missing(self, spread: _Spread, state: GroupState, before: np.ndarray, lengths: Lengths) -> np.ndarray:
         """Return the mismatch between edges and those that the energy asks for, [B, 3]."""
         i, j = spread.first, spread.second
         edges = self.rest[i] - self.rest[j]
@@ -213,8 +234,12 @@ class GroupRotations:
             size * np.linalg.norm(wanted, axis=1, keepdims=True), 1e-300
         )
         along = cosine.clip(0.0, 1.0)
-        kept = along * np.linalg.norm(edges, axis=1, keepdims=True) / size * posed + (1.0 - along) * wanted
-        return state.positions[i] - state.positions[j] - (wanted + stretch * kept) / (1.0 + stretch)
+        old = np.linalg.norm(edges, axis=1, keepdims=True)
+        kept = along * old / size * posed + (1.0 - along) * wanted
+        near = size.clip(lengths.shortest * old, lengths.longest * old)
+        allowed = along * near / size * posed + (1.0 - along) * wanted
+        asked = wanted + lengths.stretch * kept + lengths.limit * (allowed - 0.5 * posed)
+        return state.positions[i] - state.positions[j] - asked / lengths.total
 
 
 def nearest_rotation(matrix: np.ndarray, otherwise: np.ndarray) -> np.ndarray:

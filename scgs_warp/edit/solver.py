@@ -3,8 +3,9 @@
 Local and global steps alternate (Sorkine & Alexa 2007): each node fits the rotation that best explains its edges,
 regularised towards its neighbours' rotations (Levi & Gotsman 2015), then one sparse linear system gives all positions.
 A projective spring on each edge preserves its length, because thin limbs hang on few edges and plain ARAP shears those
-at a joint. The matrix depends on which nodes are held, not on where they are, and is factorised once per set of
-handles.
+at a joint. A second one, where it is asked for, acts on large changes of length alone: it spreads a bend over the edges
+of a joint instead of leaving most of it to a few. The matrix depends on which nodes are held, not on where they are,
+and is factorised once per set of handles.
 """
 
 from __future__ import annotations
@@ -23,13 +24,16 @@ from scipy.sparse.linalg import splu
 from ..kernels import arap_solver as kernels
 from ..runtime.launch import launch
 from .graph import ControlGraph
-from .rigid_groups import GroupRotations, GroupState, RigidGroups
+from .rigid_groups import NO_LENGTHS, GroupRotations, GroupState, Lengths, RigidGroups
 from .rotations import exponential, from_matrix, logarithm, to_matrix
 
 SMOOTHNESS = 0.3
 """Weight of the neighbours' rotations, in squared edge lengths."""
 STRETCH = 2.0
 """Weight of preserving an edge's length, relative to the ARAP energy."""
+SHORTEST, LONGEST = 0.92, 1.05
+"""Length of an edge that a limit on lengths allows, relative to that at rest. The inside of a joint has to give way: it
+folds if no edge may be shorter."""
 STEP_ANGLE = math.radians(15.0)
 """Largest turn of a handle between two solutions: beyond about 90 degrees the energy has other minima."""
 STEP_LENGTH = 2.0
@@ -102,11 +106,19 @@ class _System(NamedTuple):
 
 class ArapSolver:
     """Solver for one graph, with cached factorisations. Float64 on the CPU; the same arguments give bit-identical
-    results."""
+    results.
 
-    def __init__(self, graph: ControlGraph, smoothness: float = SMOOTHNESS, stretch: float = STRETCH) -> None:
+    Args:
+        smoothness: weight of the neighbours' rotations, squared edge lengths.
+        stretch: weight of preserving an edge's length, relative to the ARAP energy.
+        limit: weight of changes of an edge's length beyond ``SHORTEST`` and ``LONGEST``, likewise; 0: none.
+    """
+
+    def __init__(
+        self, graph: ControlGraph, smoothness: float = SMOOTHNESS, stretch: float = STRETCH, limit: float = 0.0
+    ) -> None:
         self.graph = graph
-        self.smoothness, self.stretch = smoothness, stretch
+        self.smoothness, self._lengths = smoothness, Lengths(stretch, limit, SHORTEST, LONGEST)
         self._begin = torch.from_numpy(graph.begin)
         self._neighbors = torch.from_numpy(graph.neighbors)
         self._weights = torch.from_numpy(graph.weights)
@@ -179,13 +191,13 @@ class ArapSolver:
                 rotations, spare = spare, rotations
             if system.factor is None:
                 break
-            stretch = self.stretch if step else 0.0  # edges of moved nodes have no valid direction yet
-            inputs = system.free, system.fixed, start, posed, *edges, stretch, rotations
+            lengths = self._lengths if step else NO_LENGTHS  # edges of moved nodes have no valid direction yet
+            inputs = system.free, system.fixed, start, posed, *edges, *lengths, rotations
             launch(kernels.edge_sums, len(free), *inputs, system.pulls, targets, sums, grain=128)
             before = positions.copy()
             positions[free] = system.factor.solve(sums.numpy())
             state = GroupState(positions, rotations.numpy(), targets.numpy(), asked[1].numpy())
-            groups.turn(state, before, stretch)
+            groups.turn(state, before, lengths)
             spare[groups.turned] = rotations[groups.turned]
             moved = float(np.abs(positions[free] - before[free]).max(initial=0.0))
             if step and not moved > tolerance:
@@ -194,7 +206,7 @@ class ArapSolver:
 
     def _groups(self, system: _System, anchors: Anchors, rest: np.ndarray) -> GroupRotations:
         free = system.free.long().numpy()
-        weights = self.stretch, self.smoothness * self.graph.edge_length**2
+        weights = self._lengths, self.smoothness * self.graph.edge_length**2
         return GroupRotations(
             self.graph, anchors.groups, rest, anchors.turned, free, system.factor, system.pulls.numpy(), *weights
         )

@@ -11,11 +11,12 @@ from helpers.edit_sessions import cloud, graph_of
 from scgs_warp.edit import ArapSolver, EditSession
 from scgs_warp.edit.graph import ControlGraph
 from scgs_warp.edit.handles import Goal, anchors_at
-from scgs_warp.edit.rigid_groups import GroupState, nearest_rotation
+from scgs_warp.edit.rigid_groups import NO_LENGTHS, GroupState, Lengths, nearest_rotation
 from scgs_warp.edit.rotations import angle, exponential, from_axis, from_matrix, rotate, to_matrix
-from scgs_warp.edit.solver import Shape, count_steps
+from scgs_warp.edit.solver import LONGEST, SHORTEST, Shape, count_steps
 
 Z = np.array([0.0, 0.0, 1.0])
+SHORT = Lengths(2.0, 15.0, SHORTEST, LONGEST)
 
 
 def free(nodes, rest: np.ndarray, to: np.ndarray, **more) -> Goal:
@@ -25,10 +26,17 @@ def free(nodes, rest: np.ndarray, to: np.ndarray, **more) -> Goal:
 
 
 def global_energy(
-    graph: ControlGraph, rest: np.ndarray, shape: Shape, goal: Goal, pins: np.ndarray, turn: np.ndarray
+    graph: ControlGraph,
+    rest: np.ndarray,
+    shape: Shape,
+    goal: Goal,
+    pins: np.ndarray,
+    turn: np.ndarray,
+    lengths: Lengths,
+    before: GroupState,
 ) -> tuple[float, np.ndarray]:
-    """Return the least energy over all free positions, and these, if the group is turned by a matrix. Dense, without
-    the spring on lengths; rotations of other nodes are those of ``shape``."""
+    """Return the least energy over all free positions, and these, if the group is turned by a matrix. Dense; rotations
+    of other nodes are those of ``shape``, and the lengths that edges should keep those of ``before``."""
     anchors = anchors_at([goal], pins, rest, 1.0)
     members, pulls = anchors.groups.members, anchors.soft * np.diff(graph.begin)
     places = anchors.positions.copy()
@@ -36,7 +44,17 @@ def global_energy(
     rotations = shape.rotations.copy()
     rotations[members] = turn
     i, j = graph.edges.T
-    wanted = 0.5 * np.einsum("eij,ej->ei", rotations[i] + rotations[j], rest[i] - rest[j])
+    edges = rest[i] - rest[j]
+    wanted = 0.5 * np.einsum("eij,ej->ei", rotations[i] + rotations[j], edges)
+    turned = 0.5 * np.einsum("eij,ej->ei", before.rotations[i] + before.rotations[j], edges)
+    for edge in np.flatnonzero(~(members[i] & members[j])):  # the group is rigid
+        posed, old = before.positions[i[edge]] - before.positions[j[edge]], np.linalg.norm(edges[edge])
+        size = np.linalg.norm(posed)
+        along = max(0.0, posed @ turned[edge] / (size * np.linalg.norm(turned[edge])))
+        allowed = min(max(size, lengths.shortest * old), lengths.longest * old)
+        kept, near = (along * length / size * posed + (1.0 - along) * turned[edge] for length in (old, allowed))
+        wanted[edge] += lengths.stretch * kept + lengths.limit * (near - 0.5 * posed)
+        wanted[edge] /= 1.0 + lengths.stretch + 0.5 * lengths.limit
     rows = np.zeros((len(i) + len(rest), len(rest)))
     rows[np.arange(len(i)), i], rows[np.arange(len(i)), j] = 1.0, -1.0
     rows[len(i) + np.arange(len(rest)), np.arange(len(rest))] = np.sqrt(pulls)
@@ -49,8 +67,8 @@ def global_energy(
 
 
 @pytest.mark.parametrize("seed", [0, 2, 5])
-@pytest.mark.parametrize("stiffness", [None, 0.7])
-def test_one_step_finds_the_best_rotation_and_positions(seed, stiffness):
+@pytest.mark.parametrize(("stiffness", "lengths"), [(None, NO_LENGTHS), (0.7, NO_LENGTHS), (None, SHORT)])
+def test_one_step_finds_the_best_rotation_and_positions(seed, stiffness, lengths):
     random = np.random.default_rng(seed)
     rest = cloud(seed, 40, (3.0, 1.0, 1.0))
     graph = graph_of(rest, 6)
@@ -64,22 +82,23 @@ def test_one_step_finds_the_best_rotation_and_positions(seed, stiffness):
     )
     start = to_matrix(exponential(random.normal(size=3) * 0.2))
     shape.rotations[group], shape.rotations[pins] = start, np.eye(3)
-    solver = ArapSolver(graph, 0.0, 0.0)
+    solver = ArapSolver(graph, 0.0, lengths.stretch, lengths.limit)
     system = solver._system(anchors)
     groups = solver._groups(system, anchors, rest)
     state = GroupState(shape.positions.copy(), shape.rotations.copy(), anchors.positions.copy(), shape.rotations.copy())
     groups.start(state)
     before = state.positions.copy()
-    state.positions[:] = global_energy(graph, rest, shape, goal, pins, groups.rotations[0])[1]
-    groups.turn(state, before, 0.0)
+    old = GroupState(before, state.rotations.copy(), state.targets, state.asked)
+    state.positions[:] = global_energy(graph, rest, shape, goal, pins, groups.rotations[0], lengths, old)[1]
+    groups.turn(state, before, lengths)
 
     def energy(vector: np.ndarray) -> float:
-        return global_energy(graph, rest, shape, goal, pins, to_matrix(exponential(vector)))[0]
+        return global_energy(graph, rest, shape, goal, pins, to_matrix(exponential(vector)), lengths, old)[0]
 
     best = min((minimize(energy, x, method="BFGS", options={"gtol": 1e-9}) for x in 0.5 * random.normal(size=(4, 3))),
                key=lambda result: result.fun)  # fmt: skip
     found, positions = groups.rotations[0], state.positions
-    lowest, expected = global_energy(graph, rest, shape, goal, pins, found)
+    lowest, expected = global_energy(graph, rest, shape, goal, pins, found, lengths, old)
     assert lowest <= best.fun * (1 + 1e-6) + 1e-12
     np.testing.assert_allclose(found, to_matrix(exponential(best.x)), atol=1e-4)
     np.testing.assert_allclose(positions, expected, atol=1e-8)

@@ -16,15 +16,15 @@ from scgs_warp.edit.graph import ControlGraph
 from scgs_warp.edit.handles import Goal, anchors_at
 from scgs_warp.edit.rigid_groups import RigidGroups
 from scgs_warp.edit.rotations import IDENTITY, angle, from_axis, from_matrix, rotate
-from scgs_warp.edit.solver import Anchors, Shape, count_steps
+from scgs_warp.edit.solver import LONGEST, SHORTEST, Anchors, Shape, count_steps
 from scgs_warp.runtime import environment
 
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
-def solve(graph: ControlGraph, rest: np.ndarray, goals: list[Goal], pins=(), steps: int = 8) -> Shape:
+def solve(graph: ControlGraph, rest: np.ndarray, goals: list[Goal], pins=(), steps: int = 8, limit=0.0) -> Shape:
     held = np.array(pins, np.int64)
-    return ArapSolver(graph).solve(rest, lambda share: anchors_at(goals, held, rest, share), steps)
+    return ArapSolver(graph, limit=limit).solve(rest, lambda share: anchors_at(goals, held, rest, share), steps)
 
 
 def turn(nodes, degrees: float = 0.0, axis=(0, 0, 1), shift=(0, 0, 0), pivot=(0, 0, 0), **more) -> Goal:
@@ -32,8 +32,8 @@ def turn(nodes, degrees: float = 0.0, axis=(0, 0, 1), shift=(0, 0, 0), pivot=(0,
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize(("stretch", "smooth"), [(0.0, 0.0), (2.0, 0.3)])
-def test_one_iteration_is_that_of_the_twin(seed, stretch, smooth):
+@pytest.mark.parametrize(("stretch", "smooth", "limit"), [(0.0, 0.0, 0.0), (2.0, 0.3, 0.0), (2.0, 0.3, 15.0)])
+def test_one_iteration_is_that_of_the_twin(seed, stretch, smooth, limit):
     random = np.random.default_rng(seed)
     rest = cloud(seed, 40)
     graph = graph_of(rest)
@@ -43,12 +43,14 @@ def test_one_iteration_is_that_of_the_twin(seed, stretch, smooth):
     anchors = Anchors(
         hard, soft, np.zeros(40, bool), posed + 0.0, np.tile(np.eye(3), (40, 1, 1)), np.zeros(40), RigidGroups.none(40)
     )
-    found = ArapSolver(graph, smooth, stretch).relax(rest, anchors, Shape(posed, anchors.rotations), 1)
+    found = ArapSolver(graph, smooth, stretch, limit).relax(rest, anchors, Shape(posed, anchors.rotations), 1)
     pulls = soft * np.diff(graph.begin)
     guessed = twin.place_nodes(graph, rest, posed, anchors.rotations, hard, pulls, posed, 0.0)
     rotations = twin.turn_nodes(graph, rest, guessed, anchors.rotations, smooth * graph.edge_length**2)
     np.testing.assert_allclose(found.rotations, rotations, atol=1e-6)
-    expected = twin.place_nodes(graph, rest, guessed, rotations, hard, pulls, posed, stretch)
+    expected = twin.place_nodes(
+        graph, rest, guessed, rotations, hard, pulls, posed, stretch, limit, (SHORTEST, LONGEST)
+    )
     np.testing.assert_allclose(found.positions, expected, atol=1e-6)
     assert np.abs(expected - posed).max() > 0.05
     first, second = graph.edges.T
@@ -205,13 +207,29 @@ def test_points_on_one_another_and_far_away():
     assert np.isfinite(found.positions).all() and np.linalg.det(found.rotations).min() > 0.99
 
 
-def test_same_bits_on_any_number_of_threads(all_threads):
+@pytest.mark.parametrize("degrees", [45, 90, 135])
+def test_a_limit_on_lengths_spreads_a_bend(degrees):
+    """No edge changes much more than the others of the joint, and nothing folds."""
+    rest = cloud(4, 160, (4.0, 0.4, 0.4))
+    graph = graph_of(rest)
+    right, left = np.flatnonzero(rest[:, 0] > 1.5), np.flatnonzero(rest[:, 0] < -1.5)
+    goal, ends = turn(right, degrees, (0, 1, 0)), graph.edges.T
+    steps, changes = count_steps(np.radians(degrees), 0.0, graph.edge_length), []
+    for limit in (0.0, 15.0):
+        posed = solve(graph, rest, [goal], left, steps, limit).positions
+        sizes = [np.linalg.norm(x[ends[0]] - x[ends[1]], axis=1) for x in (rest, posed)]
+        changes.append(np.abs(sizes[1] / sizes[0] - 1.0))
+    assert changes[1].max() < 0.75 * changes[0].max()
+
+
+@pytest.mark.parametrize("limit", [0.0, 15.0])
+def test_same_bits_on_any_number_of_threads(all_threads, limit):
     rest = cloud(11, 700)
     graph = graph_of(rest)
     results = []
     for threads in (1, 2):
         environment.configure(threads=threads)
-        found = solve(graph, rest, [turn(range(20), 60)], np.arange(300, 400))
+        found = solve(graph, rest, [turn(range(20), 60)], np.arange(300, 400), limit=limit)
         results.append((found.positions.tobytes(), found.rotations.tobytes()))
     assert results[0] == results[1]
 

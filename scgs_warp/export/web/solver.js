@@ -2,6 +2,7 @@
 // length, and neighbours their rotations. Each step fits the rotation of every point, then solves for positions.
 
 const SMOOTHNESS = 0.3, STRETCH = 2;
+const LIMIT = 15, SHORTEST = 0.92, LONGEST = 1.05; // a change of length beyond these parts of it costs more
 const ITERATIONS = { exact: 60, live: 6 };
 const TOLERANCE = 1e-4; // of an edge's length
 const FIT_STEPS = 12;
@@ -96,7 +97,7 @@ class Solver {
     for (let step = 0; step <= iterations; step++) {
       if (step) for (const m of turning) this.turn(m, rest, shape);
       if (!free.length) break;
-      this.addEdges(free, hard, soft, targets, rest, shape, step ? STRETCH : 0);
+      this.addEdges(free, hard, soft, targets, rest, shape, step ? STRETCH : 0, step ? LIMIT : 0);
       before.set(shape.points);
       this.solve(free, hard, soft, shape.points);
       let moved = 0;
@@ -119,8 +120,8 @@ class Solver {
     fitRotation(s, turns, 4 * m);
   }
 
-  addEdges(free, hard, soft, targets, rest, { points, turns }, stretch) {
-    const { graph, sums } = this, edge = [0, 0, 0];
+  addEdges(free, hard, soft, targets, rest, { points, turns }, stretch, limit) {
+    const { graph, sums } = this, edge = [0, 0, 0], weight = 1 + stretch + 0.5 * limit;
     const rotation = (m) => rotationRows([turns[4 * m], turns[4 * m + 1], turns[4 * m + 2], turns[4 * m + 3]]);
     for (const m of free) {
       const own = rotation(m), pull = soft[m] * graph.around(m).length;
@@ -135,14 +136,18 @@ class Solver {
           for (let c = 0; c < 3; c++) wanted[a] += 0.5 * (own[3 * a + c] + its[3 * a + c]) * edge[c];
         }
         const size = Math.hypot(...posed);
-        let along = 0, scale = 0;
+        let along = 0, kept = 0, allowed = 0; // share of the edge's direction, and its factors
         if (stretch && size > 0) {
           along = Math.max(dot(posed, wanted) / Math.max(size * Math.hypot(...wanted), 1e-300), 0);
-          scale = (along * Math.hypot(...edge)) / size;
+          const old = Math.hypot(...edge);
+          kept = (along * old) / size;
+          allowed = (along * Math.min(Math.max(size, SHORTEST * old), LONGEST * old)) / size;
         }
         for (let a = 0; a < 3; a++) {
-          const kept = scale * posed[a] + (1 - along) * wanted[a];
-          sums[3 * m + a] += (wanted[a] + stretch * kept) / (1 + stretch) + (hard[n] ? points[3 * n + a] : 0);
+          const turned = (1 - along) * wanted[a];
+          const asked = wanted[a] + stretch * (kept * posed[a] + turned)
+            + limit * (allowed * posed[a] + turned - 0.5 * posed[a]);
+          sums[3 * m + a] += asked / weight + (hard[n] ? points[3 * n + a] : 0);
         }
       }
     }
