@@ -6,7 +6,9 @@ Each limb is put where a turn of its joint takes it, without pins:
 
 - default: one click on the hand or foot, and one pull to where the turn takes it (`EditSession.pull`);
 - part: the limb's topmost part turned about the joint that was found (`EditSession.turn`);
-- point: one control point, moved there, and nothing else said.
+- point: one control point, moved there, and nothing else said;
+- least: the rigid limb turned about its true joint by the least angle that puts the tip there, which is what a pull
+  says about the limb. The turn about the line from joint to tip remains unknown, so that it errs, too.
 
 Rows hold `run`, `limb`, `gesture`, `degrees`, and as ratios `worst_edge` (largest relative change of an edge),
 `least_determinant`, `limb_error` (mean distance from the true turn, in limb lengths) and `torso_moved` (in heights).
@@ -60,7 +62,27 @@ def rows_of(run: Path) -> list[dict[str, Any]]:
                     "worst_edge": bent.worst_edge, "least_determinant": bent.determinant, "limb_error": bent.error,
                     "torso_moved": bent.torso_moved,
                 })  # fmt: skip
+            error = _least_turn_error(session.scene, solid, np.isin(bones, own), pivot, points[tip], degrees, axis)
+            rows.append({"run": run.name, "limb": limb, "gesture": "least", "degrees": degrees, "limb_error": error})
     return rows
+
+
+def _least_turn_error(
+    scene: Scene, solid: np.ndarray, limb: np.ndarray, pivot: np.ndarray, tip: np.ndarray, degrees: float, axis: Any
+) -> float:
+    """Return the mean distance between the limb's Gaussians after the true turn and after the least one that takes the
+    tip to the same place, in limb lengths.
+
+    Args:
+        solid: [N] bool, opaque Gaussians; limb: of those, the limb's.
+    """
+    arms = scene.gaussians_at(0.0).means.double().numpy()[solid][limb] - pivot
+    turn = from_axis(axis, degrees)
+    before, after = tip - pivot, rotate(turn, tip - pivot)
+    across = np.cross(before, after)
+    angle = np.degrees(np.arctan2(np.linalg.norm(across), before @ after))
+    apart = rotate(from_axis(across, angle), arms) - rotate(turn, arms)
+    return float(np.linalg.norm(apart, axis=1).mean() / np.linalg.norm(arms, axis=1).max())
 
 
 def _act(session: EditSession, gesture: str, tip: int, place: np.ndarray, degrees: float, axis: Any) -> None:
@@ -84,9 +106,8 @@ def main() -> int:
     configure(1)
     rows = [row for run in options.run for row in rows_of(run)]
     for row in rows:
-        numbers = " ".join(
-            f"{name} {row[name]:6.3f}" for name in ("worst_edge", "least_determinant", "limb_error", "torso_moved")
-        )
+        names = [name for name in ("worst_edge", "least_determinant", "limb_error", "torso_moved") if name in row]
+        numbers = " ".join(f"{name} {row[name]:6.3f}" for name in names)
         print(f"{row['run']:16} {row['limb']:4} {row['gesture']:8} {row['degrees']:4}  {numbers}")
     if options.json:
         origin = {"provenance": "measured", "command": command_line("benchmarks/posing.py", sys.argv[1:])}

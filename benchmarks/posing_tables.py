@@ -31,7 +31,12 @@ from markdown_table import table
 
 Results = dict[str, dict[str, Any]]
 
-GESTURES = {"default": "one pull on the hand or foot", "part": "the part turned about its joint", "point": "one point"}
+GESTURES = {
+    "default": "one pull on the hand or foot",
+    "least": "the least rigid turn that takes it there",
+    "part": "the part turned about its joint",
+    "point": "one point",
+}
 
 
 def parts_found(results: Results) -> str:
@@ -88,7 +93,7 @@ def gestures(results: Results) -> str:
                 own = [row for row in rows if (row["gesture"], row["limb"], row["degrees"]) == key]
 
                 def cells(name: str, write: Callable[[float], str], own: list[dict[str, Any]] = own) -> str:
-                    return " ".join(write(row[name]) for row in own)
+                    return " ".join(write(row[name]) for row in own if name in row)
 
                 lines.append([
                     f"{text}: {limb}, {degrees}", cells("worst_edge", _percent),
