@@ -77,9 +77,9 @@ def edge_sums(
     neighbors_in: wp.array[wp.int32],  # [E]
     weights_in: wp.array[wp.float64],  # [E]
     stretch: wp.float64,  # weight of keeping an edge's length, relative to that of keeping its shape
-    limit: wp.float64,  # weight of keeping an edge's length between these two parts of it, likewise
-    shortest: wp.float64,
-    longest: wp.float64,
+    limit: wp.float64,  # weight of keeping an edge's length between two multiples of that at rest, likewise
+    shortest: wp.float64,  # the smaller multiple
+    longest: wp.float64,  # the larger one
     rotations_in: wp.array[wp.mat33d],  # [M]
     pulls_in: wp.array[wp.float64],  # [M] weight of a soft target
     targets_in: wp.array[wp.vec3d],  # [M]
@@ -88,8 +88,9 @@ def edge_sums(
 ):
     """Compute the right-hand side of the linear system: rotated edges, known neighbours and soft targets. Grid: F.
 
-    The limit on lengths counts half its weight in the matrix, with the present edge as the other half of its target:
-    the least with which iterations cannot overshoot, and the fastest.
+    The limit on lengths counts half its weight in the matrix, with the present edge as the other half of its target.
+    With the whole weight, iterations take twice as long to converge; with less than half, they diverge where many edges
+    are beyond the limit.
     """
     at_row = first + wp.tid()
     i = nodes_in[at_row]

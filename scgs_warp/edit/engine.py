@@ -175,7 +175,7 @@ class Engine:
             goals = self._problem(edit, time, between, frame)
             anchors = anchors_at(goals.goals if goals else problem.goals, problem.pins, rest, 1.0)
             iterations = LIVE_ITERATIONS if step == steps else STEP_ITERATIONS // 2
-            shape = problem.solver.relax(rest, anchors, shape, iterations)
+            shape = problem.solver.relax(rest, anchors, shape, problem.solver.pace * iterations)
         reached = targets if taken == steps else _between(before, targets, taken / steps)
         self._live = _Live(key, reached, shape)
         return self._finish(problem, shape)

@@ -27,7 +27,7 @@ of its control points are held."""
 INNER_STIFFNESS = 0.03
 """Stiffness (edges have 1) with which a short body between two others is pulled to its place. The bodies at its ends
 place it already; held firmly, it would leave the surface little room to bend."""
-LENGTH_LIMIT = 15.0
+LENGTH_LIMIT = 10.0
 """Weight of changes of an edge's length beyond what is allowed (``ArapSolver``), relative to the ARAP energy: all free
 edges of a joint share a bend."""
 BOUNDARY_REACH = 1.5

@@ -40,7 +40,7 @@ class RigidGroups(NamedTuple):
 
 
 class Lengths(NamedTuple):
-    """Energy that keeps the lengths of edges (kernels/arap_solver.py), relative to that of their shape."""
+    """Weights of keeping the lengths of edges (kernels/arap_solver.py), relative to that of keeping their shape."""
 
     stretch: float
     """Weight of any change of length."""

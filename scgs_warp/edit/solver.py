@@ -3,9 +3,9 @@
 Local and global steps alternate (Sorkine & Alexa 2007): each node fits the rotation that best explains its edges,
 regularised towards its neighbours' rotations (Levi & Gotsman 2015), then one sparse linear system gives all positions.
 A projective spring on each edge preserves its length, because thin limbs hang on few edges and plain ARAP shears those
-at a joint. A second one, where it is asked for, acts on large changes of length alone: it spreads a bend over the edges
-of a joint instead of leaving most of it to a few. The matrix depends on which nodes are held, not on where they are,
-and is factorised once per set of handles.
+at a joint. A second one, where it is asked for, acts on large changes of length, and on edges that point elsewhere than
+the rotations of their ends say: it spreads a bend over the edges of a joint instead of leaving most of it to a few. The
+matrix depends on which nodes are held, not on where they are, and is factorised once per set of handles.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ STEP_ITERATIONS = 6
 FINAL_ITERATIONS = 60
 FREE_ITERATIONS = 200
 """Replaces ``FINAL_ITERATIONS`` if a group turns freely, because a whole limb then swings into place."""
+LIMITED_PACE = 2
+"""Factor on all numbers of iterations with a limit on lengths, with which each of them gets less far."""
 TURN_ITERATIONS = 8
 TOLERANCE = 1e-4
 """Convergence threshold in edge lengths: iterations stop when no node moves further in one iteration."""
@@ -112,6 +114,8 @@ class ArapSolver:
         smoothness: weight of the neighbours' rotations, squared edge lengths.
         stretch: weight of preserving an edge's length, relative to the ARAP energy.
         limit: weight of changes of an edge's length beyond ``SHORTEST`` and ``LONGEST``, likewise; 0: none.
+
+    Attributes: ``pace``, the factor on numbers of iterations.
     """
 
     def __init__(
@@ -119,6 +123,7 @@ class ArapSolver:
     ) -> None:
         self.graph = graph
         self.smoothness, self._lengths = smoothness, Lengths(stretch, limit, SHORTEST, LONGEST)
+        self.pace = LIMITED_PACE if limit > 0.0 else 1
         self._begin = torch.from_numpy(graph.begin)
         self._neighbors = torch.from_numpy(graph.neighbors)
         self._weights = torch.from_numpy(graph.weights)
@@ -255,7 +260,7 @@ class ArapSolver:
             last = step == steps
             anchors = path(step / steps)
             final = FREE_ITERATIONS if len(anchors.groups.centers) else FINAL_ITERATIONS
-            shape = self.relax(rest, anchors, shape, final if last else STEP_ITERATIONS)
+            shape = self.relax(rest, anchors, shape, self.pace * (final if last else STEP_ITERATIONS))
         return shape
 
     def turns(self, rest: np.ndarray, posed: np.ndarray) -> np.ndarray:

@@ -85,7 +85,7 @@ def test_a_posed_limb_moves_as_a_body_and_the_rest_keeps_its_bits(session, skin)
     wanted = session.engine.to_world(motion.apply(held))
     assert np.median(np.linalg.norm(after.means[tip].double().numpy() - wanted, axis=1)) < 0.03
     grown = (after.scales / before.scales).max(1).values
-    assert 1.2 < float(grown.max()) < 2.5, "Gaussians widen where the shoulder opens"
+    assert 1.1 < float(grown.max()) < 2.5, "Gaussians widen where the shoulder opens"
 
 
 def test_the_skin_is_saved_and_checked(session, tmp_path):

@@ -241,6 +241,17 @@ def test_live_results_reach_the_exact_ones(session):
     np.testing.assert_allclose(live, session.node_positions(0.0), atol=5e-3)
 
 
+@pytest.mark.parametrize(("part", "axis"), [("shoulder_left", (0, -1, 0)), ("hip_left", (-1, 0, 0))])
+def test_the_end_of_a_drag_hardly_moves_anything(session, part, axis):
+    """Live updates keep pace with a drag in steps of 5 degrees."""
+    for _ in range(24):
+        session.rotate(part, from_axis(axis, 5.0), since=session.edit, live=True)
+        live = session.node_positions(0.0, live=True)
+    session.release()
+    edge = session.graph.edge_length / session.engine.units[1]
+    assert np.linalg.norm(session.node_positions(0.0) - live, axis=1).max() < 0.04 * edge
+
+
 def test_a_short_body_between_two_others_is_pulled_not_held(session):
     session.turn("shoulder_left", 70, (0, -1, 0))
 

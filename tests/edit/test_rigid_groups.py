@@ -16,7 +16,7 @@ from scgs_warp.edit.rotations import angle, exponential, from_axis, from_matrix,
 from scgs_warp.edit.solver import LONGEST, SHORTEST, Shape, count_steps
 
 Z = np.array([0.0, 0.0, 1.0])
-SHORT = Lengths(2.0, 15.0, SHORTEST, LONGEST)
+LIMITED = Lengths(2.0, 15.0, SHORTEST, LONGEST)
 
 
 def free(nodes, rest: np.ndarray, to: np.ndarray, **more) -> Goal:
@@ -67,7 +67,7 @@ def global_energy(
 
 
 @pytest.mark.parametrize("seed", [0, 2, 5])
-@pytest.mark.parametrize(("stiffness", "lengths"), [(None, NO_LENGTHS), (0.7, NO_LENGTHS), (None, SHORT)])
+@pytest.mark.parametrize(("stiffness", "lengths"), [(None, NO_LENGTHS), (0.7, NO_LENGTHS), (None, LIMITED)])
 def test_one_step_finds_the_best_rotation_and_positions(seed, stiffness, lengths):
     random = np.random.default_rng(seed)
     rest = cloud(seed, 40, (3.0, 1.0, 1.0))

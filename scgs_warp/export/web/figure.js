@@ -182,6 +182,7 @@ class Figure {
 
   // Start where the bodies are, when others begin to move.
   carry(found) {
+    this.shape.anchors = null;
     for (let m = 0; m < this.count; m++) {
       const motion = found[this.owner[m]];
       this.shape.points.set(moveBy(motion, this.now.subarray(3 * m, 3 * m + 3)), 3 * m);

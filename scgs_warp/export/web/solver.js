@@ -2,8 +2,9 @@
 // length, and neighbours their rotations. Each step fits the rotation of every point, then solves for positions.
 
 const SMOOTHNESS = 0.3, STRETCH = 2;
-const LIMIT = 15, SHORTEST = 0.92, LONGEST = 1.05; // a change of length beyond these parts of it costs more
-const ITERATIONS = { exact: 60, live: 6 };
+const LIMIT = 10, SHORTEST = 0.92, LONGEST = 1.05; // an edge outside these multiples of its rest length costs more
+const ITERATIONS = { exact: 120, live: 12 };
+const NEAR = 0.25; // of an edge's length, by which held points may move and edges keep their directions
 const TOLERANCE = 1e-4; // of an edge's length
 const FIT_STEPS = 12;
 
@@ -83,6 +84,8 @@ class Solver {
   // shape: { points [M * 3], turns [M * 4] }, changed in place.
   relax(rest, anchors, shape, iterations) {
     const { graph } = this, { hard, soft, told, targets, turns } = anchors;
+    const near = this.isNear(anchors, shape.anchors);
+    shape.anchors = anchors;
     const alive = new Set();
     for (let m = 0; m < graph.count; m++) if (hard[m] || soft[m]) alive.add(graph.component[m]);
     const free = [], turning = [];
@@ -97,7 +100,7 @@ class Solver {
     for (let step = 0; step <= iterations; step++) {
       if (step) for (const m of turning) this.turn(m, rest, shape);
       if (!free.length) break;
-      this.addEdges(free, hard, soft, targets, rest, shape, step ? STRETCH : 0, step ? LIMIT : 0);
+      this.addEdges(free, hard, soft, targets, rest, shape, step || near ? STRETCH : 0, step || near ? LIMIT : 0);
       before.set(shape.points);
       this.solve(free, hard, soft, shape.points);
       let moved = 0;
@@ -106,6 +109,17 @@ class Solver {
       }
       if (step && !(moved > TOLERANCE * graph.length)) break;
     }
+  }
+
+  // Whether held points moved so little that the solution goes on where it was.
+  isNear({ hard, targets }, before) {
+    if (!before) return false;
+    for (let m = 0; m < this.graph.count; m++) {
+      if (hard[m] !== before.hard[m]) return false;
+      const moved = [0, 1, 2].map((a) => targets[3 * m + a] - before.targets[3 * m + a]);
+      if (hard[m] && Math.hypot(...moved) > NEAR * this.graph.length) return false;
+    }
+    return true;
   }
 
   turn(m, rest, { points, turns }) {
