@@ -14,11 +14,11 @@ of the default number of steps (``fig``) and of six times as many (``long``):
 
 and of two glTF characters, ``man`` and ``robot``, filmed by ``apps/synthesize.py --size 200 --train 150`` (``robot``
 with ``--clip Robot_Dance``) and trained with ``--preset cpu --steps 6000 --threads 1`` (``man-long`` without
-``--steps``):
+``--steps``, ``robot-1`` with ``--seed 1``):
 
     python benchmarks/parts.py --run man man-long --data data/man --mesh CesiumMan.glb \\
         --json benchmarks/results/parts-man.json
-    python benchmarks/parts.py --run robot --data data/robot --mesh RobotExpressive.glb \\
+    python benchmarks/parts.py --run robot robot-1 --data data/robot --mesh RobotExpressive.glb \\
         --json benchmarks/results/parts-robot.json
 """
 
