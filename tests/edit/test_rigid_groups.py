@@ -39,7 +39,7 @@ def global_energy(
     of other nodes are those of ``shape``, and the lengths that edges should keep those of ``before``."""
     anchors = anchors_at([goal], pins, rest, 1.0)
     members, pulls = anchors.groups.members, anchors.soft * np.diff(graph.begin)
-    places = anchors.positions.copy()
+    places, rigid = anchors.positions.copy(), members & anchors.hard
     places[members] = anchors.groups.centers[0] + anchors.groups.arms[members] @ turn.T
     rotations = shape.rotations.copy()
     rotations[members] = turn
@@ -47,7 +47,7 @@ def global_energy(
     edges = rest[i] - rest[j]
     wanted = 0.5 * np.einsum("eij,ej->ei", rotations[i] + rotations[j], edges)
     turned = 0.5 * np.einsum("eij,ej->ei", before.rotations[i] + before.rotations[j], edges)
-    for edge in np.flatnonzero(~(members[i] & members[j])):  # the group is rigid
+    for edge in np.flatnonzero(~(rigid[i] & rigid[j])):
         posed, old = before.positions[i[edge]] - before.positions[j[edge]], np.linalg.norm(edges[edge])
         size = np.linalg.norm(posed)
         along = max(0.0, posed @ turned[edge] / (size * np.linalg.norm(turned[edge])))
@@ -67,7 +67,8 @@ def global_energy(
 
 
 @pytest.mark.parametrize("seed", [0, 2, 5])
-@pytest.mark.parametrize(("stiffness", "lengths"), [(None, NO_LENGTHS), (0.7, NO_LENGTHS), (None, LIMITED)])
+@pytest.mark.parametrize("stiffness", [None, 0.7])
+@pytest.mark.parametrize("lengths", [NO_LENGTHS, LIMITED], ids=["free", "limited"])
 def test_one_step_finds_the_best_rotation_and_positions(seed, stiffness, lengths):
     random = np.random.default_rng(seed)
     rest = cloud(seed, 40, (3.0, 1.0, 1.0))
@@ -102,7 +103,7 @@ def test_one_step_finds_the_best_rotation_and_positions(seed, stiffness, lengths
     assert lowest <= best.fun * (1 + 1e-6) + 1e-12
     np.testing.assert_allclose(found, to_matrix(exponential(best.x)), atol=1e-4)
     np.testing.assert_allclose(positions, expected, atol=1e-8)
-    assert energy(np.zeros(3)) > 1.02 * lowest, "the rotation matters"
+    assert energy(np.zeros(3)) > 1.01 * lowest, "the rotation matters"
 
 
 @pytest.mark.parametrize("degrees", [30, 90, 150])
