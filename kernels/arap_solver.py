@@ -88,9 +88,8 @@ def edge_sums(
 ):
     """Compute the right-hand side of the linear system: rotated edges, known neighbours and soft targets. Grid: F.
 
-    The limit on lengths counts half its weight in the matrix, with the present edge as the other half of its target.
-    With the whole weight, iterations take twice as long to converge; with less than half, they diverge where many edges
-    are beyond the limit.
+    The limit on lengths counts half its weight in the matrix, with the present edge as the other half of its target:
+    with its whole weight, iterations converge more slowly; with less than half, they may diverge.
     """
     at_row = first + wp.tid()
     i = nodes_in[at_row]

@@ -116,8 +116,9 @@ class Solver {
     if (!before) return false;
     for (let m = 0; m < this.graph.count; m++) {
       if (hard[m] !== before.hard[m]) return false;
+      if (!hard[m]) continue;
       const moved = [0, 1, 2].map((a) => targets[3 * m + a] - before.targets[3 * m + a]);
-      if (hard[m] && Math.hypot(...moved) > NEAR * this.graph.length) return false;
+      if (Math.hypot(...moved) > NEAR * this.graph.length) return false;
     }
     return true;
   }
