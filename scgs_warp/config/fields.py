@@ -152,14 +152,12 @@ class PretrainConfig:
     clone_share: float = bounded(0.2, 0, 1)
     """Share of the spheres cloned in each round, until the cap: those with the largest gradients."""
     grad_threshold: float = newer(2e-4, before=2e-4, least=0)
-    """Gradient of the loss with respect to the 2D mean, in normalised device coordinates, for ``densify_by``
-    gradient."""
+    """Gradient with respect to the 2D mean, in normalised device coordinates, for ``densify_by`` gradient."""
     start_ratio: float = bounded(8.0, 1, 1e4)
     """Number of spheres per control point (with ``densify_by`` share counting at least 256) at the start; spheres at
     rest cost little."""
     max_ratio: float = bounded(2.0, 1, 1e4)
-    """Once the spheres move, at most this many per control point (counted likewise), because the network is then
-    evaluated at each sphere."""
+    """Once the spheres move, at most this many per control point (counted likewise): the network is asked for each."""
     grey: bool = newer(False, before=False)
     """Start with grey spheres (official code), not with the colours of the points."""
     opacity_rate: float = rate(0.02)
@@ -169,6 +167,8 @@ class PretrainConfig:
     """Learning rate of the spheres' colours."""
     arap_weight: float = bounded(1e-3, 0, 1e6)
     """Weight of ARAP on the trajectories of the spheres."""
+    arap_by: Literal["track", "moment"] = newer("track", before="track")
+    """Neighbours of ARAP. track: over the whole time (supplement). moment: at the view's time, less those that part."""
     random_background: bool = True
     """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
     space."""
@@ -177,8 +177,8 @@ class PretrainConfig:
     the image's width; needs alpha. It brings spheres to thin and fast parts, which the photometric loss makes
     transparent. If above 0, spheres are not larger than thin subjects are thick."""
     pooled: bool = newer(True, before=False)
-    """Add the residual averaged over squares of 2, 4 and 8 % of the width (not in the paper). A sphere is drawn to its
-    part from farther away, and moved instead of turned transparent."""
+    """Add the residual averaged over squares of 2, 4 and 8 % of the width (not in the paper). It draws a sphere to its
+    part from farther away, and moves it instead of turning it transparent."""
     fade: Literal["auto", "always", "never"] = newer("auto", before="always")
     """Let spheres turn more transparent than ``solid_opacity``. A part whose spheres have faded is lost, but strays
     should fade. auto: yes, unless ``silhouette`` leads spheres to a subject in separate parts, which is not thin."""

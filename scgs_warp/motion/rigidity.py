@@ -13,6 +13,9 @@ from ..ops.arap import arap_energy, reverse_edges, trajectory_graph
 from ..ops.neighbors import NodeLists
 from ..optim import log_linear
 
+STRETCHED = 2.0
+"""Change of an edge's length, in spacings of the control points, at which the edge counts a quarter."""
+
 
 class Graph(NamedTuple):
     """Neighbours over the whole time, with their weights: motion should be rigid between neighbouring control
@@ -21,7 +24,7 @@ class Graph(NamedTuple):
     neighbors: Tensor
     """[M, J] int32, padded with -1."""
     weights: Tensor
-    """[M, J], rows sum to 1."""
+    """[M, J], rows sum to at most 1."""
     reverse: NodeLists
     """Edges that end at each control point."""
 
@@ -69,6 +72,34 @@ def build_graph(
         if count < 1:
             return None
         graph = Graph.of(*trajectory_graph(trajectories.contiguous(), count))
+        return graph if before is None else before.replaced_by(graph)
+
+
+def momentary_graph(instants: Tensor, loss: LossConfig, before: Graph | None = None) -> Graph | None:
+    """Find neighbours by place at the first of two ``instants`` [2, M, 3].
+
+    Where two limbs have exchanged their tracks, neighbours at one moment are far apart at another. Neighbours over the
+    whole time leave such pairs out, and therefore never correct the exchange. Weights fall with the change of an edge's
+    length (Geman and McClure), because bodies that only touch may part.
+
+    Args:
+        before: the graph to replace.
+
+    Returns:
+        None if M < 2.
+    """
+    with torch.no_grad():
+        first, second = instants
+        count = min(loss.arap_neighbors, len(first) - 1)
+        if count < 1:
+            return None
+        neighbors, weights = trajectory_graph(first[None], count)
+        ends = neighbors.long().clamp(min=0)
+        lengths = (first[ends] - first[:, None]).norm(dim=2)
+        change = (second[ends] - second[:, None]).norm(dim=2) - lengths
+        spacing = lengths[:, 0].median().clamp(min=1e-12)
+        share = (1.0 + (change / (STRETCHED * spacing)).square()).pow(-2)
+        graph = Graph.of(neighbors, (weights * share).where(share.isfinite(), 0.0))
         return graph if before is None else before.replaced_by(graph)
 
 

@@ -13,7 +13,7 @@ from ..types import Gaussians
 from .base import Motion, MotionStep, TrainingPose, network_rate
 from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
-from .rigidity import Graph, arap_times, build_graph, rigidity
+from .rigidity import Graph, arap_times, build_graph, momentary_graph, rigidity
 
 
 class Spheres(Motion):
@@ -51,17 +51,24 @@ class Spheres(Motion):
             return MotionStep((time,), phase="rest")
         if not self._compares(step, config):
             return MotionStep((time,))
-        if self._graph_is_old(step, config.loss):
-            self.graph = build_graph(
-                lambda times: gaussians.means + self.translations(gaussians.means, times), config.loss, self.graph
-            )
         others = arap_times(config.loss, generator(config.seed, 22, step * config.batch + view))
+
+        def positions_at(times: Tensor) -> Tensor:
+            return gaussians.means + self.translations(gaussians.means, times)
+
+        if config.pretrain.arap_by == "moment":
+            with torch.no_grad():
+                instants = positions_at(torch.tensor((time, *others)[-2:]))
+            self.graph = momentary_graph(instants, config.loss, self.graph)
+        elif self._graph_is_old(step, config.loss):
+            self.graph = build_graph(positions_at, config.loss, self.graph)
         weight = config.pretrain.arap_weight * config.loss.arap_every
         return MotionStep((time, *others), 0.0 if self.graph is None else weight)
 
     def refresh_due(self, step: int, config: TrainConfig) -> bool:
         moving = step >= config.pretrain.warm_up
-        return moving and self._compares(step, config) and self._graph_is_old(step, config.loss)
+        old = config.pretrain.arap_by == "moment" or self._graph_is_old(step, config.loss)
+        return moving and self._compares(step, config) and old
 
     def train_at(
         self,

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from scgs_warp.config.fields import LossConfig
-from scgs_warp.motion.rigidity import arap_times, arap_weight, build_graph, rigidity
+from scgs_warp.motion.rigidity import arap_times, arap_weight, build_graph, momentary_graph, rigidity
 from scgs_warp.seeding import generator
 
 
@@ -52,6 +52,64 @@ def test_only_bending_costs_energy(device):
 
 def test_no_graph_of_one_control_point():
     assert build_graph(lambda times: torch.zeros(len(times), 1, 3), LossConfig()) is None
+    assert momentary_graph(torch.zeros(2, 1, 3), LossConfig()) is None
+
+
+def crossing_rods(device):
+    """Two rods of 8 points side by side, whose lower halves change places at the second instant."""
+    height = torch.arange(8, device=device) * 0.1
+    rods = torch.stack([torch.stack([torch.full_like(height, x), height, 0 * height], 1) for x in (0.0, 1.0)])
+    swapped = torch.stack([torch.cat([rods[1 - i, :4], rods[i, 4:]]) for i in (0, 1)])
+    return rods.reshape(-1, 3), swapped.reshape(-1, 3)
+
+
+def test_neighbors_of_a_moment_join_what_an_exchange_separates(device):
+    first, second = crossing_rods(device)
+    loss = LossConfig(arap_neighbors=2)
+    edges = [(3, 4), (4, 3), (11, 12), (12, 11)]
+
+    def joined(graph):
+        assert graph is not None
+        return [second in graph.neighbors[first].tolist() for first, second in edges]
+
+    assert all(joined(momentary_graph(torch.stack([first, second]), loss)))
+    tracks = torch.stack([first, second])
+    assert not any(joined(build_graph(lambda times: tracks[(times > 0.5).long()], loss)))
+
+
+def test_edges_that_change_their_length_count_less(device):
+    first, second = crossing_rods(device)
+    loss = LossConfig(arap_neighbors=2)
+    kept = momentary_graph(torch.stack([first, first + 0.5]), loss)
+    parted = momentary_graph(torch.stack([first, second]), loss)
+    assert kept is not None and parted is not None
+    torch.testing.assert_close(kept.weights.sum(1), torch.ones(16, device=device))
+    assert torch.equal(kept.neighbors, parted.neighbors)
+    share = parted.weights / kept.weights
+    change = math.sqrt(1.0 + 0.1**2) - 0.1  # the lower end goes over to the other rod
+    weight = (1.0 + (change / (2.0 * 0.1)) ** 2) ** -2
+    crossing = parted.neighbors[3].tolist().index(4)
+    assert float(share[3, crossing]) == pytest.approx(weight, rel=1e-4) and weight < 0.01
+    assert float(share[6].min()) == pytest.approx(1.0)
+
+
+def test_a_graph_of_a_moment_replaces_the_one_before_in_place(device):
+    first, second = crossing_rods(device)
+    loss = LossConfig(arap_neighbors=2)
+    graph = momentary_graph(torch.stack([first, first]), loss)
+    assert graph is not None
+    expected = momentary_graph(torch.stack([first, second]), loss)
+    assert momentary_graph(torch.stack([first, second]), loss, graph) is graph
+    assert expected is not None and torch.equal(graph.weights, expected.weights)
+
+
+def test_points_that_are_not_finite_have_no_weight(device):
+    first, second = crossing_rods(device)
+    second = second.clone()
+    second[5] = math.nan
+    graph = momentary_graph(torch.stack([first, second]), LossConfig(arap_neighbors=2))
+    assert graph is not None and bool(graph.weights.isfinite().all())
+    assert float(graph.weights[5].sum()) == 0.0
 
 
 def test_the_energy_is_between_the_last_two_instants():
