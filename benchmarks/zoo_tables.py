@@ -134,6 +134,20 @@ def depth(source: Source) -> str:
     return table(["", "motion error", "PSNR", "worst"], lines)
 
 
+def crossing(source: Source) -> str:
+    """Write what neighbours of a moment do for a figure whose legs cross."""
+    rows = {
+        "cpu": "`cpu`",
+        "moment": "`cpu --progressive`, `pretrain.arap_by=moment`, `pretrain.arap_weight=0.03`",
+    }
+    lines = []
+    for row, label in rows.items():
+        run = source.run(row, "man")
+        scores = (number(run.get(key), 2) for key in ("psnr", "psnr_worst"))
+        lines.append([source.label(row, label), f"{number(run.get('epe'), 2)} %", *scores, thousands(run["gaussians"])])
+    return table(["", "motion error", "PSNR", "worst", "Gaussians"], lines)
+
+
 def rig(source: Source) -> str:
     """Write how good the view of a camera that was held out is, by the angle between the cameras of a rig."""
     rows = {

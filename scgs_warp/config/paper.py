@@ -68,6 +68,7 @@ PAPER = TrainConfig(
         opacity_rate=0.05,
         color_rate=2.5e-3,
         arap_weight=1e-2,
+        arap_by="track",
         random_background=True,
         silhouette=0.0,
         pooled=False,
