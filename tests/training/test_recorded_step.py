@@ -153,8 +153,9 @@ def test_the_same_losses_where_gradients_are_added_in_any_order(device):
         {"half_size": 14, "loss": {"log_error": 2e-3, "log_error_from": 0.3, "pooled": "always"}},
         {"pretrain": {"silhouette": 1.0, "fade": "never", "warm_up": 4, "random_background": True}},
         {"loss": {"arap_pair": "random"}, "motion": {"mask": True, "time_noise": 0.1, "hyper_dim": 2}},
+        {"pretrain": {"arap_by": "moment", "arap_weight": 0.03, "warm_up": 4, "progressive": True}},
     ],
-    ids=["sizes and losses", "silhouettes", "noise"],
+    ids=["sizes and losses", "silhouettes", "noise", "neighbours of a moment"],
 )
 def test_same_bits_of_everything_that_changes_a_step(changes, device):
     compare(device, 60, **changes)
