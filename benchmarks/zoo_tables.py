@@ -143,8 +143,8 @@ def crossing(source: Source) -> str:
     lines = []
     for row, label in rows.items():
         run = source.run(row, "man")
-        scores = (number(run.get(key), 2) for key in ("psnr", "psnr_worst"))
-        lines.append([source.label(row, label), f"{number(run.get('epe'), 2)} %", *scores, thousands(run.get("gaussians"))])
+        scores = [number(run.get(key), 2) for key in ("psnr", "psnr_worst")] + [thousands(run.get("gaussians"))]
+        lines.append([source.label(row, label), f"{number(run.get('epe'), 2)} %", *scores])
     return table(["", "motion error", "PSNR", "worst", "Gaussians"], lines)
 
 
