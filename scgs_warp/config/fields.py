@@ -168,7 +168,7 @@ class PretrainConfig:
     arap_weight: float = bounded(1e-3, 0, 1e6)
     """Weight of ARAP on the trajectories of the spheres."""
     arap_by: Literal["track", "moment"] = newer("track", before="track")
-    """Neighbours of ARAP. track: over the whole time (supplement). moment: at the view's time, less those that part."""
+    """Neighbours of ARAP. track: over the whole time (supplement). moment: at the first time compared, if they stay."""
     random_background: bool = True
     """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
     space."""

@@ -18,8 +18,7 @@ STRETCHED = 2.0
 
 
 class Graph(NamedTuple):
-    """Neighbours over the whole time, with their weights: motion should be rigid between neighbouring control
-    points."""
+    """Neighbours with their weights: motion should be rigid between neighbouring control points."""
 
     neighbors: Tensor
     """[M, J] int32, padded with -1."""
