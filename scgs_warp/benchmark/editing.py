@@ -1,8 +1,9 @@
-"""Benchmarks of the editor: from a drag of a handle to what its pages get."""
+"""Benchmarks of the editor: from a drag of a handle or of a part to what its pages get."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..edit import EditSession, Target, engine
 from ..edit.handles import STAY
 from ..editor import pictures, poses
 from ..editor.model import EditorModel
+from ..editor.parts_tool import PartsTool
 from ..export import page_edit
 from ..ops.sampling import farthest_points
 from ..rendering import render
@@ -19,24 +21,70 @@ from .plan import BenchCase
 from .scenes import scene_camera
 from .workloads import draw_stages
 
+Targets = dict[str, list[tuple[Any, str]]]
+"""Functions of each stage, as objects and names of their attributes."""
 HANDLES = 3
 STEP = 0.25
-"""Motion of a handle from one drag to the next, in edge lengths of the graph."""
+"""Motion of a handle or of a part from one drag to the next, in edge lengths of the graph."""
+SWING = 4
+"""Largest distance of a handle or of a part from where it was grabbed, in steps."""
+
+PARTS = 12
+"""Number of parts of a synthetic scene, whose own motion bends no joint: those of a figure with elbows and knees."""
+LEAST_NODES = 4
+"""Mean number of control points of a part in a scene that is too small for ``PARTS``."""
 
 
 def edit_rows(case: BenchCase) -> list[dict[str, Any]]:
     """Measure drags of one of three handles at the scene's far ends, with nothing pinned, so that every control point
-    and every Gaussian moves: up to the pose that pages draw, and up to the picture for pages without WebGL 2."""
+    and every Gaussian moves, and pulls of the part with the longest chain of joints: up to the pose that pages draw,
+    and up to the picture for pages without WebGL 2."""
+    return _handle_rows(case) + _part_rows(case)
+
+
+def _handle_rows(case: BenchCase) -> list[dict[str, Any]]:
     session = EditSession(case.scene)
     model = EditorModel(session)
     model.pin_rings = None
     hold(model)
-    camera = scene_camera(case.scene, case.plan.size)
-    reach = STEP * session.graph.edge_length / session.engine.units[1]
+    reach = _reach(session)
 
     def drag(index: int) -> None:
-        along = reach * index
-        model.drag(Target((0.0, 4 * reach * math.sin(along / (4 * reach)), 0.0)))
+        model.drag(Target((0.0, SWING * reach * math.sin(index / SWING), 0.0)))
+
+    return _rows(case, model, drag, ("edit/drag", "edit/picture"), {})
+
+
+def _part_rows(case: BenchCase) -> list[dict[str, Any]]:
+    session = EditSession(case.scene)
+    if case.plan.run is None:
+        session.use_parts(min(PARTS, len(session.node_positions(0.0)) // LEAST_NODES))
+    tool = PartsTool(EditorModel(session))
+    ends = [part for part in session.parts() if part.parent is not None] or session.parts()
+    part = max(ends, key=lambda part: len(session.skeleton.chain(part.name)))
+    tool.choose(part.name)
+    tool.grab()
+    grip = session.node_positions(0.0)[list(part.nodes)].mean(axis=0)
+    reach = _reach(session)
+
+    def pull(index: int) -> None:
+        tool.pull(grip + (0.0, SWING * reach * math.sin(index / SWING), 0.0), grip)
+
+    kinematics = {"kinematics": [(session, "_reached")]}
+    return _rows(case, tool.model, pull, ("edit/pull", "edit/pull-picture"), kinematics)
+
+
+def _reach(session: EditSession) -> float:
+    """Return the distance from one drag to the next, world units."""
+    return STEP * session.graph.edge_length / session.engine.units[1]
+
+
+def _rows(
+    case: BenchCase, model: EditorModel, drag: Callable[[int], None], names: tuple[str, str], stages: Targets
+) -> list[dict[str, Any]]:
+    """Measure ``drag`` up to a page's pose and up to a picture, under two names; ``stages`` are those of the drag."""
+    session = model.session
+    camera = scene_camera(case.scene, case.plan.size)
 
     def pose(index: int) -> None:
         drag(index)
@@ -46,7 +94,7 @@ def edit_rows(case: BenchCase) -> list[dict[str, Any]]:
         drag(index)
         poses.picture_message(pictures.scene_jpeg(session, model.moment(), camera), 1)
 
-    solve = {"solve": [(session.engine, "bend_live")]}
+    solve = {**stages, "solve": [(session.engine, "bend_live")]}
     pose_stages = {
         **solve,
         "compose": [(page_edit, "compose"), (page_edit, "own_pose")],
@@ -59,7 +107,7 @@ def edit_rows(case: BenchCase) -> list[dict[str, Any]]:
         "bytes": [(pictures, "to_bytes")],
         "encode": [(pictures, "_jpeg"), (poses, "picture_message")],
     }
-    return case.rows("edit/drag", pose, pose_stages) + case.rows("edit/picture", picture, picture_stages)
+    return case.rows(names[0], pose, pose_stages) + case.rows(names[1], picture, picture_stages)
 
 
 def hold(model: EditorModel) -> None:

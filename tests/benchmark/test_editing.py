@@ -28,7 +28,9 @@ def test_a_drag_in_the_editor(tmp_path, device, capsys, monkeypatch):
     rows = rows_of(tmp_path, "edit", *TINY, "--device", device)
     check_rows(rows, device)
     drawn = ["project", "harmonics", "bin", "composite"]
-    stages = {"edit/drag": ["solve", "compose", "pack"], "edit/picture": ["solve", "skin", *drawn, "bytes", "encode"]}
+    page, picture = ["compose", "pack"], ["skin", *drawn, "bytes", "encode"]
+    stages = {"edit/drag": ["solve", *page], "edit/picture": ["solve", *picture]}
+    stages |= {"edit/pull": ["kinematics", "solve", *page], "edit/pull-picture": ["kinematics", "solve", *picture]}
     expected = [
         name for whole, parts in stages.items() for name in (whole, *(f"{whole}/{p}" for p in [*parts, "rest"]))
     ]
