@@ -3,9 +3,9 @@
 Patches merge in three stages. First those whose union moves most rigidly (Ward's criterion), pairwise in rounds, down
 to a few dozen parts. Then patches change to a neighbouring part whose motion explains theirs better, so that early
 mistakes do not last. Last, neighbouring parts merge in the order of the angle by which they turn against each other,
-until every pair turns by more than ``LEAST_TURN``, and bands of skin at joints (``joint_bands``) go to the parts beside
-them. An angle, other than a distance, neither favours large parts nor splits a body whose surface drifts slowly, and so
-the number of parts follows from the motion.
+until every pair turns by more than ``LEAST_TURN``; bands of skin at joints (``joint_bands``) go to the parts beside
+them, and parts that the motion does not tell apart merge (``shared_motion``). An angle, other than a distance, neither
+favours large parts nor splits a body whose surface drifts slowly, and so the number of parts follows from the motion.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from .joint_bands import find_band, without_band
 from .patches import Moments, Motions, Patches
+from .shared_motion import find_shared
 
 LEAST_TURN = math.radians(15.0)
 """Largest angle by which two neighbouring parts may turn against each other and still be one part."""
@@ -70,10 +71,13 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
         if count is None and turns[chosen] > LEAST_TURN and not small[chosen]:
             pooled, motions = fits.robust(labels)
             band = find_band(pooled, motions, pairs, partial(relative_turns, pooled, motions))
-            if band is None:
+            if band is not None:
+                labels = _renumbered(without_band(labels, patches.moments.errors_under(motions), band))
+                continue
+            shared = find_shared(patches.moments, labels, motions, pairs, fit_parts)
+            if shared is None:
                 break
-            labels = _renumbered(without_band(labels, patches.moments.errors_under(motions), band))
-            continue
+            chosen = shared
         labels = _renumbered(np.where(labels == pairs[chosen, 1], pairs[chosen, 0], labels))
     sizes = np.bincount(labels, weights=patches.moments.count)
     rank = np.empty(len(sizes), np.int64)

@@ -19,20 +19,25 @@ from scgs_warp.edit.joints import find_joints
 from scgs_warp.edit.parts import LEAST_TURN, find_parts, fit_parts, relative_turns
 from scgs_warp.edit.patches import Moments, Patches, make_patches
 from scgs_warp.edit.rotations import from_axis, rigid_fit, rotate, to_matrix
+from scgs_warp.edit.shared_motion import MOST_LOST, MOST_OFF, find_shared
 from scgs_warp.edit.skeleton_from_motion import observe
 from scgs_warp.runtime import environment
 
 TIMES = np.linspace(0.0, 1.0, 16)
 
 
-def chain(angles: list[float], seed: int = 0, noise: float = 0.0) -> tuple[Patches, np.ndarray, np.ndarray]:
+def chain(
+    angles: list[float], seed: int = 0, noise: float | list[float] = 0.0
+) -> tuple[Patches, np.ndarray, np.ndarray]:
     """A rod along x of segments of length 1. Each segment swings about a joint at its start: the first about y, the
     next about z, and so on, by these angles in degrees between two instants. Patches are 10 along each segment, 60
-    Gaussians each. Returns patches, the segment of each patch, and the joints at rest."""
+    Gaussians each, with noise on their tracks, for all or for each segment. Returns patches, the segment of each patch,
+    and the joints at rest."""
     random = np.random.default_rng(seed)
     count = 600 * (len(angles) + 1)
     rest = random.random((count, 3)) * [len(angles) + 1, 0.3, 0.3] - [0.0, 0.15, 0.15]
     segment = rest[:, 0].astype(int)
+    off = np.broadcast_to(noise, len(angles) + 1)[segment][:, None]
     tracks = []
     for time in TIMES:
         points, place = rest.copy(), np.eye(4)
@@ -45,7 +50,7 @@ def chain(angles: list[float], seed: int = 0, noise: float = 0.0) -> tuple[Patch
             place = place @ there @ turn @ np.linalg.inv(there)
             own = segment == index + 1
             points[own] = rest[own] @ place[:3, :3].T + place[:3, 3]
-        tracks.append(points + noise * random.normal(size=points.shape))
+        tracks.append(points + off * random.normal(size=points.shape))
     at = rest[:, 0] * 10.0 - 0.5
     low = np.floor(at).clip(0, 10 * (len(angles) + 1) - 2)
     indices = np.stack([low, low + 1], 1).astype(np.int64)
@@ -163,6 +168,48 @@ def test_bones_between_two_others_remain(cuts, joints, angles):
     assert same_partition(find_parts(patches), piece)
 
 
+@pytest.mark.parametrize("noise, parts_found", [(0.0, 2), (0.005, 2), (0.1, 1)])
+def test_a_turn_that_the_motion_does_not_show_is_no_joint(noise, parts_found):
+    patches, segment, _ = chain([30.0], noise=noise)
+    pooled, motions = fit_parts(patches.moments, segment)
+    assert math.degrees(relative_turns(pooled, motions, np.array([[0, 1]]))[0]) > 20.0, "the turn alone is a joint"
+    assert find_parts(patches).max() + 1 == parts_found
+    assert find_parts(patches, 2).max() + 1 == 2, "two are asked for"
+
+
+def test_a_well_known_part_beside_a_badly_known_one_keeps_its_joint():
+    """Most of the body is noisy, so that the turn of its end is small beside the distance of a typical patch; but the
+    end's own motion explains it far better."""
+    patches, segment, _ = chain([60.0, 60.0, 40.0], noise=[0.2, 0.2, 0.2, 0.01])
+    pairs, fits = np.array([[0, 1], [1, 2], [2, 3]]), fit_parts(patches.moments, segment)
+    own = patches.moments.errors_under(fits[1])[np.arange(len(segment)), segment]
+    far = np.flatnonzero(segment == 3)
+    both = patches.moments.take(np.flatnonzero(segment >= 2))
+    errors = both.errors_under(fit_parts(both, np.zeros(20, np.int64))[1])[10:, 0]
+    lost = errors.sum() / own[far].sum(), errors.mean() / np.median(own)
+    assert lost[0] > MOST_LOST**2 and lost[1] < MOST_OFF**2, "the second bound alone would merge it"
+    assert find_shared(patches.moments, segment, fits[1], pairs[2:], fit_parts) is None
+
+
+def test_of_several_pairs_the_one_that_shares_its_motion_best_is_merged():
+    patches, segment, _ = chain([60.0, 20.0, 25.0], noise=0.02)
+    pairs, motions = np.array([[0, 1], [1, 2], [2, 3]]), fit_parts(patches.moments, segment)[1]
+    assert find_shared(patches.moments, segment, motions, pairs, fit_parts) == 1
+    assert find_shared(patches.moments, segment, motions, pairs[[0, 2]], fit_parts) == 1
+    assert find_shared(patches.moments, segment, motions, pairs[:1], fit_parts) is None
+
+
+def test_two_badly_known_parts_of_a_well_known_body_do_not_merge():
+    """One motion explains both nearly as well as their own do, but not as well as others explain theirs."""
+    patches, segment, _ = chain([60.0, 60.0, 60.0, 40.0], noise=[0.01, 0.01, 0.01, 0.2, 0.2])
+    last, motions = np.array([[3, 4]]), fit_parts(patches.moments, segment)[1]
+    own = patches.moments.errors_under(motions)[np.arange(len(segment)), segment]
+    both = patches.moments.take(np.flatnonzero(segment >= 3))
+    errors = both.errors_under(fit_parts(both, np.zeros(20, np.int64))[1])[:, 0]
+    assert errors.sum() < MOST_LOST**2 * own[segment >= 3].sum() and errors.mean() > MOST_OFF**2 * np.median(own)
+    assert find_shared(patches.moments, segment, motions, last, fit_parts) is None
+
+
 def merged_plainly(patches: Patches) -> np.ndarray:
     """Merge as ``find_parts`` does, every round and every fit anew."""
     labels = parts._merge_by_cost(patches, parts.FIRST_PARTS)
@@ -177,10 +224,13 @@ def merged_plainly(patches: Patches) -> np.ndarray:
         if turns[best] > LEAST_TURN and not small[best]:
             pooled, motions = fit_parts(patches.moments, labels)
             band = find_band(pooled, motions, pairs, partial(relative_turns, pooled, motions))
-            if band is None:
+            if band is not None:
+                labels = parts._renumbered(without_band(labels, patches.moments.errors_under(motions), band))
+                continue
+            shared = find_shared(patches.moments, labels, motions, pairs, fit_parts)
+            if shared is None:
                 break
-            labels = parts._renumbered(without_band(labels, patches.moments.errors_under(motions), band))
-            continue
+            best = shared
         labels = parts._renumbered(np.where(labels == pairs[best, 1], pairs[best, 0], labels))
     return labels
 
