@@ -65,10 +65,10 @@ def _part_rows(case: BenchCase) -> list[dict[str, Any]]:
     tool.choose(part.name)
     tool.grab()
     grip = session.node_positions(0.0)[list(part.nodes)].mean(axis=0)
-    reach = _reach(session)
+    up = np.array([0.0, SWING * _reach(session), 0.0])
 
     def pull(index: int) -> None:
-        tool.pull(grip + (0.0, SWING * reach * math.sin(index / SWING), 0.0), grip)
+        tool.pull(grip + up * math.sin(index / SWING), grip)
 
     kinematics = {"kinematics": [(session, "_reached")]}
     return _rows(case, tool.model, pull, ("edit/pull", "edit/pull-picture"), kinematics)
