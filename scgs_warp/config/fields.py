@@ -167,8 +167,9 @@ class PretrainConfig:
     """Learning rate of the spheres' colours."""
     arap_weight: float = bounded(1e-3, 0, 1e6)
     """Weight of ARAP on the trajectories of the spheres."""
-    arap_by: Literal["track", "moment"] = newer("track", before="track")
-    """Neighbours of ARAP. track: over the whole time (supplement). moment: at the first time compared, if they stay."""
+    arap_by: Literal["auto", "track", "moment"] = newer("auto", before="track")
+    """Neighbours of ARAP: over the whole time (track, supplement), at the first time compared if they stay (moment), or
+    (auto) by track and, where neighbours then part, a second time by moment; the better motion is kept."""
     random_background: bool = True
     """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
     space."""

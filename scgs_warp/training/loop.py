@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 from torch import Tensor
 
@@ -15,6 +15,7 @@ from ..config.presets import TrainConfig
 from ..config.validation import check
 from ..data.dataset import Dataset
 from ..errors import FrameError, UserError
+from ..motion.spheres import Spheres
 from ..runtime import environment
 from ..runtime.memory import NotEnoughMemory
 from ..runtime.progress import Progress, progress
@@ -28,8 +29,10 @@ from .preflight import refuse_empty_chunks
 from .process_group import ProcessGroup, ProcessLost
 from .recorded_step import RecordedSteps
 from .run_folder import ReadOnlyRunFolder, RunFolder
+from .second_try import try_again
 from .state import StepResult, TrainState
 from .step import training_step
+from .torn_spheres import is_torn
 
 MOST_FAILURES = 20
 """Number of consecutive non-finite steps after which training stops at the last good state."""
@@ -176,6 +179,7 @@ def _train(
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
             _finish(state, steps, folder, bar)
             steps.release()
+            _perhaps_again(state, frames, folder, bar, stop)
             state.begin_main()
 
         # 2. Render, compare and update the parameters.
@@ -202,7 +206,7 @@ def _train(
 
         # 5. Agree with the other processes on stopping, and on the scene.
         last = state.step == config.steps
-        stopping = stop.is_set() if state.group is None else state.group.any(stop.is_set())
+        stopping = _stopping(state, stop)
         if last or stopping or state.step % COMPARE_EVERY == 0:
             check_replicas(state)
 
@@ -216,10 +220,48 @@ def _train(
             state.save(folder.path)
             saved_at = time.monotonic()
         if stopping:
-            if state.group is not None:
-                state.group.barrier()  # torchrun ends all processes when one has ended: the first must have saved
-            bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
-            raise KeyboardInterrupt
+            _stop(state, bar)
+
+
+def _perhaps_again(state: TrainState, frames: Frames, folder: RunFolder, bar: Progress, stop: threading.Event) -> None:
+    """Train stage 1 a second time if its spheres are torn."""
+    assert isinstance(state.motion, Spheres)
+    if not is_torn(state.gaussians, state.motion, state.config):
+        return
+    state.save(folder.path)
+    bar.print(f"step {state.step}: limbs may have changed places; stage 1 is tried a second time")
+
+    def go_on(done: int) -> None:
+        bar.advance(0, second=f"{done:,}/{state.config.pretrain_steps:,}")
+        if _stopping(state, stop):
+            _stop(state, bar)
+
+    try:
+        note = try_again(state, frames, go_on)
+    except FrameError as error:
+        raise _unreadable(state, error) from error
+    bar.advance(0, second=None)
+    bar.print(f"step {state.step}: {note}")
+    folder.log({"step": state.step + 1, "stage": state.stage, "note": note})
+
+
+def _stopping(state: TrainState, stop: threading.Event) -> bool:
+    """Return whether a process is to stop; all processes get the same answer."""
+    return stop.is_set() if state.group is None else state.group.any(stop.is_set())
+
+
+def _stop(state: TrainState, bar: Progress) -> NoReturn:
+    """Stop after the checkpoint has been saved."""
+    if state.group is not None:
+        state.group.barrier()  # torchrun ends all processes when one has ended: the first must have saved
+    bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
+    raise KeyboardInterrupt
+
+
+def _unreadable(state: TrainState, error: FrameError) -> UserError:
+    """Say that an image is no longer readable, after the checkpoint has been saved."""
+    saved = f"step {state.step} is saved: " if state.group is None or state.group.first else ""
+    return UserError(f"{error}; {saved}continue with --resume")
 
 
 def _take(
@@ -254,8 +296,7 @@ def _take(
     except FrameError as error:
         _finish(state, steps, folder, bar, results)
         state.save(folder.path)
-        saved = f"step {state.step} is saved: " if state.group is None or state.group.first else ""
-        raise UserError(f"{error}; {saved}continue with --resume") from error
+        raise _unreadable(state, error) from error
 
 
 def _finish(

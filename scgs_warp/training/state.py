@@ -47,6 +47,7 @@ from .process_group import ProcessGroup
 from .resuming import check_same_configuration, check_steps
 from .silhouettes import half_thickness, is_in_parts, is_thin
 from .start_motion import SeenMotion, learn_motion
+from .torn_spheres import may_be_tried_again
 
 Stage = Literal["pretrain", "main"]
 THICKEST = 2.0
@@ -294,7 +295,7 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     start at them (2 dB better than finding both with spheres).
 
     Thin subjects get the pooled residual. Where the subject is in separate parts and silhouettes lead spheres back to
-    them, spheres may not fade.
+    them, spheres may not fade. Subjects that are not thin may get a second try at stage 1.
     """
     filled = not data.with_alpha
     motion, growth = config.motion, config.densify
@@ -307,12 +308,14 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
         config = replace(config, densify=replace(config.densify, faint_share=0.0))
     else:  # Beside a cut-out subject every Gaussian is contradicted by the background of some view.
         config = replace(config, densify=replace(config.densify, least_views=1, clear_distance=0.0))
-    thin = "auto" in (config.loss.pooled, config.pretrain.fade) and is_thin(data)
+    thin = "auto" in (config.loss.pooled, config.pretrain.fade, config.pretrain.arap_by) and is_thin(data)
     if config.loss.pooled == "auto":
         config = replace(config, loss=replace(config.loss, pooled="always" if thin else "never"))
     if config.pretrain.fade == "auto":
         led = config.pretrain.silhouette > 0 and not thin and is_in_parts(data)
         config = replace(config, pretrain=replace(config.pretrain, fade="never" if led else "always"))
+    if config.pretrain.arap_by == "auto" and not may_be_tried_again(config, data, thin):
+        config = replace(config, pretrain=replace(config.pretrain, arap_by="track"))
     if config.loss.flow > 0.0 and not follow_each_other(data):
         config = replace(config, loss=replace(config.loss, flow=0.0))
     if has_initial_points(data, config) and not config.pretrain.with_points:

@@ -48,6 +48,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
     newer = {name: default["before"] for name, default in recorded._fields(TrainConfig()) if "before" in default}
     added = {
         "pretrain.silhouette": 0.5,
+        "pretrain.arap_by": "auto",
         "pretrain.fade": "auto",
         "pretrain.pooled": True,
         "motion.correctives": True,
