@@ -137,8 +137,10 @@ def depth(source: Source) -> str:
 def crossing(source: Source) -> str:
     """Write what neighbours of a moment do for a figure whose legs cross."""
     rows = {
-        "cpu": "`cpu`",
+        "cpu": "`cpu`, without a second try",
         "moment": "`cpu --progressive`, `pretrain.arap_by=moment`, `pretrain.arap_weight=0.03`",
+        "auto": "**`cpu`**",
+        "auto-1": "**`cpu --seed 1`**",
     }
     lines = []
     for row, label in rows.items():

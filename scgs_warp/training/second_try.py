@@ -21,9 +21,7 @@ from .state import TrainState
 from .step import training_step
 from .torn_spheres import second_config
 
-GAIN = 0.1
-"""Gain in decibels from which the second motion is kept: less may be chance."""
-VIEWS = 40
+VIEWS = 200
 """Largest number of training views by which both tries are compared."""
 
 
@@ -49,7 +47,7 @@ def try_again(state: TrainState, frames: Frames, go_on: Callable[[int], None]) -
         second.step += 1
         go_on(second.step)
     first_psnr, second_psnr = shown_psnr(state, frames.frames), shown_psnr(second, frames.frames)
-    better = second_psnr > first_psnr + GAIN
+    better = second_psnr > first_psnr
     if better:
         state.enter(second.gaussians, second.motion)
     kept = "second" if better else "first"

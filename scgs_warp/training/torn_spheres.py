@@ -24,7 +24,7 @@ APART = (4, 8)
 """Numbers of instants between two that are compared: a quarter and a half of the time."""
 NEIGHBORS = 8
 TEAR = 4.0
-"""Change of an edge's length, in distances between nearest spheres, from which it is torn."""
+"""Growth of an edge, in distances between nearest spheres, from which it is torn."""
 
 
 def may_be_tried_again(config: TrainConfig, data: Dataset, thin: bool) -> bool:
@@ -73,5 +73,5 @@ def torn_share(tracks: np.ndarray) -> float:
         for second in (first + step for apart in APART for step in (-apart, apart)):
             if 0 <= second < len(tracks):
                 now = np.linalg.norm(tracks[second][ends] - tracks[second][:, None], axis=2)
-                shares.append((np.abs(now - lengths) > tear).mean())
+                shares.append((now - lengths > tear).mean())
     return float(np.mean(shares)) if shares else 0.0
