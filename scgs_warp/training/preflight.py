@@ -24,6 +24,7 @@ CHOSEN_BY_THE_DATA = (
     "densify.clear_distance",
     "densify.faint_share",
     "loss.pooled",
+    "pretrain.arap_by",
     "pretrain.fade",
     "pretrain.steps",
 )
