@@ -135,8 +135,7 @@ class PretrainConfig:
     steps: int = milestone(5_000)
     """Number of steps of stage 1."""
     with_points: bool = False
-    """Keep stage 1 if the data has points. Otherwise control points start as a sample of these points and learn with
-    the Gaussians from the first step."""
+    """Keep stage 1 if the data has points. Otherwise these give control points, which learn with Gaussians."""
     densify_until: int = milestone(3_750)
     """Step at which spheres are no longer densified and pruned; farthest-point sampling of trajectories then reduces
     them to N_p."""

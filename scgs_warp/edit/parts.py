@@ -24,6 +24,8 @@ from .shared_motion import find_shared
 
 LEAST_TURN = math.radians(15.0)
 """Largest angle by which two neighbouring parts may turn against each other and still be one part."""
+MOST_DOUBTED = math.radians(45.0)
+"""Largest such angle between parts that the motion may not tell apart: more is no error of the motion."""
 FIRST_PARTS = 90
 """Number of parts at which merging by angle begins."""
 BOUNDARY_COST = 1.7e-3
@@ -74,10 +76,11 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
             if band is not None:
                 labels = _renumbered(without_band(labels, patches.moments.errors_under(motions), band))
                 continue
-            shared = find_shared(patches.moments, labels, motions, pairs, fit_parts)
+            close = np.flatnonzero(turns <= MOST_DOUBTED)
+            shared = find_shared(patches.moments, labels, motions, pairs[close], fit_parts)
             if shared is None:
                 break
-            chosen = shared
+            chosen = int(close[shared])
         labels = _renumbered(np.where(labels == pairs[chosen, 1], pairs[chosen, 0], labels))
     sizes = np.bincount(labels, weights=patches.moments.count)
     rank = np.empty(len(sizes), np.int64)

@@ -1,8 +1,9 @@
 """Neighbouring parts whose motion is not known well enough to tell them apart.
 
 A part that is narrow, or nearly round, hardly shows how it turns: errors of its trained motion then look like turns of
-some 30 degrees. Such a turn is no joint if one motion explains both parts nearly as well as their own motions do, and
-nearly as well as the motions of other parts explain theirs.
+some 30 degrees. Such a turn is taken for no joint if one motion explains both parts nearly as well as their own motions
+do, and nearly as well as the motions of other parts explain theirs. Errors of neighbouring points are alike, so that
+they do not average out, however many points a part has.
 """
 
 from __future__ import annotations

@@ -226,7 +226,10 @@ def _train(
 def _perhaps_again(state: TrainState, frames: Frames, folder: RunFolder, bar: Progress, stop: threading.Event) -> None:
     """Train stage 1 a second time if its spheres are torn."""
     assert isinstance(state.motion, Spheres)
-    if not is_torn(state.gaussians, state.motion, state.config):
+    torn = is_torn(state.gaussians, state.motion, state.config)
+    if state.group is not None:  # the first process decides: others may round differently
+        torn = state.group.any(state.group.first and torn)
+    if not torn:
         return
     state.save(folder.path)
     bar.print(f"step {state.step}: limbs may have changed places; stage 1 is tried a second time")
@@ -238,8 +241,10 @@ def _perhaps_again(state: TrainState, frames: Frames, folder: RunFolder, bar: Pr
 
     try:
         note = try_again(state, frames, go_on)
-    except FrameError as error:
-        raise _unreadable(state, error) from error
+    except ProcessLost:
+        raise
+    except UserError as error:
+        raise _saved(state, error) from error
     bar.advance(0, second=None)
     bar.print(f"step {state.step}: {note}")
     folder.log({"step": state.step + 1, "stage": state.stage, "note": note})
@@ -258,8 +263,8 @@ def _stop(state: TrainState, bar: Progress) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _unreadable(state: TrainState, error: FrameError) -> UserError:
-    """Say that an image is no longer readable, after the checkpoint has been saved."""
+def _saved(state: TrainState, error: UserError) -> UserError:
+    """Add to an error, such as an image that is no longer readable, that the checkpoint has been saved."""
     saved = f"step {state.step} is saved: " if state.group is None or state.group.first else ""
     return UserError(f"{error}; {saved}continue with --resume")
 
@@ -296,7 +301,7 @@ def _take(
     except FrameError as error:
         _finish(state, steps, folder, bar, results)
         state.save(folder.path)
-        raise _unreadable(state, error) from error
+        raise _saved(state, error) from error
 
 
 def _finish(

@@ -9,14 +9,16 @@ likewise, and the second try fits them worse.
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Callable
 
 import torch
 
 from ..data.dataset import Dataset, spread
-from ..evaluation.image_metrics import psnr
 from .density_control import control_density, density_due, visible_gaussians
 from .frames import Frames
+from .multi_view import check_replicas
 from .state import TrainState
 from .step import training_step
 from .torn_spheres import second_config
@@ -36,32 +38,46 @@ def try_again(state: TrainState, frames: Frames, go_on: Callable[[int], None]) -
 
     Returns:
         What was found, in one line.
+
+    Raises:
+        UserError: an image is no longer readable, or the processes of a group differ.
     """
     second = TrainState.begin(second_config(state.config), frames.frames, str(frames.device))
     second.group = state.group
+    ordered = copy.copy(frames)  # the same images in the second try's order
+    ordered.config = second.config
     while second.step < second.config.pretrain_steps:
-        visible = visible_gaussians(second, frames)
-        size = training_step(second, frames).size
+        visible = visible_gaussians(second, ordered)
+        result = training_step(second, ordered)
+        if result.failed is not None:
+            return f"{result.failed} is not finite the second time; the first motion is kept"
         if density_due(second):
-            control_density(second, size, visible)
+            control_density(second, result.size, visible)
         second.step += 1
         go_on(second.step)
-    first_psnr, second_psnr = shown_psnr(state, frames.frames), shown_psnr(second, frames.frames)
-    better = second_psnr > first_psnr
+    check_replicas(second)
+    before, after = shown_psnr(state, frames.frames), shown_psnr(second, frames.frames)
+    better = after > before
+    if state.group is not None:  # the first process decides: others may round differently
+        better = state.group.any(state.group.first and better)
     if better:
+        state.points, state.colors = second.points, second.colors
+        state.exposure, state.exposure_optimizer = second.exposure, second.exposure_optimizer
         state.enter(second.gaussians, second.motion)
     kept = "second" if better else "first"
-    return f"training views: {first_psnr:.2f} dB, the second time {second_psnr:.2f} dB; the {kept} motion is kept"
+    return f"training views: {before:.2f} dB, the second time {after:.2f} dB; the {kept} motion is kept"
 
 
 @torch.no_grad()
 def shown_psnr(state: TrainState, data: Dataset) -> float:
-    """Return the mean PSNR of at most ``VIEWS`` training views, drawn with the present spheres."""
-    scene, total = state.scene(), 0.0
-    chosen = spread(len(data), VIEWS)
-    for index in chosen:
+    """Return the PSNR of at most ``VIEWS`` training views together, drawn with the present spheres."""
+    scene, squares, count = state.scene(), 0.0, 0
+    scene.motion.eval()
+    for index in spread(len(data), VIEWS):
         frame = data[index]
-        image = scene.render(frame.camera, frame.time).rgb.cpu()
-        valid = slice(None) if frame.mask is None else frame.mask
-        total += float(psnr(image[valid], frame.image[valid]))
-    return total / len(chosen)
+        off = scene.render(frame.camera, frame.time).rgb.cpu().clamp(0.0, 1.0) - frame.image
+        off = off if frame.mask is None else off[frame.mask]
+        squares += float(off.double().square().sum())
+        count += off.numel()
+    scene.motion.train()
+    return -10.0 * math.log10(max(squares / max(count, 1), 1e-12))

@@ -38,8 +38,8 @@ def may_be_tried_again(config: TrainConfig, data: Dataset, thin: bool) -> bool:
 def second_config(config: TrainConfig) -> TrainConfig:
     """Return the configuration of the second try."""
     weight = STIFFER * config.pretrain.arap_weight
-    pretrain = dataclasses.replace(config.pretrain, progressive=True, arap_by="moment", arap_weight=weight)
-    return dataclasses.replace(config, pretrain=pretrain)
+    changed = {"progressive": True, "progressive_by": "frame", "arap_by": "moment", "arap_weight": weight}
+    return dataclasses.replace(config, pretrain=dataclasses.replace(config.pretrain, **changed))
 
 
 def is_torn(gaussians: GaussianParameters, spheres: Spheres, config: TrainConfig) -> bool:

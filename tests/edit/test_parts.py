@@ -168,9 +168,11 @@ def test_bones_between_two_others_remain(cuts, joints, angles):
     assert same_partition(find_parts(patches), piece)
 
 
-@pytest.mark.parametrize("noise, parts_found", [(0.0, 2), (0.005, 2), (0.1, 1)])
-def test_a_turn_that_the_motion_does_not_show_is_no_joint(noise, parts_found):
-    patches, segment, _ = chain([30.0], noise=noise)
+@pytest.mark.parametrize(
+    "degrees, noise, parts_found", [(30.0, 0.0, 2), (30.0, 0.005, 2), (30.0, 0.05, 1), (60.0, 0.05, 2)]
+)
+def test_a_turn_that_the_motion_hardly_shows_is_no_joint(degrees, noise, parts_found):
+    patches, segment, _ = chain([degrees], noise=noise)
     pooled, motions = fit_parts(patches.moments, segment)
     assert math.degrees(relative_turns(pooled, motions, np.array([[0, 1]]))[0]) > 20.0, "the turn alone is a joint"
     assert find_parts(patches).max() + 1 == parts_found
@@ -227,10 +229,11 @@ def merged_plainly(patches: Patches) -> np.ndarray:
             if band is not None:
                 labels = parts._renumbered(without_band(labels, patches.moments.errors_under(motions), band))
                 continue
-            shared = find_shared(patches.moments, labels, motions, pairs, fit_parts)
+            close = np.flatnonzero(turns <= parts.MOST_DOUBTED)
+            shared = find_shared(patches.moments, labels, motions, pairs[close], fit_parts)
             if shared is None:
                 break
-            best = shared
+            best = int(close[shared])
         labels = parts._renumbered(np.where(labels == pairs[best, 1], pairs[best, 0], labels))
     return labels
 

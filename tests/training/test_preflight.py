@@ -13,6 +13,7 @@ from scgs_warp.config.presets import to_dict, with_steps
 from scgs_warp.errors import UserError
 from scgs_warp.evaluation.run_time import read_seconds, training_seconds
 from scgs_warp.scene.scene import Scene
+from scgs_warp.storage import checkpoint
 from scgs_warp.training.loop import fit
 from scgs_warp.training.preflight import CHOSEN_BY_THE_DATA, in_use, refuse_early
 from scgs_warp.training.resuming import check_same_configuration
@@ -44,6 +45,14 @@ def test_what_can_be_refused_without_the_data(run, tmp_path):
     ):
         with pytest.raises(UserError, match=expected):
             refuse_early(settings, folder, resume)
+
+
+def test_neighbours_that_the_data_chose_are_left_to_it(run):
+    """The run's few steps rule a second try out, so that its checkpoint has ``track``."""
+    config = tiny_config(40)
+    assert config.pretrain.arap_by == "auto"
+    assert checkpoint.read(run, ())[1]["config"]["pretrain"]["arap_by"] == "track"
+    refuse_early(config, run, True)
 
 
 def test_settings_that_the_data_chooses_are_left_to_it():
