@@ -260,6 +260,19 @@ def test_only_solid_spheres_are_looked_at(share, torn, monkeypatch):
     assert seen == [(torn_spheres.INSTANTS, len(state.gaussians) - 7, 3)]
 
 
+def test_the_second_try_goes_frame_by_frame_whatever_the_first_did(torn, tmp_path, monkeypatch):
+    by_fifths = dataclasses.replace(CONFIG, pretrain=dataclasses.replace(CONFIG.pretrain, progressive_by="fifth"))
+    ways, step = [], second_try.training_step
+
+    def noted(state, frames):
+        ways.append((state.config.pretrain.progressive_by, frames.config.pretrain.progressive_by))
+        return step(state, frames)
+
+    monkeypatch.setattr(second_try, "training_step", noted)
+    fit(by_fifths, tiny_dataset(6), output=tmp_path / "run")
+    assert ways == [("frame", "frame")] * 12
+
+
 def test_a_second_try_that_is_not_finite_is_given_up(torn, tmp_path, monkeypatch):
     step = second_try.training_step
     monkeypatch.setattr(
