@@ -1,4 +1,4 @@
-"""Measure the time of a frame, a rasterisation, a training step or a drag in the editor, by stages and by size."""
+"""Measure a frame, a rasterisation, a training step, or a drag or pull in the editor, by stages and by size."""
 
 from __future__ import annotations
 
@@ -77,6 +77,11 @@ class Edit(Options):
 
 
 @dataclass(frozen=True)
+class Pull(Edit):
+    """Measure a pull of a part in the editor up to the new picture: joints, solve, skin, render, encode."""
+
+
+@dataclass(frozen=True)
 class Scaling(Common):
     """Sweep frames and rasterisations over Gaussians, pixels, control points and threads; show the machine's limits."""
 
@@ -87,7 +92,7 @@ class Scaling(Common):
     """Folder for one figure per sweep: scaling-NAME.png."""
 
 
-COMMANDS = {"frame": Frame, "raster": Raster, "step": Step, "edit": Edit, "scaling": Scaling}
+COMMANDS = {"frame": Frame, "raster": Raster, "step": Step, "edit": Edit, "pull": Pull, "scaling": Scaling}
 
 
 def check(options: Common) -> None:

@@ -210,6 +210,7 @@ BENCHMARKS = {
     "raster-cpu": Benchmark(stages, "apps/bench.py raster"),
     "step-cpu": Benchmark(stages, "apps/bench.py step --gaussians 40000 --size 400", TRAINING),
     "edit-cpu": Benchmark(stages, "apps/bench.py edit", EDITING),
+    "pull-cpu": Benchmark(stages, "apps/bench.py pull", EDITING),
     "table-s2-cpu": Benchmark(table_s2, "apps/bench.py frame --table-s2"),
     "million-cpu": Benchmark(stages, "apps/bench.py frame --gaussians 1000000 --size 1920x1080"),
     "opensplat": Benchmark(opensplat, "benchmarks/opensplat.py CHECKOUT"),

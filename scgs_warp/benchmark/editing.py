@@ -37,12 +37,7 @@ LEAST_NODES = 4
 
 def edit_rows(case: BenchCase) -> list[dict[str, Any]]:
     """Measure drags of one of three handles at the scene's far ends, with nothing pinned, so that every control point
-    and every Gaussian moves, and pulls of the part with the longest chain of joints: up to the pose that pages draw,
-    and up to the picture for pages without WebGL 2."""
-    return _handle_rows(case) + _part_rows(case)
-
-
-def _handle_rows(case: BenchCase) -> list[dict[str, Any]]:
+    and every Gaussian moves: up to the pose that pages draw, and up to the picture for pages without WebGL 2."""
     session = EditSession(case.scene)
     model = EditorModel(session)
     model.pin_rings = None
@@ -52,10 +47,11 @@ def _handle_rows(case: BenchCase) -> list[dict[str, Any]]:
     def drag(index: int) -> None:
         model.drag(Target((0.0, SWING * reach * math.sin(index / SWING), 0.0)))
 
-    return _rows(case, model, drag, ("edit/drag", "edit/picture"), {})
+    return _rows(case, model, drag, "edit", {})
 
 
-def _part_rows(case: BenchCase) -> list[dict[str, Any]]:
+def pull_rows(case: BenchCase) -> list[dict[str, Any]]:
+    """Measure pulls of the part with the longest chain of joints, likewise."""
     session = EditSession(case.scene)
     if case.plan.run is None:
         session.use_parts(min(PARTS, len(session.node_positions(0.0)) // LEAST_NODES))
@@ -71,7 +67,7 @@ def _part_rows(case: BenchCase) -> list[dict[str, Any]]:
         tool.pull(grip + up * math.sin(index / SWING), grip)
 
     kinematics = {"kinematics": [(session, "_reached")]}
-    return _rows(case, tool.model, pull, ("edit/pull", "edit/pull-picture"), kinematics)
+    return _rows(case, tool.model, pull, "pull", kinematics)
 
 
 def _reach(session: EditSession) -> float:
@@ -80,9 +76,9 @@ def _reach(session: EditSession) -> float:
 
 
 def _rows(
-    case: BenchCase, model: EditorModel, drag: Callable[[int], None], names: tuple[str, str], stages: Targets
+    case: BenchCase, model: EditorModel, drag: Callable[[int], None], name: str, stages: Targets
 ) -> list[dict[str, Any]]:
-    """Measure ``drag`` up to a page's pose and up to a picture, under two names; ``stages`` are those of the drag."""
+    """Measure ``drag`` up to a page's pose and up to a picture; ``stages`` are those of the drag."""
     session = model.session
     camera = scene_camera(case.scene, case.plan.size)
 
@@ -107,7 +103,7 @@ def _rows(
         "bytes": [(pictures, "to_bytes")],
         "encode": [(pictures, "_jpeg"), (poses, "picture_message")],
     }
-    return case.rows(names[0], pose, pose_stages) + case.rows(names[1], picture, picture_stages)
+    return case.rows(f"{name}/drag", pose, pose_stages) + case.rows(f"{name}/picture", picture, picture_stages)
 
 
 def hold(model: EditorModel) -> None:

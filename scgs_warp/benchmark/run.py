@@ -1,4 +1,4 @@
-"""Measure a frame, a rasterisation, a training step or an edit, as rows that state what they were measured on."""
+"""Measure a frame, a rasterisation, a training step, an edit or a pull; rows state what they were measured on."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..errors import UserError
 from ..runtime import environment
 from ..runtime.provenance import provenance
 from ..scene.scene import Scene
-from .editing import edit_rows
+from .editing import edit_rows, pull_rows
 from .gsplat import Peers
 from .memory import resident_mib
 from .plan import MIDDLE, BenchCase, BenchPlan, posed
@@ -21,7 +21,7 @@ from .scenes import load_of, synthetic_scene
 from .summary import compare_frames, motion_costs
 from .workloads import frame_rows, frames_of, raster_rows, step_rows
 
-What = Literal["frame", "raster", "step", "edit"]
+What = Literal["frame", "raster", "step", "edit", "pull"]
 
 
 def thread_counts(threads: int | None, device: str) -> tuple[int, ...]:
@@ -46,7 +46,9 @@ def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
         UserError: the run cannot be read, gsplat is asked for and not usable, the renderers disagree, or the poses of a
             scene with control points cannot be interpolated as asked.
     """
-    measure = {"frame": frame_rows, "raster": raster_rows, "step": step_rows, "edit": edit_rows}[what]
+    measure = {"frame": frame_rows, "raster": raster_rows, "step": step_rows, "edit": edit_rows, "pull": pull_rows}[
+        what
+    ]
     peers = Peers.find(plan) if plan.against else None
     rows: list[dict[str, Any]] = []
     compared: list[dict[str, Any]] = []

@@ -20,23 +20,23 @@ from scgs_warp.editor.model import EditorModel
 pytestmark = pytest.mark.usefixtures("all_threads")
 
 
-def test_a_drag_in_the_editor(tmp_path, device, capsys, monkeypatch):
+@pytest.mark.parametrize("what, first", [("edit", []), ("pull", ["kinematics"])])
+def test_a_drag_in_the_editor(what, first, tmp_path, device, capsys, monkeypatch):
     tables, images = [], []
     pack, encode = poses.pose_message, pictures._jpeg
     monkeypatch.setattr(poses, "pose_message", lambda *a: (tables.append(a[0].copy()), pack(*a))[1])
     monkeypatch.setattr(pictures, "_jpeg", lambda rgb: (images.append(rgb.copy()), encode(rgb))[1])
-    rows = rows_of(tmp_path, "edit", *TINY, "--device", device)
+    rows = rows_of(tmp_path, what, *TINY, "--device", device)
     check_rows(rows, device)
     drawn = ["project", "harmonics", "bin", "composite"]
     page, picture = ["compose", "pack"], ["skin", *drawn, "bytes", "encode"]
-    stages = {"edit/drag": ["solve", *page], "edit/picture": ["solve", *picture]}
-    stages |= {"edit/pull": ["kinematics", "solve", *page], "edit/pull-picture": ["kinematics", "solve", *picture]}
+    stages = {f"{what}/drag": [*first, "solve", *page], f"{what}/picture": [*first, "solve", *picture]}
     expected = [
         name for whole, parts in stages.items() for name in (whole, *(f"{whole}/{p}" for p in [*parts, "rest"]))
     ]
     assert [row["name"] for row in rows] == expected, "every stage is in use"
     said = capsys.readouterr().out
-    assert "edit/drag" in said and "edit/picture" in said
+    assert f"{what}/drag" in said and f"{what}/picture" in said
     assert {table.shape for table in tables} == {(12, poses.WIDTH)} and {image.shape for image in images} == {
         (48, 48, 3)
     }

@@ -66,6 +66,7 @@ def test_every_table_from_tiny_results(report, tmp_path, monkeypatch, capsys):
         "raster-cpu": ["raster", *TINY],
         "step-cpu": ["step", *TINY, "--threads", "1"],
         "edit-cpu": ["edit", *TINY, "--threads", "1"],
+        "pull-cpu": ["pull", *TINY, "--threads", "1"],
         "table-s2-cpu": ["frame", *TINY, "--table-s2", "--threads", "1"],
         "scaling-cpu": ["scaling", *TINY, "--sweeps", "nodes:6/12", "--figures", str(tmp_path / "figures")],
     }
@@ -94,6 +95,7 @@ def test_every_table_from_tiny_results(report, tmp_path, monkeypatch, capsys):
         "**raster/both**",
         "**step/arap**",
         "edit/drag/solve",
+        "pull/drag/kinematics",
         "(network and skinning)",
         "| hexplane | 1 |",
     ):
