@@ -120,8 +120,8 @@ def test_parts_are_split_and_merged_in_the_page(browser, editor):
     page.locator("#view").focus()
     for _ in range(2):
         page.keyboard.press("Control+z")
+    until(lambda: len(session.parts()) == count)
     until(lambda: window.ask("studio.tools.parts.map((part) => part.name)") == [part.name for part in session.parts()])
-    assert len(session.parts()) == count
     window.close()
 
 
