@@ -28,7 +28,6 @@ STEP = 0.25
 """Motion of a handle or of a part from one drag to the next, in edge lengths of the graph."""
 SWING = 4
 """Largest distance of a handle or of a part from where it was grabbed, in steps."""
-
 PARTS = 12
 """Number of parts of a synthetic scene, whose own motion bends no joint: those of a figure with elbows and knees."""
 LEAST_NODES = 4

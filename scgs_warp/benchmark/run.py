@@ -22,6 +22,7 @@ from .summary import compare_frames, motion_costs
 from .workloads import frame_rows, frames_of, raster_rows, step_rows
 
 What = Literal["frame", "raster", "step", "edit", "pull"]
+MEASURES = {"frame": frame_rows, "raster": raster_rows, "step": step_rows, "edit": edit_rows, "pull": pull_rows}
 
 
 def thread_counts(threads: int | None, device: str) -> tuple[int, ...]:
@@ -46,9 +47,7 @@ def bench(what: What, plan: BenchPlan) -> dict[str, Any]:
         UserError: the run cannot be read, gsplat is asked for and not usable, the renderers disagree, or the poses of a
             scene with control points cannot be interpolated as asked.
     """
-    measure = {"frame": frame_rows, "raster": raster_rows, "step": step_rows, "edit": edit_rows, "pull": pull_rows}[
-        what
-    ]
+    measure = MEASURES[what]
     peers = Peers.find(plan) if plan.against else None
     rows: list[dict[str, Any]] = []
     compared: list[dict[str, Any]] = []
