@@ -6,9 +6,14 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
 
+from ..kernels import inverse_kinematics as kernels
+from ..runtime.launch import launch
 from .part_pose import Rigid
-from .rotations import conjugate, exponential, logarithm, multiply, rotate, to_matrix
+from .rotations import multiply, rotate, to_matrix
 
 OFF_AXIS = 4.0
 """Cost of a turn across the axis about which the motion turned an inner joint, relative to a turn about it: a knee
@@ -69,17 +74,15 @@ def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -
         grip: [3] point of the last part in its unturned pose.
         place: [3] where it goes.
     """
-    found = Reached([link.quat for link in links], links[0].shift)
-    points, now = posed_chain(links, found, base, grip)
+    pose = Reached([link.quat for link in links], links[0].shift)
+    points, now = posed_chain(links, pose, base, grip)
     centre, here = points[0], now - points[0]
     length = max(sum(float(np.linalg.norm(b - a)) for a, b in pairwise(points)), 1e-12)
     there = (place - centre) * min(1.0, length / max(float(np.linalg.norm(place - centre)), 1e-300))
     costs = [_swing_cost(links), *(BEND * _cost(link.axis) for link in links[1:])]
-    for step in range(1, STEPS + 1):
-        aim = centre + _between(here, there, step / STEPS)
-        most = FINAL_ITERATIONS if step == STEPS else STEP_ITERATIONS
-        found = _solve(links, found, costs, base, grip, aim, length, most)
-    return found
+    aims = [centre + _between(here, there, step / STEPS) for step in range(1, STEPS + 1)]
+    turns, shift = _solve(links, costs, base, grip, aims, length)
+    return Reached(list(multiply(turns, np.array(pose.turns))), pose.shift + shift)
 
 
 def _cost(axis: np.ndarray | None) -> np.ndarray:
@@ -107,54 +110,25 @@ def posed_chain(links: list[Link], pose: Reached, base: Rigid, grip: np.ndarray)
 
 
 def _solve(
-    links: list[Link],
-    pose: Reached,
-    costs: list[np.ndarray],
-    base: Rigid,
-    grip: np.ndarray,
-    aim: np.ndarray,
-    length: float,
-    iterations: int,
-) -> Reached:
-    """Minimise the cost of the change since the present pose plus the pull, by Gauss-Newton steps."""
-    pull, slide = PULL / length**2, SLIDE / length**2
-    for _ in range(iterations):
-        points, end = posed_chain(links, pose, base, grip)
-        frame, columns = base.quat, [to_matrix(base.quat)]
-        for point, turn in zip(points, pose.turns):
-            columns.append(_cross(point - end) @ to_matrix(frame))
-            frame = multiply(frame, turn)
-        J = np.concatenate(columns, axis=1)
-        normal, slope = pull * J.T @ J, pull * J.T @ (end - aim)
-        normal[:3, :3] += slide * np.eye(3)
-        slope[:3] += slide * (pose.shift - links[0].shift)
-        for row, (link, turn, cost) in enumerate(zip(links, pose.turns, costs), 1):
-            block = slice(3 * row, 3 * row + 3)
-            angles = logarithm(multiply(turn, conjugate(link.quat)))
-            inner = _change_of_logarithm(angles)
-            normal[block, block] += inner.T @ cost @ inner
-            slope[block] += inner.T @ cost @ angles
-        change = -np.linalg.solve(normal, slope).reshape(-1, 3)
-        change *= min(1.0, LONGEST_TURN / max(float(np.linalg.norm(change[1:], axis=1).max()), 1e-300))
-        turns = [multiply(exponential(further), turn) for further, turn in zip(change[1:], pose.turns)]
-        pose = Reached(turns, pose.shift + change[0])
-        if np.abs(change[1:]).max() < TOLERANCE:
-            break
-    return pose
+    links: list[Link], costs: list[np.ndarray], base: Rigid, grip: np.ndarray, aims: list[np.ndarray], length: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the turns [C, 4] and the shift [3] since the present pose that minimise their cost plus the pull."""
 
+    def tensor(values: ArrayLike) -> Tensor:
+        return torch.from_numpy(np.array(values, np.float64))
 
-def _change_of_logarithm(vector: np.ndarray) -> np.ndarray:
-    """Return the derivative [3, 3] of a rotation vector by a small turn that follows the rotation."""
-    angle, cross = float(np.linalg.norm(vector)), _cross(vector)
-    if angle < 1e-3:
-        return np.eye(3) - 0.5 * cross + cross @ cross / 12.0
-    return np.eye(3) - 0.5 * cross + (1.0 / angle - 0.5 / np.tan(0.5 * angle)) / angle * cross @ cross
-
-
-def _cross(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix [3, 3] of the cross product ``vector x ...``."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    count = len(links)
+    present = to_matrix(np.array([link.quat for link in links]))
+    inputs = (
+        *(tensor([link.joint for link in links]), tensor([link.shift for link in links])),
+        *(tensor(present), tensor(costs), tensor([to_matrix(base.quat)]), tensor([base.shift, grip]), tensor(aims)),
+        torch.tensor([STEP_ITERATIONS] * (len(aims) - 1) + [FINAL_ITERATIONS], dtype=torch.int32),
+        *(PULL / length**2, SLIDE / length**2, LONGEST_TURN, TOLERANCE),
+    )
+    scratch = torch.empty(count, 3, 3, dtype=torch.float64), torch.empty(count, 3, dtype=torch.float64)
+    turns, shift = tensor([[0.0, 0.0, 0.0, 1.0]] * count), tensor([[0.0] * 3])
+    launch(kernels.reach_place, 1, *inputs, *scratch, turns, shift)
+    return turns.numpy()[:, [3, 0, 1, 2]], shift.numpy()[0]
 
 
 def _between(here: np.ndarray, there: np.ndarray, share: float) -> np.ndarray:

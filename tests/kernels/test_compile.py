@@ -50,6 +50,7 @@ STACK = {
     "cuda.compositing_blocks": {"composite_adjoint": 48},  # more than eight channels alone
     "compositing": {"sum_line_slots": 64},  # for a CPU
     "encoding": {"encode": 32},  # sine and cosine of large angles
+    "inverse_kinematics": {"reach_place": 40},  # sine and cosine of large angles, of edits alone
     "surface_depth": {"surface_depth": 1024},  # the Gaussians of a ray; part of no frame and no step
 }
 """Bytes of stack of the kernels that have one, with the reason."""
