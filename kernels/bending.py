@@ -12,8 +12,9 @@ from .skinning import aligned
 
 wp.set_module_options({"enable_backward": False})
 
-NEGLIGIBLE = wp.constant(1.0e-3)
-"""Relative stretch below which a Gaussian keeps its scales, bit for bit."""
+NEGLIGIBLE = wp.constant(1.0e-2)
+"""Relative stretch below which a Gaussian keeps its scales, bit for bit: nobody sees a Gaussian grow by so little, and
+decompositions of matrices take most of the time."""
 
 
 @wp.func
@@ -23,10 +24,20 @@ def pure(v: wp.vec3):
 
 
 @wp.func
-def widening(stretch: wp.mat33, widest: float):
-    """Return the symmetric matrix with the eigenvectors of ``stretch`` and its eigenvalues, limited to 1 .. widest, and
-    the largest of them."""
-    Q, values = wp.eig3(0.5 * (stretch + wp.transpose(stretch)))
+def largest_bound(S: wp.mat33) -> float:
+    """Return what no eigenvalue of a symmetric matrix exceeds (Gershgorin): the largest sum of a diagonal entry and the
+    sizes of those beside it."""
+    xy = wp.abs(S[0, 1])
+    xz = wp.abs(S[0, 2])
+    yz = wp.abs(S[1, 2])
+    return wp.max(S[0, 0] + xy + xz, wp.max(S[1, 1] + xy + yz, S[2, 2] + xz + yz))
+
+
+@wp.func
+def widening(S: wp.mat33, widest: float):
+    """Return the symmetric matrix with the eigenvectors of ``S`` and its eigenvalues, limited to 1 .. widest, and the
+    largest of them."""
+    Q, values = wp.eig3(S)
     limited = wp.vec3(0.0)
     largest = float(1.0)
     for a in range(3):
@@ -70,44 +81,48 @@ def bend(
 ):
     """Grid: N. Gaussians none of whose control points moves keep their bits."""
     i = first + wp.tid()
-    x = means_in[i]
-    real = wp.vec4(0.0)
-    offset = wp.vec4(0.0)
-    shift = wp.vec3(0.0)
-    stretch = wp.mat33(0.0)
-    reference = wp.vec4(0.0)
     touched = int(0)
     for k in range(indices_in.shape[1]):
-        w = weights_in[i, k]
-        if w > 0.0:
-            m = indices_in[i, k]
-            r = turns_in[m]
-            p = nodes_in[m]
-            step = quat_rotate(r, x - p) + p + shifts_in[m] - x
-            if wp.dot(reference, reference) == 0.0:
-                reference = r
-            same = w * aligned(r, reference)
-            real += same
-            offset += 0.5 * quat_multiply(pure(step), same)
-            shift += w * step
-            stretch += w * stretches_in[m]
-            touched = wp.max(touched, moved_in[m])
+        if weights_in[i, k] > 0.0:
+            touched = wp.max(touched, moved_in[indices_in[i, k]])
+    x = means_in[i]
     means_out[i] = x
     quats_out[i] = quats_in[i]
     scales_out[i] = scales_in[i]
     blends_out[i] = wp.vec4(1.0, 0.0, 0.0, 0.0)
     if touched > 0:
+        real = wp.vec4(0.0)
+        offset = wp.vec4(0.0)
+        shift = wp.vec3(0.0)
+        stretch = wp.mat33(0.0)
+        reference = wp.vec4(0.0)
+        for k in range(indices_in.shape[1]):
+            w = weights_in[i, k]
+            if w > 0.0:
+                m = indices_in[i, k]
+                r = turns_in[m]
+                p = nodes_in[m]
+                step = quat_rotate(r, x - p) + p + shifts_in[m] - x
+                if wp.dot(reference, reference) == 0.0:
+                    reference = r
+                same = w * aligned(r, reference)
+                real += same
+                offset += 0.5 * quat_multiply(pure(step), same)
+                shift += w * step
+                stretch += w * stretches_in[m]
         squared = wp.dot(real, real)
         if dual != 0 and squared > 0.0:
             moved = (2.0 / squared) * quat_multiply(offset, quat_conjugate(real))
             shift = wp.vec3(moved[1], moved[2], moved[3])
         turn = quat_normalise(real)
+        own = quat_normalise(quats_in[i])
         means_out[i] = x + shift
         blends_out[i] = turn
-        quats_out[i] = quat_multiply(turn, quat_normalise(quats_in[i]))
-        wide, largest = widening(stretch, widest)
-        if largest > 1.0 + NEGLIGIBLE:
-            axes = quat_matrix(quat_normalise(quats_in[i])) * wp.diag(scales_in[i])
-            U, sigma, _V = wp.svd3(quat_matrix(turn) * wide * axes)
-            quats_out[i] = quat_of(U)
-            scales_out[i] = sigma
+        quats_out[i] = quat_multiply(turn, own)
+        S = 0.5 * (stretch + wp.transpose(stretch))
+        if largest_bound(S) > 1.0 + NEGLIGIBLE:
+            wide, largest = widening(S, widest)
+            if largest > 1.0 + NEGLIGIBLE:
+                U, sigma, _V = wp.svd3(quat_matrix(turn) * wide * (quat_matrix(own) * wp.diag(scales_in[i])))
+                quats_out[i] = quat_of(U)
+                scales_out[i] = sigma

@@ -102,6 +102,8 @@ class Engine:
         self._posers: OrderedDict[Any, PartPoser] = OrderedDict()
         self._skins: OrderedDict[Any, PartSkin] = OrderedDict()
         self._live: _Live | None = None
+        self._under: tuple[float, NodePose, Gaussians] | None = None
+        """Gaussians under an edit's holds and exaggeration alone, which stay while parts are dragged."""
 
     def _shared(self) -> np.ndarray:
         """Return the two nearest control points of every opaque Gaussian, [N, 2]."""
@@ -205,7 +207,12 @@ class Engine:
 
     def _posed(self, time: float, bent: NodePose) -> Gaussians:
         masked = bool(self.scene.config.motion.mask) and self.rig.moves
-        return pose_gaussians(self.rig, self.scene.gaussians, self.motion_at(time), bent, self.binding, masked)
+        model = self.rig, self.scene.gaussians, self.motion_at(time)
+        if bent.base is None or bent.skin is None:
+            return pose_gaussians(*model, bent, self.binding, masked)
+        if self._under is None or self._under[0] != time or self._under[1] is not bent.base:
+            self._under = time, bent.base, pose_gaussians(*model, bent.base, self.binding, masked)
+        return pose_gaussians(*model, bent, self.binding, masked, self._under[2])
 
     def _unbent(self, edit: Edit, time: float) -> NodePose | None:
         base = self.base_at(edit, time)

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
+from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from ..ops.bending import Bent, NodeBend, bend
@@ -97,9 +98,10 @@ def stretches_of(graph: ControlGraph, rest: np.ndarray, positions: np.ndarray, t
     before, after = rest[ends] - rest[own], positions[ends] - positions[own]
     rotations = to_matrix(turns)
     back = np.einsum("eji,ej->ei", rotations[own], after)
-    A, B = np.zeros((2, len(rest), 3, 3))
-    np.add.at(A, own, before[:, :, None] * before[:, None])
-    np.add.at(B, own, (back - before)[:, :, None] * before[:, None])
+    rows = csr_matrix((np.ones(len(ends)), np.arange(len(ends)), begin), shape=(len(graph), len(ends)))
+    A, B = (
+        (rows @ (x[:, :, None] * before[:, None]).reshape(-1, 9)).reshape(-1, 3, 3) for x in (before, back - before)
+    )
     little = LITTLE * np.trace(A, axis1=1, axis2=2)
     A += np.where(little > 0, little, 1.0)[:, None, None] * np.eye(3)
     return np.eye(3) + B @ np.linalg.inv(A)

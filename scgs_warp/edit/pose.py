@@ -118,6 +118,7 @@ def pose_gaussians(
     bent: NodePose,
     binding: tuple[Tensor, Tensor],
     masked: bool = False,
+    under: Gaussians | None = None,
 ) -> Gaussians:
     """Return activated Gaussians under an edit, normalised units: skinned by its pose, harmonics turned with it.
 
@@ -130,9 +131,10 @@ def pose_gaussians(
         binding: result of ``rig.binding(gaussians)``, which depends on neither time nor edit.
         masked: the last hyper-coordinate is the logit of a Gaussian's share in the motion. The share applies to holds
             and exaggeration, which change the motion, but not to handles, which must also move static Gaussians.
+        under: Gaussians under ``bent.base``, if they are known.
     """
     if bent.base is not None and (masked or bent.skin is not None):
-        posed = pose_gaussians(rig, gaussians, motion, bent.base, binding, masked)
+        posed = under or pose_gaussians(rig, gaussians, motion, bent.base, binding, masked)
         if bent.skin is not None:
             return _with_parts(posed, bent, bent.base, bent.skin)
         return _on_top(posed, gaussians, bent, bent.base, binding)

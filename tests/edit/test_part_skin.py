@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from scgs_warp.edit.engine import Engine
 from scgs_warp.edit.graph import build_graph
 from scgs_warp.edit.part_skin import LITTLE, part_skin, stretches_of
+from scgs_warp.edit.playback import Hold
 from scgs_warp.edit.rotations import IDENTITY, from_axis, rotate
 from scgs_warp.errors import UserError
 
@@ -86,6 +88,23 @@ def test_a_posed_limb_moves_as_a_body_and_the_rest_keeps_its_bits(session, skin)
     assert np.median(np.linalg.norm(after.means[tip].double().numpy() - wanted, axis=1)) < 0.03
     grown = (after.scales / before.scales).max(1).values
     assert 1.1 < float(grown.max()) < 2.5, "Gaussians widen where the shoulder opens"
+
+
+def test_gaussians_do_not_depend_on_what_was_shown_before(session):
+    """The engine keeps Gaussians as they are before parts are posed: other times and holds replace them."""
+    session.turn("shoulder_left", 70, (0, -1, 0))
+    turned = session.edit
+    held = dataclasses.replace(turned, holds=(Hold(session.skeleton.part("knee_right").nodes, 0.8),))
+    shown = [(edit, time) for edit in (turned, held, turned) for time in (0.0, 0.4, 0.0)]
+    one = session.engine
+    kept = [one.normalised(time, one.bend(edit, time)) for edit, time in shown]
+    for found, (edit, time) in zip(kept, shown):
+        fresh = Engine(session.scene)
+        wanted = fresh.normalised(time, fresh.bend(edit, time))
+        assert all(
+            getattr(found, name).equal(getattr(wanted, name)) for name in ("means", "quats", "scales", "sh_rest")
+        )
+    assert not kept[0].means.equal(kept[1].means) and not kept[0].means.equal(kept[3].means)
 
 
 def test_the_skin_is_saved_and_checked(session, tmp_path):

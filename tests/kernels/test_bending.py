@@ -96,6 +96,23 @@ def test_what_no_control_point_moves_keeps_its_bits(device):
     assert (found.blends.cpu()[still] == torch.tensor([1.0, 0, 0, 0])).all()
 
 
+@pytest.mark.parametrize(("stretch", "sheared"), [(0.008, 0.0), (0.02, 0.0), (0.0, 0.008), (0.0, 0.02)])
+def test_only_a_stretch_of_more_than_a_hundredth_widens(stretch, sheared, device):
+    """Also one along a diagonal, which shows in no entry of the matrix's own diagonal."""
+    own = torch.eye(3)
+    own[0, 0] += stretch
+    own[1, 2] = own[2, 1] = sheared
+    gaussians, by, binding = scene(6)
+    by = by._replace(stretches=own.repeat(len(by.nodes), 1, 1), turns=by.turns[:1].repeat(len(by.nodes), 1))
+    moved, of_nodes, bound = on(device, gaussians, by, binding)
+    scales = bend(*moved, of_nodes, *bound, widest=2.0).scales.cpu()
+    if max(stretch, sheared) < 0.01:
+        assert scales.equal(gaussians[2])
+    else:
+        grown = scales.prod(1) / gaussians[2].prod(1)
+        assert ((grown - (1.0 + max(stretch, sheared))).abs() < 1e-4).all()
+
+
 def test_wrong_shapes_are_refused():
     gaussians, by, binding = scene(0)
     with pytest.raises(ValueError, match=r"turns must be \[12, 4\]"):

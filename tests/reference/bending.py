@@ -6,6 +6,9 @@ import numpy as np
 
 from scgs_warp.edit.rotations import multiply, to_matrix
 
+NEGLIGIBLE = 0.01
+"""Relative stretch up to which nothing widens."""
+
 
 def bend(mean, quat, scale, nodes, shifts, turns, stretches, weights, dual: bool, widest: float):
     """Return the moved mean [3], the covariance [3, 3], and the rotation [4] of one Gaussian with K control points."""
@@ -23,6 +26,7 @@ def bend(mean, quat, scale, nodes, shifts, turns, stretches, weights, dual: bool
     turn = real / np.linalg.norm(real)
     stretch = np.einsum("k,kij->ij", weights, stretches)
     values, vectors = np.linalg.eigh(0.5 * (stretch + stretch.T))
-    wide = vectors @ np.diag(values.clip(1.0, widest)) @ vectors.T
+    limited = values.clip(1.0, widest)
+    wide = vectors @ np.diag(limited) @ vectors.T if limited.max() > 1.0 + NEGLIGIBLE else np.eye(3)
     F = to_matrix(turn) @ wide @ to_matrix(quat / np.linalg.norm(quat)) @ np.diag(scale)
     return mean + shift, F @ F.T, turn
