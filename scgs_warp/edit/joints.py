@@ -13,10 +13,11 @@ from .rotations import from_matrix, logarithm
 
 AXIS_SHARE = 0.8
 """Share of the variance of the relative rotation that its main axis explains at least, if the joint has an axis."""
-
-MIN_PRIOR = 1e-2
-"""Weight of the boundary's middle, at least, relative to that of the motion. A hinge hardly determines the position
-along its axis, which noise would choose."""
+MISTAKE = math.radians(1.25)
+"""Standard deviation of turns between two parts that the motion may show by mistake, radians. Turns of this size
+determine a point as well as the boundary's middle does."""
+HINGE = 0.1
+"""Variance of turns across the main axis, relative to that about it, below which a joint is a hinge."""
 
 
 class Joint(NamedTuple):
@@ -68,7 +69,8 @@ def _fit(patches: Patches, labels: np.ndarray, motions: Motions, pair: list[int]
 
     Seen from the first part, the second moves by ``x -> Q_t x + s_t``. The point minimises the variance of this over
     time, plus its squared distance from the boundary's middle; the latter's weight is the ratio of the variance to the
-    boundary's extent.
+    boundary's extent, at least ``MISTAKE`` squared. A hinge leaves the position along its axis open: where small turns
+    across it put the point beyond the boundary, they are mistakes, and the boundary's middle counts.
     """
     first, second = pair
     seen = motions.seen_from(first, second)
@@ -78,9 +80,14 @@ def _fit(patches: Patches, labels: np.ndarray, motions: Motions, pair: list[int]
     b = b - A @ middle
     normal, right = A.T @ A / times, A.T @ b / times
     play2 = float(((A @ np.linalg.lstsq(A, b, rcond=1e-6)[0] - b) ** 2).sum() / times)
-    known = float(np.linalg.eigvalsh(normal)[1])  # a hinge leaves the position along its axis open
-    prior = max(play2 / extent**2, MIN_PRIOR * known, 1e-12)
-    offset = np.linalg.solve(normal + prior * np.eye(3), right)
+    values, axes = np.linalg.eigh(normal)
+    values = np.maximum(values, 0.0)
+    known = float(values[1])
+    prior = max(play2 / extent**2, MISTAKE**2)
+    alone = axes.T @ right / np.maximum(values, 1e-300)  # where the motion by itself puts the point
+    if values[0] < HINGE * known and abs(alone[0]) > extent:
+        values[0] = 0.0
+    offset = axes @ (values * alone / (values + prior))
     play = math.sqrt(float(((A @ offset - b) ** 2).sum() / times))
     if turn < LEAST_TURN:
         return Joint(-1, middle + patches.centre, None, turn, play, 0.0)
