@@ -15,10 +15,9 @@ from ..config.presets import TrainConfig
 from ..config.validation import check
 from ..data.dataset import Dataset
 from ..errors import FrameError, UserError
-from ..motion.spheres import Spheres
 from ..runtime import environment
 from ..runtime.memory import NotEnoughMemory
-from ..runtime.progress import Progress, progress
+from ..runtime.progress import Progress, clock, progress
 from ..runtime.stop_signals import stop_signals
 from ..scene.scene import Scene
 from ..storage import checkpoint
@@ -32,7 +31,6 @@ from .run_folder import ReadOnlyRunFolder, RunFolder
 from .second_try import try_again
 from .state import StepResult, TrainState
 from .step import training_step
-from .torn_spheres import is_torn
 
 MOST_FAILURES = 20
 """Number of consecutive non-finite steps after which training stops at the last good state."""
@@ -224,18 +222,16 @@ def _train(
 
 
 def _perhaps_again(state: TrainState, frames: Frames, folder: RunFolder, bar: Progress, stop: threading.Event) -> None:
-    """Train stage 1 a second time if its spheres are torn."""
-    assert isinstance(state.motion, Spheres)
-    torn = is_torn(state.gaussians, state.motion, state.config)
-    if state.group is not None:  # the first process decides: others may round differently
-        torn = state.group.any(state.group.first and torn)
-    if not torn:
+    """Train stage 1 a second time if the configuration leaves the choice between both to the result."""
+    total, began = state.steps_again, time.monotonic()
+    if not total:
         return
     state.save(folder.path)
-    bar.print(f"step {state.step}: limbs may have changed places; stage 1 is tried a second time")
+    bar.print(f"step {state.step}: stage 1 is tried a second time, frame by frame")
 
     def go_on(done: int) -> None:
-        bar.advance(0, second=f"{done:,}/{state.config.pretrain_steps:,}")
+        left = (time.monotonic() - began) / done * (total - done)
+        bar.advance(0, second=f"{done:,}/{total:,}, {clock(left)} left")
         if _stopping(state, stop):
             _stop(state, bar)
 

@@ -30,11 +30,12 @@ class Pace:
         self._began = 0.0
         self._done = config.steps < SHORTEST
 
-    def note(self, step: int) -> str | None:
+    def note(self, step: int, again: int = 0) -> str | None:
         """Count a step, and return the estimate after ``MEASURED`` of them; None before and after.
 
         Args:
             step: number of completed steps of the run.
+            again: number of steps of a second try at stage 1 that is to come.
         """
         if self._done:
             return None
@@ -45,9 +46,10 @@ class Pace:
             return None
         self._done = True
         each = (self._now() - self._began) / (MEASURED - SKIPPED)
-        left = each * (self.config.steps - step)
+        more = self.config.steps - step + again
+        left = each * more
         slowest = SLOWEST if step > self.config.half_size else SLOWEST_FROM_HALF
         return (
-            f"on this machine, {self.config.steps - step:,} more steps ({self.config.preset}) take {clock(left)} to "
+            f"on this machine, {more:,} more steps ({self.config.preset}) take {clock(left)} to "
             f"{clock(slowest * left)}: {1000 * each:.0f} ms each so far, more as Gaussians are added"
         )

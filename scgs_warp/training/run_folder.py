@@ -238,7 +238,7 @@ class RunFolder:
             bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
         else:
             bar.advance(1)
-        pace = self._pace.note(done)
+        pace = self._pace.note(done, state.steps_again)
         if pace is not None:
             self.tell(pace)
         if done % self._between == 0 and result.failed is None:

@@ -1,10 +1,8 @@
-"""Second try at stage 1, for limbs that have exchanged their tracks.
+"""Second try at stage 1: frame by frame, with neighbours of the moment, and held together more firmly.
 
-Where legs pass each other while a figure walks, the left shin may become the right one halfway, since images of single
-moments do not tell them apart. Such shins tear off their thighs. If neighbouring spheres part as far as this
-(``torn_spheres``), stage 1 is trained again, frame by frame and with neighbours of the moment
-(``rigidity.momentary_graph``). The spheres that show the training views better are kept: bodies that truly part tear
-likewise, and the second try fits them worse.
+Images of single moments do not tell legs apart that pass each other, nor how a round head turns: spheres then move no
+further than the images ask for. Led from the first pose on, they follow more often (``rigidity.momentary_graph``). Of
+both tries, the spheres that show the training views better are kept: bodies that truly part fit the second one worse.
 """
 
 from __future__ import annotations
@@ -19,9 +17,9 @@ from ..data.dataset import Dataset, spread
 from .density_control import control_density, density_due, visible_gaussians
 from .frames import Frames
 from .multi_view import check_replicas
+from .second_config import second_config
 from .state import TrainState
 from .step import training_step
-from .torn_spheres import second_config
 
 VIEWS = 200
 """Largest number of training views by which both tries are compared."""

@@ -45,9 +45,9 @@ from .pretrain import (
 )
 from .process_group import ProcessGroup
 from .resuming import check_same_configuration, check_steps
+from .second_config import may_be_tried_again
 from .silhouettes import half_thickness, is_in_parts, is_thin
 from .start_motion import SeenMotion, learn_motion
-from .torn_spheres import may_be_tried_again
 
 Stage = Literal["pretrain", "main"]
 THICKEST = 2.0
@@ -149,6 +149,12 @@ class TrainState:
         gaussians = initial_gaussians(self.config, self.points, self.colors, (self.gaussians, self.motion))
         self.stage = "main"
         self.enter(gaussians, points)
+
+    @property
+    def steps_again(self) -> int:
+        """Number of steps of a second try at stage 1 that is to come."""
+        to_come = self.stage == "pretrain" and self.config.pretrain.arap_by == "auto"
+        return self.config.pretrain_steps if to_come else 0
 
     @property
     def device(self) -> torch.device:

@@ -27,16 +27,14 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import UserError
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.torchrun import process_rank
-from scgs_warp.training import loop, process_group, torn_spheres
+from scgs_warp.training import loop, process_group, second_config
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
 from scgs_warp.training.process_group import ProcessGroup, join_processes
 from scgs_warp.training.state import StepResult, TrainState
 
 SHORT = timedelta(seconds=6)
-USUALLY = torn_spheres.LEAST_VISITS, torn_spheres.TORN
-ALL_TORN = 1, 0.0
-"""Values of the same with which stage 1 is tried a second time."""
+USUALLY = second_config.LEAST_VISITS
 ENDING = ("hung", "killed")
 """Scenarios after which the processes are no longer joined."""
 
@@ -53,7 +51,7 @@ RICH = tiny_config(
     densify={"absolute_grad": True},
 )
 LONG = tiny_config(500, batch=2, motion={"width": 32}, densify={"max_gaussians": 3000, "until": 400})
-TORN = tiny_config(30, batch=2, pretrain={"steps": 12, "densify_until": 8, "warm_up": 2, "progressive_every": 1})
+TWICE = tiny_config(30, batch=2, pretrain={"steps": 12, "densify_until": 8, "warm_up": 2, "progressive_every": 1})
 PLANES = tiny_config(20, batch=4, coarse=3, motion={"model": "hexplane"})
 
 
@@ -71,7 +69,7 @@ DATA: dict[str, tuple[TrainConfig, Callable[[], Dataset]]] = {
     "rich": (RICH, spoilt),
     "planes": (PLANES, lambda: tiny_dataset(6)),
     "long": (LONG, tiny_dataset),
-    "torn": (TORN, lambda: tiny_dataset(6)),
+    "twice": (TWICE, lambda: tiny_dataset(6)),
     "uneven": (tiny_config(40, batch=3), lambda: tiny_dataset(6)),
 }
 
@@ -110,7 +108,7 @@ def play(name: str, group: ProcessGroup | None, output: Path) -> None:
     if name in mishaps:
         step, rank, act = mishaps[name]
         at_step(step, rank, group, act)
-    torn_spheres.LEAST_VISITS, torn_spheres.TORN = ALL_TORN if name == "torn" else USUALLY
+    second_config.LEAST_VISITS = 1 if name == "twice" else USUALLY
     process_group.PIECE = 999 if name == "rich" else 1 << 22
     loop.COMPARE_EVERY = 5 if name == "nudged" else 500
     config, data = DATA.get(name, DATA["plain"])

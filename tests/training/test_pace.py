@@ -10,14 +10,14 @@ from scgs_warp.config.presets import preset, with_steps
 from scgs_warp.training.pace import MEASURED, SKIPPED, Pace
 
 
-def notes(config, seconds: float, steps: int = 3_000, first: int = 0) -> dict[int, str]:
+def notes(config, seconds: float, steps: int = 3_000, first: int = 0, again: int = 0) -> dict[int, str]:
     """Take steps of the same length, slow ones at the beginning."""
     now = [0.0]
     pace = Pace(config, lambda: now[0])
     found = {}
     for step in range(first + 1, first + steps + 1):
         now[0] += 9.0 if step <= first + SKIPPED else seconds
-        note = pace.note(step)
+        note = pace.note(step, again)
         if note is not None:
             found[step] = note
     return found
@@ -29,6 +29,11 @@ def test_one_estimate_after_the_first_steps():
     assert found[MEASURED] == (
         "on this machine, 23,800 more steps (cpu) take 19:50 to 39:40: 50 ms each so far, more as Gaussians are added"
     )
+
+
+def test_a_second_try_takes_time():
+    found = notes(dataclasses.replace(preset("cpu"), half_size=0), 0.05, again=3_000)
+    assert "26,800 more steps (cpu) take 22:20 to 44:40" in found[MEASURED]
 
 
 @pytest.mark.parametrize(("first", "range_of"), [(0, "take 1:08 to 3:24"), (4_000, "take 0:28 to 0:56")])

@@ -16,14 +16,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from helpers.parallel_job import ALL_TORN, DATA, LONG, PLAIN, TORN
+from helpers.parallel_job import DATA, LONG, PLAIN, TWICE
 from helpers.paths import ROOT
 from helpers.tiny import tiny_config, tiny_dataset, write_dnerf
 from scgs_warp.apps.train import cli
 from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage.checkpoint import read
-from scgs_warp.training import loop, torn_spheres
+from scgs_warp.training import loop, second_config
 from scgs_warp.training.loop import fit
 
 PATHS = {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
@@ -72,9 +72,8 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
         config, data = DATA[name]
         fit(config, data(), output=folder / name)
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in zip(("LEAST_VISITS", "TORN"), ALL_TORN):
-            patch.setattr(torn_spheres, name, value)
-        fit(TORN, tiny_dataset(6), output=folder / "torn")
+        patch.setattr(second_config, "LEAST_VISITS", 1)
+        fit(TWICE, tiny_dataset(6), output=folder / "twice")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         stop_at(25, patch)
         fit(PLAIN, tiny_dataset(6), output=folder / "resumed")
@@ -87,14 +86,14 @@ def together(alone: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     status and standard error."""
     folder = tmp_path_factory.mktemp("together")
     shutil.copytree(alone / "resumed", folder / "resumed")
-    names = ["plain", "rich", "planes", "torn", "resumed", "uneven", "nudged", "stopped", "hung", "killed"]
+    names = ["plain", "rich", "planes", "twice", "resumed", "uneven", "nudged", "stopped", "hung", "killed"]
     processes = start(folder, *names)
     said = [process.communicate(timeout=300) for process in processes]
     assert processes[1].returncode == -signal.SIGKILL, said
     return folder, processes[0].returncode, said[0][1]
 
 
-@pytest.mark.parametrize("name", ["plain", "rich", "planes", "torn", "resumed"])
+@pytest.mark.parametrize("name", ["plain", "rich", "planes", "twice", "resumed"])
 def test_the_bits_are_those_of_one_process(name, alone, together):
     """Among them frames that cannot be learnt from, frames of another size, and a checkpoint of one process."""
     folder = together[0]
@@ -103,7 +102,7 @@ def test_the_bits_are_those_of_one_process(name, alone, together):
     logs = [(run / "log.jsonl").read_text().splitlines() for run in (folder / name, expected)]
     kept = [[{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in log] for log in logs]
     assert kept[0] == kept[1]
-    assert any("note" in line and "motion is kept" in line["note"] for line in kept[0]) == (name == "torn")
+    assert any("note" in line and "motion is kept" in line["note"] for line in kept[0]) == (name == "twice")
     assert name != "rich" or 10 < len([line for line in kept[0] if "dropped" in line]) < 40
 
 

@@ -1,4 +1,4 @@
-"""A second try at stage 1 where limbs have exchanged their tracks: when, with which settings, and of which bits."""
+"""A second try at stage 1: when, with which settings, and of which bits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import os
 import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -19,66 +18,18 @@ from scgs_warp.config.presets import preset
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import FrameError, UserError
 from scgs_warp.evaluation.image_metrics import psnr
-from scgs_warp.training import loop, second_try, torn_spheres
+from scgs_warp.training import loop, second_config, second_try
 from scgs_warp.training.loop import fit
+from scgs_warp.training.second_config import may_be_tried_again
 from scgs_warp.training.state import TrainState, resolve_auto
-from scgs_warp.training.torn_spheres import TEAR, may_be_tried_again, second_config, torn_share
 
-TIMES = np.linspace(0.0, 1.0, torn_spheres.INSTANTS)
 CONFIG = tiny_config(40, pretrain={"steps": 12, "densify_until": 8, "warm_up": 2, "progressive_every": 1})
 
 
 @pytest.fixture
-def torn(monkeypatch):
-    """Take all spheres for torn ones, however few steps each frame gets."""
-    monkeypatch.setattr(torn_spheres, "LEAST_VISITS", 1)
-    monkeypatch.setattr(torn_spheres, "TORN", 0.0)
-
-
-def column(x: float, low: float, high: float, count: int) -> np.ndarray:
-    """Points of a bar that stands at x, [count, 3]."""
-    return np.random.default_rng(int(100 * x) % 97).random((count, 3)) * [0.1, 0.1, high - low] + [x, 0.0, low]
-
-
-def tracks_of(points: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """Tracks [T, N, 3] of points that move along x by ``shifts`` [T, N]."""
-    return points + shifts[:, :, None] * [1.0, 0.0, 0.0]
-
-
-def walker(exchanged: bool) -> np.ndarray:
-    """Two legs that swing past each other and back; if exchanged, two quarters of each do, and two stay."""
-    points = np.concatenate([column(0.0, 0.0, 1.0, 100), column(1.0, 0.0, 1.0, 100) + np.array([0.0, 0.5, 0.0])])
-    swing = np.where(np.arange(200) < 100, 1.0, -1.0) * (0.5 - 0.5 * np.cos(3.0 * math.pi * TIMES[:, None]))
-    if exchanged:
-        swing = swing * (4.0 * points[:, 2] % 2.0 < 1.0)
-    return tracks_of(points, swing)
-
-
-def test_edges_that_part_count():
-    assert torn_share(walker(exchanged=False)) == 0.0, "legs pass each other at a distance"
-    assert torn_share(walker(exchanged=True)) > torn_spheres.TORN
-    alone = tracks_of(column(0.0, 0.0, 1.0, 100), np.tile(TIMES[:, None], 100))
-    assert torn_share(alone) == 0.0, "all move alike"
-
-
-def test_an_edge_is_torn_from_its_change_in_spacings_on():
-    """Two rows of points side by side, one of which slides along: an edge of one spacing grows."""
-    row = np.stack([np.arange(20.0), np.zeros(20), np.zeros(20)], 1)
-    rows = np.concatenate([row, row + np.array([0.0, 1.0, 0.0])])
-    for slide, expected in ((TEAR - 0.2, False), (TEAR + 2.5, True)):
-        moves = (
-            np.where(np.arange(40) >= 20, slide, 0.0) * TIMES[:, None] * 4.0
-        )  # by ``slide`` in a quarter of the time
-        quarter = tracks_of(rows, moves)[:5]
-        assert (torn_share(quarter) > 0.0) == expected
-
-
-def test_of_few_or_infinite_spheres_none_is_torn():
-    assert torn_share(np.zeros((17, 1, 3))) == 0.0 and torn_share(np.zeros((17, 0, 3))) == 0.0
-    assert torn_share(np.zeros((17, 5, 3))) == 0.0, "they coincide"
-    tracks = walker(exchanged=True)
-    tracks[3, 7, 1] = np.inf
-    assert torn_share(tracks) == 0.0
+def tried(monkeypatch):
+    """Let stage 1 be tried again, however few steps each frame gets."""
+    monkeypatch.setattr(second_config, "LEAST_VISITS", 1)
 
 
 def test_where_a_second_try_may_help():
@@ -108,7 +59,7 @@ def test_the_choice_is_made_before_the_first_step(monkeypatch):
 def test_the_settings_of_the_second_try():
     first = preset("cpu")
     first = dataclasses.replace(first, pretrain=dataclasses.replace(first.pretrain, progressive_by="fifth"))
-    second = second_config(first)
+    second = second_config.second_config(first)
     assert (second.pretrain.progressive, second.pretrain.arap_by) == (True, "moment")
     assert second.pretrain.progressive_by == "frame"
     assert second.pretrain.arap_weight == pytest.approx(10.0 * first.pretrain.arap_weight)
@@ -128,7 +79,7 @@ def spheres_of(state: TrainState) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("first_psnr, better", [(20.0, "first"), (15.0, "first"), (14.9, "second")])
-def test_the_better_motion_is_kept(first_psnr, better, torn, tmp_path, device, monkeypatch):
+def test_the_better_motion_is_kept(first_psnr, better, tried, tmp_path, device, monkeypatch):
     seen, begun, shown = [], [], []
 
     def score(state, data):
@@ -158,16 +109,21 @@ def test_the_better_motion_is_kept(first_psnr, better, torn, tmp_path, device, m
     assert len(notes) == 1 and f"the {better} motion is kept" in notes[0]
 
 
-def test_without_tears_nothing_is_tried_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(torn_spheres, "LEAST_VISITS", 1)
-    monkeypatch.setattr(torn_spheres, "TORN", 1.1)
+def test_what_is_asked_for_is_not_tried_again(tried, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "try_again", lambda *args: pytest.fail("tried again"))
-    fit(CONFIG, tiny_dataset(6), output=tmp_path / "auto")
-    by_track = dataclasses.replace(CONFIG, pretrain=dataclasses.replace(CONFIG.pretrain, arap_by="track"))
-    monkeypatch.setattr(torn_spheres, "TORN", 0.0)
-    fit(by_track, tiny_dataset(6), output=tmp_path / "track")
-    names = [path.name for path in (tmp_path / "auto").glob("*.safetensors")]
-    assert names == ["checkpoint.safetensors"]
+    for name in ("track", "moment"):
+        asked = dataclasses.replace(CONFIG, pretrain=dataclasses.replace(CONFIG.pretrain, arap_by=name))
+        fit(asked, tiny_dataset(6), output=tmp_path / name)
+
+
+def test_the_steps_of_a_second_try_are_counted_until_it_is_made(tried):
+    data = tiny_dataset(6)
+    state = TrainState.begin(CONFIG, data, "cpu")
+    assert state.steps_again == 12
+    state.begin_main()
+    assert state.steps_again == 0
+    asked = dataclasses.replace(CONFIG, pretrain=dataclasses.replace(CONFIG.pretrain, arap_by="track"))
+    assert TrainState.begin(asked, data, "cpu").steps_again == 0
 
 
 def test_views_are_compared_as_they_are_drawn(monkeypatch):
@@ -201,7 +157,7 @@ def test_masks_and_views_of_nothing_count_as_they_should():
 
 
 @pytest.mark.parametrize("stop_at", [0, 1, 7, 12])
-def test_a_run_that_is_stopped_in_the_second_try_gives_the_same_bits(stop_at, torn, tmp_path, device, monkeypatch):
+def test_a_run_that_is_stopped_in_the_second_try_gives_the_same_bits(stop_at, tried, tmp_path, device, monkeypatch):
     data = tiny_dataset(6)
     fit(CONFIG, data, output=tmp_path / "whole", device=device)
     whole = (tmp_path / "whole/checkpoint.safetensors").read_bytes()
@@ -230,7 +186,7 @@ def test_a_run_that_is_stopped_in_the_second_try_gives_the_same_bits(stop_at, to
     assert notes_of(tmp_path / "cut") == notes_of(tmp_path / "whole")
 
 
-def test_a_crash_after_the_second_try_repeats_it(torn, tmp_path, monkeypatch):
+def test_a_crash_after_the_second_try_repeats_it(tried, tmp_path, monkeypatch):
     data = tiny_dataset(6)
     fit(CONFIG, data, output=tmp_path / "whole")
 
@@ -247,20 +203,7 @@ def test_a_crash_after_the_second_try_repeats_it(torn, tmp_path, monkeypatch):
     assert notes_of(cut) == notes_of(whole) and len(notes_of(cut)) == 1, "the line is not written twice"
 
 
-@pytest.mark.parametrize("share, torn", [(0.009, False), (0.011, True)])
-def test_only_solid_spheres_are_looked_at(share, torn, monkeypatch):
-    """Strays drift apart without end; from which share on spheres are torn."""
-    state = TrainState.begin(CONFIG, tiny_dataset(6), "cpu")
-    config = dataclasses.replace(CONFIG, pretrain=dataclasses.replace(CONFIG.pretrain, arap_by="auto"))
-    with torch.no_grad():
-        state.gaussians.opacity_logits[:7] = -9.0
-    seen = []
-    monkeypatch.setattr(torn_spheres, "torn_share", lambda tracks: seen.append(tracks.shape) or share)
-    assert torn_spheres.is_torn(state.gaussians, state.motion, config) == torn
-    assert seen == [(torn_spheres.INSTANTS, len(state.gaussians) - 7, 3)]
-
-
-def test_the_second_try_goes_frame_by_frame_whatever_the_first_did(torn, tmp_path, monkeypatch):
+def test_the_second_try_goes_frame_by_frame_whatever_the_first_did(tried, tmp_path, monkeypatch):
     by_fifths = dataclasses.replace(CONFIG, pretrain=dataclasses.replace(CONFIG.pretrain, progressive_by="fifth"))
     ways, step = [], second_try.training_step
 
@@ -273,7 +216,7 @@ def test_the_second_try_goes_frame_by_frame_whatever_the_first_did(torn, tmp_pat
     assert ways == [("frame", "frame")] * 12
 
 
-def test_a_second_try_that_is_not_finite_is_given_up(torn, tmp_path, monkeypatch):
+def test_a_second_try_that_is_not_finite_is_given_up(tried, tmp_path, monkeypatch):
     step = second_try.training_step
     monkeypatch.setattr(
         second_try, "training_step", lambda state, frames: step(state, frames)._replace(failed="the loss")
@@ -282,7 +225,7 @@ def test_a_second_try_that_is_not_finite_is_given_up(torn, tmp_path, monkeypatch
     assert notes_of(tmp_path / "run") == ["the loss is not finite the second time; the first motion is kept"]
 
 
-def test_exposure_and_points_of_the_kept_motion(torn, tmp_path, monkeypatch):
+def test_exposure_and_points_of_the_kept_motion(tried, tmp_path, monkeypatch):
     """Per-frame colours learn in stage 1, too: those of the other motion would not fit."""
     config = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, frame_colors=2e-3))
     kept: dict[str, list[TrainState]] = {"shown": [], "main": []}
@@ -297,7 +240,7 @@ def test_exposure_and_points_of_the_kept_motion(torn, tmp_path, monkeypatch):
     assert main.points is second.points and main.colors is second.colors
 
 
-def test_an_image_that_is_lost_in_the_second_try(torn, tmp_path, monkeypatch):
+def test_an_image_that_is_lost_in_the_second_try(tried, tmp_path, monkeypatch):
     def lost(state, frames):
         raise FrameError("train/r_003.png: no such file")
 
