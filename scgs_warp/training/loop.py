@@ -177,7 +177,7 @@ def _train(
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
             _finish(state, steps, folder, bar)
             steps.release()
-            _perhaps_again(state, frames, folder, bar, stop)
+            _perhaps_again(state, frames, folder, bar, stop, watcher)
             state.begin_main()
 
         # 2. Render, compare and update the parameters.
@@ -221,7 +221,14 @@ def _train(
             _stop(state, bar)
 
 
-def _perhaps_again(state: TrainState, frames: Frames, folder: RunFolder, bar: Progress, stop: threading.Event) -> None:
+def _perhaps_again(
+    state: TrainState,
+    frames: Frames,
+    folder: RunFolder,
+    bar: Progress,
+    stop: threading.Event,
+    watcher: Watcher | None,
+) -> None:
     """Train stage 1 a second time if the configuration leaves the choice between both to the result."""
     total, began = state.steps_again, time.monotonic()
     if not total:
@@ -229,9 +236,11 @@ def _perhaps_again(state: TrainState, frames: Frames, folder: RunFolder, bar: Pr
     state.save(folder.path)
     bar.print(f"step {state.step}: stage 1 is tried a second time, frame by frame")
 
-    def go_on(done: int) -> None:
-        left = (time.monotonic() - began) / done * (total - done)
-        bar.advance(0, second=f"{done:,}/{total:,}, {clock(left)} left")
+    def go_on(second: TrainState) -> None:
+        left = (time.monotonic() - began) / second.step * (total - second.step)
+        bar.advance(0, second=f"{second.step:,}/{total:,}, {clock(left)} left")
+        if watcher is not None and watcher.due():
+            watcher.show(second)
         if _stopping(state, stop):
             _stop(state, bar)
 

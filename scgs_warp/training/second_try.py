@@ -25,14 +25,14 @@ VIEWS = 200
 """Largest number of training views by which both tries are compared."""
 
 
-def try_again(state: TrainState, frames: Frames, go_on: Callable[[int], None]) -> str:
+def try_again(state: TrainState, frames: Frames, go_on: Callable[[TrainState], None]) -> str:
     """Train stage 1 a second time, from its beginning, and let ``state`` keep the better spheres.
 
     The result follows from the state: a run that is stopped here and resumed from the end of stage 1 repeats it.
 
     Args:
         state: at the end of stage 1.
-        go_on: called after each step with its number; raises KeyboardInterrupt to stop.
+        go_on: called after each step with the state of the second try; raises KeyboardInterrupt to stop.
 
     Returns:
         What was found, in one line.
@@ -52,7 +52,7 @@ def try_again(state: TrainState, frames: Frames, go_on: Callable[[int], None]) -
         if density_due(second):
             control_density(second, result.size, visible)
         second.step += 1
-        go_on(second.step)
+        go_on(second)
     check_replicas(second)
     before, after = shown_psnr(state, frames.frames), shown_psnr(second, frames.frames)
     better = after > before

@@ -167,10 +167,10 @@ def test_a_run_that_is_stopped_in_the_second_try_gives_the_same_bits(stop_at, tr
         if stop_at == 0:  # the process is killed at once
             raise RuntimeError
 
-        def signalled(done):
-            if done == stop_at:
+        def signalled(second):
+            if second.step == stop_at:
                 os.kill(os.getpid(), signal.SIGTERM)
-            go_on(done)
+            go_on(second)
 
         return again(state, frames, signalled)
 
@@ -238,6 +238,21 @@ def test_exposure_and_points_of_the_kept_motion(tried, tmp_path, monkeypatch):
     assert main is kept["shown"][0] and main is not second
     assert main.exposure is second.exposure and main.exposure_optimizer is second.exposure_optimizer
     assert main.points is second.points and main.colors is second.colors
+
+
+def test_a_live_view_shows_the_second_try(tried, tmp_path):
+    shown: list[tuple[str, int, bool]] = []
+
+    class Viewer:
+        def due(self) -> bool:
+            return True
+
+        def show(self, state: TrainState) -> None:
+            shown.append((state.stage, state.step, state.config.pretrain.progressive))
+
+    fit(CONFIG, tiny_dataset(6), output=tmp_path / "run", watcher=Viewer())
+    first, second = ([("pretrain", step, again) for step in range(1, 13)] for again in (False, True))
+    assert shown == first + second + [("main", step, False) for step in range(13, 41)]
 
 
 def test_an_image_that_is_lost_in_the_second_try(tried, tmp_path, monkeypatch):
