@@ -13,8 +13,8 @@ from .skinning import aligned
 wp.set_module_options({"enable_backward": False})
 
 NEGLIGIBLE = wp.constant(1.0e-2)
-"""Relative stretch below which a Gaussian keeps its scales, bit for bit: nobody sees a Gaussian grow by so little, and
-decompositions of matrices take most of the time."""
+"""Relative stretch up to which a Gaussian keeps its scales, bit for bit: the decompositions that widen it take most of
+the time, and most Gaussians of a bent body stretch by less than a hundredth."""
 
 
 @wp.func

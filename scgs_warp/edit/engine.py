@@ -209,6 +209,7 @@ class Engine:
         masked = bool(self.scene.config.motion.mask) and self.rig.moves
         model = self.rig, self.scene.gaussians, self.motion_at(time)
         if bent.base is None or bent.skin is None:
+            self._under = None
             return pose_gaussians(*model, bent, self.binding, masked)
         if self._under is None or self._under[0] != time or self._under[1] is not bent.base:
             self._under = time, bent.base, pose_gaussians(*model, bent.base, self.binding, masked)

@@ -16,6 +16,10 @@ AXIS_SHARE = 0.8
 MISTAKE = math.radians(1.25)
 """Standard deviation of turns between two parts that the motion may show by mistake, radians. Turns of this size
 determine a point as well as the boundary's middle does."""
+NEAR = 1e-2
+"""Weight of the boundary's middle, relative to that of the motion, for the play of a pair. Both thighs turn about one
+line, so that a thigh could hang on the other one as on the hips. With this weight, play grows with the turn, and the
+thigh hangs on the hips."""
 HINGE = 0.1
 """Variance of turns across the main axis, relative to that about it, below which a joint is a hinge."""
 
@@ -32,7 +36,7 @@ class Joint(NamedTuple):
     turn: float
     """Largest angle between two instants, radians."""
     play: float
-    """Root mean square distance by which the point moves against itself on the two parts."""
+    """Root mean square distance by which the point moves against itself on the two parts, with ``NEAR``."""
     confidence: float
     """0: the motion never bent the joint, and the point is the middle of the boundary; near 1: the motion alone
     determines the point."""
@@ -85,13 +89,14 @@ def _fit(patches: Patches, labels: np.ndarray, motions: Motions, pair: list[int]
     known = float(values[1])
     prior = max(play2 / extent**2, MISTAKE**2)
     alone = axes.T @ right / np.maximum(values, 1e-300)  # where the motion by itself puts the point
+    offset = values * alone / (values + prior)
     if values[0] < HINGE * known and abs(alone[0]) > extent:
-        values[0] = 0.0
-    offset = axes @ (values * alone / (values + prior))
-    play = math.sqrt(float(((A @ offset - b) ** 2).sum() / times))
+        offset[0] = 0.0
+    near = values * alone / (values + max(play2 / extent**2, NEAR * known))
+    play = math.sqrt(float(((A @ axes @ near - b) ** 2).sum() / times))
     if turn < LEAST_TURN:
         return Joint(-1, middle + patches.centre, None, turn, play, 0.0)
-    return Joint(-1, middle + offset + patches.centre, _axis(turned, motions.rotations[first, 0]), turn, play,
+    return Joint(-1, middle + axes @ offset + patches.centre, _axis(turned, motions.rotations[first, 0]), turn, play,
                  known / (known + prior))  # fmt: skip
 
 

@@ -15,14 +15,16 @@ from ..runtime.launch import launch
 from .part_pose import Rigid
 from .rotations import multiply, rotate, to_matrix
 
-STIFF = 100.0
-"""Cost of what a limb does not do of itself, relative to a swing of its first joint in any direction.
-
-It is the cost of a turn of an inner joint: a limb swings as a whole, and its inner joints bend as far as the distance
-of the place requires. A twist of the first joint about the line to the last one costs as much: the place of a hand
-leaves it open, and the least turn from hand to hand would roll the upper arm. So does a squared shift of the first
-joint, in lengths of the chain: a nearly straight limb bends a lot for a small change of distance, so that a joint
-beside its true place would bend the elbow of an arm that only swings. The shoulder gives way a little instead."""
+BEND = 100.0
+"""Cost of a turn of an inner joint, relative to a swing of the first one: a limb swings as a whole, and its inner
+joints bend as far as the distance of the place requires."""
+TWIST = 1000.0
+"""Cost of a twist of the first joint about the line to the last one, likewise: the place of a hand leaves it open, and
+the least turn from hand to hand would roll the upper arm."""
+SLIDE = 3000.0
+"""Cost of a squared shift of the first joint, in lengths of the chain, likewise. A nearly straight limb bends a lot for
+a small change of distance, so that a joint beside its true place would bend the elbow of an arm that only swings. The
+shoulder gives way a little instead. With less than 10 times ``BEND``, it slides where the elbow should bend."""
 OFF_AXIS = 4.0
 """Cost of a turn across the axis about which the motion turned an inner joint, relative to a turn about it: a knee
 bends forwards."""
@@ -64,8 +66,8 @@ def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -
     """Return the pose of a chain that takes a point to a place, or as near as the chain reaches.
 
     Among the poses that reach it, the one that differs least from the present one is taken: the sum of squared angles
-    is least, where angles of inner joints, a twist of the first one and its shift count ``STIFF`` times, and angles
-    across known axes ``OFF_AXIS`` times more. The result depends on the arguments alone.
+    is least, where angles of inner joints count ``BEND`` times, those across known axes ``OFF_AXIS`` times as much, a
+    twist of the first joint ``TWIST`` times, and its shift ``SLIDE`` times. The result depends on the arguments alone.
 
     Args:
         links: joints from the base to the end.
@@ -78,7 +80,7 @@ def reach(links: list[Link], base: Rigid, grip: np.ndarray, place: np.ndarray) -
     centre, here = points[0], now - points[0]
     length = max(sum(float(np.linalg.norm(b - a)) for a, b in pairwise(points)), 1e-12)
     there = (place - centre) * min(1.0, length / max(float(np.linalg.norm(place - centre)), 1e-300))
-    costs = [_swing_cost(links), *(STIFF * _cost(link.axis) for link in links[1:])]
+    costs = [_swing_cost(links), *(BEND * _cost(link.axis) for link in links[1:])]
     aims = [centre + _between(here, there, step / STEPS) for step in range(1, STEPS + 1)]
     turns, shift = _solve(links, costs, base, grip, aims, length)
     return Reached(list(multiply(turns, np.array(pose.turns))), pose.shift + shift)
@@ -91,10 +93,10 @@ def _cost(axis: np.ndarray | None) -> np.ndarray:
 
 def _swing_cost(links: list[Link]) -> np.ndarray:
     """Return the quadratic form [3, 3] of the first joint's cost: a twist about the line to the last joint costs
-    ``STIFF`` times more than a swing. A chain of one joint has no such line."""
+    ``TWIST`` times more than a swing. A chain of one joint has no such line."""
     bone = rotate(links[0].quat, links[-1].joint - links[0].joint)
     length2 = float(bone @ bone)
-    return np.eye(3) if length2 < 1e-18 else np.eye(3) + (STIFF - 1.0) * np.outer(bone, bone) / length2
+    return np.eye(3) if length2 < 1e-18 else np.eye(3) + (TWIST - 1.0) * np.outer(bone, bone) / length2
 
 
 def posed_chain(links: list[Link], pose: Reached, base: Rigid, grip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,7 +124,7 @@ def _solve(
         *(tensor([link.joint for link in links]), tensor([link.shift for link in links])),
         *(tensor(present), tensor(costs), tensor([to_matrix(base.quat)]), tensor([base.shift, grip]), tensor(aims)),
         torch.tensor([STEP_ITERATIONS] * (len(aims) - 1) + [FINAL_ITERATIONS], dtype=torch.int32),
-        *(PULL / length**2, STIFF / length**2, LONGEST_TURN, TOLERANCE),
+        *(PULL / length**2, SLIDE / length**2, LONGEST_TURN, TOLERANCE),
     )
     scratch = torch.empty(count, 3, 3, dtype=torch.float64), torch.empty(count, 3, dtype=torch.float64)
     turns, shift = tensor([[0.0, 0.0, 0.0, 1.0]] * count), tensor([[0.0] * 3])

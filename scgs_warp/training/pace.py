@@ -49,7 +49,8 @@ class Pace:
         more = self.config.steps - step + again
         left = each * more
         slowest = SLOWEST if step > self.config.half_size else SLOWEST_FROM_HALF
+        twice = f", {again:,} of them for a second try at stage 1" if again else ""
         return (
-            f"on this machine, {more:,} more steps ({self.config.preset}) take {clock(left)} to "
+            f"on this machine, {more:,} more steps ({self.config.preset}{twice}) take {clock(left)} to "
             f"{clock(slowest * left)}: {1000 * each:.0f} ms each so far, more as Gaussians are added"
         )

@@ -1,8 +1,9 @@
 """Second try at stage 1: frame by frame, with neighbours of the moment, and held together more firmly.
 
-Images of single moments do not tell legs apart that pass each other, nor how a round head turns: spheres then move no
-further than the images ask for. Led from the first pose on, they follow more often (``rigidity.momentary_graph``). Of
-both tries, the spheres that show the training views better are kept: bodies that truly part fit the second one worse.
+Images of single moments tell neither which of two legs passes the other nor how far a round head turns, and spheres
+move no further than the images require. The second try adds frame after frame, so that spheres begin in the pose of
+the frame before, and ties each sphere to its neighbours at that moment (``rigidity.momentary_graph``). The spheres that
+show the training views better are kept: bodies that truly part fit the second try worse.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from .step import training_step
 
 VIEWS = 200
 """Largest number of training views by which both tries are compared."""
+LEAST_GAIN = 0.1
+"""PSNR in dB by which the second motion must be better: two trainings differ by less than this by chance."""
 
 
 def try_again(state: TrainState, frames: Frames, go_on: Callable[[TrainState], None]) -> str:
@@ -55,7 +58,7 @@ def try_again(state: TrainState, frames: Frames, go_on: Callable[[TrainState], N
         go_on(second)
     check_replicas(second)
     before, after = shown_psnr(state, frames.frames), shown_psnr(second, frames.frames)
-    better = after > before
+    better = after > before + LEAST_GAIN
     if state.group is not None:  # the first process decides: others may round differently
         better = state.group.any(state.group.first and better)
     if better:

@@ -33,7 +33,7 @@ def test_one_estimate_after_the_first_steps():
 
 def test_a_second_try_takes_time():
     found = notes(dataclasses.replace(preset("cpu"), half_size=0), 0.05, again=3_000)
-    assert "26,800 more steps (cpu) take 22:20 to 44:40" in found[MEASURED]
+    assert "26,800 more steps (cpu, 3,000 of them for a second try at stage 1) take 22:20 to 44:40" in found[MEASURED]
 
 
 @pytest.mark.parametrize(("first", "range_of"), [(0, "take 1:08 to 3:24"), (4_000, "take 0:28 to 0:56")])

@@ -1,6 +1,6 @@
 // Inverse kinematics (scgs_warp/edit/reach.py): the least turns of a chain of joints that take a point to a place.
 
-const STIFF = 100, OFF_AXIS = 4, PULL = 1e6; // costs, as there
+const BEND = 100, TWIST = 1000, SLIDE = 3000, OFF_AXIS = 4, PULL = 1e6; // costs, as there
 const STEPS = 6, LONGEST_TURN = 0.5;
 
 // Solve a symmetric positive system by Gaussian elimination, in place.
@@ -62,7 +62,7 @@ function between(here, there, share) {
 
 // Gauss-Newton steps for the cost of the change since the links' present pose plus the pull.
 function approach(links, costs, pose, base, grip, aim, length, iterations) {
-  const pull = PULL / length ** 2, slide = STIFF / length ** 2, size = 3 * links.length + 3;
+  const pull = PULL / length ** 2, slide = SLIDE / length ** 2, size = 3 * links.length + 3;
   for (let iteration = 0; iteration < iterations; iteration++) {
     const { points, end } = posedChain(links, pose, base, grip);
     const columns = []; // of the end's derivative
@@ -110,13 +110,13 @@ const product = (left, right) => left.map((row) => right[0].map((_, c) => row.re
 
 // Quadratic form of an inner joint's cost: a turn across a known axis costs more than one about it.
 function bendCost(axis) {
-  return axis ? alongAndAcross(STIFF * OFF_AXIS, -STIFF * (OFF_AXIS - 1), axis) : alongAndAcross(STIFF, 0, [0, 0, 0]);
+  return axis ? alongAndAcross(BEND * OFF_AXIS, -BEND * (OFF_AXIS - 1), axis) : alongAndAcross(BEND, 0, [0, 0, 0]);
 }
 
 // That of the first joint: a twist about the line to the last joint costs more than a swing.
 function swingCost(links) {
   const bone = qRotate(links[0].quat, plus(links[links.length - 1].joint, links[0].joint, -1)), square = dot(bone, bone);
-  return alongAndAcross(1, square < 1e-18 ? 0 : (STIFF - 1) / square, bone);
+  return alongAndAcross(1, square < 1e-18 ? 0 : (TWIST - 1) / square, bone);
 }
 
 // Derivative of a rotation vector by a small turn that follows the rotation.
