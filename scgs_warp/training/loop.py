@@ -245,7 +245,7 @@ def _perhaps_again(
             _stop(state, bar)
 
     try:
-        note = try_again(state, frames, go_on)
+        note = try_again(state, frames, partial(steps_of, tell=bar.print), go_on)
     except ProcessLost:
         raise
     except UserError as error:

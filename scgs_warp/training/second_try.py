@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from typing import Protocol
 
 import torch
 
@@ -19,8 +20,7 @@ from .density_control import control_density, density_due, visible_gaussians
 from .frames import Frames
 from .multi_view import check_replicas
 from .second_config import second_config
-from .state import TrainState
-from .step import training_step
+from .state import StepResult, TrainState
 
 VIEWS = 200
 """Largest number of training views by which both tries are compared."""
@@ -28,13 +28,27 @@ LEAST_GAIN = 0.1
 """PSNR in dB by which the second motion must be better: two trainings differ by less than this by chance."""
 
 
-def try_again(state: TrainState, frames: Frames, go_on: Callable[[TrainState], None]) -> str:
+class Steps(Protocol):
+    """Takes the steps of a state; on a GPU, results become known later (``recorded_step``)."""
+
+    def take(self) -> list[StepResult]: ...
+    def settle(self) -> list[StepResult]: ...
+    def release(self) -> None: ...
+
+
+def try_again(
+    state: TrainState,
+    frames: Frames,
+    steps_of: Callable[[TrainState, Frames], Steps],
+    go_on: Callable[[TrainState], None],
+) -> str:
     """Train stage 1 a second time, from its beginning, and let ``state`` keep the better spheres.
 
     The result follows from the state: a run that is stopped here and resumed from the end of stage 1 repeats it.
 
     Args:
         state: at the end of stage 1.
+        steps_of: returns what takes the steps of a state.
         go_on: called after each step with the state of the second try; raises KeyboardInterrupt to stop.
 
     Returns:
@@ -47,13 +61,20 @@ def try_again(state: TrainState, frames: Frames, go_on: Callable[[TrainState], N
     second.group = state.group
     ordered = copy.copy(frames)  # the same images in the second try's order
     ordered.config = second.config
+    steps = steps_of(second, ordered)
     while second.step < second.config.pretrain_steps:
+        due, last = density_due(second), second.step + 1 == second.config.pretrain_steps
+        results = steps.settle() if due else []
         visible = visible_gaussians(second, ordered)
-        result = training_step(second, ordered)
-        if result.failed is not None:
-            return f"{result.failed} is not finite the second time; the first motion is kept"
-        if density_due(second):
-            control_density(second, result.size, visible)
+        results += steps.take()
+        if due or last:
+            results += steps.settle()
+            steps.release()
+        failed = next((result.failed for result in results if result.failed is not None), None)
+        if failed is not None:
+            return f"{failed} is not finite the second time; the first motion is kept"
+        if due:
+            control_density(second, results[-1].size, visible)
         second.step += 1
         go_on(second)
     check_replicas(second)

@@ -94,13 +94,13 @@ def test_the_better_motion_is_kept(first_psnr, better, tried, tmp_path, device, 
         begin_main(state)
 
     monkeypatch.setattr(TrainState, "begin_main", look)
-    step = second_try.training_step
+    visible = second_try.visible_gaussians
 
     def note(state, frames):
         seen.append((state.step, frames.index_at(state.step, state.config.pretrain.progressive)))
-        return step(state, frames)
+        return visible(state, frames)
 
-    monkeypatch.setattr(second_try, "training_step", note)
+    monkeypatch.setattr(second_try, "visible_gaussians", note)
     fit(CONFIG, tiny_dataset(6), output=tmp_path / "run", device=device)
     assert [number for number, _ in seen] == list(range(12)), "a whole stage 1"
     assert seen[0][1] == 0, "frame by frame from the first one"
@@ -170,7 +170,7 @@ def test_a_run_that_is_stopped_in_the_second_try_gives_the_same_bits(stop_at, tr
     whole = (tmp_path / "whole/checkpoint.safetensors").read_bytes()
     again = loop.try_again
 
-    def interrupted(state, frames, go_on):
+    def interrupted(state, frames, steps_of, go_on):
         if stop_at == 0:  # the process is killed at once
             raise RuntimeError
 
@@ -179,16 +179,17 @@ def test_a_run_that_is_stopped_in_the_second_try_gives_the_same_bits(stop_at, tr
                 os.kill(os.getpid(), signal.SIGTERM)
             go_on(second)
 
-        return again(state, frames, signalled)
+        return again(state, frames, steps_of, signalled)
 
     with monkeypatch.context() as patch, pytest.raises(RuntimeError if stop_at == 0 else KeyboardInterrupt):
         patch.setattr(loop, "try_again", interrupted)
         fit(CONFIG, data, output=tmp_path / "cut", device=device)
-    steps: list[int] = []
+    steps: list[tuple[str, int]] = []
     with monkeypatch.context() as patch:
-        before_each_step(patch, lambda state: steps.append(state.step))
+        before_each_step(patch, lambda state: steps.append((state.config.pretrain.arap_by, state.step)))
         fit(CONFIG, data, output=tmp_path / "cut", device=device, resume=True)
-    assert steps[0] == 12, "the end of stage 1 was saved"
+    expected = [("moment", step) for step in range(12)] + [("auto", step) for step in range(12, 40)]
+    assert steps == expected, "the end of stage 1 was saved"
     assert (tmp_path / "cut/checkpoint.safetensors").read_bytes() == whole
     assert notes_of(tmp_path / "cut") == notes_of(tmp_path / "whole")
 
@@ -212,22 +213,25 @@ def test_a_crash_after_the_second_try_repeats_it(tried, tmp_path, monkeypatch):
 
 def test_the_second_try_goes_frame_by_frame_whatever_the_first_did(tried, tmp_path, monkeypatch):
     by_fifths = dataclasses.replace(CONFIG, pretrain=dataclasses.replace(CONFIG.pretrain, progressive_by="fifth"))
-    ways, step = [], second_try.training_step
+    ways, visible = [], second_try.visible_gaussians
 
     def noted(state, frames):
         ways.append((state.config.pretrain.progressive_by, frames.config.pretrain.progressive_by))
-        return step(state, frames)
+        return visible(state, frames)
 
-    monkeypatch.setattr(second_try, "training_step", noted)
+    monkeypatch.setattr(second_try, "visible_gaussians", noted)
     fit(by_fifths, tiny_dataset(6), output=tmp_path / "run")
     assert ways == [("frame", "frame")] * 12
 
 
 def test_a_second_try_that_is_not_finite_is_given_up(tried, tmp_path, monkeypatch):
-    step = second_try.training_step
-    monkeypatch.setattr(
-        second_try, "training_step", lambda state, frames: step(state, frames)._replace(failed="the loss")
-    )
+    step = loop.training_step
+
+    def spoilt(state, frames):
+        result = step(state, frames)
+        return result._replace(failed="the loss") if state.config.pretrain.arap_by == "moment" else result
+
+    monkeypatch.setattr(loop, "training_step", spoilt)
     fit(CONFIG, tiny_dataset(6), output=tmp_path / "run")
     assert notes_of(tmp_path / "run") == ["the loss is not finite the second time; the first motion is kept"]
 
@@ -266,6 +270,6 @@ def test_an_image_that_is_lost_in_the_second_try(tried, tmp_path, monkeypatch):
     def lost(state, frames):
         raise FrameError("train/r_003.png: no such file")
 
-    monkeypatch.setattr(second_try, "training_step", lost)
+    monkeypatch.setattr(second_try, "visible_gaussians", lost)
     with pytest.raises(UserError, match=r"r_003.png: no such file; step 12 is saved: continue with --resume"):
         fit(CONFIG, tiny_dataset(6), output=tmp_path / "run")
