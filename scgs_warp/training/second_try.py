@@ -25,7 +25,7 @@ from .state import StepResult, TrainState
 VIEWS = 200
 """Largest number of training views by which both tries are compared."""
 LEAST_GAIN = 0.1
-"""PSNR in dB by which the second motion must be better: two trainings differ by less than this by chance."""
+"""PSNR in dB by which the second motion must be better: a smaller gain in stage 1 may be chance."""
 
 
 class Steps(Protocol):
