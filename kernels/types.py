@@ -35,9 +35,9 @@ POSITION_MAX = wp.constant(1.0e18)
 SLOT_GEOMETRY = 8
 """Number of columns before the channels in a gradient slot: 2D mean (2), conic (3), opacity, absolute 2D mean (2)."""
 
-PACKED_GEOMETRY = 9
+PACKED_GEOMETRY = 10
 """Number of columns before the channels in a splat packed for the CPU: mean (2), scaled conic (3), log2 of the opacity,
-its inverse, -B / A, and the power without sharpness at which alpha is ALPHA_MIN."""
+its inverse, -B / A, the depth of the Gaussian below its peak at which alpha is ALPHA_MIN, and -B / C."""
 
 CHANNEL_GROUP = 8
 """More than four channels of a packed splat on the CPU are padded with zeros to a multiple of this number."""

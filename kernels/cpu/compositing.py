@@ -1,15 +1,17 @@
-"""Alpha compositing on a CPU: one tile per grid index, a row of 16 pixels in one SIMD register.
+"""Alpha compositing on a CPU: one tile per grid index, a block of 4 x 4 pixels in one SIMD register.
 
 The kernels compute what ``compositing`` computes; the work is laid out as follows:
 
 - Splats are packed beforehand (``pack_splats``): a pair reads one or two cache lines, and the logarithm and the
   divisions are done once per splat.
-- Exponentials are taken to base 2: ``alpha = 2^(p - s ln 2 p^2 + log2 o)``, where the factor of ``p = -q / (2 ln 2)``
-  is folded into the conic.
-- One vector operation finds which of a tile's 16 rows a splat reaches; only those are visited.
+- Exponentials are taken to base 2: ``alpha = 2^(log2 o - d - s ln 2 d^2)``, where the factor of the depth
+  ``d = q / (2 ln 2)`` is folded into the conic.
+- Which of a tile's 16 blocks a splat reaches is computed for all of them at once, one per lane; only those are visited.
+  Blocks are reached less often than rows of 16 pixels would be, by two fifths for splats of a few pixels.
+- Inside a block, the depth is a plane, whose coefficients differ between blocks, plus a square that is the same in all.
 - A pixel that has ended gets a negative transmittance, so the test of the next transmittance, > 1e-4, always fails.
 - The adjoint first contracts a splat's channels with the incoming gradient, so one running sum per pixel suffices. The
-  sums of a (tile, splat) pair stay in registers, one column of pixels per lane; at the end the lanes are added up, for
+  sums of a (tile, splat) pair stay in registers, one pixel of a block per lane; at the end the lanes are added up, for
   16 sums at a time.
 """
 

@@ -1,7 +1,8 @@
-// Alpha compositing of one tile and its adjoint: 16 x 16 pixels, a row of 16 in one vector.
+// Alpha compositing of one tile and its adjoint: 16 x 16 pixels in blocks of 4 x 4, a block in one vector.
 #pragma once
 #include "lane_sums.h"
 #include "simd.h"
+#include "tile_blocks.h"
 
 enum {
     GEOMETRY = PACKED_GEOMETRY,  // leading columns of a packed splat
@@ -9,65 +10,6 @@ enum {
     AHEAD = 32,                  // pairs from the request of a packed splat to its use: it seldom lies in a near cache
     AHEAD_ADJOINT = 8,           // the same in the adjoint, which takes longer over a pair
 };
-
-// A splat as seen from the tile's first pixel; the lanes of the last three are the tile's rows.
-struct Splat {
-    float mx, a, log2_opacity, floor;
-    vf dy, bdy, cdy2;
-};
-
-// Position of a tile in the image and in the list of pairs.
-struct Tile {
-    int begin, end;       // its pairs
-    int wide, tall;       // its pixels inside the image
-    float x, y;           // centre of its first pixel
-    long long corner;     // index of its first pixel
-    long long plane;      // pixels of the image
-    long long row_pitch;  // pixels of a row of the image
-
-    Tile(int tile, const wp::array_t<wp::vec_t<2, int>>& ranges, int width, int height, int columns) {
-        const int x0 = 16 * (tile % columns), y0 = 16 * (tile / columns);
-        begin = ranges.data[tile].c[0];
-        end = ranges.data[tile].c[1];
-        wide = width - x0 < 16 ? width - x0 : 16;
-        tall = height - y0 < 16 ? height - y0 : 16;
-        x = 16.0f * (tile % columns) + 0.5f;
-        y = 16.0f * (tile / columns) + 0.5f;
-        corner = (long long)y0 * width + x0;
-        plane = (long long)width * height;
-        row_pitch = width;
-    }
-};
-
-static inline Splat read_splat(const float* s, const Tile& tile) {
-    FUSE_WITHIN_EXPRESSIONS
-    Splat g;
-    g.mx = s[0] - tile.x;
-    g.a = s[2];
-    g.log2_opacity = s[5];
-    g.floor = s[8];
-    g.dy = lane_numbers() - (s[1] - tile.y);
-    g.bdy = s[3] * g.dy;
-    g.cdy2 = s[4] * g.dy * g.dy;
-    return g;
-}
-
-// Return one bit per row, set if the ellipse meets it: q is evaluated at the row's point nearest to the ellipse's axis.
-static inline unsigned reached_rows(const Splat& g, float slope) {
-    FUSE_WITHIN_EXPRESSIONS
-    vf x = slope * g.dy;
-    vf low = vf{} - g.mx, high = vf{} + (15.0f - g.mx);
-    x = x < low ? low : x;
-    x = x > high ? high : x;
-    return bits((g.a * x + g.bdy) * x + g.cdy2 >= g.floor - 1e-3f);
-}
-
-// Return the exponent of a Gaussian at a row's pixels. Forward pass and adjoint must round alike to agree on the
-// contributing splats.
-static inline vf power_of(vf dx, float a, float bdy, float cdy2) {
-    FUSE_WITHIN_EXPRESSIONS
-    return (a * dx + bdy) * dx + cdy2;
-}
 
 static inline void composite_tile(
     int tile, const wp::array_t<float>& packed, const wp::array_t<float>& background,
@@ -77,10 +19,10 @@ static inline void composite_tile(
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const Tile place = Tile(tile, ranges, width, height, columns);
-    const int begin = place.begin, end = place.end, wide = place.wide, tall = place.tall;
-    const long long plane = place.plane, corner = place.corner;
+    const int begin = place.begin, end = place.end;
+    const long long plane = place.plane;
     const int stride = packed.shape.dims[1];
-    const vf LANE = lane_numbers(), ZERO = vf{};
+    const vf U = pixel_columns(), V = pixel_rows(), ZERO = vf{};
     const float curvature = LN_2 * sharpness;
 
     struct Three {
@@ -101,49 +43,50 @@ static inline void composite_tile(
     const bool keep = last.shape.dims[0] > 0;
 
     // One pass over the tile's splats for `count` channels from c0 on; only the first pass stores alpha and the like.
-    // For each chunk of 32 splats and each row, the row's state stays in registers while the splats that reach it are
-    // visited.
+    // For each chunk of 32 splats and each block, the block's state stays in registers while the splats that reach it
+    // are visited.
     auto pass = [&](auto group, auto keeping, int c0, int count) {
         constexpr int C = decltype(group)::value;
         constexpr bool KEEP = decltype(keeping)::value;
         vf T[16], sum[16][C];
         vi ends[16];
-        Splat chunk[32];
-        float channel[32][C];
+        Depth chunk[32];
+        float channel[32][C], log2_opacity[32], bound[32];
         alignas(64) short reached[32];
-        for (int r = 0; r < 16; ++r) {
-            T[r] = LANE < (float)wide ? ZERO + 1.0f : ZERO - 1.0f;
-            for (int c = 0; c < C; ++c) sum[r][c] = ZERO;
-            ends[r] = vi{};
+        for (int b = 0; b < 16; ++b) {
+            T[b] = ((U < (float)place.wide_of(b)) & (V < (float)place.tall_of(b))) ? ZERO + 1.0f : ZERO - 1.0f;
+            for (int c = 0; c < C; ++c) sum[b][c] = ZERO;
+            ends[b] = vi{};
         }
-        unsigned alive = (1u << tall) - 1u;
+        unsigned alive = place.blocks();
         for (int p0 = begin; p0 < end && alive; p0 += 32) {
             const int n = end - p0 < 32 ? end - p0 : 32;
             for (int k = 0; k < n; ++k) {
                 const float* s = packed.data + (long long)splats.data[p0 + k] * stride;
                 if (p0 + k + AHEAD < end)
                     __builtin_prefetch(packed.data + (long long)splats.data[p0 + k + AHEAD] * stride);
-                chunk[k] = read_splat(s, place);
-                reached[k] = (short)reached_rows(chunk[k], s[7]);
+                const Offsets o = offsets(s, place);
+                chunk[k] = depth_from(s, o);
+                reached[k] = (short)reached_blocks(s, o);
+                log2_opacity[k] = s[5];
+                bound[k] = s[8];
                 for (int c = 0; c < C; ++c) channel[k][c] = s[GEOMETRY + c0 + c];
             }
             for (int k = n; k < 32; ++k) reached[k] = 0;
-            for (unsigned rows = alive; rows; rows &= rows - 1u) {
-                const int r = __builtin_ctz(rows);
-                vs in_row;
-                __builtin_memcpy(&in_row, reached, 64);
-                unsigned hits = __builtin_bit_cast(unsigned, __builtin_convertvector((in_row >> r) << 15, vb32));
-                vf t = T[r], own[C];
-                vi own_ends = ends[r];
-                for (int c = 0; c < C; ++c) own[c] = sum[r][c];
+            for (unsigned blocks = alive; blocks; blocks &= blocks - 1u) {
+                const int b = __builtin_ctz(blocks);
+                vs in_block;
+                __builtin_memcpy(&in_block, reached, 64);
+                unsigned hits = __builtin_bit_cast(unsigned, __builtin_convertvector((in_block >> b) << 15, vb32));
+                vf t = T[b], own[C];
+                vi own_ends = ends[b];
+                for (int c = 0; c < C; ++c) own[c] = sum[b][c];
                 for (; hits; hits &= hits - 1u) {
                     const int k = __builtin_ctz(hits);
-                    const Splat& g = chunk[k];
-                    const vf power = power_of(LANE - g.mx, g.a, ((const float*)&g.bdy)[r], ((const float*)&g.cdy2)[r]);
-                    const vi skip = ~((power <= 0.0f) & (power >= g.floor));  // skips NaN too: infinities may cancel
-                    vf alpha = exp2v(power * (1.0f - curvature * power) + g.log2_opacity);
+                    const vf depth = depth_at(chunk[k], b, U, V);
+                    vf alpha = exp2v(log2_opacity[k] - depth * (1.0f + curvature * depth));
                     alpha = alpha > ALPHA_MAX ? ZERO + ALPHA_MAX : alpha;
-                    alpha = skip ? ZERO : alpha;
+                    alpha = within(depth, bound[k]) ? alpha : ZERO;
                     const vf next = t - t * alpha;
                     const vi go = next > TRANSMITTANCE_MIN;
                     const vf w = go ? alpha * t : ZERO;
@@ -151,21 +94,23 @@ static inline void composite_tile(
                     for (int c = 0; c < C; ++c) own[c] += w * channel[k][c];
                     if (KEEP) own_ends = (w > 0.0f) ? vi{} + (p0 + k + 1) : own_ends;
                 }
-                T[r] = t;
-                for (int c = 0; c < C; ++c) sum[r][c] = own[c];
-                if (KEEP) ends[r] = own_ends;
-                if (!bits(t > 0.0f)) alive &= ~(1u << r);
+                T[b] = t;
+                for (int c = 0; c < C; ++c) sum[b][c] = own[c];
+                if (KEEP) ends[b] = own_ends;
+                if (!bits(t > 0.0f)) alive &= ~(1u << b);
             }
         }
-        for (int r = 0; r < tall; ++r) {
-            const vf t = (vf)((vu)T[r] & 0x7fffffffu);
-            const long long at = corner + (long long)r * width;
-            for (int c = 0; c < count; ++c)
-                store(image.data + (c0 + c) * plane + at, sum[r][c] + t * background.data[c0 + c], wide);
-            if (c0 == 0) store(alpha_image.data + at, 1.0f - t, wide);
+        for (unsigned blocks = place.blocks(); blocks; blocks &= blocks - 1u) {
+            const int b = __builtin_ctz(blocks);
+            const vf t = (vf)((vu)T[b] & 0x7fffffffu);
+            const long long at = place.at(b);
+            const int columns_left = place.wide_of(b), rows_left = place.tall_of(b);
+            auto put = [&](float* to, vf v) { store_block(to + at, v, width, columns_left, rows_left); };
+            for (int c = 0; c < count; ++c) put(image.data + (c0 + c) * plane, sum[b][c] + t * background.data[c0 + c]);
+            if (c0 == 0) put(alpha_image.data, 1.0f - t);
             if (KEEP) {
-                store(transmittance.data + at, t, wide);
-                store((float*)last.data + at, (vf)ends[r], wide);
+                put(transmittance.data, t);
+                put((float*)last.data, (vf)ends[b]);
             }
         }
     };
@@ -191,11 +136,11 @@ static inline void composite_tile_adjoint(
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const Tile place = Tile(tile, ranges, width, height, columns);
-    const int begin = place.begin, end = place.end, wide = place.wide, tall = place.tall;
+    const int begin = place.begin, end = place.end;
     if (begin == end) return;
     const long long plane = place.plane, corner = place.corner;
     const int stride = packed.shape.dims[1];
-    const vf LANE = lane_numbers(), ZERO = vf{};
+    const vf U = pixel_columns(), V = pixel_rows(), ZERO = vf{};
     const float curvature = LN_2 * sharpness;
 
     struct Any {
@@ -223,19 +168,20 @@ static inline void composite_tile_adjoint(
         vf T[16], v[16][K], w[16];
         vf behind[16];  // what shines through from behind, times its gradient, per unit of transmittance
         vi ends[16];
-        vi row_ends = {};
+        vi block_ends = {};
         int last_pair = begin;
-        for (int r = 0; r < 16; ++r) {
-            const int n = r < tall ? wide : 0;
-            const long long at = corner + (long long)r * width;
-            T[r] = load(transmittance.data + at, n);
-            ends[r] = (vi)load((const float*)last.data + at, n);
-            vf total = ZERO - load(v_alpha.data + at, n);
-            for (int c = 0; c < channels; ++c) total += load(v_image.data + c * plane + at, n) * background.data[c];
-            behind[r] = total;
-            for (int c = 0; c < C; ++c) v[r][c] = c < channels ? load(v_image.data + c * plane + at, n) : ZERO;
-            for (int k = 0; k < 16; ++k) row_ends[r] = ends[r][k] > row_ends[r] ? ends[r][k] : row_ends[r];
-            last_pair = row_ends[r] > last_pair ? row_ends[r] : last_pair;
+        auto get = [&](const float* from, int b) {
+            return load_block(from + place.at(b), width, place.wide_of(b), place.tall_of(b));
+        };
+        for (int b = 0; b < 16; ++b) {
+            T[b] = get(transmittance.data, b);
+            ends[b] = (vi)get((const float*)last.data, b);
+            vf total = ZERO - get(v_alpha.data, b);
+            for (int c = 0; c < channels; ++c) total += get(v_image.data + c * plane, b) * background.data[c];
+            behind[b] = total;
+            for (int c = 0; c < C; ++c) v[b][c] = c < channels ? get(v_image.data + c * plane, b) : ZERO;
+            for (int k = 0; k < 16; ++k) block_ends[b] = ends[b][k] > block_ends[b] ? ends[b][k] : block_ends[b];
+            last_pair = block_ends[b] > last_pair ? block_ends[b] : last_pair;
         }
         for (int r = 0; r < 16; ++r) {  // the next tile's pixels
             const long long next = corner + (long long)r * width + 16;
@@ -255,66 +201,58 @@ static inline void composite_tile_adjoint(
                 __builtin_prefetch(packed.data + (long long)splats.data[p - AHEAD_ADJOINT] * stride);
                 __builtin_prefetch(v_slots.data + (long long)slots.data[p - AHEAD_ADJOINT] * row_size, 1);
             }
-            const Splat g = read_splat(s, place);
-            unsigned rows = reached_rows(g, s[7]) & bits(row_ends > p);
-            const unsigned visited = rows;
-            if (!rows) {
+            const Offsets o = offsets(s, place);
+            unsigned blocks = reached_blocks(s, o) & bits(block_ends > p);
+            const unsigned visited = blocks;
+            if (!blocks) {
                 __builtin_memset(out, 0, row_size * sizeof(float));
                 continue;
             }
-            const float to_conic = -1.3862943611198906f;  // removes the factor folded into the packed conic
+            const float to_conic = 1.3862943611198906f;  // removes the factor folded into the packed conic
             const float A = to_conic * s[2], B = 0.5f * to_conic * s[3], D = to_conic * s[4];
-            const vf dx = LANE - g.mx, adx = A * dx, bdx = B * dx;
-            const float *dys = (const float*)&g.dy, *bdy = (const float*)&g.bdy, *cdy2 = (const float*)&g.cdy2;
-            vf g_opacity = ZERO, g0 = ZERO, g1 = ZERO, g2 = ZERO, abs_x = ZERO, abs_y = ZERO, v_channel[K];
+            const float *xs = (const float*)&o.x, *ys = (const float*)&o.y;
+            const Depth splat_depth = depth_from(s, o);
+            vf g_opacity = ZERO, gx = ZERO, gy = ZERO, gxx = ZERO, gxy = ZERO, gyy = ZERO, abs_x = ZERO, abs_y = ZERO;
+            vf v_channel[K];
             for (int c = 0; c < K; ++c) v_channel[c] = ZERO;
-            while (rows) {
-                const int r = __builtin_ctz(rows);
-                rows &= rows - 1u;
-                const float dy = dys[r];
-                const vf power = power_of(dx, g.a, bdy[r], cdy2[r]);
-                const vi skip = ~((power <= 0.0f) & (power >= g.floor)) | (ends[r] <= p);
-                const vf raw = exp2v(power * (1.0f - curvature * power) + g.log2_opacity);
+            while (blocks) {
+                const int b = __builtin_ctz(blocks);
+                blocks &= blocks - 1u;
+                const vf depth = depth_at(splat_depth, b, U, V);
+                const vf raw = exp2v(s[5] - depth * (1.0f + curvature * depth));
                 vf alpha = raw > ALPHA_MAX ? ZERO + ALPHA_MAX : raw;
-                alpha = skip ? ZERO : alpha;
-                const vf t = T[r] / (1.0f - alpha);
+                alpha = (within(depth, s[8]) & (ends[b] > p)) ? alpha : ZERO;
+                const vf t = T[b] / (1.0f - alpha);
                 const vf weight = alpha * t;
                 vf own = ZERO;
                 if (C > 0)
-                    for (int c = 0; c < C; ++c) own += v[r][c] * s[GEOMETRY + c];
+                    for (int c = 0; c < C; ++c) own += v[b][c] * s[GEOMETRY + c];
                 else
-                    for (int c = 0; c < channels; ++c)
-                        own += load(v_image.data + c * plane + corner + (long long)r * width, wide) * s[GEOMETRY + c];
-                const vf ahead = own - behind[r];
+                    for (int c = 0; c < channels; ++c) own += get(v_image.data + c * plane, b) * s[GEOMETRY + c];
+                const vf ahead = own - behind[b];
                 vf grad = weight * ahead;
                 grad = raw > ALPHA_MAX ? ZERO : grad;
-                behind[r] += alpha * ahead;
-                T[r] = t;
+                behind[b] += alpha * ahead;
+                T[b] = t;
                 g_opacity += grad;
-                grad = grad * (1.0f - 2.0f * curvature * power);
-                const vf grad_dy = grad * dy;
-                g0 += grad;
-                g1 += grad_dy;
-                g2 += grad_dy * dy;
+                grad = grad * (1.0f + 2.0f * curvature * depth);
+                const vf dx = U + xs[b], dy = V + ys[b], grad_dx = grad * dx, grad_dy = grad * dy;
+                gx += grad_dx;
+                gy += grad_dy;
+                gxx += grad_dx * dx;
+                gxy += grad_dx * dy;
+                gyy += grad_dy * dy;
                 if (ABSOLUTE) {
-                    const vf gx = grad * (adx + B * dy), gy = grad * (bdx + D * dy);
-                    abs_x += gx < 0.0f ? -gx : gx;
-                    abs_y += gy < 0.0f ? -gy : gy;
+                    abs_x += __builtin_elementwise_abs(A * grad_dx + B * grad_dy);
+                    abs_y += __builtin_elementwise_abs(B * grad_dx + D * grad_dy);
                 }
                 if (C > 0)
-                    for (int c = 0; c < C; ++c) v_channel[c] += v[r][c] * weight;
+                    for (int c = 0; c < C; ++c) v_channel[c] += v[b][c] * weight;
                 else
-                    w[r] = weight;
+                    w[b] = weight;
             }
-            const vf g0dx = g0 * dx;
-            vf sums[16] = {A * g0dx + B * g1,
-                           B * g0dx + D * g1,
-                           -0.5f * (g0dx * dx),
-                           -(g1 * dx),
-                           -0.5f * g2,
-                           g_opacity * s[6],
-                           abs_x,
-                           abs_y};
+            vf sums[16] = {A * gx + B * gy, B * gx + D * gy,  -0.5f * gxx, -gxy,
+                           -0.5f * gyy,     g_opacity * s[6], abs_x,       abs_y};
             for (int c = 0; c < C; ++c) sums[8 + c] = v_channel[c];
             const vf total = lane_sums(sums);
             if (C > 0) {
@@ -327,8 +265,8 @@ static inline void composite_tile_adjoint(
                 vf channel_sums[16] = {};
                 for (int c = 0; c < count; ++c)
                     for (unsigned left = visited; left; left &= left - 1u) {
-                        const long long at = corner + (long long)__builtin_ctz(left) * width;
-                        channel_sums[c] += load(v_image.data + (c0 + c) * plane + at, wide) * w[__builtin_ctz(left)];
+                        const int b = __builtin_ctz(left);
+                        channel_sums[c] += get(v_image.data + (c0 + c) * plane, b) * w[b];
                     }
                 store(out + 8 + c0, lane_sums(channel_sums), count);
             }

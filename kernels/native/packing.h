@@ -13,11 +13,12 @@ ALWAYS_INLINE void read_channels(const wp::array_t<float>& channels, int begin, 
     for (int c = 0; c < 16; ++c) to[c] = from + c < count ? to[c] : vf{};
 }
 
-// Return the power without sharpness at which a splat's alpha is ALPHA_MIN.
-ALWAYS_INLINE vf sharp_floor(vf log2_opacity, float sharpness) {
+// Return the next float above the depth, without sharpness, at which a splat's alpha is ALPHA_MIN; 0 if it never is.
+ALWAYS_INLINE vf depth_bound(vf log2_opacity, float sharpness) {
     FUSE_WITHIN_EXPRESSIONS
-    const vf floor = -7.994353436858858f - log2_opacity;  // log2(1 / 255)
-    return 2.0f * floor / (1.0f + __builtin_elementwise_sqrt(1.0f - 4.0f * LN_2 * sharpness * floor));
+    const vf depth = 7.994353436858858f + log2_opacity;  // log2(255)
+    const vf least = 2.0f * depth / (1.0f + __builtin_elementwise_sqrt(1.0f + 4.0f * LN_2 * sharpness * depth));
+    return depth >= 0.0f ? (vf)((vi)least + 1) : vf{};
 }
 
 static inline void pack_block(
@@ -27,7 +28,7 @@ static inline void pack_block(
     FUSE_WITHIN_EXPRESSIONS
     const int total = opacities.shape[0], width = packed.shape[1];
     const int rows = total - begin < 16 ? total - begin : 16;
-    const float factor = -0.5f * LOG2_E;
+    const float factor = 0.5f * LOG2_E;
     vf mean[2], conic[3], own[16] = {}, values[16];
     read_vectors(means2d.data, begin, rows, 2, mean);
     read_vectors(conics.data, begin, rows, 3, conic);
@@ -53,6 +54,7 @@ static inline void pack_block(
     own[5] = visible ? logarithm2(safe) : vf{} - 1.0e30f;
     own[6] = visible ? 1.0f / safe : vf{};
     own[7] = -conic[1] / conic[0];
-    own[8] = sharp_floor(own[5], sharpness);
+    own[8] = depth_bound(own[5], sharpness);
+    own[9] = -conic[1] / conic[2];
     write_columns(packed.data, begin, rows, width, 0, width == 16 ? 16 : PACKED_GEOMETRY, own);
 }

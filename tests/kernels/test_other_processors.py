@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -24,24 +25,47 @@ NOT_RUN = {"roofline", "sharing"}
 """Modules that compute nothing."""
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("processor", PROCESSORS)
-def test_all_stages(processor, tmp_path):
+def ledger_of(processor: str, stages: Sequence[str], folder: Path) -> dict[str, dict]:
+    """Run the tests of these stages there, and return what was launched and differed, by kernel."""
     if reason := why_not(processor):
         pytest.skip(reason)
     environment = {
         **os.environ,
         "SCGS_PROCESSOR": processor,
-        "SCGS_PROCESSOR_LEDGER": str(tmp_path / "ledger.json"),
+        "SCGS_PROCESSOR_LEDGER": str(folder / "ledger.json"),
         "PYTHONPATH": str(TESTS),
         "SCGS_NEEDS": "",
     }
-    files = [str(TESTS / "kernels" / f"test_{stage}.py") for stage in STAGES]
-    words = [sys.executable, "-m", "pytest", "-x", "-p", "other_processors.plugin", "-k", f"not ({LEFT_OUT})", *files]
+    files = [str(TESTS / "kernels" / f"test_{stage}.py") for stage in stages]
+    words = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-n",
+        "0",
+        "-p",
+        "other_processors.plugin",
+        "-k",
+        f"not ({LEFT_OUT})",
+        *files,
+    ]
     result = subprocess.run(words, cwd=TESTS.parent, env=environment, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout[-6000:] + result.stderr[-2000:]
-    ledger = json.loads((tmp_path / "ledger.json").read_text(encoding="utf-8"))
+    return json.loads((folder / "ledger.json").read_text(encoding="utf-8"))
+
+
+def test_one_stage(tmp_path):
+    ledger = ledger_of("avx2", ["adam"], tmp_path)
+    assert ledger["adam.adam_step"]["launches"] > 0
+    assert ledger["adam.adam_step"]["largest_difference"] < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("processor", PROCESSORS)
+def test_all_stages(processor, tmp_path):
+    ledger = ledger_of(processor, STAGES, tmp_path)
     for kernel, row in ledger.items():
         print(f"{processor} {kernel}: {row}")
     modules = {path.stem for path in Path(cpu.__path__[0]).glob("*.py")} - {"__init__"} - NOT_RUN

@@ -20,7 +20,8 @@ import warp as wp
 
 from other_processors import memory
 from other_processors.program import ARGUMENTS_AT, PROCESSORS, REGIONS_AT, SHARED_SIZE, Program, shared_file
-from scgs_warp.runtime.launch import CpuKernel
+from scgs_warp.runtime import launch
+from scgs_warp.runtime.cpu_kernel import CpuKernel
 
 FORMS = "scgs_warp.kernels.cpu."
 PARAMETERS = 3
@@ -110,24 +111,29 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item in kept]
 
 
+def _alone(*_args: object) -> bool:
+    """Refuse to share a grid among threads: :func:`launch.launch` then runs it in one piece."""
+    return False
+
+
 def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.TemporaryDirectory(prefix="scgs-warp-processor-")
     device = Device(os.environ["SCGS_PROCESSOR"], Path(folder.name))
     memory.note_addresses()
-    bind = CpuKernel.bind
+    run_here = CpuKernel.__call__
 
-    def bind_there(self: CpuKernel, arguments: bytes, tensors: tuple, begin: int = 0) -> Callable[[int, int], None]:
-        here = bind(self, arguments, tensors, begin)
+    def run_there(self: CpuKernel, args: tuple, begin: int, size: int) -> None:
+        def here() -> None:
+            run_here(self, args, begin, size)
+
         if not self.kernel.module.name.startswith(FORMS):
-            return here
+            here()
+            return
+        words = begin.to_bytes(4, "little") + self.pack(args)
+        device.launch(self, here, self.bounds(size), words)
 
-        def call(first: int, size: int, _tensors: tuple = tensors) -> None:
-            words = (begin + first).to_bytes(4, "little") + arguments
-            device.launch(self, lambda: here(first, size), self._bounds(size), words)
-
-        return call
-
-    CpuKernel.bind = bind_there  # type: ignore[method-assign]
+    CpuKernel.__call__ = run_there  # type: ignore[method-assign]
+    launch.share = _alone  # type: ignore[assignment]
 
     def finish() -> None:
         device.close()
