@@ -58,7 +58,7 @@ Conventions
 -----------
 
 - Frames: OpenCV cameras (x right, y down, z forward); ``viewmat`` is world-to-camera; quaternions are ``wxyz``.
-  Pixel centres lie at +0.5. Images are planar, ``[C, H, W]``: a row of 16 pixels is one SIMD register.
+  Pixel centres lie at +0.5. Images are planar, ``[C, H, W]``: SIMD registers load pixels that lie side by side.
 - Every kernel's first argument is ``first: int``, the grid index at which this launch starts
   (``i = first + wp.tid()``). On a CPU ``scgs_warp.runtime.launch.launch`` uses it to split one grid over threads, which
   requires a one-dimensional grid. The exception are kernels that work by blocks of threads: their grid has the

@@ -8,7 +8,7 @@ LOG2_E = 1.4426950408889634
 """Constant log2(e), since exponentials are taken to base 2."""
 
 TILE_SIZE = 16
-"""Side of a tile in pixels: a row of a tile fills one 512-bit SIMD register, and a tile's 256 pixels one CUDA block."""
+"""Side of a tile in pixels: a tile has 16 blocks of 4 x 4, each in one 512-bit SIMD register, and one CUDA block."""
 
 LANES = 16
 """Number of floats in a vector of the CPU's kernels, one AVX-512 register."""
@@ -37,7 +37,7 @@ SLOT_GEOMETRY = 8
 
 PACKED_GEOMETRY = 10
 """Number of columns before the channels in a splat packed for the CPU: mean (2), scaled conic (3), log2 of the opacity,
-its inverse, -B / A, the depth of the Gaussian below its peak at which alpha is ALPHA_MIN, and -B / C."""
+its inverse, -B / A, the bound below which a fall counts (0: nowhere), and -B / C. See ``cpu.compositing``."""
 
 CHANNEL_GROUP = 8
 """More than four channels of a packed splat on the CPU are padded with zeros to a multiple of this number."""

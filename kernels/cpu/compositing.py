@@ -4,11 +4,10 @@ The kernels compute what ``compositing`` computes; the work is laid out as follo
 
 - Splats are packed beforehand (``pack_splats``): a pair reads one or two cache lines, and the logarithm and the
   divisions are done once per splat.
-- Exponentials are taken to base 2: ``alpha = 2^(log2 o - d - s ln 2 d^2)``, where the factor of the depth
-  ``d = q / (2 ln 2)`` is folded into the conic.
+- Exponentials are taken to base 2: ``alpha = 2^(log2 o - f - s ln 2 f^2)``, where the factor of the fall
+  ``f = q / (2 ln 2)`` is folded into the conic.
 - Which of a tile's 16 blocks a splat reaches is computed for all of them at once, one per lane; only those are visited.
-  Blocks are reached less often than rows of 16 pixels would be, by two fifths for splats of a few pixels.
-- Inside a block, the depth is a plane, whose coefficients differ between blocks, plus a square that is the same in all.
+  A splat of a few pixels reaches fewer blocks than it would reach rows of 16 pixels.
 - A pixel that has ended gets a negative transmittance, so the test of the next transmittance, > 1e-4, always fails.
 - The adjoint first contracts a splat's channels with the incoming gradient, so one running sum per pixel suffices. The
   sums of a (tile, splat) pair stay in registers, one pixel of a block per lane; at the end the lanes are added up, for
@@ -69,7 +68,7 @@ def pack_splats(
     channels_in: wp.array2d[float],  # [N, C]
     sharpness: float,
     # Out:
-    packed_out: wp.array2d[float],  # [N, 16], or [N, 9 + C or more] with more than 4 channels
+    packed_out: wp.array2d[float],  # [N, 16], or [N, 10 + C or more] with more than 4 channels
 ):
     """Pack 16 splats. Grid: ceil(N / 16)."""
     begin = (first + wp.tid()) * _LANES
@@ -80,7 +79,7 @@ def pack_splats(
 def composite(
     first: int,
     # In:
-    packed_in: wp.array2d[float],  # [N, 8 + C padded]
+    packed_in: wp.array2d[float],  # [N, 16], or [N, 10 + C or more]
     background_in: wp.array[float],  # [C]
     ranges_in: wp.array[wp.vec2i],  # [T]
     splats_in: wp.array[int],  # [P]
@@ -115,7 +114,7 @@ def composite(
 def composite_adjoint(
     first: int,
     # In:
-    packed_in: wp.array2d[float],  # [N, 8 + C padded]
+    packed_in: wp.array2d[float],  # [N, 16], or [N, 10 + C or more]
     background_in: wp.array[float],  # [C]
     ranges_in: wp.array[wp.vec2i],  # [T]
     splats_in: wp.array[int],  # [P]

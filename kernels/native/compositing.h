@@ -22,7 +22,8 @@ static inline void composite_tile(
     const int begin = place.begin, end = place.end;
     const long long plane = place.plane;
     const int stride = packed.shape.dims[1];
-    const vf U = pixel_columns(), V = pixel_rows(), ZERO = vf{};
+    const Points first = first_pixels(place);
+    const vf ZERO = vf{};
     const float curvature = LN_2 * sharpness;
 
     struct Three {
@@ -50,11 +51,11 @@ static inline void composite_tile(
         constexpr bool KEEP = decltype(keeping)::value;
         vf T[16], sum[16][C];
         vi ends[16];
-        Depth chunk[32];
-        float channel[32][C], log2_opacity[32], bound[32];
+        const float* chunk[32];
         alignas(64) short reached[32];
         for (int b = 0; b < 16; ++b) {
-            T[b] = ((U < (float)place.wide_of(b)) & (V < (float)place.tall_of(b))) ? ZERO + 1.0f : ZERO - 1.0f;
+            const vi inside = (lane_columns() < (float)place.wide_of(b)) & (lane_rows() < (float)place.tall_of(b));
+            T[b] = inside ? ZERO + 1.0f : ZERO - 1.0f;
             for (int c = 0; c < C; ++c) sum[b][c] = ZERO;
             ends[b] = vi{};
         }
@@ -65,12 +66,8 @@ static inline void composite_tile(
                 const float* s = packed.data + (long long)splats.data[p0 + k] * stride;
                 if (p0 + k + AHEAD < end)
                     __builtin_prefetch(packed.data + (long long)splats.data[p0 + k + AHEAD] * stride);
-                const Offsets o = offsets(s, place);
-                chunk[k] = depth_from(s, o);
-                reached[k] = (short)reached_blocks(s, o);
-                log2_opacity[k] = s[5];
-                bound[k] = s[8];
-                for (int c = 0; c < C; ++c) channel[k][c] = s[GEOMETRY + c0 + c];
+                chunk[k] = s;
+                reached[k] = (short)reached_blocks(s, first);
             }
             for (int k = n; k < 32; ++k) reached[k] = 0;
             for (unsigned blocks = alive; blocks; blocks &= blocks - 1u) {
@@ -78,20 +75,21 @@ static inline void composite_tile(
                 vs in_block;
                 __builtin_memcpy(&in_block, reached, 64);
                 unsigned hits = __builtin_bit_cast(unsigned, __builtin_convertvector((in_block >> b) << 15, vb32));
+                const Points pixels = pixels_of(place, b);
                 vf t = T[b], own[C];
                 vi own_ends = ends[b];
                 for (int c = 0; c < C; ++c) own[c] = sum[b][c];
                 for (; hits; hits &= hits - 1u) {
                     const int k = __builtin_ctz(hits);
-                    const vf depth = depth_at(chunk[k], b, U, V);
-                    vf alpha = exp2v(log2_opacity[k] - depth * (1.0f + curvature * depth));
-                    alpha = alpha > ALPHA_MAX ? ZERO + ALPHA_MAX : alpha;
-                    alpha = within(depth, bound[k]) ? alpha : ZERO;
+                    const float* s = chunk[k];
+                    const Seen seen = see(s, pixels, curvature);
+                    vf alpha = seen.raw > ALPHA_MAX ? ZERO + ALPHA_MAX : seen.raw;
+                    alpha = seen.counts ? alpha : ZERO;
                     const vf next = t - t * alpha;
                     const vi go = next > TRANSMITTANCE_MIN;
                     const vf w = go ? alpha * t : ZERO;
                     t = go ? next : (vf)((vu)t | 0x80000000u);
-                    for (int c = 0; c < C; ++c) own[c] += w * channel[k][c];
+                    for (int c = 0; c < C; ++c) own[c] += w * s[GEOMETRY + c0 + c];
                     if (KEEP) own_ends = (w > 0.0f) ? vi{} + (p0 + k + 1) : own_ends;
                 }
                 T[b] = t;
@@ -140,7 +138,8 @@ static inline void composite_tile_adjoint(
     if (begin == end) return;
     const long long plane = place.plane, corner = place.corner;
     const int stride = packed.shape.dims[1];
-    const vf U = pixel_columns(), V = pixel_rows(), ZERO = vf{};
+    const Points first = first_pixels(place);
+    const vf ZERO = vf{};
     const float curvature = LN_2 * sharpness;
 
     struct Any {
@@ -201,8 +200,7 @@ static inline void composite_tile_adjoint(
                 __builtin_prefetch(packed.data + (long long)splats.data[p - AHEAD_ADJOINT] * stride);
                 __builtin_prefetch(v_slots.data + (long long)slots.data[p - AHEAD_ADJOINT] * row_size, 1);
             }
-            const Offsets o = offsets(s, place);
-            unsigned blocks = reached_blocks(s, o) & bits(block_ends > p);
+            unsigned blocks = reached_blocks(s, first) & bits(block_ends > p);
             const unsigned visited = blocks;
             if (!blocks) {
                 __builtin_memset(out, 0, row_size * sizeof(float));
@@ -210,18 +208,15 @@ static inline void composite_tile_adjoint(
             }
             const float to_conic = 1.3862943611198906f;  // removes the factor folded into the packed conic
             const float A = to_conic * s[2], B = 0.5f * to_conic * s[3], D = to_conic * s[4];
-            const float *xs = (const float*)&o.x, *ys = (const float*)&o.y;
-            const Depth splat_depth = depth_from(s, o);
             vf g_opacity = ZERO, gx = ZERO, gy = ZERO, gxx = ZERO, gxy = ZERO, gyy = ZERO, abs_x = ZERO, abs_y = ZERO;
             vf v_channel[K];
             for (int c = 0; c < K; ++c) v_channel[c] = ZERO;
             while (blocks) {
                 const int b = __builtin_ctz(blocks);
                 blocks &= blocks - 1u;
-                const vf depth = depth_at(splat_depth, b, U, V);
-                const vf raw = exp2v(s[5] - depth * (1.0f + curvature * depth));
-                vf alpha = raw > ALPHA_MAX ? ZERO + ALPHA_MAX : raw;
-                alpha = (within(depth, s[8]) & (ends[b] > p)) ? alpha : ZERO;
+                const Seen seen = see(s, pixels_of(place, b), curvature);
+                vf alpha = seen.raw > ALPHA_MAX ? ZERO + ALPHA_MAX : seen.raw;
+                alpha = (seen.counts & (ends[b] > p)) ? alpha : ZERO;
                 const vf t = T[b] / (1.0f - alpha);
                 const vf weight = alpha * t;
                 vf own = ZERO;
@@ -231,17 +226,17 @@ static inline void composite_tile_adjoint(
                     for (int c = 0; c < channels; ++c) own += get(v_image.data + c * plane, b) * s[GEOMETRY + c];
                 const vf ahead = own - behind[b];
                 vf grad = weight * ahead;
-                grad = raw > ALPHA_MAX ? ZERO : grad;
+                grad = seen.raw > ALPHA_MAX ? ZERO : grad;
                 behind[b] += alpha * ahead;
                 T[b] = t;
                 g_opacity += grad;
-                grad = grad * (1.0f + 2.0f * curvature * depth);
-                const vf dx = U + xs[b], dy = V + ys[b], grad_dx = grad * dx, grad_dy = grad * dy;
+                grad = grad * (1.0f + 2.0f * curvature * seen.fall);
+                const vf grad_dx = grad * seen.dx, grad_dy = grad * seen.dy;
                 gx += grad_dx;
                 gy += grad_dy;
-                gxx += grad_dx * dx;
-                gxy += grad_dx * dy;
-                gyy += grad_dy * dy;
+                gxx += grad_dx * seen.dx;
+                gxy += grad_dx * seen.dy;
+                gyy += grad_dy * seen.dy;
                 if (ABSOLUTE) {
                     abs_x += __builtin_elementwise_abs(A * grad_dx + B * grad_dy);
                     abs_y += __builtin_elementwise_abs(B * grad_dx + D * grad_dy);

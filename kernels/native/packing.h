@@ -13,12 +13,13 @@ ALWAYS_INLINE void read_channels(const wp::array_t<float>& channels, int begin, 
     for (int c = 0; c < 16; ++c) to[c] = from + c < count ? to[c] : vf{};
 }
 
-// Return the next float above the depth, without sharpness, at which a splat's alpha is ALPHA_MIN; 0 if it never is.
-ALWAYS_INLINE vf depth_bound(vf log2_opacity, float sharpness) {
+// Return the bound below which a fall counts, -log2 of a Gaussian of sharpness 0: where it is equal or larger, alpha,
+// with its sharpness, is under ALPHA_MIN. 0: it counts nowhere.
+ALWAYS_INLINE vf fall_bound(vf log2_opacity, float sharpness) {
     FUSE_WITHIN_EXPRESSIONS
-    const vf depth = 7.994353436858858f + log2_opacity;  // log2(255)
-    const vf least = 2.0f * depth / (1.0f + __builtin_elementwise_sqrt(1.0f + 4.0f * LN_2 * sharpness * depth));
-    return depth >= 0.0f ? (vf)((vi)least + 1) : vf{};
+    const vf fall = 7.994353436858858f + log2_opacity;  // log2(255)
+    const vf largest = 2.0f * fall / (1.0f + __builtin_elementwise_sqrt(1.0f + 4.0f * LN_2 * sharpness * fall));
+    return fall >= 0.0f ? (vf)((vi)largest + 1) : vf{};
 }
 
 static inline void pack_block(
@@ -54,7 +55,7 @@ static inline void pack_block(
     own[5] = visible ? logarithm2(safe) : vf{} - 1.0e30f;
     own[6] = visible ? 1.0f / safe : vf{};
     own[7] = -conic[1] / conic[0];
-    own[8] = depth_bound(own[5], sharpness);
+    own[8] = fall_bound(own[5], sharpness);
     own[9] = -conic[1] / conic[2];
     write_columns(packed.data, begin, rows, width, 0, width == 16 ? 16 : PACKED_GEOMETRY, own);
 }

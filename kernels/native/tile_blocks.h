@@ -1,5 +1,5 @@
-// A tile of 16 x 16 pixels as 16 blocks of 4 x 4, one vector each, and splats as its blocks see them. Block b lies in
-// column b % 4 and row b / 4 of the blocks; lane k holds the pixel in column k % 4 and row k / 4 of a block.
+// A tile of 16 x 16 pixels as 16 blocks of 4 x 4, one vector each, and packed splats as its blocks see them. Block b
+// lies in column b % 4 and row b / 4 of the blocks; lane k holds the pixel in column k % 4 and row k / 4 of a block.
 #pragma once
 #include "simd.h"
 
@@ -38,62 +38,63 @@ struct Tile {
     }
 };
 
-// Column and row of a block's pixels, 0 to 3.
-static inline vf pixel_columns() { return vf{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3}; }
-static inline vf pixel_rows() { return vf{0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}; }
+// Column and row of a block's pixels, or of a tile's blocks: 0 to 3.
+static inline vf lane_columns() { return vf{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3}; }
+static inline vf lane_rows() { return vf{0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}; }
 
-// The depth of a Gaussian, -log2 of its value, as seen from a tile. Lanes of the first three are the tile's blocks,
-// those of the last are a block's pixels (u, v):
-//     depth = at_first + along_u u + along_v v + quadratic
-struct Depth {
-    vf at_first, along_u, along_v, quadratic;
-};
-
-// Where a tile's blocks lie: their first pixel minus the splat's mean.
-struct Offsets {
+// Points of an image: the centres of a block's pixels, or of the first pixels of a tile's blocks.
+struct Points {
     vf x, y;
 };
 
-static inline Offsets offsets(const float* s, const Tile& tile) {
-    FUSE_WITHIN_EXPRESSIONS
-    return {4.0f * pixel_columns() - (s[0] - tile.x), 4.0f * pixel_rows() - (s[1] - tile.y)};
+static inline Points first_pixels(const Tile& tile) {
+    return {4.0f * lane_columns() + tile.x, 4.0f * lane_rows() + tile.y};
 }
 
-static inline Depth depth_from(const float* s, const Offsets& o) {
-    FUSE_WITHIN_EXPRESSIONS
-    const vf u = pixel_columns(), v = pixel_rows();
-    const float a = s[2], b = s[3], c = s[4];
-    const vf by = b * o.y, cy = c * o.y;
-    return {(a * o.x + by) * o.x + cy * o.y, 2.0f * a * o.x + by, b * o.x + 2.0f * cy, (a * u + b * v) * u + c * v * v};
+static inline Points pixels_of(const Tile& tile, int block) {
+    return {lane_columns() + (tile.x + 4 * (block & 3)), lane_rows() + (tile.y + 4 * (block >> 2))};
 }
 
-// Return the depth at a block's pixels. Forward pass and adjoint must round alike to agree on the contributing splats.
-static inline vf depth_at(const Depth& d, int block, vf u, vf v) {
+// Return -log2 of a Gaussian of sharpness 0 at a distance from its mean.
+static inline vf fall_at(const float* splat, vf dx, vf dy) {
     FUSE_WITHIN_EXPRESSIONS
-    const float *first = (const float*)&d.at_first, *along_u = (const float*)&d.along_u,
-                *along_v = (const float*)&d.along_v;
-    return (d.quadratic + first[block]) + along_u[block] * u + along_v[block] * v;
+    return (splat[2] * dx + splat[3] * dy) * dx + splat[4] * dy * dy;
 }
 
-// Return where a depth is at least zero and below the bound: as integers, negative floats and NaN exceed all others.
-static inline vi within(vf depth, float bound) { return (vu)depth < __builtin_bit_cast(unsigned, bound); }
+// A packed splat at a block's pixels.
+struct Seen {
+    vf dx, dy;  // from the mean to the pixels
+    vf fall;    // -log2 of the Gaussian of sharpness 0
+    vf raw;     // alpha before it is clamped, garbage where it does not count
+    vi counts;  // where alpha is at least ALPHA_MIN
+};
+
+// Forward pass and adjoint both call this, so they agree on the pixels that count. The fall counts if it is at least
+// zero and below a positive, finite bound: as integers, negative floats and NaN exceed all such bounds.
+ALWAYS_INLINE Seen see(const float* splat, const Points& pixels, float curvature) {
+    FUSE_WITHIN_EXPRESSIONS
+    const vf dx = pixels.x - splat[0], dy = pixels.y - splat[1];
+    const vf fall = fall_at(splat, dx, dy);
+    const vf raw = exp2v(splat[5] - fall * (1.0f + curvature * fall));
+    return {dx, dy, fall, raw, (vu)fall < __builtin_bit_cast(unsigned, splat[8])};
+}
 
 static inline vf clamped(vf value, vf low, vf high) {
     value = value < low ? low : value;
     return value > high ? high : value;
 }
 
-// Return one bit per block, set if the ellipse meets it. Of a rectangle, the point of least depth lies on the side that
-// faces the centre in x, or on the one that faces it in y.
-static inline unsigned reached_blocks(const float* s, const Offsets& o) {
+// Return one bit per block, set if the ellipse meets the rectangle that the block's pixel centres span, or nearly meets
+// it, since the falls are rounded. A rectangle's point of least fall lies on the side that faces the mean in x, or on
+// the one that faces it in y.
+static inline unsigned reached_blocks(const float* splat, const Points& first) {
     FUSE_WITHIN_EXPRESSIONS
-    const vf right = o.x + 3.0f, bottom = o.y + 3.0f, zero = vf{};
-    const vf x0 = clamped(zero, o.x, right), y0 = clamped(s[9] * x0, o.y, bottom);
-    const vf y1 = clamped(zero, o.y, bottom), x1 = clamped(s[7] * y1, o.x, right);
-    const vf d0 = (s[2] * x0 + s[3] * y0) * x0 + s[4] * y0 * y0;
-    const vf d1 = (s[2] * x1 + s[3] * y1) * x1 + s[4] * y1 * y1;
-    const float bound = s[8] > 0.0f ? s[8] + 1e-3f : -1.0f;
-    return bits((d0 <= bound) | (d1 <= bound));
+    if (__builtin_bit_cast(unsigned, splat[8]) == 0) return 0;
+    const vf left = first.x - splat[0], top = first.y - splat[1], right = left + 3.0f, bottom = top + 3.0f;
+    const vf x0 = clamped(vf{}, left, right), y0 = clamped(splat[9] * x0, top, bottom);
+    const vf y1 = clamped(vf{}, top, bottom), x1 = clamped(splat[7] * y1, left, right);
+    const float bound = splat[8] + 1e-3f;
+    return bits((fall_at(splat, x0, y0) <= bound) | (fall_at(splat, x1, y1) <= bound));
 }
 
 // Load the pixels of a block of which `wide` columns and `tall` rows lie inside the image, with zeros elsewhere.

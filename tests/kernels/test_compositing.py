@@ -228,6 +228,54 @@ def test_poison_is_left_out(device: str, field: str, value: float):
             assert torch.isfinite(gradient).all(), f"{form}: {name}"
 
 
+@pytest.mark.parametrize("sharpness", [0.0, 0.5])
+@pytest.mark.parametrize("nudge", [0.0, 1e-4, 1e-3])
+def test_a_splat_shows_at_the_pixel_of_its_mean(device: str, nudge: float, sharpness: float):
+    """One splat at the centre of each pixel: rounding must not take its own pixel for one outside of it."""
+    side, generator = 20, torch.Generator().manual_seed(3)
+    index = torch.arange(side * side)
+    means = torch.stack([index % side, index // side], 1) + 0.5
+    means = means + nudge * torch.randn(means.shape, generator=generator)
+    narrow, wide = 3.3 * torch.rand(2, side * side, generator=generator)
+    lean = (2.0 * torch.rand(side * side, generator=generator) - 1.0) * (narrow * wide).sqrt()
+    one = random_splats(0, 1, side, side, sharpness=sharpness)
+    splats = replace(
+        one,
+        means2d=means,
+        conics=torch.stack([narrow, 0.99 * lean, wide], 1),
+        depths=index + 1.0,
+        opacities=torch.full((side * side,), 0.02),
+        radii=torch.full((side * side, 2), 10, dtype=one.radii.dtype),
+    )
+    names = ("means2d", "conics", "depths", "opacities", "radii")
+    splats = replace(splats, **{name: getattr(splats, name).to(device) for name in names})
+    channels = torch.eye(side * side)[:, ::7].contiguous().to(device)
+    for form in forms(device):
+        image, _ = composite(splats, channels, bin_splats(splats), form=form)  # type: ignore[arg-type]
+        own = image.cpu().flatten(1)[torch.arange(image.shape[0]), index[::7]]
+        assert own.min() > 0.01, form
+
+
+def test_a_long_needle_with_a_broken_channel_is_left_out(device: str):
+    """Its squared distance rounds to less than zero where its nearest point is sought."""
+    one, c = random_splats(0, 1, 16, 16, device), 4
+    needle = replace(
+        one,
+        means2d=torch.tensor([[-5864.413, -3607.5933]], device=device),
+        conics=torch.tensor([[0.91625553, -1.4881736, 2.417078]], device=device),
+        opacities=torch.full((1,), 0.99, device=device),
+        radii=torch.full_like(one.radii, 10_000),
+    )
+    channels = torch.full((1, c), torch.nan, device=device)
+    background = torch.full((c,), 0.5, device=device)
+    tiles = bin_splats(needle)
+    assert len(tiles.splats) == 1
+    for form in forms(device):
+        image, alpha = composite(needle, channels, tiles, background, form=form)  # type: ignore[arg-type]
+        assert torch.equal(image, background[:, None, None].expand_as(image)), form
+        assert not alpha.any(), form
+
+
 @pytest.mark.parametrize("broken", [False, True])
 @pytest.mark.parametrize("sharpness", [0.0, 0.5])
 @pytest.mark.parametrize("c", [4, 11])

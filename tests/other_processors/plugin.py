@@ -1,4 +1,4 @@
-"""The pytest plugin: launches of SIMD forms run on the processor that ``SCGS_PROCESSOR`` names.
+"""The pytest plugin: launches of SIMD forms run on the processor that ``SCGS_PROCESSOR`` names, chunk by chunk.
 
 Every launch also runs here, and ``SCGS_PROCESSOR_LEDGER`` names a JSON file that gets what differed: for each kernel
 its launches, those with the same values, and the largest difference relative to the largest magnitude of an array.
@@ -22,6 +22,7 @@ from other_processors import memory
 from other_processors.program import ARGUMENTS_AT, PROCESSORS, REGIONS_AT, SHARED_SIZE, Program, shared_file
 from scgs_warp.runtime import launch
 from scgs_warp.runtime.cpu_kernel import CpuKernel
+from scgs_warp.runtime.cpu_threads import Chunks
 
 FORMS = "scgs_warp.kernels.cpu."
 PARAMETERS = 3
@@ -111,29 +112,32 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item in kept]
 
 
-def _alone(*_args: object) -> bool:
-    """Refuse to share a grid among threads: :func:`launch.launch` then runs it in one piece."""
-    return False
-
-
 def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.TemporaryDirectory(prefix="scgs-warp-processor-")
     device = Device(os.environ["SCGS_PROCESSOR"], Path(folder.name))
     memory.note_addresses()
-    run_here = CpuKernel.__call__
 
-    def run_there(self: CpuKernel, args: tuple, begin: int, size: int) -> None:
+    def run(kernel: CpuKernel, packed: bytes, begin: int, size: int) -> None:
+        bounds, words = kernel.bounds(size), begin.to_bytes(4, "little") + packed
+
         def here() -> None:
-            run_here(self, args, begin, size)
+            kernel._entry(bounds, words)
 
-        if not self.kernel.module.name.startswith(FORMS):
+        if kernel.kernel.module.name.startswith(FORMS):
+            device.launch(kernel, here, bounds, words)
+        else:
             here()
-            return
-        words = begin.to_bytes(4, "little") + self.pack(args)
-        device.launch(self, here, self.bounds(size), words)
 
-    CpuKernel.__call__ = run_there  # type: ignore[method-assign]
-    launch.share = _alone  # type: ignore[assignment]
+    def run_all(self: CpuKernel, args: tuple, begin: int, size: int) -> None:
+        run(self, self.pack(args), begin, size)
+
+    def share(kernel: CpuKernel, packed: bytes, chunks: Chunks, _threads: int, begin: int) -> bool:
+        for first, size in chunks:
+            run(kernel, packed, begin + first, size)
+        return True
+
+    CpuKernel.__call__ = run_all  # type: ignore[method-assign]
+    launch.share = share  # type: ignore[assignment]
 
     def finish() -> None:
         device.close()
