@@ -276,6 +276,35 @@ def test_a_long_needle_with_a_broken_channel_is_left_out(device: str):
         assert not alpha.any(), form
 
 
+def test_no_rounding_makes_a_needle_more_opaque(device: str):
+    """The squared distance of a pixel from a needle thousands of pixels long often rounds to less than zero."""
+    count, side, generator = 64, 16, torch.Generator().manual_seed(5)
+    angles = torch.pi * torch.rand(count, generator=generator).double()
+    along = torch.stack([angles.cos(), angles.sin()], 1)
+    away = (
+        5000.0
+        * torch.rand(count, 1, generator=generator)
+        * torch.where(torch.arange(count) % 2 == 0, 1.0, -1.0)[:, None]
+    )
+    across = torch.stack([-along[:, 1], along[:, 0]], 1)
+    products = [
+        along[:, i] * along[:, j] / 4000.0**2 + across[:, i] * across[:, j] for i, j in ((0, 0), (0, 1), (1, 1))
+    ]
+    one = random_splats(0, 1, side, side)
+    for needle in range(count):
+        splats = replace(
+            one,
+            means2d=(side / 2 + away * along)[needle : needle + 1].float().to(device),
+            conics=torch.stack(products, 1)[needle : needle + 1].float().to(device),
+            depths=torch.ones(1, device=device),
+            opacities=torch.full((1,), 0.1, device=device),
+            radii=torch.full((1, 2), 20_000, dtype=one.radii.dtype, device=device),
+        )
+        for form in forms(device):
+            _, alpha = composite(splats, torch.ones(1, 3, device=device), bin_splats(splats), form=form)  # type: ignore[arg-type]
+            assert alpha.max() <= 0.1 + 1e-6, form
+
+
 @pytest.mark.parametrize("broken", [False, True])
 @pytest.mark.parametrize("sharpness", [0.0, 0.5])
 @pytest.mark.parametrize("c", [4, 11])
