@@ -19,7 +19,19 @@ from typing import Any
 from literature_tables import Column, Literature, literature_table, read_literature
 from markdown_table import duration, number, percent, signed, table, thousands
 from provenance import OLDER, REPORTED, TRAINING, changed_since, older_note, reported_note
-from zoo_tables import change_of_defaults, clips, crossing, depth, differences, exposure, films, gallery, rig, zoo
+from zoo_tables import (
+    change_of_defaults,
+    clips,
+    crossing,
+    depth,
+    differences,
+    exposure,
+    films,
+    gallery,
+    rig,
+    second_try,
+    zoo,
+)
 
 from scgs_warp.ablation.published import PUBLISHED_PSNR, TABLE_S1
 
@@ -350,6 +362,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "rig": rig,
     "depth": depth,
     "crossing": crossing,
+    "second-try": second_try,
     "clips": clips,
     "gallery": gallery,
     "zoo": zoo,

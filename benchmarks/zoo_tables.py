@@ -150,6 +150,19 @@ def crossing(source: Source) -> str:
     return table(["", "motion error", "PSNR", "worst", "Gaussians"], lines)
 
 
+def second_try(source: Source) -> str:
+    """Write the motion error and PSNR of scenes of the zoo without and with a second try at stage 1."""
+    rows = [source.label("before", "without"), source.label("after", "with")]
+    lines = []
+    for scene in ZOO:
+        runs = source.run("before", scene), source.run("after", scene)
+        if all(runs):
+            cells = [number(run[key], 2) for key in ("epe", "psnr", "psnr_worst") for run in runs]
+            lines.append([scene, *cells])
+    head = [f"{name}, {row}" for name in ("motion error, %", "PSNR", "worst image") for row in rows]
+    return table(["", *head], lines)
+
+
 def rig(source: Source) -> str:
     """Write how good the view of a camera that was held out is, by the angle between the cameras of a rig."""
     rows = {
