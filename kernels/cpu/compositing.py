@@ -51,6 +51,14 @@ def composite_tile_adjoint(
 ): ...
 
 
+@native_function("slots.h")
+def sum_slots_block(
+    begin: int, offsets: wp.array[wp.int64], v_slots: wp.array2d[float], more: int,
+    v_means2d: wp.array[wp.vec2], v_conics: wp.array[wp.vec3], v_opacities: wp.array[float],
+    v_channels: wp.array2d[float], absgrad: wp.array[wp.vec2],
+): ...
+
+
 @native_function("depth.h")
 def expected_depth_block(
     begin: int, accumulated: wp.array[float], alpha: wp.array[float], unit: wp.float64, depth: wp.array[float],
@@ -148,6 +156,35 @@ def composite_adjoint(
         sharpness,
         absolute,
         v_slots_out,
+    )
+
+
+@wp.kernel
+def sum_slots(
+    first: int,
+    # In:
+    offsets_in: wp.array[wp.int64],  # [N + 1] a splat's slots
+    v_slots_in: wp.array2d[float],  # [P, 16]
+    more: int,  # whether these sums go on from what the outputs hold, else from zero
+    # Out:
+    v_means2d_out: wp.array[wp.vec2],  # [N]
+    v_conics_out: wp.array[wp.vec3],  # [N]
+    v_opacities_out: wp.array[float],  # [N]
+    v_channels_out: wp.array2d[float],  # [N, C], C <= 8
+    absgrad_out: wp.array[wp.vec2],  # [N]; empty: not wanted
+):
+    """Sum the slots of 16 splats, to the bits of the portable form. Grid: ceil(N / 16)."""
+    begin = (first + wp.tid()) * _LANES
+    sum_slots_block(
+        begin,
+        offsets_in,
+        v_slots_in,
+        more,
+        v_means2d_out,
+        v_conics_out,
+        v_opacities_out,
+        v_channels_out,
+        absgrad_out,
     )
 
 

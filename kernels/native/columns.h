@@ -27,12 +27,15 @@ ALWAYS_INLINE void read_vectors(const void* data, int begin, int rows, int width
         split2(a, to);
 }
 
+// Write columns as such rows.
 ALWAYS_INLINE void write_vectors(void* data, int begin, int rows, int width, const vf* from) {
     vf a[4];
     if (width == 4)
         join4(from, a);
-    else
+    else if (width == 3)
         join3(from, a);
+    else
+        join2(from, a);
     __builtin_memcpy((float*)data + (long long)begin * width, a, rows == 16 ? 64 * width : 4 * width * rows);
 }
 

@@ -11,6 +11,12 @@ ALWAYS_INLINE void split2(const vf* a, vf* to) {
     to[1] = __builtin_shufflevector(a[0], a[1], 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
 }
 
+// Turn two columns into 16 rows of two floats, in two registers.
+ALWAYS_INLINE void join2(const vf* a, vf* to) {
+    to[0] = __builtin_shufflevector(a[0], a[1], 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+    to[1] = __builtin_shufflevector(a[0], a[1], 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+}
+
 // Turn 16 rows of three floats, in three registers, into three columns.
 ALWAYS_INLINE void split3(const vf* a, vf* to) {
     to[0] = __builtin_shufflevector(

@@ -1,4 +1,5 @@
-"""Launches of the forms of compositing that use a block of threads per tile: ``cuda`` and the portable ``blocks``."""
+"""Launches of the forms of compositing that use a block of threads per tile, ``cuda`` and the portable ``blocks``, and
+of the sums of gradients of every form."""
 
 from __future__ import annotations
 
@@ -8,9 +9,11 @@ import torch
 from torch import Tensor
 
 from ..kernels import compositing
+from ..kernels.cpu import compositing as cpu_kernels
 from ..kernels.cuda import compositing as native
 from ..kernels.cuda import compositing_blocks
 from ..kernels.cuda import slots as slots_cuda
+from ..kernels.types import LANES
 from ..runtime.launch import launch, launch_blocks
 
 
@@ -81,12 +84,13 @@ def sum_slots(
         more: whether to add to the outputs instead of overwriting them.
     """
     count, slots = len(offsets) - 1, (offsets, v_slots, int(more))
-    if v_slots.shape[1] != slots_cuda.SLOT_WIDTH:
-        launch(compositing.sum_slots, count, *slots, *outputs)
-    elif form == "cuda":
+    lines = v_slots.shape[1] == slots_cuda.SLOT_WIDTH
+    if form == "cpu" and lines:
+        launch(cpu_kernels.sum_slots, -(-count // LANES), *slots, *outputs, grain=32)
+    elif form == "cuda" and lines:
         launch(slots_cuda.sum_slots, slots_cuda.SLOT_WIDTH * count, *slots, *outputs)
     else:
-        launch(compositing.sum_line_slots, count, *slots, *outputs)
+        launch(compositing.sum_slots, count, *slots, *outputs)
 
 
 def launch_native(kernel: Any, blocks: int, *args: Any, begin: int = 0) -> None:

@@ -48,7 +48,6 @@ REGISTERS = {
 STACK = {
     "bending": {"bend": 40},  # the singular value decomposition of a stretched Gaussian, of edits alone
     "cuda.compositing_blocks": {"composite_adjoint": 48},  # more than eight channels alone
-    "compositing": {"sum_line_slots": 64},  # for a CPU
     "encoding": {"encode": 32},  # sine and cosine of large angles
     "inverse_kinematics": {"reach_place": 40},  # sine and cosine of large angles, of edits alone
     "surface_depth": {"surface_depth": 1024},  # the Gaussians of a ray; part of no frame and no step

@@ -14,6 +14,7 @@ from helpers.splats import random_splats
 from reference.compositing import composite as composite_reference
 from scgs_warp.kernels import compositing as kernels
 from scgs_warp.kernels.types import STEP_FINE, STEP_HALTED, STEP_LOSS, STEP_REGULARISER
+from scgs_warp.ops import compositing_cuda
 from scgs_warp.ops.binning import bin_splats
 from scgs_warp.ops.compositing import composite
 from scgs_warp.rendering.render import expected_depth
@@ -325,6 +326,32 @@ def test_a_distance_beyond_float32_shows_nothing(device: str, c: int, sharpness:
             assert torch.equal(ours, other), form
         for name, gradient in zip(NAMES, gradients(poisoned, channels, background, 8, form)):
             assert torch.isfinite(gradient).all(), f"{form}: {name}"
+
+
+@pytest.mark.parametrize("more", [False, True])
+@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize("c", [1, 3, 4, 8])
+@pytest.mark.parametrize("n", [1, 16, 37])
+def test_sums_of_slots_have_the_same_bits(n: int, c: int, absolute: bool, more: bool):
+    """Of the form for a CPU and the portable one, where some gradients overflow, too."""
+    generator = torch.Generator().manual_seed(n + c)
+    counts = torch.randint(0, 6, (n,), generator=generator)
+    counts[0] = 3
+    offsets = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
+    slots = torch.randn(int(offsets[-1]), 16, generator=generator)
+    slots[::7, :8] = torch.tensor([torch.inf, -torch.inf, torch.nan, 1e38, -1e38, 3e37, 1e30, 1e37])
+    shapes = ((n, 2), (n, 3), (n,), (n, c), (n, 2))
+    before = [torch.randn(shape, generator=generator) for shape in shapes]
+    results = []
+    for form in ("cpu", "pixel"):
+        outputs = [tensor.clone() for tensor in before]
+        wanted = (*outputs[:4], outputs[4] if absolute else None)
+        compositing_cuda.sum_slots(form, offsets, slots, wanted, more=more)
+        results.append(outputs)
+    for got, expected in zip(*results):
+        assert torch.equal(got, expected)
+    assert torch.equal(results[0][4], before[4]) != absolute
+    assert all(tensor.isfinite().all() for tensor in results[0][:3])
 
 
 def backward_buffers(splats: Splats, channels: Tensor, form: str, absolute: bool) -> tuple[list[Tensor], Stats, Tensor]:
