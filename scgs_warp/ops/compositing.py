@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -237,7 +238,14 @@ def _pixels(tiles: Tiles, window: Window) -> list[tuple[int, int]]:
 def _load(tiles: Tiles, window: Window) -> Tensor:
     """Return the cumulative cost on a CPU of the window's tiles, [T], in pairs."""
     ends = tiles.ranges[window[0] : window[1], 1]
-    return ends + torch.arange(EMPTY_TILE, (len(ends) + 1) * EMPTY_TILE, EMPTY_TILE)
+    return ends + _empty_tiles(len(ends))
+
+
+@functools.lru_cache(maxsize=64)
+def _empty_tiles(count: int) -> Tensor:
+    """Return the cumulative cost of ``count`` empty tiles, [count]."""
+    with torch.inference_mode(False):
+        return torch.arange(EMPTY_TILE, (count + 1) * EMPTY_TILE, EMPTY_TILE)
 
 
 def _packed_width(channels: int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -32,3 +33,8 @@ class CpuKernel:
     def __call__(self, args: tuple, begin: int, size: int) -> None:
         """Run a part of the grid in this thread; ``args`` are those after ``first``."""
         self._entry(self.bounds(size), begin.to_bytes(4, "little") + self.pack(args))
+
+    def bound(self, args: tuple) -> Callable[[], None]:
+        """Return a function that runs a grid of one index with these arguments, packed once; the caller keeps their
+        tensors alive."""
+        return functools.partial(self._entry, self.bounds(1), (0).to_bytes(4, "little") + self.pack(args))

@@ -45,6 +45,10 @@ MAX_CHUNKS_PER_SHARE = 32
 """Largest number of chunks in a thread's fair share of the whole grid; it limits how small chunks get."""
 
 
+_yield_core: Callable[[], object] = getattr(os, "sched_yield", functools.partial(time.sleep, 0.0))
+"""Function that lets another thread have the core. A sleep of 0 seconds takes 50 microseconds or more on Linux."""
+
+
 @functools.cache
 def _shares(threads: int) -> np.ndarray:
     """Return the ends of the chunks as fractions of the whole grid, ascending to 1."""
@@ -61,6 +65,7 @@ class Chunks:
     def __init__(self, firsts: np.ndarray, sizes: np.ndarray) -> None:
         self.firsts, self.sizes = np.ascontiguousarray(firsts, np.int32), sizes
         self._bounds: np.ndarray | None = None
+        self._places: tuple[int, int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.firsts)
@@ -74,6 +79,13 @@ class Chunks:
             raw = b"".join(map(of_size, self.sizes.tolist()))
             self._bounds = np.frombuffer(raw, np.uint8).reshape(len(self), -1)
         return self._bounds
+
+    def places(self, of_size: Callable[[int], bytes]) -> tuple[int, int, int]:
+        """Return the address of the launch bounds, their bytes per chunk, and the address of the first indices."""
+        if self._places is None:
+            bounds = self.bounds(of_size)
+            self._places = bounds.ctypes.data, bounds.shape[1], self.firsts.ctypes.data
+        return self._places
 
 
 @functools.lru_cache(maxsize=1024)
@@ -91,17 +103,21 @@ def cut_by_load(load: Tensor, threads: int) -> Chunks:
         threads: number of threads that share the work.
     """
     running = load.numpy()
-    last = np.searchsorted(running, _shares(threads) * float(running[-1]))
-    ends = np.unique(np.append(np.minimum(last + 1, len(running)), len(running)))
-    order = np.argsort(-np.diff(running[ends - 1], prepend=0), kind="stable")
+    ends = np.minimum(np.searchsorted(running, _shares(threads) * float(running[-1])) + 1, len(running))
+    ends[-1] = len(running)
+    ends = ends[np.append(ends[:-1] != ends[1:], True)]
+    costs = running[ends - 1]
+    costs[1:] -= running[ends[:-1] - 1]
+    order = np.argsort(-costs, kind="stable")
     firsts, sizes = _between(ends)
     return Chunks(firsts[order], sizes[order])
 
 
 def _between(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the first indices and the sizes of consecutive chunks."""
-    sizes = np.diff(ends, prepend=0)
-    return ends - sizes, sizes
+    firsts = np.zeros_like(ends)
+    firsts[1:] = ends[:-1]
+    return firsts, ends - firsts
 
 
 class HelperThreads:
@@ -137,11 +153,13 @@ class HelperThreads:
         try:
             if not self._calls and not self._prepare():
                 return False
-            firsts, bounds = chunks.firsts + np.int32(begin) if begin else chunks.firsts, chunks.bounds(kernel.bounds)
+            places, firsts = chunks.places(kernel.bounds), chunks.firsts
+            if begin:
+                firsts = firsts + np.int32(begin)
+                places = (*places[:2], firsts.ctypes.data)
             self._arguments[FIRST_SIZE:size] = arguments
             seats = min(threads, len(chunks), MOST_SEATS + 1) - 1
-            places = bounds.ctypes.data, bounds.shape[1], firsts.ctypes.data, self._address
-            self._job[ENTRY:SPINS] = kernel.address, *places, size, len(chunks), seats
+            self._job[ENTRY:SPINS] = kernel.address, *places, self._address, size, len(chunks), seats
             self._run(len(chunks), seats)
         finally:
             self._busy.release()
@@ -154,7 +172,7 @@ class HelperThreads:
         with suppress(NotEnoughMemory):
             for kernel in (kernels.share_job, kernels.finish_job, kernels.serve_job):
                 cpu = prepared(kernel, lambda kernel=kernel: CpuKernel(kernel, (self._shared,)))
-                calls[kernel.key] = functools.partial(cpu, (self._shared,), 0, 1)
+                calls[kernel.key] = cpu.bound((self._shared,))
             self._calls = calls
         return bool(self._calls)
 
@@ -190,7 +208,7 @@ class HelperThreads:
                     self._wake(helpers)
                 else:
                     self._calls["finish_job"]()
-                    time.sleep(0.0)
+                    _yield_core()
             except BaseException as error:
                 if job[STATE] == before:
                     raise
