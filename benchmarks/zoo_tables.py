@@ -152,7 +152,7 @@ def crossing(source: Source) -> str:
 
 def second_try(source: Source) -> str:
     """Write the motion error and PSNR of scenes of the zoo without and with a second try at stage 1."""
-    rows = [source.label("before", "without"), source.label("after", "with")]
+    rows = [source.label("before", "one try"), source.label("after", "two tries")]
     lines = []
     for scene in ZOO:
         runs = source.run("before", scene), source.run("after", scene)

@@ -8,7 +8,7 @@ LOG2_E = 1.4426950408889634
 """Constant log2(e), since exponentials are taken to base 2."""
 
 TILE_SIZE = 16
-"""Side of a tile in pixels: a tile has 16 blocks of 4 x 4, each in one 512-bit SIMD register, and one CUDA block."""
+"""Side of a tile in pixels. Its 256 pixels are 16 SIMD registers of 4 x 4 pixels, or one CUDA block."""
 
 LANES = 16
 """Number of floats in a vector of the CPU's kernels, one AVX-512 register."""

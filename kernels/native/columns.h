@@ -27,7 +27,7 @@ ALWAYS_INLINE void read_vectors(const void* data, int begin, int rows, int width
         split2(a, to);
 }
 
-// Write columns as such rows.
+// Write columns as rows begin to begin + rows - 1 of an array of vectors of `width` floats.
 ALWAYS_INLINE void write_vectors(void* data, int begin, int rows, int width, const vf* from) {
     vf a[4];
     if (width == 4)

@@ -13,8 +13,8 @@ ALWAYS_INLINE void read_channels(const wp::array_t<float>& channels, int begin, 
     for (int c = 0; c < 16; ++c) to[c] = from + c < count ? to[c] : vf{};
 }
 
-// Return the bound below which a fall counts, -log2 of a Gaussian of sharpness 0: where it is equal or larger, alpha,
-// with its sharpness, is under ALPHA_MIN. 0: it counts nowhere.
+// Return the bound below which a splat's fall counts (Seen::fall): where the fall is equal or larger, alpha, with its
+// sharpness, is under ALPHA_MIN. 0: it counts nowhere.
 ALWAYS_INLINE vf fall_bound(vf log2_opacity, float sharpness) {
     FUSE_WITHIN_EXPRESSIONS
     const vf fall = 7.994353436858858f + log2_opacity;  // log2(255)

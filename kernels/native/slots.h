@@ -9,6 +9,7 @@ static inline void sum_slots_block(
     wp::array_t<wp::vec2>& v_means2d, wp::array_t<wp::vec3>& v_conics, wp::array_t<float>& v_opacities,
     wp::array_t<float>& v_channels, wp::array_t<wp::vec2>& absgrad
 ) {
+    FUSE_WITHIN_EXPRESSIONS
     const int total = v_opacities.shape[0], channels = v_channels.shape[1];
     const int rows = total - begin < 16 ? total - begin : 16;
     const bool absolute = absgrad.shape[0] > 0;

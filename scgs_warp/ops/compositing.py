@@ -241,7 +241,7 @@ def _load(tiles: Tiles, window: Window) -> Tensor:
     return ends + _empty_tiles(len(ends))
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=4)
 def _empty_tiles(count: int) -> Tensor:
     """Return the cumulative cost of ``count`` empty tiles, [count]."""
     with torch.inference_mode(False):

@@ -35,6 +35,11 @@ class CpuKernel:
         self._entry(self.bounds(size), begin.to_bytes(4, "little") + self.pack(args))
 
     def bound(self, args: tuple) -> Callable[[], None]:
-        """Return a function that runs a grid of one index with these arguments, packed once; the caller keeps their
-        tensors alive."""
-        return functools.partial(self._entry, self.bounds(1), (0).to_bytes(4, "little") + self.pack(args))
+        """Return a function that runs a grid of one index with these arguments, packed once. It keeps the kernel's code
+        loaded; the caller keeps the tensors alive."""
+        bounds, words = self.bounds(1), (0).to_bytes(4, "little") + self.pack(args)
+
+        def run() -> None:
+            self._entry(bounds, words)
+
+        return run

@@ -45,8 +45,10 @@ MAX_CHUNKS_PER_SHARE = 32
 """Largest number of chunks in a thread's fair share of the whole grid; it limits how small chunks get."""
 
 
+IMPATIENCE = 1.5e-4
+"""Seconds for which the caller, which waits for the last chunks, offers its core without sleeping. Since Python 3.11, a
+sleep of 0 seconds takes 50 microseconds or more on Linux, as long as a short kernel."""
 _yield_core: Callable[[], object] = getattr(os, "sched_yield", functools.partial(time.sleep, 0.0))
-"""Function that lets another thread have the core. A sleep of 0 seconds takes 50 microseconds or more on Linux."""
 
 
 @functools.cache
@@ -64,8 +66,7 @@ class Chunks:
 
     def __init__(self, firsts: np.ndarray, sizes: np.ndarray) -> None:
         self.firsts, self.sizes = np.ascontiguousarray(firsts, np.int32), sizes
-        self._bounds: np.ndarray | None = None
-        self._places: tuple[int, int, int] | None = None
+        self._placed: tuple[np.ndarray, int, int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.firsts)
@@ -73,19 +74,15 @@ class Chunks:
     def __iter__(self) -> Iterator[tuple[int, int]]:
         return zip(self.firsts.tolist(), self.sizes.tolist())
 
-    def bounds(self, of_size: Callable[[int], bytes]) -> np.ndarray:
-        """Return the launch bounds of the chunks, [chunks, bytes]."""
-        if self._bounds is None:
+    def placed(self, of_size: Callable[[int], bytes]) -> tuple[np.ndarray, int, int, int]:
+        """Return the launch bounds of the chunks, [chunks, bytes], their address, their bytes per chunk, and the
+        address of the first indices."""
+        placed = self._placed
+        if placed is None:
             raw = b"".join(map(of_size, self.sizes.tolist()))
-            self._bounds = np.frombuffer(raw, np.uint8).reshape(len(self), -1)
-        return self._bounds
-
-    def places(self, of_size: Callable[[int], bytes]) -> tuple[int, int, int]:
-        """Return the address of the launch bounds, their bytes per chunk, and the address of the first indices."""
-        if self._places is None:
-            bounds = self.bounds(of_size)
-            self._places = bounds.ctypes.data, bounds.shape[1], self.firsts.ctypes.data
-        return self._places
+            bounds = np.frombuffer(raw, np.uint8).reshape(len(self), -1)
+            placed = self._placed = bounds, bounds.ctypes.data, bounds.shape[1], self.firsts.ctypes.data
+        return placed
 
 
 @functools.lru_cache(maxsize=1024)
@@ -153,10 +150,11 @@ class HelperThreads:
         try:
             if not self._calls and not self._prepare():
                 return False
-            places, firsts = chunks.places(kernel.bounds), chunks.firsts
+            placed = chunks.placed(kernel.bounds)  # held until the job is done, as are the first indices
+            places, firsts = placed[1:], chunks.firsts
             if begin:
                 firsts = firsts + np.int32(begin)
-                places = (*places[:2], firsts.ctypes.data)
+                places = (*placed[1:3], firsts.ctypes.data)
             self._arguments[FIRST_SIZE:size] = arguments
             seats = min(threads, len(chunks), MOST_SEATS + 1) - 1
             self._job[ENTRY:SPINS] = kernel.address, *places, self._address, size, len(chunks), seats
@@ -196,7 +194,7 @@ class HelperThreads:
 
         What is raised before the job was offered is raised at once.
         """
-        job, before, called, interrupt = self._job, int(self._job[STATE]), False, None
+        job, before, called, sleep_at, interrupt = self._job, int(self._job[STATE]), False, 0.0, None
         while True:
             try:
                 if job[STATE] == before:
@@ -208,7 +206,12 @@ class HelperThreads:
                     self._wake(helpers)
                 else:
                     self._calls["finish_job"]()
-                    _yield_core()
+                    now = time.perf_counter()
+                    sleep_at = sleep_at or now + IMPATIENCE
+                    if now < sleep_at:
+                        _yield_core()
+                    else:
+                        time.sleep(0.0)
             except BaseException as error:
                 if job[STATE] == before:
                     raise

@@ -102,6 +102,7 @@ def test_parts_are_split_and_merged_in_the_page(browser, editor):
     page.keyboard.press("Escape")
     until(lambda: not window.ask("studio.link.state.selection.length"))
     window.ask("studio.link.ask('tool', { rings: 0 })")
+    window.still()  # the arrows of the part are no longer drawn, and cannot be hit
     page.mouse.click(*place)
     until(lambda: window.ask("studio.link.state.selection.length") == 1)
     assert page.locator("#chosen").inner_text() == "1 control point"

@@ -1,4 +1,5 @@
-"""The pytest plugin: launches of SIMD forms run on the processor that ``SCGS_PROCESSOR`` names, chunk by chunk.
+"""The pytest plugin: launches of SIMD forms run on the processor that ``SCGS_PROCESSOR`` names, in the chunks that
+this machine's threads would take.
 
 Every launch also runs here, and ``SCGS_PROCESSOR_LEDGER`` names a JSON file that gets what differed: for each kernel
 its launches, those with the same values, and the largest difference relative to the largest magnitude of an array.
