@@ -25,8 +25,11 @@ def test_stages_unwrap_what_they_wrap_and_count_nested_ones_once():
     owner.outer = lambda: (busy(20_000), owner.inner())
     before = dict(vars(owner))
     stages = bench_clock.Stages("cpu", {"outer": [(owner, "outer")], "inner": [(owner, "inner")]})
-    found = stages.repeat(lambda index: (owner.outer(), busy(40_000)), 0.0)
-    assert set(found) == {"outer", "rest"} and vars(owner) == before
+    for _ in range(3):  # another process may take the core in one of them
+        found = stages.repeat(lambda index: (owner.outer(), busy(40_000)), 0.0)
+        assert set(found) == {"outer", "rest"} and vars(owner) == before
+        if 0.2 < found["outer"][1] < 0.8:
+            break
     assert 0.2 < found["outer"][1] < 0.8
     with pytest.raises(ZeroDivisionError):
         stages.repeat(lambda index: 1 / 0, 0.0)
